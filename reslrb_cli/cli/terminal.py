@@ -1,6 +1,6 @@
 """The terminal: streams on which nothing fails, what an error comes to, and signals.
 
-What commands print and log (`echo`, `LineFormatter`): keys, names and paths are a user's or a file's, and must not
+What commands print and log (`echo`, `LogLines`): keys, names and paths are a user's or a file's, and must not
 command the terminal.
 
 Standard output and error of a command, as streams on which nothing fails: a terminal that was closed, a disk that is
@@ -148,14 +148,6 @@ def echo(line: object) -> None:
     click.echo(printable(line))
 
 
-class LineFormatter(logging.Formatter):
-    """Formats a record as its message alone, in one line, with what is not printable in it escaped."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        """The line."""
-        return printable(record.getMessage())
-
-
 class Forgiving:
     """Passes text on to `stream`, and goes on where that fails; else it is that stream. None shows nothing.
 
@@ -220,11 +212,16 @@ def forgiving_output() -> Iterator[None]:
 
 
 class LogLines(logging.Handler):
-    """Writes each message as a line on what is the standard error at that moment."""
+    """Writes each message as a line on what is the standard error at that moment, above a progress bar where there is
+    one, with what is not printable in it escaped."""
 
     def emit(self, record: logging.LogRecord) -> None:
         try:
-            click.echo(self.format(record), err=True)
+            line, bars = printable(record.getMessage()), sys.modules.get("tqdm")
+            if bars is None:
+                click.echo(line, err=True)
+            else:
+                bars.tqdm.write(line, file=sys.stderr)
         except Exception:
             self.handleError(record)
 

@@ -170,19 +170,15 @@ def _kind(entry: Mapping[str, Any]) -> str | None:
 
 def _record(entry: dict[str, Any]) -> dict[str, Any] | None:
     """A line of `metrics.jsonl`, changed so that its figures are figures; None where what each has is missing."""
-    for key in _FIGURES:
-        if not is_number(entry.get(key)):
-            return None
-    for key in _ALL_FIGURES:
-        if not is_number(entry.get(key)):
-            entry[key] = None
+    if not all(is_number(entry.get(key)) for key in _FIGURES):
+        return None
     errors = entry.get("parameter_errors")
-    if not isinstance(errors, dict):
-        errors = entry["parameter_errors"] = {}
-    for key, value in errors.items():
-        if not is_number(value):
-            errors[key] = None
-    return entry
+    entry["parameter_errors"] = _figures(errors) if isinstance(errors, dict) else {}
+    return entry | _figures({key: entry.get(key) for key in _ALL_FIGURES})
+
+
+def _figures(values: Mapping[str, Any]) -> dict[str, float | None]:
+    return {key: value if is_number(value) else None for key, value in values.items()}
 
 
 def is_number(value: object) -> TypeGuard[float]:
