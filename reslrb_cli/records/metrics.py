@@ -175,12 +175,8 @@ def read_records(folder: Path, count: int, last: Mapping[str, Any] | None) -> tu
     if len(records) == count - 1 and last is not None:
         records.append(_record(json.dumps(last).encode(), count - 1, path))
     if len(records) < count:
-        raise ConfigError(
-            path,
-            "",
-            f"holds {len(records)} of the {count} iterations of the checkpoint; put it back, or begin anew from "
-            "`initial: {run: ...}`",
-        )
+        held = f"holds {len(records)} of the {count} iterations of the checkpoint"
+        raise ConfigError(path, "", f"{held}; put it back, or begin anew from `initial: {{run: ...}}`")
     return records, sum(map(len, whole))
 
 

@@ -70,9 +70,7 @@ def notes(records: Sequence[MethodRecord]) -> list[str]:
         if record.biased:
             size = "" if not record.bias else f" by {record.bias:.2g} of the whole"
             lines.append(f"{where}: biased{size}, against {record.bias_reference}")
-        elif (record.message and record.relative_rmse is not None) or (
-            record.message and record.status is not BenchStatus.OK
-        ):
+        elif record.message and (record.relative_rmse is not None or record.status is not BenchStatus.OK):
             lines.append(f"{where}: {record.message}")
     return lines
 
@@ -83,13 +81,9 @@ def reference_line(record: ReferenceRecord) -> str:
     words = f"{shorten(record.parameter, KEY_WIDTH)}: {floor}, {record.repeats} steps of {record.method.label}"
     if record.bias_z is not None:
         verdict = {True: "DIFFERS from", False: "agrees with", None: "not decided against"}[record.biased]
-        words += (
-            f"; {verdict} {record.bias_reference}: max |z| {abs(record.bias_z):.1f} (limit {record.bias_z_limit:.1f})"
-        )
+        z = f"max |z| {abs(record.bias_z):.1f} (limit {record.bias_z_limit:.1f})"
+        words += f"; {verdict} {record.bias_reference}: {z}"
     return words
-
-
-# --- the closing sentence ---------------------------------------------------------------------------------------------
 
 
 def closing_sentence(records: Sequence[MethodRecord]) -> str:
@@ -120,10 +114,8 @@ def closing_sentence(records: Sequence[MethodRecord]) -> str:
             sentence += f"; {_times(best, beaten)} times as efficient as {beaten.method.label}"
     sentence += "."
     if biased and _efficiency(biased[0]) > _efficiency(best):
-        first = biased[0]
-        sentence += (
-            f" The biased {first.method.label} has {_efficiency(first) / _efficiency(best):.2g} times its efficiency"
-        )
+        first, times = biased[0], _efficiency(biased[0]) / _efficiency(best)
+        sentence += f" The biased {first.method.label} has {times:.2g} times its efficiency"
         sentence += f", but its error stays above {first.bias:.2g}." if first.bias else "."
     return sentence
 

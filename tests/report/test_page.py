@@ -30,7 +30,7 @@ from reslrb_cli.report import page as page_module
 from reslrb_cli.report.page import render, write_page, write_report
 from reslrb_cli.report.page.values import parameter_table, texture_pictures
 from reslrb_cli.report.perceptual import with_seen_errors
-from reslrb_cli.report.sources import read_sources
+from reslrb_cli.report.sources import Run, read_sources
 from reslrb_cli.report.tonemap import exposure_for, exposure_words, shown_exposures
 
 # What stands on a run's page.
@@ -133,11 +133,12 @@ def test_textures_stand_beside_each_other(tmp_path):
 def test_heights_are_shown_from_the_lowest_to_the_highest(tmp_path):
     """They may be negative, and far below what a picture shows."""
     heights = np.array([[-1e-3, 0, 3e-3]], np.float32)[:, :, None]
-    (tmp_path / "true").mkdir()
-    np.savez(tmp_path / "parameters.npz", **{"slab.heightmap": np.zeros_like(heights)})
-    np.savez(tmp_path / "true" / "parameters.npz", **{"slab.heightmap": heights})
+    (tmp_path / "parameters" / "true").mkdir(parents=True)
+    np.savez(tmp_path / "parameters" / "parameters.npz", **{"slab.heightmap": np.zeros_like(heights)})
+    np.savez(tmp_path / "parameters" / "true" / "parameters.npz", **{"slab.heightmap": heights})
     about = {"quantity": "length", "shape": [1, 3, 1]}
-    page = Page(texture_pictures(tmp_path, {"parameters": {"slab.heightmap": about}}))
+    manifest = {"results": {"parameters": {"slab.heightmap": about}}}
+    page = Page(texture_pictures(Run(tmp_path, "slab", manifest, [])))
     shown = {alt: pixels(uri) for alt, uri in page.pictures}
     assert shown["true: slab.heightmap"][0, 0, 0] == 0
     assert shown["true: slab.heightmap"][0, 2, 0] == 1

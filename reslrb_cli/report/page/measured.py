@@ -184,7 +184,7 @@ def run_comparison(runs: Sequence[Run]) -> Parts:
         "Images": lambda: _each(runs, image_rows),
         "Errors as people see them": lambda: seen_tables(runs),
         "Parameters": lambda: _each(runs, lambda run: parameter_table(run.results)),
-        "Textures": lambda: _each(runs, lambda run: texture_pictures(run.path / "parameters", run.results)),
+        "Textures": lambda: _each(runs, texture_pictures),
     }
     return [(title, guarded(make)) for title, make in made.items()]
 
@@ -243,24 +243,24 @@ def measured(source: Measurements | Maps) -> Markup:
         "bench": bench, "gradcheck": gradcheck, "convergence": convergence,
     }  # fmt: skip
     markup, unknown = makers[source.kind](source.objects)
-    words = [f"{count(len(source.damaged), 'line')} could not be read (the first is line {source.damaged[0]})."] if (
-        source.damaged) else []  # fmt: skip
-    words += [f"{count(unknown, 'line')} of other kinds, or damaged, left out."] if unknown else []
-    origins = [lay_out("run.origin", origin) for origin in source.origins]
-    return markup + Markup().join([*map(soft, words), *origins])
+    if source.damaged:
+        markup += soft(
+            f"{count(len(source.damaged), 'line')} could not be read (the first is line {source.damaged[0]})."
+        )
+    if unknown:
+        markup += soft(f"{count(unknown, 'line')} of other kinds, or damaged, left out.")
+    return markup + Markup().join(lay_out("run.origin", origin) for origin in source.origins)
 
 
 def gradcheck(objects: Sequence[Mapping[str, Any]]) -> tuple[Markup, int]:
     """The comparisons as a table, what fails first, and what is missing; and how many lines are neither."""
     records = [record for entry in objects if (record := record_of(GradcheckRecord, entry)) is not None]
     missing = [found for entry in objects if (found := record_of(MissingRecord, entry)) is not None]
-    rows = [
-        {"case": record.case, "cells": cells(record), "fails": record.verdict is Verdict.FAILS} for record in records
-    ]
-    rows.sort(key=lambda row: not row["fails"])
+    failing = [record for record in records if record.verdict is Verdict.FAILS]
+    ordered = failing + [record for record in records if record.verdict is not Verdict.FAILS]
     lines = [line for line in summary_lines(records) if not line.startswith("FAILS")] if records else []
     lines += [found.line() for found in missing]
-    failed = [failure_line(record) for record in records if record.verdict is Verdict.FAILS]
     several = len({record.case for record in records}) > 1
-    markup = lay_out("measured.gradcheck", failed, lines, list(HEAD), several, rows)
+    rows = [{"case": record.case, "cells": cells(record), "fails": record in failing} for record in ordered]
+    markup = lay_out("measured.gradcheck", list(map(failure_line, failing)), lines, list(HEAD), several, rows)
     return markup, len(objects) - len(records) - len(missing)

@@ -46,11 +46,9 @@ class StepParts:
         steady = records[WARM_UP:] or records
         outside = 1e3 * records[-1]["elapsed_s"] - sum(record["step_ms"] for record in records)
         return cls(
-            statistics.median(record["step_ms"] for record in steady),
-            _median(steady, "primal_ms"),
-            _median(steady, "adjoint_ms"),
+            _median(steady, "step_ms") or 0.0, _median(steady, "primal_ms"), _median(steady, "adjoint_ms"),
             max(outside / len(records), 0.0),
-        )
+        )  # fmt: skip
 
     def words(self) -> str:
         """In a line."""
@@ -122,21 +120,22 @@ DAMAGED = "This part cannot be shown: what was recorded of it is damaged."
 
 def header(run: Run) -> Markup:
     """The run's name, how it ended, what it came to, and what went wrong."""
+    seconds, loss = run.elapsed_s, run.results.get("loss")
     parts = (
-        [f"{count(len(run.records), 'iteration')} in {duration(run.elapsed_s)}"] if run.elapsed_s is not None else []
+        "" if seconds is None else f"{count(len(run.records), 'iteration')} in {duration(seconds)}",
+        "" if loss is None else f"loss {number(loss)}",
+        error_line(run.results),
     )
-    parts += [f"loss {number(run.results['loss'])}"] if run.results.get("loss") is not None else []
-    parts += [line for line in [error_line(run.results)] if line]
-    return lay_out("header", run.name, run.manifest.get("status", "unknown"), ", ".join(parts)) + problems(run)
+    lead = ", ".join(part for part in parts if part)
+    return lay_out("header", run.name, run.manifest.get("status", "unknown"), lead) + problems(run)
 
 
 def problems(run: Run) -> Markup:
     """What went wrong in a run, and what of its records could not be read."""
-    lines = warnings(run.results, "±")
+    lines, error = warnings(run.results, "±"), run.manifest.get("error")
     if run.damaged:
         where = f"{count(len(run.damaged), 'line')} of metrics.jsonl (the first is line {run.damaged[0]})"
         lines.append(f"{where} could not be read.")
-    error = run.manifest.get("error")
     return lay_out("note", [error] if error else [], "failed") + lay_out("note", lines)
 
 
@@ -150,7 +149,7 @@ def run_parts(run: Run) -> dict[str, Markup]:
         "Images": lambda: image_rows(run),
         "Views": lambda: view_table(run.manifest.get("views"), results),
         "Errors as people see them": lambda: seen_tables([run]),
-        "Textures": lambda: texture_pictures(run.path / "parameters", results, run.current),
+        "Textures": lambda: texture_pictures(run),
         "Convergence": lambda: convergence(run),
     }
     return {title: guarded(make) for title, make in parts.items()} | record_parts(run)

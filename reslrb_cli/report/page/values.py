@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -51,19 +50,16 @@ def parameter_table(results: Mapping[str, Any], end: str = "end", notes: bool = 
     return lay_out("run.parameters", rows, moments, list(errors), noted, relative)
 
 
-def texture_pictures(
-    folder: Path, results: Mapping[str, Any], current: Mapping[str, Array] | None = None
-) -> Markup:  # fmt: skip
-    """Each texture at the start and at the end, the true one where it is known, and what of it light and sensor reach.
-
-    `folder` is a run's `parameters/`; `current` are the values now, by key, of a run that has no end yet.
-    """
+def texture_pictures(run: Run) -> Markup:
+    """Each texture at the start and at the end, or now, the true one where it is known, and what of it light and sensor
+    reach."""
+    folder = run.path / "parameters"
     archives = {moment: read_parameters(folder / sub) for moment, sub in _FOLDERS.items()}
     titles = {moment: title for title, moment in MOMENTS}
-    if current is not None:
-        archives["final"], titles["final"] = dict(current), "now"
+    if run.current is not None:
+        archives["final"], titles["final"] = dict(run.current), "now"
     parts = Markup()
-    for name, about in (results.get("parameters") or {}).items():
+    for name, about in (run.results.get("parameters") or {}).items():
         found = {moment: archive[name] for moment, archive in archives.items() if name in archive}
         arrays = {moment: array for moment, array in found.items() if array.ndim == 3 and array.size}
         if not arrays:
@@ -132,12 +128,8 @@ Figures = list[float | None]
 def convergence(run: Run) -> Markup:
     """Loss, and errors by parameter where they are known, against iterations and against time."""
     if not run.records:
-        when = (
-            "has been completed yet; the first one also compiles what the others use"
-            if run.at_work
-            else "was completed"
-        )
-        return lay_out("paragraph", f"No iteration {when}.")
+        yet = "has been completed yet; the first one also compiles what the others use"
+        return lay_out("paragraph", f"No iteration {yet if run.at_work else 'was completed'}.")
     relative = units_differ(run.results)
     scales = run.scales if relative else {}
     errors = {name: _errors(run, name, scales.get(name)) for name in run.records[-1]["parameter_errors"]}
