@@ -26,7 +26,6 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-import math
 import os
 import select
 import signal
@@ -233,12 +232,3 @@ def tell(error: BaseException) -> tuple[str, int] | None:
         where = context.command_path if context else "reslrb"
         return f"{where}: {one_line(error.format_message()).rstrip('.')}. See `{where} --help`.", ExitCode.USAGE
     return errors.tell(error)
-
-
-def without_nan(value: Any) -> Any:
-    """The same with numbers that are not finite as text, "nan", "inf" and "-inf": JSON has none."""
-    if isinstance(value, dict):
-        return {key: without_nan(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [without_nan(entry) for entry in value]
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value

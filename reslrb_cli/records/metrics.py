@@ -12,7 +12,7 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -44,13 +44,14 @@ class Line:
         return json.dumps(head | values.pop("method", {}) | finite(values), allow_nan=False)
 
 
-def finite(value: Any) -> Any:
-    """The same of mappings, lists and numbers, with None for numbers that are not finite: JSON has none."""
+def finite(value: Any, instead: Callable[[float], object] = lambda number: None) -> Any:
+    """The same of mappings, lists and numbers, with None, or what is to stand `instead`, for numbers that are not
+    finite: JSON has none."""
     if isinstance(value, dict):
-        return {key: finite(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return {key: finite(entry, instead) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(entry, instead) for entry in value]
+    return instead(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _nan_for_null(value: object, handler: ValidatorFunctionWrapHandler) -> float:

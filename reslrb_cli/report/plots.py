@@ -44,7 +44,8 @@ LEAST_LOG, MOST_LABELLED = 5.0, 300.0
 class Curve:
     """One curve: points (x, y), those that are None or not finite left out. `place` chooses its colour and its dashes.
 
-    `band` has the ends of each point's interval, where there are such. `points`: each point has a mark.
+    `band` has the ends of each point's interval, where there are such. `points`: each point has a mark;
+    `dashed`: it is drawn in dashes, whatever its place.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Curve:
     place: int = 0
     band: tuple[Sequence[float | None], Sequence[float | None]] | None = None
     points: bool = False
+    dashed: bool = False
 
     def known(self) -> Array:
         """Its points as (N, 2)."""
@@ -67,7 +69,7 @@ def draw(axis: Any, curves: Sequence[Curve], log_x: float | None = None) -> None
     above 0.
     """
     for curve in curves:
-        _draw(axis, curve, curve.known())
+        _draw(axis, curve)
     values = np.concatenate([curve.known() for curve in curves])
     low, high = values.min(axis=0), values.max(axis=0)
     if low[1] > 0 and high[1] > LEAST_LOG * low[1]:
@@ -87,11 +89,12 @@ def points_together(count: int) -> int:
     return -(-count // MOST_POINTS)
 
 
-def _draw(axis: Any, curve: Curve, points: Array) -> None:
+def _draw(axis: Any, curve: Curve) -> None:
+    points = curve.known()
     xs, ys = _thinned(points, points_together(len(points)))
     marker = "o" if curve.points or len(xs) == 1 else ""
     again, place = divmod(curve.place, len(COLORS))
-    style = "--" if again else "-"
+    style = "--" if again or curve.dashed else "-"
     axis.plot(xs, ys, linewidth=1.5, color=COLORS[place], marker=marker, markersize=4, linestyle=style,
               label=curve.name)  # fmt: skip
     if curve.band is not None:
@@ -116,14 +119,6 @@ def _thinned(points: Array, together: int) -> tuple[Any, Any]:
     counts = np.diff([*starts, len(points)])
     xs, ys = (sums / counts[:, None]).T
     return xs, ys
-
-
-_MARKERS = "osD^vPX*<>"
-
-
-def _style(place: int) -> dict[str, Any]:
-    """How the curve of a place is drawn."""
-    return {"color": f"C{place % 10}", "marker": _MARKERS[place % len(_MARKERS)], "markersize": 5, "linewidth": 1.3}
 
 
 def _figure(inches: tuple[float, float]) -> Figure:
@@ -160,7 +155,9 @@ def plot_bench(series: Sequence[Series], path: Path, title: str, abscissa: str =
         times.append(Curve(label, xs, [step.median for _, step, _ in done], k, band, points=True))
         peaks.append(Curve(label, xs, [peak for _, _, peak in done], k, points=True))
         ended = [(x, record.status) for x, record in records if record.status is not BenchStatus.OK]
-        _mark_ends(memory_axis, [x for x, _ in ended], COLORS[k % len(COLORS)], k)
+        for x, _ in ended:  # crosses above the diagram, a little apart where several cases ended at one value
+            memory_axis.plot([x * 2 ** (0.06 * k)], [1.025], "x", color=COLORS[k % len(COLORS)], markersize=8,
+                             transform=memory_axis.get_xaxis_transform(), clip_on=False)  # fmt: skip
         ends |= {status.value.replace("_", " ") for _, status in ended}
     for axis, curves, label in ((time_axis, times, "time of a step (ms)"), (memory_axis, peaks, "peak memory (MiB)")):
         _draw_panel(axis, curves, abscissa, label)
@@ -179,13 +176,6 @@ def _draw_panel(axis: Any, curves: Sequence[Curve], caption: str, label: str) ->
         axis.legend(fontsize="small")
     axis.set(xlabel=caption, ylabel=label)
     axis.grid(True, which="both", alpha=0.25)
-
-
-def _mark_ends(axis: Any, depths: list[int], color: Any, row: int) -> None:
-    """Crosses above the diagram, a little apart where several cases ended at one depth."""
-    for depth in depths:
-        place = axis.get_xaxis_transform()
-        axis.plot([depth * 2 ** (0.06 * row)], [1.025], "x", color=color, markersize=8, transform=place, clip_on=False)
 
 
 #: Panels at most: all together, and the first parameters.
@@ -234,18 +224,17 @@ def _draw_errors(
         if record is None or not curve:
             continue
         drawn = True
-        name = f"{label} (biased)" if record.biased else label
-        style = _style(k)
-        axis.plot([p.elapsed_s for p in curve], [p.relative_rmse for p in curve], label=name,
-                  linestyle="--" if record.biased else "-", **style)  # fmt: skip
+        name, color = f"{label} (biased)" if record.biased else label, COLORS[k % len(COLORS)]
+        times, errors = [p.elapsed_s for p in curve], [p.relative_rmse for p in curve]
+        _draw(axis, Curve(name, times, errors, k, points=True, dashed=bool(record.biased)))
         few = [p for p in curve if p.repeats < FEW]
-        axis.plot([p.elapsed_s for p in few], [p.relative_rmse for p in few], color=style["color"], linestyle="",
-                  marker=style["marker"], markersize=5, markerfacecolor="white")  # fmt: skip
+        axis.plot([p.elapsed_s for p in few], [p.relative_rmse for p in few], "o", color=color, markersize=4,
+                  markerfacecolor="white")  # fmt: skip
         # Where the variance of single steps says that averages lead, without a bias.
         if record.relative_rmse is not None and record.step_s is not None:
-            ends = [curve[0].elapsed_s, curve[-1].elapsed_s]
+            ends = [times[0], times[-1]]
             line = [record.relative_rmse * (time / record.step_s) ** -0.5 for time in ends]
-            axis.plot(ends, line, color=style["color"], linewidth=0.8, linestyle=":")
+            axis.plot(ends, line, color=color, linewidth=0.8, linestyle=":")
     if floor is not None:
         axis.axhline(floor, color="0.4", linestyle=(0, (6, 3)), linewidth=1.0)
         axis.annotate(" standard error of the reference", (0, floor), xycoords=("axes fraction", "data"),

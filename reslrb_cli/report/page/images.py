@@ -79,16 +79,6 @@ def _embed(png: bytes, shape: tuple[int, ...], *about: Any) -> Picture:
     return Picture(f"data:image/png;base64,{base64.b64encode(png).decode()}", (shape[1], shape[0]), *about)
 
 
-def titled(word: str, rest: str) -> Markup:
-    """A line of a caption that begins with a title."""
-    return lay_out("titled", word, rest)
-
-
-def gallery(pictures: Sequence[Picture], title: str = "", remark: str = "") -> Markup:
-    """Pictures beside each other, below a title and a remark."""
-    return lay_out("gallery", pictures, title, remark)
-
-
 def fit(values: Array) -> Array:
     """`values` (H, W, C), shrunk to `MOST_PIXELS` where they are more."""
     together = max(values.shape[:2]) // MOST_PIXELS
@@ -119,15 +109,15 @@ def gradient_maps(paths: Sequence[Path]) -> Markup:
         try:
             layers = read_layers(path)
         except (OSError, ValueError):
-            rows += gallery([], key(path.stem), "This file is damaged.")
+            rows += lay_out("gallery", [], key(path.stem), "This file is damaged.")
             continue
         sums = {name: np.nan_to_num(layers[name].astype(np.float64)).sum(-1, keepdims=True)
                 for name in ("gradient", "reference", "z")}  # fmt: skip
         end = signed_end(np.stack([sums["gradient"], sums["reference"]]))
-        shown = [show_map(sums[name], end, name, titled(name, ", sum over channels"), signed=True)
+        shown = [show_map(sums[name], end, name, lay_out("titled", name, ", sum over channels"), signed=True)
                  for name in ("gradient", "reference")]  # fmt: skip
-        caption = titled("difference", " in standard errors")
-        rows += gallery([*shown, show_map(sums["z"], MOST_Z, "z", caption, signed=True)], key(path.stem))
+        caption = lay_out("titled", "difference", " in standard errors")
+        rows += lay_out("gallery", [*shown, show_map(sums["z"], MOST_Z, "z", caption, signed=True)], key(path.stem))
     return rows + soft(f"{len(paths) - MOST_MAPS} more maps are not shown." if len(paths) > MOST_MAPS else "")
 
 
@@ -204,19 +194,19 @@ def _row(folder: Path, suffix: str, results: Mapping[str, Any], exposure: float 
     exposure = exposure_for(loaded["target"]) if exposure is None else exposure
     sensor = f" of sensor {suffix[1:]}" if suffix else ""
     shown = [
-        show(image * exposure, f"{title}{sensor}", titled(title, f", {image.shape[1]}×{image.shape[0]}"))
+        show(image * exposure, f"{title}{sensor}", lay_out("titled", title, f", {image.shape[1]}×{image.shape[0]}"))
         for title, image in loaded.items()
         if image is not None
     ]
     weights = load_image(folder / f"weights{suffix}.exr")
     if weights is not None:  # not all pixels count alike
         share = weights[:, :, :1] / max(float(weights.max()), 1e-30)
-        shown.append(show(share, f"mask{sensor}", titled("mask", ": black is left out of the loss")))
+        shown.append(show(share, f"mask{sensor}", lay_out("titled", "mask", ": black is left out of the loss")))
     shown += _error_maps(folder, suffix, results)
     title = f"Sensor {suffix[1:]}" if suffix else ""
     between = _between(folder, suffix, exposure)
-    return gallery(shown, title, exposure_words(exposure, loaded["target"])) + (
-        gallery(between, "", "on the way:") if between else "")  # fmt: skip
+    return lay_out("gallery", shown, title, exposure_words(exposure, loaded["target"])) + (
+        lay_out("gallery", between, "", "on the way:") if between else "")  # fmt: skip
 
 
 def _error_maps(folder: Path, suffix: str, results: Mapping[str, Any]) -> list[Picture]:
@@ -226,11 +216,11 @@ def _error_maps(folder: Path, suffix: str, results: Mapping[str, Any]) -> list[P
     shown = []
     if about is not None and about.get("end") and "difference" in layers:
         grey = np.abs(layers["difference"].astype(np.float64)).mean(axis=2, keepdims=True)
-        caption = titled("|image − target|", f" at the end, mean {number(about['mean'], 3)}")
+        caption = lay_out("titled", "|image − target|", f" at the end, mean {number(about['mean'], 3)}")
         shown.append(show_map(grey, about["end"], "error map", caption))
     if "gradient" in layers:
         total = np.nan_to_num(layers["gradient"].astype(np.float64)).sum(axis=2, keepdims=True)
-        caption = titled("∂loss/∂image", " at the end, sum over channels")
+        caption = lay_out("titled", "∂loss/∂image", " at the end, sum over channels")
         shown.append(show_map(total, signed_end(total), "derivative of the loss", caption, signed=True))
     return shown
 

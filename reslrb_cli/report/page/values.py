@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from reslrb_cli.records.images import finite_range, in_range, read_mask, read_parameters
 from reslrb_cli.report.format import number
-from reslrb_cli.report.page.images import gallery, show, titled
+from reslrb_cli.report.page.images import show
 from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
 from reslrb_cli.report.perceptual import PLACES, is_color
 from reslrb_cli.report.plots import COLORS, MOST_POINTS, Curve, points_together
@@ -38,7 +38,7 @@ def parameter_table(results: Mapping[str, Any], end: str = "end", notes: bool = 
     errors = kinds if has_truth else {}
     rows = [
         {
-            "name": name, "about": about, "notes": _notes(about), "swatches": _swatches(name, about),
+            "name": name, "about": about, "swatches": _swatches(name, about),
             "errors": [(results.get(kind) or {}).get(name) for kind in errors.values()],
             "worse": name in (results.get("worse") or ()), "spread": spread_words(results, name, "±"),
             "verdict": verdict_words(results, name), "settled": is_settled(results, name),
@@ -68,13 +68,13 @@ def texture_pictures(run: Run) -> Markup:
         shown = []
         for moment, array in arrays.items():
             value = [lay_out("run.value", about[moment])] if about.get(moment) else []
-            size = titled(titles[moment], f", {array.shape[1]}×{array.shape[0]}")
+            size = lay_out("titled", titles[moment], f", {array.shape[1]}×{array.shape[0]}")
             shown.append(show(array, f"{titles[moment]}: {name}", size, *value))
         mask = read_mask(folder, name)
         if mask is not None and mask.ndim == 2 and not mask.all():
-            share = titled("reached", f" by light and sensor (white): {100 * mask.mean():.3g} %")
+            share = lay_out("titled", "reached", f" by light and sensor (white): {100 * mask.mean():.3g} %")
             shown.append(show(mask[:, :, None].astype(np.float32), f"reached: {name}", share))
-        parts += gallery(shown, key(name), words)
+        parts += lay_out("gallery", shown, key(name), words)
     return parts
 
 
@@ -91,12 +91,6 @@ def _visible(arrays: Mapping[str, Array], heights: bool) -> tuple[dict[str, Arra
     known = arrays.get("true", arrays.get("final"))
     exposure = exposure_for(known) if known is not None and float(np.nanmax(known)) > 1 else 1.0
     return {moment: array * exposure for moment, array in arrays.items()}, exposure_words(exposure)
-
-
-def _notes(about: Mapping[str, Any]) -> list[str]:
-    shape, reached = "×".join(str(size) for size in about.get("shape") or ()), about.get("reached")
-    share = f"{100 * reached:.3g} % reached" if reached is not None and reached < 1 else ""
-    return [about.get("quantity") or "", shape if shape != "3" else "", share]
 
 
 def _swatches(key: str, about: Mapping[str, Any]) -> dict[str, str]:
