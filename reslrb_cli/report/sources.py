@@ -52,10 +52,9 @@ class Run:
         results = self.manifest.get("results")
         return results if isinstance(results, dict) else {}
 
-    @property
-    def elapsed_s(self) -> float | None:
-        """Seconds in its iterations; None where it has none."""
-        return self.records[-1]["elapsed_s"] if self.records else None
+    def last(self, name: str) -> float | None:
+        """The last figure of that name that is known."""
+        return next((record[name] for record in reversed(self.records) if record[name] is not None), None)
 
     @property
     def codegen_s(self) -> float:

@@ -183,9 +183,8 @@ def suite_table(records: Iterable[GradcheckRecord], about: Mapping[str, str]) ->
 
 def limits(records: Iterable[GradcheckRecord]) -> tuple[float, float]:
     """The limit of |z| that all cases share, and the largest of relative L2 at equal seeds; 0 where there is none."""
-    found = list(records)
-    z = max((r.z_max_limit for r in found if r.z_max_limit is not None), default=0.0)
-    return z, max((r.relative_l2_limit for r in found if r.relative_l2_limit is not None), default=0.0)
+    found = [(record.z_max_limit or 0.0, record.relative_l2_limit or 0.0) for record in records]
+    return max((z for z, _ in found), default=0.0), max((distance for _, distance in found), default=0.0)
 
 
 def _references(rows: Sequence[GradcheckRecord]) -> str:

@@ -192,16 +192,12 @@ def run_comparison(runs: Sequence[Run]) -> Parts:
 def overview(runs: Sequence[Run]) -> Markup:
     """A line for each run: how it ended, what it came to, and what an iteration took."""
     rows = [
-        {"run": run, "place": place, "estimator": _estimator(run), "loss": _final_loss(run), "error": _final_error(run),
+        {"run": run, "place": place, "estimator": _estimator(run), "error": _final_error(run),
+         "loss": run.last("loss") if (loss := run.results.get("loss")) is None else loss,
          "step": StepParts.of(run.records)}
         for place, run in enumerate(runs)
     ]  # fmt: skip
     return lay_out("run.overview", rows)
-
-
-def _final_loss(run: Run) -> float | None:
-    losses = [record["loss"] for record in run.records if record["loss"] is not None]
-    return run.results["loss"] if run.results.get("loss") is not None else losses[-1] if losses else None
 
 
 def _estimator(run: Run) -> str:
@@ -220,8 +216,8 @@ def _final_error(run: Run) -> str:
     key = worst(run.results)
     if key is not None:
         return f"{number(run.results['relative_error'][key]['final'], 3)} of the truth at worst"
-    known = [record["parameter_rmse"] for record in run.records if record["parameter_rmse"] is not None]
-    return f"RMSE {number(known[-1], 3)}" if known else ""
+    known = run.last("parameter_rmse")
+    return "" if known is None else f"RMSE {number(known, 3)}"
 
 
 def _each(runs: Sequence[Run], make: Callable[[Run], Markup]) -> Markup:

@@ -120,7 +120,7 @@ DAMAGED = "This part cannot be shown: what was recorded of it is damaged."
 
 def header(run: Run) -> Markup:
     """The run's name, how it ended, what it came to, and what went wrong."""
-    seconds, loss = run.elapsed_s, run.results.get("loss")
+    seconds, loss = run.last("elapsed_s"), run.results.get("loss")
     parts = (
         "" if seconds is None else f"{count(len(run.records), 'iteration')} in {duration(seconds)}",
         "" if loss is None else f"loss {number(loss)}",
