@@ -206,11 +206,8 @@ def plot_convergence(
 
 def panels(parameters: Sequence[str]) -> list[str]:
     """What is drawn: all together first; a single parameter is all there is."""
-    keys = list(dict.fromkeys(parameters))
-    if "all" not in keys:
-        return keys[:PANELS]
-    alone = [key for key in keys if key != "all"]
-    return ["all"] if len(alone) == 1 else ["all", *alone][:PANELS]
+    keys = sorted(dict.fromkeys(parameters), key=lambda key: key != "all")
+    return keys[: 1 if len(keys) == 2 and keys[0] == "all" else PANELS]
 
 
 def _draw_errors(

@@ -13,7 +13,7 @@ from textwrap import wrap
 from typing import Any, NamedTuple
 
 from reslrb_cli.records.decisions import PaidRecord, RivalRecord
-from reslrb_cli.report.format import count, duration, line, number, shorten, with_error
+from reslrb_cli.report.format import count, line, number, shorten, with_error
 
 #: The verdict on a value that can be relied on, as recorded; all others say what keeps it from that.
 SETTLED, MOVING, UNDETERMINED = "settled", "still moving", "not determined"
@@ -122,27 +122,6 @@ def certainty_lines(results: Mapping[str, Any]) -> list[str]:
             line += f" ({remedy.words}: {remedy.setting})"
         lines.append(line)
     return lines
-
-
-def certainty_words(results: Mapping[str, Any]) -> str:
-    """What spreads and verdicts rest on; empty where there are none."""
-    measured = results.get("certainty")
-    if not measured:
-        return ""
-    parts = [count(measured["gradients"], "gradient")]
-    parts += [count(measured["changes"], "pair") + " of images"] if measured["changes"] else []
-    parts += [count(measured["probes"], "random probe")] if measured["probes"] else []
-    noise = {
-        "measured": ", and the noise of the rendered target",
-        "in part": ", and the noise of the targets that were rendered, not that of the others",
-        "left out": "; noise of the target is not in it",
-    }.get(measured.get("target_noise", ""), "")
-    cost = f"{duration(measured['measure_s'])}, {100 * measured['share']:.2g} % of the iterations' time"
-    return (
-        "Spread is one standard deviation of a final value about the optimum, by the noise of gradients and the "
-        f"curvature of the loss, where it ended (of a texture that of a typical entry that is seen, the others known)"
-        f"{noise}; from {', '.join(parts)}, in {cost}."
-    )
 
 
 def noise_line(results: Mapping[str, Any]) -> str:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup, escape
 
-from reslrb_cli.report.format import duration, number
+from reslrb_cli.report.format import count, duration, number
 from reslrb_cli.report.plots import COLORS, Curve, draw
 
 if TYPE_CHECKING:
@@ -58,6 +58,7 @@ def _environment() -> Environment:
     made.filters |= {
         "number": number,
         "duration": lambda seconds: "" if seconds is None else duration(seconds),
+        "amount": count,
         "mib": lambda size: f"{number(size / 2**20)} MiB",
         "moment": lambda time: str(time or "").replace("T", " ").replace("+00:00", " UTC"),
         "command": lambda words: shlex.join(map(str, words or ())),

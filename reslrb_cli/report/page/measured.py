@@ -235,10 +235,8 @@ def measured(source: Measurements | Maps) -> Markup:
     """Everything that there is to show of it."""
     if isinstance(source, Maps):
         return gradient_maps(source.files)
-    makers: dict[str, Callable[[Sequence[Mapping[str, Any]]], tuple[Markup, int]]] = {
-        "bench": bench, "gradcheck": gradcheck, "convergence": convergence,
-    }  # fmt: skip
-    markup, unknown = makers[source.kind](source.objects)
+    make = {"bench": bench, "gradcheck": gradcheck, "convergence": convergence}[source.kind]
+    markup, unknown = make(source.objects)
     if source.damaged:
         markup += soft(
             f"{count(len(source.damaged), 'line')} could not be read (the first is line {source.damaged[0]})."
@@ -252,11 +250,11 @@ def gradcheck(objects: Sequence[Mapping[str, Any]]) -> tuple[Markup, int]:
     """The comparisons as a table, what fails first, and what is missing; and how many lines are neither."""
     records = [record for entry in objects if (record := record_of(GradcheckRecord, entry)) is not None]
     missing = [found for entry in objects if (found := record_of(MissingRecord, entry)) is not None]
-    failing = [record for record in records if record.verdict is Verdict.FAILS]
-    ordered = failing + [record for record in records if record.verdict is not Verdict.FAILS]
+    failed = [failure_line(record) for record in records if record.verdict is Verdict.FAILS]
+    ordered = sorted(records, key=lambda record: record.verdict is not Verdict.FAILS)
     lines = [line for line in summary_lines(records) if not line.startswith("FAILS")] if records else []
     lines += [found.line() for found in missing]
     several = len({record.case for record in records}) > 1
-    rows = [{"case": record.case, "cells": cells(record), "fails": record in failing} for record in ordered]
-    markup = lay_out("measured.gradcheck", list(map(failure_line, failing)), lines, list(HEAD), several, rows)
+    rows = [{"case": record.case, "cells": cells(record)} for record in ordered]
+    markup = lay_out("measured.gradcheck", failed, lines, list(HEAD), several, rows)
     return markup, len(objects) - len(records) - len(missing)

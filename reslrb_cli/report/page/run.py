@@ -18,7 +18,7 @@ from reslrb_cli.report.format import count, duration, number
 from reslrb_cli.report.page.images import image_rows, seen_tables, view_table
 from reslrb_cli.report.page.layout import lay_out, soft
 from reslrb_cli.report.page.values import convergence, parameter_table, texture_pictures
-from reslrb_cli.report.run_summary import certainty_words, error_line, measured_line, warnings
+from reslrb_cli.report.run_summary import error_line, measured_line, warnings
 from reslrb_cli.report.sources import Run
 
 #: Steps that are left out of medians: the first ones compile kernels.
@@ -144,7 +144,8 @@ def run_parts(run: Run) -> dict[str, Markup]:
     results = run.results
     parts: dict[str, Callable[[], Markup]] = {
         "Parameters": lambda: (
-            parameter_table(results, "now" if run.at_work else "end", notes=True) + soft(certainty_words(results))
+            parameter_table(results, "now" if run.at_work else "end", notes=True)
+            + lay_out("run.certainty", results.get("certainty") or {})
         ),
         "Images": lambda: image_rows(run),
         "Views": lambda: view_table(run.manifest.get("views"), results),
