@@ -17,7 +17,7 @@ from typing import Any
 import click
 
 from reslrb_cli import __version__
-from reslrb_cli.cli.terminal import Interrupts, LineFormatter, LogLines, forgiving_output, tell
+from reslrb_cli.cli.terminal import Interrupts, LogLines, forgiving_output, tell
 from reslrb_cli.errors import LINE_LENGTH, ExitCode, one_line
 
 # What `reslrb --help` says of each command, so that it need not load them; in the order of a user's work.
@@ -95,9 +95,7 @@ def main() -> None:
     """Recover scene parameters from images of what light paths carry, with Mitsuba 3."""
     logger = logging.getLogger("reslrb_cli")
     if not logger.handlers:
-        handler = LogLines()
-        handler.setFormatter(LineFormatter())
-        logger.addHandler(handler)
+        logger.addHandler(LogLines())
         logger.setLevel(logging.INFO)
     try:
         os.getcwd()

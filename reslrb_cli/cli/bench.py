@@ -199,13 +199,13 @@ def _run(sweep: Sweep, book: Book, json_file: Path | None, began: float) -> tupl
     from reslrb_cli.cli.terminal import Interrupts
     from reslrb_cli.measure.bench import bench
     from reslrb_cli.measure.processes import abandon_all
-    from reslrb_cli.report.tables import table_head, table_line
+    from reslrb_cli.report.tables import bench_cells, bench_columns
 
-    labels, notes = [case.label for case in sweep.cases], []
+    table, notes = bench_columns([case.label for case in sweep.cases], sweep.swept), []
 
     def show(rows: list[Result]) -> None:
         for row in rows:
-            echo(table_line(row.case.label, row.value, row.record, row.step_ratio, row.kernel_ratio, labels))
+            echo(table.line(bench_cells(row)))
             if row.reason:
                 notes.append(f"{sweep.name(row.value)}, {row.case.label}: {row.reason}")
 
@@ -215,7 +215,7 @@ def _run(sweep: Sweep, book: Book, json_file: Path | None, began: float) -> tupl
     origin = origin_of(sweep.variant)
     keeper = Keeper(json_file, origin, lambda: [row.record for row in book.results(book.done)], under_way, book.kept)
     with Interrupts(last_act=abandon_all) as interrupts:
-        echo(table_head(labels, sweep.swept))
+        echo(table.head())
         show(book.results(book.done))
         say = logging.getLogger(__name__).info
         spent_s = time.monotonic() - began

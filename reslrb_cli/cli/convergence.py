@@ -32,7 +32,7 @@ from reslrb_cli.cli.options import (
 )
 from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.errors import ConfigError, ExitCode
-from reslrb_cli.report.format import WITHOUT_BORDER, count
+from reslrb_cli.report.format import WITHOUT_BORDER, Columns, count
 
 if TYPE_CHECKING:
     from reslrb_cli.measure.convergence.judgement import Results
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from reslrb_cli.measure.resume_store import Earlier
     from reslrb_cli.records.measurement_files import Line
     from reslrb_cli.records.measurements import MethodRecord, RunBestRecord, RunMethodRecord, RunPointRecord
-    from reslrb_cli.report.convergence_tables import Table
 
 
 @contextmanager
@@ -71,7 +70,14 @@ def measure_runs(
     from reslrb_cli.measure.optimization_benchmark.session import RunsSession
     from reslrb_cli.measure.resume_store import Earlier
     from reslrb_cli.records.measurements import SummaryRecord
-    from reslrb_cli.report.convergence_tables import RunsTable, best_line, runs_closing_sentence, runs_notes
+    from reslrb_cli.report.convergence_tables import (
+        best_line,
+        run_cells,
+        runs_cells,
+        runs_closing_sentence,
+        runs_columns,
+        runs_notes,
+    )
     from reslrb_cli.report.plots import plot_runs
 
     points: list[RunPointRecord] = []
@@ -80,7 +86,7 @@ def measure_runs(
         check(plan, earlier, where)
     echo(f"{where}; {allowance(plan.budget_s, None, 'run')}")
     with _workplace() as (folder, interrupts):
-        table = RunsTable(list(plan.names))
+        table = runs_columns(list(plan.names))
         spent_s = time.monotonic() - began
         session = RunsSession(
             plan, folder, lambda: interrupts.requested, echo, spent_s=spent_s, earlier=earlier, device=where
@@ -89,7 +95,7 @@ def measure_runs(
 
         def show(point: RunPointRecord) -> None:
             if point.elapsed_s == session.limit_s:
-                echo(table.point(point, session.run_of(point).first_s))
+                echo(table.line(run_cells(point, session.run_of(point).first_s)))
 
         def found() -> tuple[list[RunMethodRecord], list[RunBestRecord], str]:
             now = outcome(session.members, session.limit_s, plan.names)
@@ -116,7 +122,7 @@ def measure_runs(
         records, bests, sentence = found()
         echo(table.head())
         for record in records:
-            echo(table.line(record))
+            echo(table.line(runs_cells(record)))
         for line in [*runs_notes(records), *(best.line for best in bests), sentence]:
             echo(line)
         conditions = _runs_conditions(plan, session)
@@ -276,7 +282,7 @@ def _run(
     from reslrb_cli.measure.convergence.session import Session
     from reslrb_cli.measure.convergence.setup import Role
     from reslrb_cli.records.measurements import SummaryRecord
-    from reslrb_cli.report.convergence_tables import closing_sentence, notes, reference_line
+    from reslrb_cli.report.convergence_tables import closing_sentence, method_cells, notes, reference_line
 
     with _workplace() as (folder, interrupts):
         spent_s = time.monotonic() - began
@@ -289,7 +295,7 @@ def _run(
 
         origin = origin_of(plan.variant)
         keeper = Keeper(json_file, origin, lambda: [], lambda: lines(Judgement(session).results()), session.keep)
-        table: Table | None = None
+        table: Columns | None = None
         for rounds in session.run():
             keeper.refresh()
             if rounds < 4 or rounds & (rounds - 1):
@@ -301,7 +307,7 @@ def _run(
             judgement = Judgement(session)
             for member in session.of(Role.CASE):
                 if judgement.ready and member.refusal is None:
-                    echo(table.line(judgement.overall(member), f"{rounds} rounds"))
+                    echo(table.line(method_cells(judgement.overall(member), f"{rounds} rounds")))
         results = Judgement(session).results()
         keeper.finish(lines(results))
         table = _table(session)
@@ -309,7 +315,7 @@ def _run(
         shown = _shown(results.methods)
         for record in results.methods:
             if record.parameter in shown:
-                echo(table.line(record))
+                echo(table.line(method_cells(record)))
         for stood in results.references:
             if stood.parameter in shown:
                 echo(reference_line(stood))
@@ -319,12 +325,13 @@ def _run(
         return results, _conditions(plan, session), interrupts.requested
 
 
-def _table(session: Session) -> Table:
+def _table(session: Session) -> Columns:
     """A table whose columns fit what the session has measured, or is about to."""
     from reslrb_cli.measure.convergence.setup import Role
-    from reslrb_cli.report.convergence_tables import Table
+    from reslrb_cli.report.convergence_tables import method_columns
 
-    return Table([member.label for member in session.of(Role.CASE)], [*session.facts.get("shapes", ()), "999 rounds"])
+    labels = [member.label for member in session.of(Role.CASE)]
+    return method_columns(labels, [*session.facts.get("shapes", ()), "999 rounds"])
 
 
 def _shown(records: Sequence[MethodRecord]) -> list[str]:

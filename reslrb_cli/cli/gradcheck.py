@@ -306,19 +306,19 @@ def _run(
     check: Gradcheck, variant: str, to_keep: dict[str, Any], json_file: Path | None, folder: Path | None
 ) -> tuple[list[GradcheckRecord], bool]:
     """Measure, print and write; returns all records, and whether the user interrupted."""
-    from reslrb_cli.report.tables import Table
+    from reslrb_cli.report.tables import cells, gradcheck_columns
 
     records: list[GradcheckRecord] = []
     drawn = False
     keeper = Keeper(json_file, origin_of(variant), lambda: records, lambda: [], lambda: check.kept(to_keep))
     with Interrupts() as interrupts:
-        table = Table(check.expected())
+        table = gradcheck_columns(check.expected())
         echo(table.head())
         for result in check.run(lambda: interrupts.requested, logger.info, keeper.refresh):
             records.append(result.record)
             keeper.refresh()
             if result.record.verdict is not Verdict.NOT_MEASURED:  # the last lines say how many there are
-                echo(table.line(result.record))
+                echo(table.line(cells(result.record)))
             _draw(result, folder)
             drawn = drawn or result.maps is not None
         keeper.finish(records)

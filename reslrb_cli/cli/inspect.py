@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from reslrb_cli.cli.options import overrides_option, start_variant
-from reslrb_cli.cli.terminal import echo, without_nan
+from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.loader import loads, parse_override, read_text
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse, write
 from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.records.metrics import finite
 from reslrb_cli.report.format import table
 
 if TYPE_CHECKING:
@@ -296,7 +297,7 @@ def command(
         report = {"obstacle": plan} if isinstance(plan, str) else plan and dataclasses.asdict(plan)
         extra = {} if measured is None else {"conditioning": measured.to_json()}
         everything_known = {"run": subject.run} | plain(summary) | {"plan": report, "edges": edges} | extra
-        click.echo(json.dumps(without_nan(everything_known), indent=2, allow_nan=False))
+        click.echo(json.dumps(finite(everything_known, str), indent=2, allow_nan=False))
         return None
     if subject.run is not None:
         echo(run_line(subject))

@@ -18,7 +18,7 @@ import click
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.cli.terminal import echo, without_nan
+from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import with_integrator
 from reslrb_cli.config.schema import Config
@@ -33,6 +33,7 @@ from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, NonFiniteStep, lo
 from reslrb_cli.records.decisions import GuidedRecord, SequenceRecord
 from reslrb_cli.records.manifest import MANIFEST_FILE as MANIFEST
 from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.records.metrics import finite
 from reslrb_cli.records.run_folder import RunFolder
 from reslrb_cli.scene.images import read_bitmap
 
@@ -163,7 +164,7 @@ def show_offenders(config: Config, as_json: bool) -> int:
     found = find_offenders(replay.problem, replay.iteration)
     if as_json:
         report = {"iteration": replay.iteration, "offenders": [dataclasses.asdict(entry) for entry in found]}
-        click.echo(json.dumps(without_nan(report), indent=2, allow_nan=False))
+        click.echo(json.dumps(finite(report, str), indent=2, allow_nan=False))
     else:
         lines = [line for entry in found for line in offender_lines(entry, replay.iteration)]
         for line in lines or [f"iteration {replay.iteration}: all is finite this time"]:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import sys
 import time
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import click
@@ -61,7 +58,7 @@ class Progress:
     """Shows each record of `total` on standard error; as a context manager it tidies the terminal up at the end.
 
     `done` of them were before, in a run that goes on.
-    `meter` is what measured the parameters' errors. While a bar is shown, the log goes above it.
+    `meter` is what measured the parameters' errors.
     """
 
     def __init__(self, total: int, quiet: bool, meter: ErrorMeter, done: int = 0) -> None:
@@ -70,7 +67,6 @@ class Progress:
         self._bar: Any = None
         self._width: int | None = None
         self._choice = 0
-        self._around = contextlib.ExitStack()
         self._last_line, self._tenth = time.monotonic(), 10 * done // total
         if not quiet and self._stream.isatty():
             from tqdm import tqdm
@@ -117,18 +113,11 @@ class Progress:
         self._choice, self._bar.bar_format = len(choices), LEAST_FRAME
 
     def __enter__(self) -> Progress:
-        if self._bar is not None:
-            from tqdm.contrib.logging import logging_redirect_tqdm
-
-            self._around.enter_context(logging_redirect_tqdm([logging.getLogger("reslrb_cli")]))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._bar is not None:
             self._bar.close()
-        self._around.close()
 
 
 class Reading:
@@ -155,7 +144,8 @@ class Reading:
         if path != self._path:
             from tqdm import tqdm
 
-            self._end()
+            if self._bar is not None:
+                self._bar.close()
             self._path = path
             self._bar = tqdm(
                 total=size, file=self._stream, unit="B", unit_scale=True, unit_divisor=1024, dynamic_ncols=True,
@@ -164,16 +154,11 @@ class Reading:
         self._bar.total = size
         self._bar.update(done - self._bar.n)
 
-    def _end(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-
     def __enter__(self) -> Reading:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._end()
-        if error is None and time.monotonic() - self._began >= LEAST_SECONDS:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+        if kind is None and time.monotonic() - self._began >= LEAST_SECONDS:
             click.echo("drawing", file=self._stream)

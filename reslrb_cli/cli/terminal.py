@@ -1,6 +1,6 @@
 """The terminal: streams on which nothing fails, what an error comes to, and signals.
 
-What commands print and log (`echo`, `LineFormatter`): keys, names and paths are a user's or a file's, and must not
+What commands print and log (`echo`, `LogLines`): keys, names and paths are a user's or a file's, and must not
 command the terminal.
 
 Standard output and error of a command, as streams on which nothing fails: a terminal that was closed, a disk that is
@@ -26,7 +26,6 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-import math
 import os
 import select
 import signal
@@ -34,7 +33,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, NoReturn, TextIO
 
 import click
@@ -82,9 +81,7 @@ class Interrupts:
                 signal.signal(number, self._mark)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for number, before in self._before.items():
             signal.signal(number, before)
         self._stop()
@@ -146,14 +143,6 @@ def _say(line: str) -> None:
 def echo(line: object) -> None:
     """Print one line on standard output, with what is not printable in it escaped."""
     click.echo(printable(line))
-
-
-class LineFormatter(logging.Formatter):
-    """Formats a record as its message alone, in one line, with what is not printable in it escaped."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        """The line."""
-        return printable(record.getMessage())
 
 
 class Forgiving:
@@ -220,11 +209,16 @@ def forgiving_output() -> Iterator[None]:
 
 
 class LogLines(logging.Handler):
-    """Writes each message as a line on what is the standard error at that moment."""
+    """Writes each message as a line on what is the standard error at that moment, above a progress bar where there is
+    one, with what is not printable in it escaped."""
 
     def emit(self, record: logging.LogRecord) -> None:
         try:
-            click.echo(self.format(record), err=True)
+            line, bars = printable(record.getMessage()), sys.modules.get("tqdm")
+            if bars is None:
+                click.echo(line, err=True)
+            else:
+                bars.tqdm.write(line, file=sys.stderr)
         except Exception:
             self.handleError(record)
 
@@ -238,12 +232,3 @@ def tell(error: BaseException) -> tuple[str, int] | None:
         where = context.command_path if context else "reslrb"
         return f"{where}: {one_line(error.format_message()).rstrip('.')}. See `{where} --help`.", ExitCode.USAGE
     return errors.tell(error)
-
-
-def without_nan(value: Any) -> Any:
-    """The same with numbers that are not finite as text, "nan", "inf" and "-inf": JSON has none."""
-    if isinstance(value, dict):
-        return {key: without_nan(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [without_nan(entry) for entry in value]
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value

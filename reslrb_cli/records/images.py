@@ -185,7 +185,7 @@ def write_parameters(folder: Path, values: Mapping[str, Array]) -> None:
     for key, value in values.items():
         entry: dict[str, Any] = {"shape": list(value.shape)}
         if value.ndim == 3:
-            shown = _relief(value) if key.endswith(f".{HEIGHTMAP}") else None
+            shown = in_range(value, *finite_range([value])) if key.endswith(f".{HEIGHTMAP}") else None
             write_image(folder / file_stem(key), value, shown)
             entry["file"] = file_stem(key) + ".exr"
         elif value.size <= 64:
@@ -227,7 +227,6 @@ def read_mask(folder: Path, key: str) -> Array | None:
     return mask if mask.dtype == bool else None
 
 
-def _relief(heights: Array) -> Array:
-    """Heights, which may be negative and far below 1, over the range that they have."""
-    low, high = finite_range([heights])
+def in_range(heights: Array, low: float, high: float) -> Array:
+    """Heights, which may be negative and far below 1, from 0 at `low` to 1 at `high`."""
     return (heights - low) / ((high - low) or 1.0)

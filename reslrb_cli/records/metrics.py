@@ -12,7 +12,7 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -44,13 +44,14 @@ class Line:
         return json.dumps(head | values.pop("method", {}) | finite(values), allow_nan=False)
 
 
-def finite(value: Any) -> Any:
-    """The same of mappings, lists and numbers, with None for numbers that are not finite: JSON has none."""
+def finite(value: Any, instead: Callable[[float], object] = lambda number: None) -> Any:
+    """The same of mappings, lists and numbers, with None, or what is to stand `instead`, for numbers that are not
+    finite: JSON has none."""
     if isinstance(value, dict):
-        return {key: finite(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return {key: finite(entry, instead) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(entry, instead) for entry in value]
+    return instead(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _nan_for_null(value: object, handler: ValidatorFunctionWrapHandler) -> float:
@@ -175,12 +176,8 @@ def read_records(folder: Path, count: int, last: Mapping[str, Any] | None) -> tu
     if len(records) == count - 1 and last is not None:
         records.append(_record(json.dumps(last).encode(), count - 1, path))
     if len(records) < count:
-        raise ConfigError(
-            path,
-            "",
-            f"holds {len(records)} of the {count} iterations of the checkpoint; put it back, or begin anew from "
-            "`initial: {run: ...}`",
-        )
+        held = f"holds {len(records)} of the {count} iterations of the checkpoint"
+        raise ConfigError(path, "", f"{held}; put it back, or begin anew from `initial: {{run: ...}}`")
     return records, sum(map(len, whole))
 
 
@@ -212,8 +209,17 @@ def _record(line: bytes, number: int, path: Path) -> Record:
     raise ConfigError(path, f"line {number + 1}", f"is not what a run writes ({reason})")
 
 
+class _Tally:
+    """What of a whole run is added up from its records."""
+
+    def to_json(self) -> dict[str, Any]:
+        """For the manifest."""
+        found: dict[str, Any] = finite(asdict(self))  # type: ignore[call-overload]  # of a dataclass derived from this
+        return found
+
+
 @dataclass
-class NonFiniteTally:
+class NonFiniteTally(_Tally):
     """Iterations with values that were not finite, the number of these values, and those of each parameter."""
 
     iterations: int = 0
@@ -226,10 +232,6 @@ class NonFiniteTally:
         self.values += record.nonfinite
         self.by_parameter.update(record.nonfinite_by_parameter)
 
-    def to_json(self) -> dict[str, Any]:
-        """For the manifest."""
-        return {"iterations": self.iterations, "values": self.values, "by_parameter": dict(self.by_parameter)}
-
     def __str__(self) -> str:
         """For the last line of a run; empty where all was finite."""
         if not self.iterations:
@@ -240,7 +242,7 @@ class NonFiniteTally:
 
 
 @dataclass
-class ClampTally:
+class ClampTally(_Tally):
     """Iterations in which gradients were clamped, the number of entries, and the bias over the run by parameter."""
 
     iterations: int = 0
@@ -253,11 +255,6 @@ class ClampTally:
             self.iterations += record.clamped.entries > 0
             self.entries += record.clamped.entries
             self.bias |= record.clamped.bias
-
-    def to_json(self) -> dict[str, Any]:
-        """For the manifest."""
-        found: dict[str, Any] = finite(asdict(self))
-        return found
 
     def __str__(self) -> str:
         """For the last line of a run; empty where nothing was clamped."""

@@ -323,11 +323,8 @@ def check_writable(folder: RunFolder) -> None:
     except OSError as error:
         if is_machine_fault(error):
             raise MachineError(f"{folder.path}: {error.strerror}; nothing of the run was changed") from None
-        raise ConfigError(
-            folder.path,
-            "",
-            f"cannot be written to ({error.strerror}); to go on in another folder, add --set run.output=FOLDER",
-        ) from None
+        reason = f"cannot be written to ({error.strerror}); to go on in another folder, add --set run.output=FOLDER"
+        raise ConfigError(folder.path, "", reason) from None
 
 
 def _check_links(folder: Path) -> None:

@@ -1,8 +1,4 @@
-"""Convergence and whole optimisations as aligned tables, and what they come to in a sentence.
-
-The methods of a convergence are lines of a `Table`, and `closing_sentence` is what they come to; whole optimisations
-have a `RunsTable`, and `runs_closing_sentence` says which method is the best.
-"""
+"""Convergence and whole optimisations as aligned tables, and what they come to in a sentence."""
 
 from __future__ import annotations
 
@@ -21,53 +17,34 @@ from reslrb_cli.records.measurements import (
     RunMethodRecord,
     RunPointRecord,
 )
-from reslrb_cli.report.format import count, line, number, shorten
+from reslrb_cli.report.format import Columns, count, interval, number, shorten
 
 #: Characters that a parameter's key may take.
 KEY_WIDTH = 28
-_FIGURES = ("step s", "steps", "error", "slope", "efficiency", "max |z| (limit)")
-_HEAD = ("", "parameter", *_FIGURES, *(f"s to {target:.0%}" for target in TARGETS))
-_WIDTHS = (0, 0, 8, 5, 8, 20, 24, 16) + (9,) * len(TARGETS)
 
 
-class Table:
-    """Lines that stand below each other, whose first columns fit `labels` and `parameters`."""
+def method_columns(labels: Sequence[str], parameters: Sequence[str]) -> Columns:
+    """The columns of a convergence, whose first two fit `labels` and `parameters`."""
+    figures = ("step s", "steps", "error", "slope", "efficiency", "max |z| (limit)")
+    titles = ("", "parameter", *figures, *(f"s to {target:.0%}" for target in TARGETS))
+    names = max(len(shorten(key, KEY_WIDTH)) for key in ("parameter", *parameters))
+    widths = (max(map(len, labels), default=0), names, 8, 5, 8, 20, 24, 16) + (9,) * len(TARGETS)
+    return Columns(titles, widths, "<<>")
 
-    def __init__(self, labels: Sequence[str], parameters: Sequence[str]) -> None:
-        self._widths = (
-            max(map(len, labels), default=0),
-            max([len("parameter"), *(len(shorten(key, KEY_WIDTH)) for key in parameters)]),
-        )
 
-    def head(self) -> str:
-        """The first line."""
-        return self._line(_HEAD)
-
-    def line(self, record: MethodRecord, parameter: str | None = None) -> str:
-        """The line of one record, `parameter` in place of its own where it is given."""
-        name = shorten(parameter or record.parameter, KEY_WIDTH)
-        if record.relative_rmse is None:
-            reason = record.message if record.status is BenchStatus.OK else record.status.value
-            return self._line((record.method.label, name, reason))
-        cells = (
-            record.method.label,
-            name,
-            number(record.step_s, 3),
-            str(record.repeats),
-            f"{record.relative_rmse:.3g}",
-            _range(record.slope),
-            _range(record.efficiency),
-            _deviation(record),
-            *(_seconds(record, f"{target:g}") for target in TARGETS),
-        )
-        return self._line(cells)
-
-    def _line(self, cells: tuple[str, ...]) -> str:
-        return line(cells, (*self._widths, *_WIDTHS[2:]), "<<>")
+def method_cells(record: MethodRecord, parameter: str | None = None) -> tuple[str, ...]:
+    """The line of one record, `parameter` in place of its own where it is given."""
+    named = (record.method.label, shorten(parameter or record.parameter, KEY_WIDTH))
+    if record.relative_rmse is None:
+        return *named, record.message if record.status is BenchStatus.OK else record.status.value
+    return (
+        *named, number(record.step_s, 3), str(record.repeats), number(record.relative_rmse, 3), _range(record.slope),
+        _range(record.efficiency), _deviation(record), *(_seconds(record, f"{target:g}") for target in TARGETS),
+    )  # fmt: skip
 
 
 def _range(value: Range | None) -> str:
-    return "" if value is None else f"{value.value:.3g} [{value.low:.3g}, {value.high:.3g}]"
+    return "" if value is None else interval(value.value, value.low, value.high, 3)
 
 
 def _deviation(record: MethodRecord) -> str:
@@ -93,9 +70,7 @@ def notes(records: Sequence[MethodRecord]) -> list[str]:
         if record.biased:
             size = "" if not record.bias else f" by {record.bias:.2g} of the whole"
             lines.append(f"{where}: biased{size}, against {record.bias_reference}")
-        elif (record.message and record.relative_rmse is not None) or (
-            record.message and record.status is not BenchStatus.OK
-        ):
+        elif record.message and (record.relative_rmse is not None or record.status is not BenchStatus.OK):
             lines.append(f"{where}: {record.message}")
     return lines
 
@@ -106,13 +81,9 @@ def reference_line(record: ReferenceRecord) -> str:
     words = f"{shorten(record.parameter, KEY_WIDTH)}: {floor}, {record.repeats} steps of {record.method.label}"
     if record.bias_z is not None:
         verdict = {True: "DIFFERS from", False: "agrees with", None: "not decided against"}[record.biased]
-        words += (
-            f"; {verdict} {record.bias_reference}: max |z| {abs(record.bias_z):.1f} (limit {record.bias_z_limit:.1f})"
-        )
+        z = f"max |z| {abs(record.bias_z):.1f} (limit {record.bias_z_limit:.1f})"
+        words += f"; {verdict} {record.bias_reference}: {z}"
     return words
-
-
-# --- the closing sentence ---------------------------------------------------------------------------------------------
 
 
 def closing_sentence(records: Sequence[MethodRecord]) -> str:
@@ -143,10 +114,8 @@ def closing_sentence(records: Sequence[MethodRecord]) -> str:
             sentence += f"; {_times(best, beaten)} times as efficient as {beaten.method.label}"
     sentence += "."
     if biased and _efficiency(biased[0]) > _efficiency(best):
-        first = biased[0]
-        sentence += (
-            f" The biased {first.method.label} has {_efficiency(first) / _efficiency(best):.2g} times its efficiency"
-        )
+        first, times = biased[0], _efficiency(biased[0]) / _efficiency(best)
+        sentence += f" The biased {first.method.label} has {times:.2g} times its efficiency"
         sentence += f", but its error stays above {first.bias:.2g}." if first.bias else "."
     return sentence
 
@@ -168,46 +137,32 @@ def _ratio(one: MethodRecord, other: MethodRecord) -> tuple[float, float, float]
 
 
 def _times(one: MethodRecord, other: MethodRecord) -> str:
-    ratio, low, high = _ratio(one, other)
-    return f"{ratio:.2g} [{low:.2g}, {high:.2g}]"
+    return interval(*_ratio(one, other), 2)
 
 
-_RUNS_HEAD = ("", "seed", "iterations", "first s", "loss", "error")
-_RUNS_WIDTHS = (0, 8, 20, 20, 30, 30)
+def runs_columns(labels: Sequence[str]) -> Columns:
+    """The columns of whole optimisations, whose first fits `labels`."""
+    titles = ("", "seed", "iterations", "first s", "loss", "error")
+    return Columns(titles, (max(map(len, labels), default=0), 8, 20, 20, 30, 30), "<>")
 
 
-class RunsTable:
-    """Lines that stand below each other, whose first column fits `labels`."""
+def run_cells(point: RunPointRecord, first_s: float | None) -> tuple[str, ...]:
+    """The line of one run, at the end of its time."""
+    return (point.method.label, str(point.seed), str(point.iteration), number(first_s, 3), number(point.loss, 4),
+            number(point.parameter_error, 4))  # fmt: skip
 
-    def __init__(self, labels: Sequence[str]) -> None:
-        self._width = max(map(len, labels), default=0)
 
-    def head(self) -> str:
-        """The first line."""
-        return self._line(_RUNS_HEAD)
-
-    def point(self, point: RunPointRecord, first_s: float | None) -> str:
-        """The line of one run, at the end of its time."""
-        return self._line((point.method.label, str(point.seed), str(point.iteration), number(first_s, 3),
-                           number(point.loss, 4), number(point.parameter_error, 4)))  # fmt: skip
-
-    def line(self, record: RunMethodRecord) -> str:
-        """The line of one method: medians, and the least and the greatest of its runs."""
-        if record.runs == 0:
-            ended = "not measured" if record.status is BenchStatus.OK else record.status.value
-            return self._line((record.method.label, "", ended))
-        return self._line((record.method.label, count(record.runs, "run"), band(record.iterations, 3),
-                           band(record.first_s, 3), band(record.loss, 4), band(record.parameter_error, 4)))  # fmt: skip
-
-    def _line(self, cells: tuple[str, ...]) -> str:
-        return line(cells, (self._width, *_RUNS_WIDTHS[1:]), "<>")
+def runs_cells(record: RunMethodRecord) -> tuple[str, ...]:
+    """The line of one method: medians, and the least and the greatest of its runs."""
+    if record.runs == 0:
+        return record.method.label, "", "not measured" if record.status is BenchStatus.OK else record.status.value
+    return (record.method.label, count(record.runs, "run"), band(record.iterations, 3), band(record.first_s, 3),
+            band(record.loss, 4), band(record.parameter_error, 4))  # fmt: skip
 
 
 def band(value: Band | None, digits: int) -> str:
     """A median with its band; nothing for None."""
-    return "" if value is None else (
-        f"{value.median:.{digits}g} [{value.low:.{digits}g}, {value.high:.{digits}g}]"
-    )  # fmt: skip
+    return "" if value is None else interval(value.median, value.low, value.high, digits)
 
 
 def best_line(record: RunBestRecord) -> str:
@@ -217,8 +172,7 @@ def best_line(record: RunBestRecord) -> str:
         words += ", the best of its rates"
         words += ", and the outermost that was tried" if record.outermost else ""
     if record.ratio is not None:
-        apart = f"{number(record.ratio.value, 3)} [{number(record.ratio.low, 3)}, {number(record.ratio.high, 3)}]"
-        words += f"; {apart} times that of {record.to}{' at its best' if record.at else ''}"
+        words += f"; {_range(record.ratio)} times that of {record.to}{' at its best' if record.at else ''}"
     return words
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import zip_longest
 
 from reslrb_cli.errors import printable
@@ -30,6 +31,12 @@ def with_error(value: float, error: float, sign: str = "+-") -> str:
     value, error, decimals = value / 10.0**scale, error / 10.0**scale, max(-last, 0)
     text = f"{value:.{decimals}f} {sign} {error:.{decimals}f}"
     return text if scale == 0 else f"({text})e{scale:+03d}"
+
+
+def interval(value: float, low: float, high: float, digits: int | str) -> str:
+    """A value with the ends of its interval; `digits` significant ones, or a format."""
+    spec = digits if isinstance(digits, str) else f".{digits}g"
+    return f"{value:{spec}} [{low:{spec}}, {high:{spec}}]"
 
 
 def duration(seconds: float) -> str:
@@ -69,6 +76,23 @@ def line(cells: Sequence[str], widths: Sequence[int], align: str = "<") -> str:
     """
     sides = align.ljust(len(cells), align[-1])
     return "  ".join(f"{cell:{side}{width}}" for cell, side, width in zip(cells, sides, widths, strict=False)).rstrip()
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Columns of a table whose lines are told one by one: their titles and widths, and `align` as of `line`."""
+
+    titles: Sequence[str]
+    widths: Sequence[int]
+    align: str
+
+    def head(self) -> str:
+        """The first line."""
+        return self.line(self.titles)
+
+    def line(self, cells: Sequence[str]) -> str:
+        """The line of these cells; those that are left out are the last."""
+        return line(cells, self.widths, self.align)
 
 
 def table(rows: Sequence[Sequence[str]], align: str = "<") -> list[str]:

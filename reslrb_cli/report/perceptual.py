@@ -1,15 +1,8 @@
 """Errors as people see them: of images against their targets, and of recovered colours.
 
 Colours are linear sRGB (BT.709 primaries, D65), as Mitsuba's RGB variants have them. Arrays are (..., 3).
-
-- `ciede2000`, `itp`, `told`: differences between colours, by colour-science, and what is told of many of them.
-- `color_errors`: how far recovered colours are from the true ones.
-- `flip_map`: HDR-FLIP: how an error strikes someone who flips between two images, at all exposures that show something.
-  From the package `flip-evaluator`, which is an extra: `pip install reslrb[flip]`.
-- `image_errors`: the error of an image against its target.
-- `seen_errors`: the errors of a run, from the images and parameters in its folder.
-- `with_seen_errors`: the same for runs of which such errors were never recorded: they are found in what the folder
-  holds.
+HDR-FLIP tells how an error strikes someone who flips between two images, at all exposures that show something; its
+package `flip-evaluator` is an extra: `pip install reslrb[flip]`.
 """
 
 from __future__ import annotations
@@ -105,30 +98,28 @@ def color_errors(moments: Mapping[str, Array], true: Array, mask: Array | None, 
     shows it. Empty where these are no such arrays, or the mask is.
     """
     found: dict[str, Any] = {}
-    exposure = exposure_for(_texture(true)) if quantity and _is_told(true) else 1.0
-    for moment, value in moments.items():
-        pair = _entries(value, true, mask)
-        if pair is not None and pair[0].size:
-            difference = itp(*(exposure * array for array in pair)) if quantity else ciede2000(*pair)
-            found[moment] = told(difference)
-    if not found:
+    target = _texture(true)
+    if target is None:
         return {}
-    return {"measure": "itp" if quantity else "ciede2000", "exposure": exposure} | found
+    exposure = exposure_for(target) if quantity else 1.0
+    for moment, value in moments.items():
+        texture = _texture(value)
+        if texture is not None and value.ndim == true.ndim:
+            pair = _entries(texture, target, mask)
+            if pair[0].size:
+                difference = itp(*(exposure * array for array in pair)) if quantity else ciede2000(*pair)
+                found[moment] = told(difference)
+    return {"measure": "itp" if quantity else "ciede2000", "exposure": exposure} | found if found else {}
 
 
-def _is_told(array: Array) -> bool:
-    return array.shape == (3,) or (array.ndim == 3 and array.shape[2] == 3)
+def _texture(array: Array) -> Array | None:
+    """Colours (3,) or (H, W, 3) as (H, W, 3); None for anything else."""
+    array = array.reshape(1, 1, 3) if array.shape == (3,) else array
+    return array if array.ndim == 3 and array.shape[2] == 3 else None
 
 
-def _texture(array: Array) -> Array:
-    return array.reshape(1, 1, 3) if array.ndim == 1 else array
-
-
-def _entries(value: Array, true: Array, mask: Array | None) -> tuple[Array, Array] | None:
+def _entries(value: Array, true: Array, mask: Array | None) -> tuple[Array, Array]:
     """The colours (N, 3) to be compared, of both."""
-    if value.ndim != true.ndim or not (_is_told(value) and _is_told(true)):
-        return None
-    value, true = _texture(value), _texture(true)
     grid = comparison_grid(value.shape, true.shape)
     if mask is None or mask.shape != value.shape[:2]:
         mask = np.ones(value.shape[:2], dtype=bool)

@@ -1,17 +1,10 @@
-"""Measurements as plots.
-
-- `plot_bench`: step time and peak memory against path depth, as in the paper's Figure 6, or against what else was
-  swept.
-- `plot_convergence`: error against run time, on logarithmic axes: one panel for all parameters together, and one for
-  each of several.
-- `plot_runs`: loss and parameter error of whole optimisations against run time: medians, and bands over the seeds.
-- `plot_maps`: maps of a texture's gradient, of its reference, and of their difference in standard errors.
-"""
+"""Measurements as pictures: what a bench, a convergence or whole optimisations came to, and maps of gradients."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,12 +28,97 @@ from reslrb_cli.report.tonemap import color_map
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_MARKERS = "osD^vPX*<>"
+Array = np.ndarray[Any, Any]
+
+#: Colours that can be told apart, on light and on dark. Further curves have them again, in dashes.
+COLORS = ("#3b7ddd", "#e07b39", "#2f9e62", "#d0517e", "#8b6fd6", "#b08900", "#1f9eb3", "#9c6b4f")
+
+#: Points of a curve, at most; of a longer one each is the mean of some.
+MOST_POINTS = 600
+
+#: An axis is logarithmic where its values span more than this factor, and has ticks between its decades up to that one.
+LEAST_LOG, MOST_LABELLED = 5.0, 300.0
 
 
-def _style(place: int) -> dict[str, Any]:
-    """How the curve of a place is drawn."""
-    return {"color": f"C{place % 10}", "marker": _MARKERS[place % len(_MARKERS)], "markersize": 5, "linewidth": 1.3}
+@dataclass(frozen=True)
+class Curve:
+    """One curve: points (x, y), those that are None or not finite left out. `place` chooses its colour and its dashes.
+
+    `band` has the ends of each point's interval, where there are such. `points`: each point has a mark;
+    `dashed`: it is drawn in dashes, whatever its place.
+    """
+
+    name: str
+    xs: Sequence[float | None]
+    ys: Sequence[float | None]
+    place: int = 0
+    band: tuple[Sequence[float | None], Sequence[float | None]] | None = None
+    points: bool = False
+    dashed: bool = False
+
+    def known(self) -> Array:
+        """Its points as (N, 2)."""
+        array = np.array([self.xs, self.ys], dtype=np.float64).T  # None is NaN
+        return array[np.isfinite(array).all(axis=1)]
+
+
+def draw(axis: Any, curves: Sequence[Curve], log_x: float | None = None) -> None:
+    """Draw curves, each of which has a point.
+
+    The y axis is logarithmic where values differ much, the x axis, to the base `log_x`, where that is given and all are
+    above 0.
+    """
+    for curve in curves:
+        _draw(axis, curve)
+    values = np.concatenate([curve.known() for curve in curves])
+    low, high = values.min(axis=0), values.max(axis=0)
+    if low[1] > 0 and high[1] > LEAST_LOG * low[1]:
+        axis.set_yscale("log")
+        _mark_decades(axis.yaxis, high[1] / low[1])
+    if log_x is not None and low[0] > 0 and high[0] > low[0]:
+        axis.set_xscale("log", base=log_x)
+        if log_x == 2:
+            axis.xaxis.set_major_formatter("{x:g}")
+            axis.set_xticks(sorted(set(values[:, 0])))
+        else:
+            _mark_decades(axis.xaxis, high[0] / low[0])
+
+
+def points_together(count: int) -> int:
+    """How many of `count` points make one that is drawn."""
+    return -(-count // MOST_POINTS)
+
+
+def _draw(axis: Any, curve: Curve) -> None:
+    points = curve.known()
+    xs, ys = _thinned(points, points_together(len(points)))
+    marker = "o" if curve.points or len(xs) == 1 else ""
+    again, place = divmod(curve.place, len(COLORS))
+    style = "--" if again or curve.dashed else "-"
+    axis.plot(xs, ys, linewidth=1.5, color=COLORS[place], marker=marker, markersize=4, linestyle=style,
+              label=curve.name)  # fmt: skip
+    if curve.band is not None:
+        band = (np.array(end, dtype=np.float64) for end in (curve.xs, *curve.band))  # None is NaN
+        axis.fill_between(*band, color=COLORS[place], alpha=0.18, linewidth=0)
+
+
+def _mark_decades(axis: Any, span: float) -> None:
+    """Mark a logarithmic axis in plain text, which takes a fraction of the time of formulas."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    plain = FuncFormatter(lambda value, _: f"{value:g}")
+    axis.set_major_formatter(plain)
+    axis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
+    axis.set_minor_formatter(plain if span < MOST_LABELLED else NullFormatter())
+
+
+def _thinned(points: Array, together: int) -> tuple[Any, Any]:
+    """Means of so many points each; the last is of what is left."""
+    starts = np.arange(0, len(points), together)
+    sums = np.add.reduceat(points, starts, axis=0)
+    counts = np.diff([*starts, len(points)])
+    xs, ys = (sums / counts[:, None]).T
+    return xs, ys
 
 
 def _figure(inches: tuple[float, float]) -> Figure:
@@ -64,42 +142,40 @@ Series = tuple[str, Sequence[tuple[int, BenchRecord]]]
 
 
 def plot_bench(series: Sequence[Series], path: Path, title: str, abscissa: str = "path depth") -> None:
-    """Write a PNG with one curve for each of the series; bars span from the least to the greatest step time.
+    """Write a PNG with one curve for each of the series; bands go from the least to the greatest step time.
 
     Where a case ran out of memory or failed, a cross stands above the diagram of memory at that value.
     """
     figure = _figure((11.0, 4.6))
     time_axis, memory_axis = figure.subplots(1, 2)
+    times, peaks, ends = [], [], set()
     for k, (label, records) in enumerate(series):
-        style = _style(k)
-        done = [(x, record) for x, record in records if record.step_ms is not None and record.peak_mib is not None]
-        values = [x for x, _ in done]
-        steps = [record.step_ms for _, record in done if record.step_ms is not None]
-        errors = [[s.median - s.min for s in steps], [s.max - s.median for s in steps]]
-        time_axis.errorbar(values, [s.median for s in steps], yerr=errors, label=label, capsize=2, **style)
-        memory_axis.plot(values, [max(record.peak_mib or 0, 1e-3) for _, record in done], label=label, **style)
-        _mark_ends(memory_axis, [x for x, r in records if r.status is not BenchStatus.OK], style["color"], k)
-    finished = any(record.status is BenchStatus.OK for _, records in series for _, record in records)
-    ends = {record.status for _, records in series for _, record in records} - {BenchStatus.OK}
-    words = {BenchStatus.OUT_OF_MEMORY: "out of memory", BenchStatus.FAILED: "failed"}
-    for axis, label in ((time_axis, "time of a step (ms)"), (memory_axis, "peak memory (MiB)")):
-        axis.set(yscale="log" if finished else "linear", xlabel=abscissa, ylabel=label)
+        done = [(x, step, record.peak_mib) for x, record in records if (step := record.step_ms) is not None]
+        xs, band = [x for x, _, _ in done], ([step.min for _, step, _ in done], [step.max for _, step, _ in done])
+        times.append(Curve(label, xs, [step.median for _, step, _ in done], k, band, points=True))
+        peaks.append(Curve(label, xs, [peak for _, _, peak in done], k, points=True))
+        ended = [(x, record.status) for x, record in records if record.status is not BenchStatus.OK]
+        for x, _ in ended:  # crosses above the diagram, a little apart where several cases ended at one value
+            memory_axis.plot([x * 2 ** (0.06 * k)], [1.025], "x", color=COLORS[k % len(COLORS)], markersize=8,
+                             transform=memory_axis.get_xaxis_transform(), clip_on=False)  # fmt: skip
+        ends |= {status.value.replace("_", " ") for _, status in ended}
+    for axis, curves, label in ((time_axis, times, "time of a step (ms)"), (memory_axis, peaks, "peak memory (MiB)")):
+        _draw_panel(axis, curves, abscissa, label)
         axis.set_xscale("log", base=2)
         axis.set_xticks(sorted({x for _, records in series for x, _ in records}))
-        axis.xaxis.set_major_formatter("{x:.0f}")
-        axis.grid(True, which="both", alpha=0.25)
+        axis.xaxis.set_major_formatter("{x:g}")
     if ends:
-        crosses = " or ".join(words[end] for end in sorted(ends))
-        memory_axis.set_title(f"×: {crosses}", fontsize="small", loc="left")
-    time_axis.legend(fontsize="small")
+        memory_axis.set_title(f"×: {' or '.join(sorted(ends))}", fontsize="small", loc="left")
     _save(figure, path, title)
 
 
-def _mark_ends(axis: Any, depths: list[int], color: Any, row: int) -> None:
-    """Crosses above the diagram, a little apart where several cases ended at one depth."""
-    for depth in depths:
-        place = axis.get_xaxis_transform()
-        axis.plot([depth * 2 ** (0.06 * row)], [1.025], "x", color=color, markersize=8, transform=place, clip_on=False)
+def _draw_panel(axis: Any, curves: Sequence[Curve], caption: str, label: str) -> None:
+    known = [curve for curve in curves if len(curve.known())]
+    if known:
+        draw(axis, known)
+        axis.legend(fontsize="small")
+    axis.set(xlabel=caption, ylabel=label)
+    axis.grid(True, which="both", alpha=0.25)
 
 
 #: Panels at most: all together, and the first parameters.
@@ -130,11 +206,8 @@ def plot_convergence(
 
 def panels(parameters: Sequence[str]) -> list[str]:
     """What is drawn: all together first; a single parameter is all there is."""
-    keys = list(dict.fromkeys(parameters))
-    if "all" not in keys:
-        return keys[:PANELS]
-    alone = [key for key in keys if key != "all"]
-    return ["all"] if len(alone) == 1 else ["all", *alone][:PANELS]
+    keys = sorted(dict.fromkeys(parameters), key=lambda key: key != "all")
+    return keys[: 1 if len(keys) == 2 and keys[0] == "all" else PANELS]
 
 
 def _draw_errors(
@@ -148,18 +221,17 @@ def _draw_errors(
         if record is None or not curve:
             continue
         drawn = True
-        name = f"{label} (biased)" if record.biased else label
-        style = _style(k)
-        axis.plot([p.elapsed_s for p in curve], [p.relative_rmse for p in curve], label=name,
-                  linestyle="--" if record.biased else "-", **style)  # fmt: skip
+        name, color = f"{label} (biased)" if record.biased else label, COLORS[k % len(COLORS)]
+        times, errors = [p.elapsed_s for p in curve], [p.relative_rmse for p in curve]
+        _draw(axis, Curve(name, times, errors, k, points=True, dashed=bool(record.biased)))
         few = [p for p in curve if p.repeats < FEW]
-        axis.plot([p.elapsed_s for p in few], [p.relative_rmse for p in few], color=style["color"], linestyle="",
-                  marker=style["marker"], markersize=5, markerfacecolor="white")  # fmt: skip
+        axis.plot([p.elapsed_s for p in few], [p.relative_rmse for p in few], "o", color=color, markersize=4,
+                  markerfacecolor="white")  # fmt: skip
         # Where the variance of single steps says that averages lead, without a bias.
         if record.relative_rmse is not None and record.step_s is not None:
-            ends = [curve[0].elapsed_s, curve[-1].elapsed_s]
+            ends = [times[0], times[-1]]
             line = [record.relative_rmse * (time / record.step_s) ** -0.5 for time in ends]
-            axis.plot(ends, line, color=style["color"], linewidth=0.8, linestyle=":")
+            axis.plot(ends, line, color=color, linewidth=0.8, linestyle=":")
     if floor is not None:
         axis.axhline(floor, color="0.4", linestyle=(0, (6, 3)), linewidth=1.0)
         axis.annotate(" standard error of the reference", (0, floor), xycoords=("axes fraction", "data"),
@@ -175,16 +247,14 @@ def plot_runs(points: Sequence[RunPointRecord], error_of: str, path: Path, title
     """Write a PNG; a second panel for the error, which `error_of` names, where it is known."""
     panels = [("loss", "loss"), ("parameter_error", error_of)] if error_of else [("loss", "loss")]
     figure = _figure((1.0 + 6.2 * len(panels), 5.2))
-    axes = figure.subplots(1, len(panels), squeeze=False).ravel()
     labels = list(dict.fromkeys(point.method.label for point in points))
-    for axis, (of, name) in zip(axes, panels, strict=True):
+    for axis, (of, name) in zip(figure.subplots(1, len(panels), squeeze=False).ravel(), panels, strict=True):
+        curves = []
         for place, label in enumerate(labels):
-            _draw_runs(axis, [point for point in points if point.method.label == label], of, label, f"C{place % 10}")
-        axis.set(xlabel="seconds of a run, all costs counted", ylabel=name)
-        if any(line.get_ydata()[0] > 0 for line in axis.lines):
-            axis.set_yscale("log")
-        axis.grid(True, which="both", alpha=0.25)
-    axes[0].legend(fontsize="small")
+            along = curve([point for point in points if point.method.label == label], of)
+            ends = [band.low for _, band in along], [band.high for _, band in along]
+            curves.append(Curve(label, [time for time, _ in along], [band.median for _, band in along], place, ends))
+        _draw_panel(axis, curves, "seconds of a run, all costs counted", name)
     _save(figure, path, title)
 
 
@@ -196,15 +266,6 @@ def curve(points: Sequence[RunPointRecord], of: str) -> list[tuple[float, Band]]
         if value is not None:
             found.setdefault(point.elapsed_s, []).append(value)
     return [(time, band) for time in sorted(found) if (band := Band.of(found[time])) is not None]
-
-
-def _draw_runs(axis: Any, points: Sequence[RunPointRecord], of: str, label: str, color: str) -> None:
-    along = curve(points, of)
-    if along:
-        times = [time for time, _ in along]
-        axis.plot(times, [band.median for _, band in along], label=label, color=color, linewidth=1.4)
-        axis.fill_between(times, [band.low for _, band in along], [band.high for _, band in along],
-                          color=color, alpha=0.18, linewidth=0)  # fmt: skip
 
 
 #: z at the ends of the scale.

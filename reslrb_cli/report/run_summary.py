@@ -1,8 +1,5 @@
 """A finished run in a few lines, for a terminal: how it ended, and its parameters.
 
-How it ended is a line: its loss, its errors, and what did not work (`last_line`). The parameters are a few aligned
-lines (`parameter_lines`).
-
 How certain its values are is said in words, of the manifest's `results`, whose `certainty` may be missing.
 """
 
@@ -12,12 +9,11 @@ import math
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from textwrap import wrap
-from typing import Any
+from typing import Any, NamedTuple
 
 from reslrb_cli.records.decisions import PaidRecord, RivalRecord
-from reslrb_cli.report.format import count, duration, line, number, shorten, with_error
+from reslrb_cli.report.format import count, line, number, shorten, with_error
 
 #: The verdict on a value that can be relied on, as recorded; all others say what keeps it from that.
 SETTLED, MOVING, UNDETERMINED = "settled", "still moving", "not determined"
@@ -53,8 +49,7 @@ def is_settled(results: Mapping[str, Any], key: str) -> bool:
     return bool(_about(results, key).get("verdict") == SETTLED)
 
 
-@dataclass(frozen=True)
-class Remedy:
+class Remedy(NamedTuple):
     """What would help, in a word or two, and the setting for it."""
 
     words: str
@@ -113,13 +108,10 @@ def spread_words(results: Mapping[str, Any], key: str, sign: str = "+-") -> str:
 
 def certainty_lines(results: Mapping[str, Any]) -> list[str]:
     """For each verdict but the good one a line that names the parameters that have it."""
-    found: dict[str, list[str]] = {}
-    for key, about in _parameters(results).items():
-        verdict = about.get("verdict", SETTLED)
-        if verdict != SETTLED:
-            found.setdefault(verdict, []).append(key)
+    verdicts = {key: about.get("verdict", SETTLED) for key, about in _parameters(results).items()}
     lines = []
-    for verdict, keys in found.items():
+    for verdict in dict.fromkeys(verdict for verdict in verdicts.values() if verdict != SETTLED):
+        keys = [key for key in verdicts if verdicts[key] == verdict]
         named = ", ".join(shorten(key, KEY_WIDTH) for key in keys[:MOST_NAMED])
         rest = f" and {count(len(keys) - MOST_NAMED, 'more parameter')}" if len(keys) > MOST_NAMED else ""
         remedies = [remedy for key in keys if (remedy := find_remedy(results, key)) is not None]
@@ -130,27 +122,6 @@ def certainty_lines(results: Mapping[str, Any]) -> list[str]:
             line += f" ({remedy.words}: {remedy.setting})"
         lines.append(line)
     return lines
-
-
-def certainty_words(results: Mapping[str, Any]) -> str:
-    """What spreads and verdicts rest on; empty where there are none."""
-    measured = results.get("certainty")
-    if not measured:
-        return ""
-    parts = [count(measured["gradients"], "gradient")]
-    parts += [count(measured["changes"], "pair") + " of images"] if measured["changes"] else []
-    parts += [count(measured["probes"], "random probe")] if measured["probes"] else []
-    noise = {
-        "measured": ", and the noise of the rendered target",
-        "in part": ", and the noise of the targets that were rendered, not that of the others",
-        "left out": "; noise of the target is not in it",
-    }.get(measured.get("target_noise", ""), "")
-    cost = f"{duration(measured['measure_s'])}, {100 * measured['share']:.2g} % of the iterations' time"
-    return (
-        "Spread is one standard deviation of a final value about the optimum, by the noise of gradients and the "
-        f"curvature of the loss, where it ended (of a texture that of a typical entry that is seen, the others known)"
-        f"{noise}; from {', '.join(parts)}, in {cost}."
-    )
 
 
 def noise_line(results: Mapping[str, Any]) -> str:
@@ -254,9 +225,9 @@ def warnings(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
         start, end = (number(results["image_loss"][at], 3) for at in ("initial", "final"))
         lines.append(f"the images got farther from their targets (loss {start} to {end})")
     worse = [key for key in results.get("worse") or () if key in results["parameter_rmse"]]
-    worse.sort(key=lambda key: -_growth(results["parameter_rmse"][key]))
-    for key in worse[:MOST_NAMED]:
-        lines.append(f"{shorten(key, KEY_WIDTH)} got worse (RMSE {_from_to(results['parameter_rmse'][key])})")
+    errors = {key: results["parameter_rmse"][key] for key in worse}
+    worse.sort(key=lambda key: -errors[key]["final"] / max(errors[key]["initial"], 1e-30))
+    lines += [f"{shorten(key, KEY_WIDTH)} got worse (RMSE {_from_to(errors[key])})" for key in worse[:MOST_NAMED]]
     if len(worse) > MOST_NAMED:
         lines.append(f"and so did {count(len(worse) - MOST_NAMED, 'more parameter')}")
     if lines:
@@ -286,10 +257,6 @@ def _image_ratio(results: Mapping[str, Any]) -> float | None:
     if initial is None or final is None:
         return None
     return float(final / initial) if initial else math.inf if final else 1.0
-
-
-def _growth(pair: Mapping[str, float]) -> float:
-    return pair["final"] / max(pair["initial"], 1e-30)
 
 
 def _from_to(pair: Mapping[str, float | None]) -> str:
@@ -330,16 +297,13 @@ def parameter_lines(results: Mapping[str, Any], width: int) -> list[str]:
     if not listed:
         return []
     relative = units_differ(results)
-    titles = [title for title, moment in MOMENTS if any(parameters[key].get(moment) for key in listed)]
-    rows = [[_value(parameters[key].get(moment)) for title, moment in MOMENTS if title in titles] for key in listed]
-    errors = {key: error_words(results, key, relative) for key in listed}
-    if any(errors.values()):
-        titles.append("relative error" if relative else "RMSE")
-        rows = [[*row, errors[key]] for row, key in zip(rows, listed, strict=True)]
-    verdicts = {key: verdict_words(results, key) for key in listed}
-    if any(verdicts.values()):
-        titles += ["spread", "verdict"]
-        rows = [[*row, spread_words(results, key), verdicts[key]] for row, key in zip(rows, listed, strict=True)]
+    columns = {title: [_value(parameters[key].get(moment)) for key in listed] for title, moment in MOMENTS}
+    columns["relative error" if relative else "RMSE"] = [error_words(results, key, relative) for key in listed]
+    columns = {title: cells for title, cells in columns.items() if any(cells)}
+    verdicts = [verdict_words(results, key) for key in listed]
+    if any(verdicts):
+        columns |= {"spread": [spread_words(results, key) for key in listed], "verdict": verdicts}
+    titles, rows = list(columns), list(zip(*columns.values(), strict=True))
     lines = _table(listed, titles, rows, width) or _blocks(listed, titles, rows, width)
     if len(shown) > len(listed):
         lines.append(shorten(f"and {count(len(shown) - len(listed), 'more parameter')}, on the page", width))
@@ -353,11 +317,10 @@ def units_differ(results: Mapping[str, Any]) -> bool:
 
 def error_words(results: Mapping[str, Any], key: str, relative: bool) -> str:
     """The error of one parameter at start and end, `0.189 to 0.222`; empty where it is not known."""
-    pair = (results.get("relative_error" if relative else "parameter_rmse") or {}).get(key)
-    if pair is None or pair.get("initial") is None:
+    pair = (results.get("relative_error" if relative else "parameter_rmse") or {}).get(key) or {}
+    if pair.get("initial") is None:
         return ""
-    worse = ", worse" if key in (results.get("worse") or ()) else ""
-    return f"{number(pair['initial'], 3)} to {number(pair.get('final'), 3)}{worse}"
+    return _from_to(pair) + (", worse" if key in (results.get("worse") or ()) else "")
 
 
 def _value(about: Mapping[str, Any] | None) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -51,6 +51,20 @@ class Run:
         """What it came to, so far."""
         results = self.manifest.get("results")
         return results if isinstance(results, dict) else {}
+
+    def last(self, name: str) -> float | None:
+        """The last figure of that name that is known."""
+        return next((record[name] for record in reversed(self.records) if record[name] is not None), None)
+
+    @property
+    def codegen_s(self) -> float:
+        """Seconds of these in which kernels were generated and compiled."""
+        return sum(record["codegen_ms"] for record in self.records) / 1e3
+
+    @property
+    def peak(self) -> str:
+        """The most memory that it took, in words."""
+        return f"{max(record['peak_mib'] for record in self.records):.4g} MiB" if self.records else ""
 
     @property
     def scales(self) -> dict[str, float | None]:
@@ -155,24 +169,20 @@ def _kind(entry: Mapping[str, Any]) -> str | None:
 
 def _record(entry: dict[str, Any]) -> dict[str, Any] | None:
     """A line of `metrics.jsonl`, changed so that its figures are figures; None where what each has is missing."""
-    for key in _FIGURES:
-        if not _is_number(entry.get(key)):
-            return None
-    for key in _ALL_FIGURES:
-        if not _is_number(entry.get(key)):
-            entry[key] = None
+    if not all(is_number(entry.get(key)) for key in _FIGURES):
+        return None
     errors = entry.get("parameter_errors")
-    if not isinstance(errors, dict):
-        errors = entry["parameter_errors"] = {}
-    for key, value in errors.items():
-        if not _is_number(value):
-            errors[key] = None
-    return entry
+    entry["parameter_errors"] = _figures(errors) if isinstance(errors, dict) else {}
+    return entry | _figures({key: entry.get(key) for key in _ALL_FIGURES})
 
 
-def _is_number(value: Any) -> bool:
-    kind = type(value)
-    return (kind is float or kind is int) and -1e300 < value < 1e300
+def _figures(values: Mapping[str, Any]) -> dict[str, float | None]:
+    return {key: value if is_number(value) else None for key, value in values.items()}
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Whether it is a finite number."""
+    return isinstance(value, float | int) and not isinstance(value, bool) and -1e300 < value < 1e300
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

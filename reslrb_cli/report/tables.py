@@ -1,59 +1,32 @@
-"""Measurements as aligned tables: bench, conditioning, gradcheck and its suite.
-
-- `table_head`, `table_line`: the results of a bench.
-- `conditioning_lines`, `chain_lines`: conditioning.
-- `Table`, `markdown_table`: the results of a gradcheck, aligned and as Markdown; `summary_lines`, what they come to.
-- `suite_table`: the results of a suite of cases: one line for each case, with what each estimator came to.
-"""
+"""Measurements as aligned tables: bench, conditioning, gradcheck and its suite; and what a gradcheck comes to."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
+from reslrb_cli.measure.bench import Result
 from reslrb_cli.measure.conditioning import QUANTITIES, Conditioning
-from reslrb_cli.records.measurements import BenchRecord, GradcheckRecord, Kind, Reference, Spread, Verdict
-from reslrb_cli.report.format import line, table
-
-_BENCH_HEAD = (
-    "depth", "", "step ms", "over baseline", "kernel ms", "over baseline", "codegen", "tracing", "cold ms", "peak MiB",
-    "scratch B", "n",
-)  # fmt: skip
-
-_BENCH_WIDTHS = (7, 0, 9, 19, 9, 19, 7, 7, 8, 9, 9, 3)
+from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Spread, Verdict
+from reslrb_cli.report.format import Columns, interval, number, table
 
 
-def table_head(labels: list[str], swept: str = "depth") -> str:
-    """The first line; `labels` are all that will stand in the second column, what is `swept` stands in the first."""
-    return _line((swept, *_BENCH_HEAD[1:]), max(map(len, labels)))
+def bench_columns(labels: Sequence[str], swept: str = "depth") -> Columns:
+    """The columns of a bench; `labels` are all that will stand in the second one, what is `swept` in the first."""
+    titles = (swept, "", "step ms", "over baseline", "kernel ms", "over baseline", "codegen", "tracing", "cold ms",
+              "peak MiB", "scratch B", "n")  # fmt: skip
+    return Columns(titles, (7, max(map(len, labels)), 9, 19, 9, 19, 7, 7, 8, 9, 9, 3), "><>")
 
 
-def table_line(
-    label: str,
-    value: int,
-    record: BenchRecord,
-    step_ratio: Spread | None,
-    kernel_ratio: Spread | None,
-    labels: list[str],
-) -> str:
-    """The line of one result, at a value of what is swept: medians, and ratios with their least and greatest."""
-    width = max(map(len, labels))
+def bench_cells(row: Result) -> tuple[str, ...]:
+    """Medians of one result, and ratios with their least and greatest."""
+    record, named = row.record, (str(row.value), row.case.label)
     if record.step_ms is None or record.kernel_ms is None:
-        return _line((str(value), label, record.status.value), width)
-    cells = (
-        str(value),
-        label,
-        f"{record.step_ms.median:.1f}",
-        _ratio(step_ratio),
-        f"{record.kernel_ms.median:.1f}",
-        _ratio(kernel_ratio),
-        _milliseconds(record.codegen_ms),
-        _milliseconds(record.tracing_ms),
-        f"{record.cold_ms or 0:.0f}",
-        f"{record.peak_mib or 0:.1f}",
-        str(record.scratch_bytes),
-        str(record.repeats),
-    )
-    return _line(cells, width)
+        return *named, record.status.value
+    return (
+        *named, _milliseconds(record.step_ms), _ratio(row.step_ratio), _milliseconds(record.kernel_ms),
+        _ratio(row.kernel_ratio), _milliseconds(record.codegen_ms), _milliseconds(record.tracing_ms),
+        f"{record.cold_ms or 0:.0f}", f"{record.peak_mib or 0:.1f}", str(record.scratch_bytes), str(record.repeats),
+    )  # fmt: skip
 
 
 def _milliseconds(time: Spread | None) -> str:
@@ -61,21 +34,14 @@ def _milliseconds(time: Spread | None) -> str:
 
 
 def _ratio(ratio: Spread | None) -> str:
-    return "" if ratio is None else f"{ratio.median:.2f} [{ratio.min:.2f}, {ratio.max:.2f}]"
-
-
-def _line(cells: Sequence[str], label_width: int) -> str:
-    before, _, *after = _BENCH_WIDTHS
-    return line(cells, (before, label_width, *after), "><>")
-
-
-_CHAIN_HEAD = ("vertices", "paths", "median", "99 %", "largest")
-_CONDITIONING_HEAD = ("parameter", "entries", "value", "gradient", "noise", "image / unit", "curvature", "length")
+    return "" if ratio is None else interval(ratio.median, ratio.min, ratio.max, ".2f")
 
 
 def conditioning_lines(measured: Conditioning) -> list[str]:
     """One line a parameter, in its units, and the spread of what differs between them; `-` where nothing was seen."""
-    rows: list[tuple[str, ...]] = [_CONDITIONING_HEAD]
+    rows: list[tuple[str, ...]] = [
+        ("parameter", "entries", "value", "gradient", "noise", "image / unit", "curvature", "length")
+    ]
     for row in measured.rows:
         numbers = (row.value, row.gradient, row.noise, row.change, row.curvature, row.length)
         rows.append((row.key, str(row.entries), *map(_number, numbers)))
@@ -86,7 +52,7 @@ def conditioning_lines(measured: Conditioning) -> list[str]:
 
 def chain_lines(measured: Conditioning) -> list[str]:
     """One line for each length of a chain of Jacobians: how many, and their condition numbers."""
-    rows: list[tuple[str, ...]] = [_CHAIN_HEAD]
+    rows: list[tuple[str, ...]] = [("vertices", "paths", "median", "99 %", "largest")]
     for chain in measured.chains:
         numbers = (chain.median, chain.percentile_99, chain.largest)
         rows.append((str(chain.vertices), str(chain.paths), *map(_number, numbers)))
@@ -94,14 +60,12 @@ def chain_lines(measured: Conditioning) -> list[str]:
 
 
 def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
+    return number(value, 3) or "-"
 
 
 HEAD = ("parameter", "integrator", "reference", "seeds", "rel. L2", "z rms", "max |z|", "cosine", "variance",
         "detectable", "verdict")  # fmt: skip
 
-#: The first three columns are text; 0 is as wide as what stands in it.
-_GRADCHECK_WIDTHS = (0, 0, 0, 5, 17, 11, 11, 8, 8, 10, 0)
 _REFERENCES = {Reference.FINITE_DIFFERENCE: "differences", Reference.FORWARD_MODE: "forward mode"}
 _KINDS = {Kind.EQUAL_SEEDS: ", equal seeds"}
 
@@ -175,30 +139,16 @@ def summary_lines(records: Sequence[GradcheckRecord]) -> list[str]:
     return lines + [f"FAILS: {failure_line(record)}" for record in records if record.verdict is Verdict.FAILS]
 
 
-class Table:
-    """Lines of a table of these records; its columns of text are as wide as theirs."""
-
-    def __init__(self, records: Iterable[GradcheckRecord]) -> None:
-        columns = zip(*(cells(record)[:3] for record in records), strict=True)
-        self._widths = [max(map(len, (head, *column))) for head, column in zip(HEAD, columns, strict=False)]
-
-    def head(self) -> str:
-        """The first line."""
-        return self._line(HEAD)
-
-    def line(self, record: GradcheckRecord) -> str:
-        """The line of one record."""
-        return self._line(cells(record))
-
-    def _line(self, values: Sequence[str]) -> str:
-        return line(values, (*self._widths, *_GRADCHECK_WIDTHS[3:]), "<<<>")
+def gradcheck_columns(records: Iterable[GradcheckRecord]) -> Columns:
+    """The columns of a table of these records; those of text are as wide as theirs."""
+    texts = zip(*(cells(record)[:3] for record in records), strict=True)
+    widths = [max(map(len, (title, *column))) for title, column in zip(HEAD, texts, strict=False)]
+    return Columns(HEAD, (*widths, 5, 17, 11, 11, 8, 8, 10, 0), "<<<>")
 
 
-def markdown_table(records: Iterable[GradcheckRecord], cases: bool = False) -> str:
-    """The same as a Markdown table; with a first column of the records' cases if `cases`."""
-    head = ("case", *HEAD) if cases else HEAD
-    rows = [(record.case, *cells(record)) if cases else cells(record) for record in records]
-    return _markdown(head, rows)
+def markdown_table(records: Iterable[GradcheckRecord]) -> str:
+    """The same as a Markdown table."""
+    return _markdown(HEAD, map(cells, records))
 
 
 def _markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -207,13 +157,9 @@ def _markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def _limited(value: float | None, limit: float | None, spec: str) -> str:
-    if value is None:
-        return ""
-    return f"{value:{spec}}" if limit is None else f"{value:{spec}} < {limit:{spec}}" if value < limit else (
-        f"{value:{spec}} > {limit:{spec}}")  # fmt: skip
-
-
-_NAMES = {Reference.FINITE_DIFFERENCE: "differences"}
+    if value is None or limit is None:
+        return "" if value is None else f"{value:{spec}}"
+    return f"{value:{spec}} {'<' if value < limit else '>'} {limit:{spec}}"
 
 
 def suite_table(records: Iterable[GradcheckRecord], about: Mapping[str, str]) -> str:
@@ -237,15 +183,14 @@ def suite_table(records: Iterable[GradcheckRecord], about: Mapping[str, str]) ->
 
 def limits(records: Iterable[GradcheckRecord]) -> tuple[float, float]:
     """The limit of |z| that all cases share, and the largest of relative L2 at equal seeds; 0 where there is none."""
-    found = list(records)
-    z = max((r.z_max_limit for r in found if r.z_max_limit is not None), default=0.0)
-    return z, max((r.relative_l2_limit for r in found if r.relative_l2_limit is not None), default=0.0)
+    found = [(record.z_max_limit or 0.0, record.relative_l2_limit or 0.0) for record in records]
+    return max((z for z, _ in found), default=0.0), max((distance for _, distance in found), default=0.0)
 
 
 def _references(rows: Sequence[GradcheckRecord]) -> str:
     gradients = [r.reference for r in rows if r.kind is not Kind.IMAGE]
     images = [r.reference for r in rows if r.kind is Kind.IMAGE]
-    parts = [_NAMES.get(name, name.value) for name in dict.fromkeys(gradients)]
+    parts = [_REFERENCES.get(name, name.value) for name in dict.fromkeys(gradients)]
     return ", ".join(parts + [f"image: {name.value}" for name in dict.fromkeys(images)])
 
 

@@ -11,7 +11,8 @@ from cli.tiny import write_experiment
 from reslrb_cli.cli import main, progress
 from reslrb_cli.report import perceptual
 from reslrb_cli.report.page import values
-from reslrb_cli.report.page.layout import Curve, diagram
+from reslrb_cli.report.page.layout import diagram
+from reslrb_cli.report.plots import Curve
 from reslrb_cli.runs import recorder as recording
 
 #: What was drawn before, by labels.

@@ -27,7 +27,7 @@ from records.test_metrics import make_record
 from reslrb_cli.cli import _Main, main
 from reslrb_cli.cli import progress as module
 from reslrb_cli.cli.progress import Progress, Reading, descriptions
-from reslrb_cli.cli.terminal import Forgiving, forgiving_output
+from reslrb_cli.cli.terminal import Forgiving, LogLines, forgiving_output
 from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.records.measurement_files import read_lines
 
@@ -325,6 +325,21 @@ def test_every_width_has_a_bar_the_percentage_and_the_loss(monkeypatch, width, u
         assert error in words
     assert ("00:00 left" in frames[-1] or "<00:00" in frames[-1]) == (width >= 80)
     assert (LAMP[-14:] in words) == (units == 2 and width >= 120)
+
+
+def test_what_is_logged_stands_above_the_bar_once(monkeypatch):
+    logger = logging.Logger("lines")
+    logger.addHandler(LogLines())
+    master, slave = os.openpty()
+    with os.fdopen(slave, "w") as terminal:
+        monkeypatch.setattr(sys, "stderr", terminal)
+        with Progress(3, quiet=False, meter=make_meter(1)):
+            logger.warning("beware of \x1b[31m")
+        text = os.read(master, 1 << 16).decode()
+    os.close(master)
+    assert text.count("beware") == 1
+    assert re.search(r"(^|[\r\n])beware of \\x1b\[31m\r\n", text)
+    assert "\x1b[31m" not in text
 
 
 def test_a_terminal_that_changes_its_width(monkeypatch):

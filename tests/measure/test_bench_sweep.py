@@ -20,7 +20,7 @@ from reslrb_cli.measure.processes import MAX_ROUNDS, MIN_ROUNDS, Pace, Refused, 
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurements import BenchStatus, Spread
 from reslrb_cli.report.plots import plot_bench
-from reslrb_cli.report.tables import table_head, table_line
+from reslrb_cli.report.tables import bench_cells, bench_columns
 
 # The order of a sweep, and what becomes of cases that end: with processes that only pretend.
 
@@ -379,8 +379,9 @@ def test_the_table_begins_with_what_is_swept_and_the_picture_is_drawn(tmp_path: 
     Pretended.ends = {("walk_ad", 5): 2}
     rows, _ = run_swept("film", [16, 128])
     labels = LIST.split(",")
-    assert table_head(labels, "film").split()[:2] == ["film", "step"]
-    lines = [table_line(row.case.label, row.value, row.record, None, None, labels) for row in rows]
+    table = bench_columns(labels, "film")
+    assert table.head().split()[:2] == ["film", "step"]
+    lines = [table.line(bench_cells(row)) for row in rows]
     assert [line.split()[:2] for line in lines] == [[str(width), name] for width in (16, 128) for name in labels]
     assert lines[2].endswith("out_of_memory")
     series = [(label, [(row.value, row.record) for row in rows if row.case.label == label]) for label in labels]

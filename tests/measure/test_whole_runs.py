@@ -41,7 +41,7 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import target_arrays
 from reslrb_cli.records.measurement_files import read_samples, write_samples
 from reslrb_cli.records.measurements import BenchStatus
-from reslrb_cli.report.convergence_tables import RunsTable, best_line, runs_closing_sentence, runs_notes
+from reslrb_cli.report.convergence_tables import best_line, runs_cells, runs_closing_sentence, runs_columns, runs_notes
 from reslrb_cli.report.plots import curve, plot_runs
 
 # Whole optimisations at equal wall time: with pretended processes of known cost and known losses.
@@ -256,8 +256,8 @@ def test_records_and_lines(tmp_path: Path) -> None:
     line = json.loads(record.to_json())
     assert (line["kind"], line["label"], line["status"]) == ("run_method", "reslrb:stack", "ok")
     assert set(line["loss"]) == {"median", "low", "high"}
-    table = RunsTable(["ptracer", "reslrb:stack"])
-    assert "1 run" in table.line(record)
+    table = runs_columns(["ptracer", "reslrb:stack"])
+    assert "1 run" in table.line(runs_cells(record))
     assert len(table.head()) <= 140
     plot_runs(points, "RMSE", tmp_path / "a $ x.png", "x_$1\ny")
     assert (tmp_path / "a $ x.png").read_bytes().startswith(b"\x89PNG")

@@ -27,10 +27,10 @@ from report.measured import (
 from reslrb_cli.records.images import read_layers
 from reslrb_cli.records.manifest import Status, read_manifest
 from reslrb_cli.report import page as page_module
-from reslrb_cli.report.page import render_page, write_page, write_report
+from reslrb_cli.report.page import render, write_page, write_report
 from reslrb_cli.report.page.values import parameter_table, texture_pictures
 from reslrb_cli.report.perceptual import with_seen_errors
-from reslrb_cli.report.sources import read_sources
+from reslrb_cli.report.sources import Run, read_sources
 from reslrb_cli.report.tonemap import exposure_for, exposure_words, shown_exposures
 
 # What stands on a run's page.
@@ -81,6 +81,10 @@ class Page(html.parser.HTMLParser):
         return next(row for row in self.cells[section] if row and row[0].startswith(first))
 
 
+def render_run(folder):
+    return render(read_sources([folder]))
+
+
 def page_of(folder):
     return Page(write_report(folder).read_text(encoding="utf-8"))
 
@@ -129,11 +133,12 @@ def test_textures_stand_beside_each_other(tmp_path):
 def test_heights_are_shown_from_the_lowest_to_the_highest(tmp_path):
     """They may be negative, and far below what a picture shows."""
     heights = np.array([[-1e-3, 0, 3e-3]], np.float32)[:, :, None]
-    (tmp_path / "true").mkdir()
-    np.savez(tmp_path / "parameters.npz", **{"slab.heightmap": np.zeros_like(heights)})
-    np.savez(tmp_path / "true" / "parameters.npz", **{"slab.heightmap": heights})
+    (tmp_path / "parameters" / "true").mkdir(parents=True)
+    np.savez(tmp_path / "parameters" / "parameters.npz", **{"slab.heightmap": np.zeros_like(heights)})
+    np.savez(tmp_path / "parameters" / "true" / "parameters.npz", **{"slab.heightmap": heights})
     about = {"quantity": "length", "shape": [1, 3, 1]}
-    page = Page(texture_pictures(tmp_path, {"parameters": {"slab.heightmap": about}}))
+    manifest = {"results": {"parameters": {"slab.heightmap": about}}}
+    page = Page(texture_pictures(Run(tmp_path, "slab", manifest, [])))
     shown = {alt: pixels(uri) for alt, uri in page.pictures}
     assert shown["true: slab.heightmap"][0, 0, 0] == 0
     assert shown["true: slab.heightmap"][0, 2, 0] == 1
@@ -192,7 +197,7 @@ def test_dark_scenes_are_shown_brighter_and_say_so(tmp_path):
 
 def test_swatches_have_the_colours_of_the_values(tmp_path):
     """One exposure for all moments of a lamp, in sRGB; none for what is no colour."""
-    markup = render_page(make_run(tmp_path / "lamp", keys=(FLOOR, LAMP, "plate.eta.value")))
+    markup = render_run(make_run(tmp_path / "lamp", keys=(FLOOR, LAMP, "plate.eta.value")))
     swatches = [
         tuple(map(int, found.split(","))) for found in re.findall(r'"swatch" style="background:rgb\((.*?)\)"', markup)
     ]
@@ -250,7 +255,7 @@ EVIL = '<script>alert("1")</script>.a & b.value'
 def test_names_stay_text(tmp_path):
     folder = make_run(tmp_path / "<img src=x onerror=alert(1)>", keys=(EVIL, "\x1b[31m</pre>\u202e.value"))
     (folder / "config.yaml").write_text("name: </pre><script>alert(1)</script>\n")
-    markup = render_page(folder)
+    markup = render_run(folder)
     page = Page(markup)
     assert "script" not in page.tags
     assert page.tags.count("img") == len(page.pictures) == 9
@@ -261,7 +266,7 @@ def test_names_stay_text(tmp_path):
 
 
 def test_nothing_is_loaded(tmp_path):
-    markup = render_page(make_run(tmp_path / "lamp"))
+    markup = render_run(make_run(tmp_path / "lamp"))
     assert re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', markup) == []
     assert "url(http" not in markup
     assert "default-src 'none'" in html.unescape(markup)

@@ -27,8 +27,8 @@ from report.test_page import EVIL, Page, pixels
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.manifest import Status
 from reslrb_cli.report.page import render
-from reslrb_cli.report.page.layout import COLORS
 from reslrb_cli.report.page.run import DAMAGED
+from reslrb_cli.report.plots import COLORS
 from reslrb_cli.report.sources import Maps, Measurements, Run, read_sources
 
 # One page about several runs and measurements: what stands on it, and what is damaged or hostile in it.

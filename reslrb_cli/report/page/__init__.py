@@ -53,8 +53,3 @@ def render(sources: Sequence[Source], live: bool = False) -> str:
     else:
         title, head, parts = several_parts(sources)
     return document(title, head, parts, REFRESH_SECONDS if live else None)
-
-
-def render_page(folder: Path) -> str:
-    """The page of a run folder as HTML."""
-    return render([read_run(folder)])

@@ -1,11 +1,4 @@
-"""The images on the page: start, end, target and maps of every sensor, and tables of what they come to.
-
-- `show`, `show_map`: arrays as pictures that a page holds in itself, in their own colours and in those of a scale.
-- `gradient_maps`: maps of gradients of textures: the gradient, its reference, and their difference in standard errors.
-- `view_table`: what of every view counts: its share of the loss, its exposure, and the pixels that are left out.
-- `seen_tables`: errors as people see them, as tables: of images, and of recovered colours.
-- `image_rows`: a row for every sensor.
-"""
+"""The images on the page: start, end, target and maps of every sensor, and tables of what they come to."""
 
 from __future__ import annotations
 
@@ -14,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -22,7 +15,7 @@ from markupsafe import Markup
 from reslrb_cli.optimization.targets import WORDS
 from reslrb_cli.records.images import load_image, read_layers
 from reslrb_cli.report.format import number
-from reslrb_cli.report.page.layout import Piece, Words, key, lay_out, soft, table, titled
+from reslrb_cli.report.page.layout import key, lay_out, soft
 from reslrb_cli.report.sources import Run
 from reslrb_cli.report.tonemap import (
     as_png,
@@ -45,22 +38,19 @@ MOST_PIXELS = 640
 FEW_PIXELS = 256
 
 
-class Scale(NamedTuple):
-    """The scale of a map's colours: some of them, and what stands at its ends, and between them."""
-
-    stops: Sequence[str]
-    ends: Sequence[str]
-
-
 @dataclass(frozen=True)
 class Picture:
-    """A picture as a `data:` address, with its size, (width, height), in its own pixels; `caption` has lines."""
+    """A picture as a `data:` address, with its size, (width, height), in its own pixels; `caption` has lines.
+
+    That of a map has a scale: some of its colours (`stops`), and what stands at its ends, and between them (`ends`).
+    """
 
     uri: str
     size: tuple[int, int]
     alt: str
-    caption: Sequence[Words]
-    scale: Scale | None = None
+    caption: Sequence[str]
+    stops: Sequence[str] = ()
+    ends: Sequence[str] = ()
 
     @property
     def smooth(self) -> bool:
@@ -68,33 +58,25 @@ class Picture:
         return max(self.size) >= FEW_PIXELS
 
 
-def show(values: Array, alt: str, *caption: Words) -> Picture:
+def show(values: Array, alt: str, *caption: str) -> Picture:
     """Linear values (H, W, C) as an sRGB picture; fewer channels than three are shown as grey."""
     values = fit(np.nan_to_num(values[:, :, :3] if values.shape[2] >= 3 else values[:, :, :1], posinf=1e30))
     encoded = np.round(255 * encode(np.clip(values, 0.0, 1.0))).astype(np.uint8)
     return _embed(as_png(np.broadcast_to(encoded, (*encoded.shape[:2], 3))), encoded.shape, alt, caption)
 
 
-def show_map(values: Array, end: float, alt: str, *caption: Words, signed: bool = False) -> Picture:
+def show_map(values: Array, end: float, alt: str, *caption: str, signed: bool = False) -> Picture:
     """Values (H, W, 1) in colours, from 0 to `end`, or if `signed` from -`end`, with the scale below the caption."""
     grey = fit(values)[:, :, 0]
     last = number(end)
     ends = [f"−{last}", "0", f"{last} or more"] if signed else ["0", f"{last} or more"]
-    scale = Scale(color_stops(9, signed), ends)
     about = f"{alt}, from {ends[0]} to {last}"
-    return _embed(colored(grey / end, signed), grey.shape, about, caption, scale)
+    return _embed(colored(grey / end, signed), grey.shape, about, caption, color_stops(9, signed), ends)
 
 
-def _embed(
-    png: bytes, shape: tuple[int, ...], alt: str, caption: Sequence[Words], scale: Scale | None = None
-) -> Picture:
+def _embed(png: bytes, shape: tuple[int, ...], *about: Any) -> Picture:
     """A PNG of an array of `shape`, (H, W, ...)."""
-    return Picture(f"data:image/png;base64,{base64.b64encode(png).decode()}", (shape[1], shape[0]), alt, caption, scale)
-
-
-def gallery(pictures: Sequence[Picture], title: Words = "", remark: str = "") -> Markup:
-    """Pictures beside each other, below a title and a remark."""
-    return lay_out("gallery", pictures, title, remark)
+    return Picture(f"data:image/png;base64,{base64.b64encode(png).decode()}", (shape[1], shape[0]), *about)
 
 
 def fit(values: Array) -> Array:
@@ -127,15 +109,15 @@ def gradient_maps(paths: Sequence[Path]) -> Markup:
         try:
             layers = read_layers(path)
         except (OSError, ValueError):
-            rows += gallery([], key(path.stem), "This file is damaged.")
+            rows += lay_out("gallery", [], key(path.stem), "This file is damaged.")
             continue
         sums = {name: np.nan_to_num(layers[name].astype(np.float64)).sum(-1, keepdims=True)
                 for name in ("gradient", "reference", "z")}  # fmt: skip
         end = signed_end(np.stack([sums["gradient"], sums["reference"]]))
-        shown = [show_map(sums[name], end, name, titled(name, ", sum over channels"), signed=True)
+        shown = [show_map(sums[name], end, name, lay_out("titled", name, ", sum over channels"), signed=True)
                  for name in ("gradient", "reference")]  # fmt: skip
-        caption = titled("difference", " in standard errors")
-        rows += gallery([*shown, show_map(sums["z"], MOST_Z, "z", caption, signed=True)], key(path.stem))
+        caption = lay_out("titled", "difference", " in standard errors")
+        rows += lay_out("gallery", [*shown, show_map(sums["z"], MOST_Z, "z", caption, signed=True)], key(path.stem))
     return rows + soft(f"{len(paths) - MOST_MAPS} more maps are not shown." if len(paths) > MOST_MAPS else "")
 
 
@@ -146,94 +128,47 @@ def view_table(views: Sequence[Mapping[str, Any]] | None, results: Mapping[str, 
     """
     if not views or (len(views) == 1 and not _is_special(views[0])):
         return Markup()
-    cells = [
-        [
-            str(view["sensor"]),
-            "held out" if view["held_out"] else number(view["share"]),
-            _exposure(view, results),
-            f"{view['left_out']} of {view['pixels']}",
-            "; ".join(_kinds(view)),
-        ]
-        for view in views
-    ]
+    exposures = {view["exposure"]: _recovered(view["exposure"], results) for view in views}
     held_out = results.get("held_out") or {}
-    losses = " → ".join(number(held_out[moment]) for moment in ("initial", "final") if moment in held_out)
-    words = soft(f"Loss of the views that are held out: {losses}.") if losses else ""
-    return table(("sensor", "share of the loss", "exposure", "pixels left out", "of which"), cells) + words
+    losses = [held_out[moment] for moment in ("initial", "final") if moment in held_out]
+    return lay_out("run.views", views, WORDS, exposures, losses)
 
 
 def _is_special(view: Mapping[str, Any]) -> bool:
     return bool(view["left_out"] or view["kinds"] or view["counted"] or view["exposure"] != 1)
 
 
-def _exposure(view: Mapping[str, Any], results: Mapping[str, Any]) -> str:
-    """The number, or what was recovered."""
-    exposure = view["exposure"]
-    if not isinstance(exposure, str):
-        return number(exposure)
+def _recovered(exposure: object, results: Mapping[str, Any]) -> list[float]:
+    """The values of a parameter that is an exposure, as far as they are known."""
     final = ((results.get("parameters") or {}).get(exposure) or {}).get("final") or {}
     value = final.get("value")
-    values = value if isinstance(value, list) else [value]
-    return "recovered" if value is None else f"{', '.join(map(number, values))} (recovered)"
+    return value if isinstance(value, list) else [] if value is None else [value]
 
 
-def _kinds(view: Mapping[str, Any]) -> list[str]:
-    left_out = [f"{count} {WORDS[kind]}" for kind, count in view["kinds"].items()]
-    return left_out + [f"{count} {WORDS[kind]} and stay" for kind, count in view["counted"].items()]
-
-
-_HEAD = ("image", "PSNR", "SSIM", "CIEDE2000", "ΔE ITP", "HDR-FLIP", "|image − target|")
-_TOLD = "Each line: mean; median, 95 %, 99 % of the pixels or texels are below; the greatest."
-_MEASURES = {"ciede2000": "CIEDE2000", "itp": "ΔE ITP"}
+_MEASURES = {"ciede2000": "CIEDE2000", "itp": "ΔE ITP", "flip": "HDR-FLIP", "absolute": "|image − target|"}
 
 
 def seen_tables(runs: Sequence[Run]) -> Markup:
     """The errors of the images and colours of runs, a line for each at the start and at the end."""
-    rows: list[list[Words]] = []
-    colors: list[list[Words]] = []
-    notes, several = [], len(runs) > 1
+    images: list[dict[str, Any]] = []
+    colors: list[dict[str, Any]] = []
+    notes: list[str] = []
     for run in runs:
-        seen = run.results.get("seen") or {}
-        before: list[str | Piece] = [key(run.name), " "] if several else []
+        seen, name = run.results.get("seen") or {}, run.name if len(runs) > 1 else ""
         for suffix, about in (seen.get("images") or {}).items():
             sensor = f"sensor {suffix[1:]}, " if suffix else ""
-            rows += [_image_row([*before, f"{sensor}{title}"], about[moment]) for title, moment in _moments(about)]
-        for name, about in (seen.get("colors") or {}).items():
-            pair = [_spread(about.get(moment)) for moment in ("initial", "final")]
-            colors.append([[*before, key(name)], _MEASURES.get(about.get("measure"), ""), *pair])
+            images += [
+                {"run": name, "name": sensor + title, "errors": about[moment]}
+                for title, moment in (("start", "initial"), ("end", "final"))
+                if moment in about
+            ]
+        colors += [{"run": name, "name": key, "about": about} for key, about in (seen.get("colors") or {}).items()]
         notes += [seen["note"]] if seen.get("note") and seen["note"] not in notes else []
-    if not rows and not colors:
+    if not images and not colors:
         return Markup()
-    drop = 5 if rows and not any(row[5] for row in rows) else None  # no column for what nobody measured
-    head = [title for place, title in enumerate(_HEAD) if place != drop]
-    shown = [[cell for place, cell in enumerate(row) if place != drop] for row in rows]
-    tables = table(head, shown, "spreads") + table(("colour", "in", "start", "end"), colors, "spreads")
-    return tables + Markup().join(map(soft, (_TOLD, *notes)))
-
-
-def _moments(about: Mapping[str, Any]) -> list[tuple[str, str]]:
-    return [(title, moment) for title, moment in (("start", "initial"), ("end", "final")) if moment in about]
-
-
-def _image_row(name: Sequence[str | Piece], errors: Mapping[str, Any]) -> list[Words]:
-    ratio, ssim = errors.get("psnr_db"), errors.get("ssim")
-    bad = errors.get("not_finite")
-    return [
-        [*name, Piece(Piece(f"{bad} pixels not finite", "worse small") if bad else "", "below")],
-        Piece(f"{number(ratio, 4)} dB" if ratio is not None else "∞", "number"),
-        "too small" if ssim is None else number(ssim, 4),
-        *(_spread(errors.get(name)) for name in ("ciede2000", "itp", "flip", "absolute")),
-    ]
-
-
-def _spread(told: Mapping[str, float] | None) -> Words:
-    """Mean, percentiles and maximum, in two lines; where all are the same, that."""
-    if not told:
-        return ""
-    if told["mean"] == told["max"]:
-        return number(told["max"], 3)
-    rest = " ".join(number(told[name], 3) for name in ("p50", "p95", "p99", "max") if name in told)
-    return [Piece(number(told["mean"], 3), "numbers"), Piece(Piece(rest, "numbers"), "below")]
+    has_flip = any(row["errors"].get("flip") for row in images)
+    measures = {name: title for name, title in _MEASURES.items() if name != "flip" or has_flip}
+    return lay_out("run.seen", images, colors, measures, notes)
 
 
 #: Images between the first and the last that are shown of a sensor, at most.
@@ -259,19 +194,19 @@ def _row(folder: Path, suffix: str, results: Mapping[str, Any], exposure: float 
     exposure = exposure_for(loaded["target"]) if exposure is None else exposure
     sensor = f" of sensor {suffix[1:]}" if suffix else ""
     shown = [
-        show(image * exposure, f"{title}{sensor}", titled(title, f", {image.shape[1]}×{image.shape[0]}"))
+        show(image * exposure, f"{title}{sensor}", lay_out("titled", title, f", {image.shape[1]}×{image.shape[0]}"))
         for title, image in loaded.items()
         if image is not None
     ]
     weights = load_image(folder / f"weights{suffix}.exr")
     if weights is not None:  # not all pixels count alike
         share = weights[:, :, :1] / max(float(weights.max()), 1e-30)
-        shown.append(show(share, f"mask{sensor}", titled("mask", ": black is left out of the loss")))
+        shown.append(show(share, f"mask{sensor}", lay_out("titled", "mask", ": black is left out of the loss")))
     shown += _error_maps(folder, suffix, results)
     title = f"Sensor {suffix[1:]}" if suffix else ""
     between = _between(folder, suffix, exposure)
-    return gallery(shown, title, exposure_words(exposure, loaded["target"])) + (
-        gallery(between, "", "on the way:") if between else "")  # fmt: skip
+    return lay_out("gallery", shown, title, exposure_words(exposure, loaded["target"])) + (
+        lay_out("gallery", between, "", "on the way:") if between else "")  # fmt: skip
 
 
 def _error_maps(folder: Path, suffix: str, results: Mapping[str, Any]) -> list[Picture]:
@@ -281,11 +216,11 @@ def _error_maps(folder: Path, suffix: str, results: Mapping[str, Any]) -> list[P
     shown = []
     if about is not None and about.get("end") and "difference" in layers:
         grey = np.abs(layers["difference"].astype(np.float64)).mean(axis=2, keepdims=True)
-        caption = titled("|image − target|", f" at the end, mean {number(about['mean'], 3)}")
+        caption = lay_out("titled", "|image − target|", f" at the end, mean {number(about['mean'], 3)}")
         shown.append(show_map(grey, about["end"], "error map", caption))
     if "gradient" in layers:
         total = np.nan_to_num(layers["gradient"].astype(np.float64)).sum(axis=2, keepdims=True)
-        caption = titled("∂loss/∂image", " at the end, sum over channels")
+        caption = lay_out("titled", "∂loss/∂image", " at the end, sum over channels")
         shown.append(show_map(total, signed_end(total), "derivative of the loss", caption, signed=True))
     return shown
 

@@ -1,67 +1,54 @@
-"""Parts of a page on a file of measurements, by the command that wrote it, on a folder of maps, and on several runs.
-
-- `bench`: what `bench` measured: time and memory of a step against what was varied, and all of it as a table.
-- `convergence`: what `convergence` measured: error against run time, by method.
-- `whole_runs`: what `convergence --runs` measured: whole optimisations against run time, medians and bands over the
-  seeds.
-- `several_parts`: several runs and measurements: what can be compared in one picture, then each by itself.
-- `measured`: everything that there is to show of one file, or of a folder of maps; `gradcheck` has its comparisons.
-"""
+"""Parts of a page on a file of measurements, by the command that wrote it, on a folder of maps, and on several runs."""
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 from markupsafe import Markup
 
-from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verdict, record_of
-from reslrb_cli.report.format import count, duration, number
+from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Spread, Verdict, record_of
+from reslrb_cli.report.format import count, number
 from reslrb_cli.report.page.images import gradient_maps, image_rows, seen_tables
-from reslrb_cli.report.page.layout import (
-    Curve,
-    Piece,
-    Titled,
-    Words,
-    diagram,
-    diagrams,
-    key,
-    lay_out,
-    legend,
-    soft,
-    table,
-)
-from reslrb_cli.report.page.run import StepParts, bars, guarded, origin_facts, problems, record_parts
+from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
+from reslrb_cli.report.page.run import StepParts, bars, guarded, problems, record_parts
 from reslrb_cli.report.page.values import convergence_of_all, parameter_table, texture_pictures
+from reslrb_cli.report.plots import Curve
 from reslrb_cli.report.run_summary import worst
-from reslrb_cli.report.sources import Maps, Measurements, Run, Source
+from reslrb_cli.report.sources import Maps, Measurements, Run, Source, is_number
 from reslrb_cli.report.tables import HEAD, cells, failure_line, summary_lines
 
 Entry = Mapping[str, Any]
+Naming = Callable[[Entry], str]
 
 #: What can be varied: its name in the records, in words, and what they are called where they are fixed.
 SWEPT = {"max_depth": "path depth", "spp": "samples per pixel", "pixels": "pixels of the film", "texels": "texels"}
-_ENDED = {"out_of_memory": "out of memory", "failed": "failed"}
 
 
 def bench(objects: Sequence[Entry]) -> tuple[Markup, int]:
     """Diagrams and a table; and how many lines are no records of a bench."""
     entries = [_with_sizes(entry) for entry in objects if "integrator" in entry and "status" in entry]
     labels = list(dict.fromkeys(map(label, entries)))
-    varied = [name for name in SWEPT if len({entry[name] for entry in entries if entry.get(name)}) > 1] or ["max_depth"]
-    parts = legend(labels)
+    values = {name: [entry[name] for entry in entries if entry.get(name)] for name in SWEPT}
+    usual = {name: max(dict.fromkeys(found), key=found.count) for name, found in values.items() if found}
+    varied = [name for name in SWEPT if len(set(values[name])) > 1] or ["max_depth"]
+    parts = lay_out("legend", labels)
     for name in varied:
-        chosen = [
-            entry for entry in entries if all(_is_usual(entry, other, entries) for other in varied if other != name)
+        others = [other for other in varied if other != name]
+        chosen = [entry for entry in entries if all(entry.get(other) == usual[other] for other in others)]
+        drawn = [
+            ("", diagram(_curves(chosen, labels, label, name, what), SWEPT[name], words, log_x=2))
+            for what, words in (("step_ms", "time of a step (ms)"), ("peak_mib", "peak memory (MiB)"))
         ]
-        curves = [_curves(chosen, labels, name, what) for what in ("step_ms", "peak_mib")]
-        drawn = zip(curves, ("time of a step (ms)", "peak memory (MiB)"), strict=True)
-        parts += diagrams(*(Titled(diagram(made, SWEPT[name], axis, log_x=2)) for made, axis in drawn))
-        others = [f"{SWEPT[other]} {number(_usual(other, entries))}" for other in varied if other != name]
-        parts += soft(f"At {', '.join(others)}." if others else "")
-    parts += soft(_conditions(entries, varied)) + _bench_table(entries, varied)
+        at = ", ".join(f"{SWEPT[other]} {number(usual[other])}" for other in others)
+        parts += lay_out("diagrams", drawn) + soft(f"At {at}." if at else "")
+    fixed = [f"{SWEPT[name]} {number(value)}" for name, value in usual.items() if name not in varied]
+    entries.sort(key=lambda entry: [entry.get(name) or 0 for name in varied])
+    rows = [{"label": label(entry), "entry": entry} for entry in entries]
+    parts += lay_out("measured.bench", rows, {name: SWEPT[name] for name in varied}, fixed)
     return parts, len(objects) - len(entries)
 
 
@@ -77,72 +64,23 @@ def _with_sizes(entry: Entry) -> dict[str, Any]:
     return {"pixels": pixels, "texels": entry.get("texels")} | dict(entry)
 
 
-def _usual(name: str, entries: Sequence[Entry]) -> Any:
-    """The value that most of the records have."""
-    values = [entry[name] for entry in entries if entry.get(name)]
-    return max(dict.fromkeys(values), key=values.count) if values else None
-
-
-def _is_usual(entry: Entry, name: str, entries: Sequence[Entry]) -> bool:
-    return bool(entry.get(name) == _usual(name, entries))
-
-
-def _curves(entries: Sequence[Entry], labels: Sequence[str], abscissa: str, what: str) -> list[Curve]:
+def _curves(entries: Sequence[Entry], labels: Sequence[str], naming: Naming, x: str, y: str) -> list[Curve]:
+    """A curve for each label, of the figures `y` over `x`; of those that are spreads the medians, with a band."""
     curves = []
     for place, name in enumerate(labels):
-        rows = [entry for entry in entries if label(entry) == name and entry.get("step_ms") and entry.get(abscissa)]
-        rows.sort(key=lambda entry: entry[abscissa])
-        xs = [entry[abscissa] for entry in rows]
-        if what == "peak_mib":
-            curves.append(Curve(name, xs, [entry.get(what) for entry in rows], place, points=True))
-        else:
-            low, median, high = ([entry[what][end] for entry in rows] for end in ("min", "median", "max"))
-            curves.append(Curve(name, xs, median, place, (low, high), points=True))
+        rows = sorted((row for row in entries if naming(row) == name and row.get(x)), key=lambda row: float(row[x]))
+        figures = [row.get(y) for row in rows]
+        spreads = [value for value in figures if isinstance(value, Mapping)]
+        if spreads:
+            rows = [row for row in rows if isinstance(row.get(y), Mapping)]
+            low, figures, high = ([value[end] for value in spreads] for end in ("min", "median", "max"))
+        xs, band = [row[x] for row in rows], (low, high) if spreads else None
+        curves.append(Curve(name, xs, figures, place, band, points=True))
     return curves
 
 
-def _conditions(entries: Sequence[Entry], varied: Sequence[str]) -> str:
-    fixed = [f"{SWEPT[name]} {number(_usual(name, entries))}" for name in SWEPT
-             if name not in varied and _usual(name, entries)]  # fmt: skip
-    words = f"Fixed: {', '.join(fixed)}. " if fixed else ""
-    return f"{words}Medians; bands and brackets go from the least to the greatest."
-
-
-def _bench_table(entries: Sequence[Entry], varied: Sequence[str]) -> Markup:
-    head = ["integrator", *(SWEPT[name] for name in varied), "step", "kernels", "first step", "peak memory", "scratch"]
-    rows: list[list[Words]] = []
-    for entry in sorted(entries, key=lambda entry: [entry.get(name) or 0 for name in varied]):
-        cells: list[Words] = [key(label(entry)), *(number(entry.get(name), 6) for name in varied)]
-        if entry["status"] in _ENDED:
-            rows.append([*cells, Piece(_ENDED[entry["status"]], "worse"), "", "", "", ""])
-            continue
-        cold, scratch = entry.get("cold_ms"), entry.get("scratch_bytes")
-        rows.append([
-            *cells, _spread(entry.get("step_ms")), _spread(entry.get("kernel_ms")),
-            "" if cold is None else duration(cold / 1e3),
-            "" if entry.get("peak_mib") is None else f"{entry['peak_mib']:.4g} MiB",
-            "" if scratch is None else f"{scratch} B",
-        ])  # fmt: skip
-    return table(head, rows, "dense")
-
-
-def _spread(times: Mapping[str, float] | None) -> Words:
-    if not times:
-        return ""
-    return _with_ends(f"{number(times['median'], 3)} ms", times, "min", "max")
-
-
-def _with_ends(words: str, interval: Mapping[str, float | None], low: str = "low", high: str = "high") -> Words:
-    """Words, and the ends of their interval where it has both."""
-    ends = [number(interval.get(end), 3) for end in (low, high)]
-    return [words, " ", Piece(f"[{', '.join(ends)}]", "soft small")] if all(ends) else words
-
-
-Naming = Callable[[Entry], str]
-
 #: Quantities that are drawn, at most: all parameters together, the image, then single ones.
 MOST_DRAWN = 8
-_SHARES = {"0.1": "to 10 %", "0.03": "to 3 %", "0.01": "to 1 %"}
 
 
 def convergence(objects: Sequence[Entry]) -> tuple[Markup, int]:
@@ -158,8 +96,6 @@ def convergence(objects: Sequence[Entry]) -> tuple[Markup, int]:
         markup += _steps(kinds["point"], kinds["method"], name)
     if kinds["run_point"] or kinds["run_method"]:
         markup += whole_runs(kinds["run_point"], kinds["run_method"], name)
-        markup += Markup().join(soft(f"{name(entry)}: {entry['message']}") for entry in kinds["run_method"]
-                          if entry.get("message"))  # fmt: skip
     return markup, len(objects) - len(known) - len(said)
 
 
@@ -170,15 +106,15 @@ def _steps(points: Sequence[Entry], methods: Sequence[Entry], name: Naming) -> M
     quantities.sort(key=lambda what: {"all": 0, "image": 1}.get(what, 2))
     if len(quantities) == 2 and quantities[0] == "all":  # the only parameter is all of them
         del quantities[0]
-    drawn = [_error_diagram(points, labels, what, name) for what in quantities[:MOST_DRAWN]]
-    parts = legend(labels) + diagrams(*drawn)
-    if points:
-        parts += soft("Dots across: the standard error of the reference itself, below which nothing can be told.")
-    if len(quantities) > MOST_DRAWN:
-        parts += soft(f"{len(quantities) - MOST_DRAWN} more parameters are in the table alone.")
-    told = [entry for entry in methods if quantity(entry) in quantities]
-    parts += _error_table(told, quantities, name)
-    return parts + Markup().join(soft(f"{name(entry)}: {entry['message']}") for entry in told if entry.get("message"))
+    drawn = [_error_diagram([entry for entry in points if quantity(entry) == what], labels, what, name)
+             for what in quantities[:MOST_DRAWN]]  # fmt: skip
+    rows = [
+        {"name": name(entry), "of": what, "place": quantities.index(what), "entry": entry}
+        for entry in methods
+        if (what := quantity(entry)) in quantities
+    ]
+    return lay_out("legend", labels) + lay_out("diagrams", drawn) + lay_out(
+        "measured.methods", rows, bool(points), len(quantities), MOST_DRAWN)  # fmt: skip
 
 
 def quantity(entry: Entry) -> str:
@@ -193,119 +129,27 @@ def method_label(entry: Entry, with_spp: bool = False) -> str:
     return ", ".join(part for part in parts if part)
 
 
-def _error_diagram(points: Sequence[Entry], labels: Sequence[str], what: str, naming: Naming) -> Titled:
-    of_it = [entry for entry in points if quantity(entry) == what]
-    curves = []
-    for place, name in enumerate(labels):
-        rows = sorted((entry for entry in of_it if naming(entry) == name and _time(entry)), key=_time)
-        curves.append(Curve(name, [_time(entry) for entry in rows], [entry.get("relative_rmse") for entry in rows],
-                            place, points=True))  # fmt: skip
-    floors = [value for entry in of_it if isinstance(value := entry.get("reference_rmse"), int | float) and value > 0]
-    drawing = diagram(curves, "time (s)", "relative error", 10, sorted(floors)[len(floors) // 2 :][:1])
-    return Titled(drawing, {"all": "all parameters", "image": "the image"}.get(what, key(what)))
-
-
-def _time(entry: Entry) -> float:
-    return float(entry.get("elapsed_s") or 0.0)
-
-
-def _error_table(methods: Sequence[Entry], quantities: Sequence[str], naming: Naming) -> Markup:
-    several = len(quantities) > 1
-    head = ["method", *["of"] * several, "slope", "efficiency", "bias, z", *_SHARES.values()]
-    rows: list[list[Words]] = []
-    for entry in sorted(methods, key=lambda entry: quantities.index(quantity(entry))):
-        biased = Piece("biased", "worse") if entry.get("biased") else ""
-        name: list[Words] = [[key(naming(entry)), " ", biased], *[key(quantity(entry))] * several]
-        if (ended := _ended(entry)) is not None:
-            rows.append([*name, ended, *[""] * (len(head) - len(name) - 1)])
-            continue
-        seconds, beyond = entry.get("seconds_to") or {}, entry.get("extrapolated") or ()
-        rows.append([
-            *name, figure_of(entry.get("slope")), figure_of(entry.get("efficiency")), _bias(entry),
-            *(seconds_of(seconds.get(share), share in beyond) for share in _SHARES),
-        ])  # fmt: skip
-    return table(head, rows, "dense")
-
-
-def _ended(entry: Entry) -> Piece | None:
-    """How a method ended before it was measured; None where it was not."""
-    status = str(entry.get("status", "ok"))
-    return None if status == "ok" else Piece(status.replace("_", " "), "worse")
-
-
-def _bias(entry: Entry) -> Words:
-    """The largest deviation in standard errors, and the limit that it keeps or exceeds."""
-    z, limit = entry.get("bias_z"), entry.get("bias_z_limit")
-    if not isinstance(z, int | float) or not isinstance(limit, int | float):
-        return figure_of(z)
-    return f"{abs(z):.2g} {'<' if abs(z) < limit else '>'} {limit:.2g}"
-
-
-def figure_of(value: Any) -> Words:
-    """A figure, and its interval where it has one: a number, or `{value, low, high}`."""
-    if isinstance(value, Mapping):
-        return _with_ends(number(value.get("value"), 3), value)
-    return number(value, 3) if isinstance(value, int | float) else ""
-
-
-def seconds_of(value: Any, extrapolated: bool) -> Words:
-    """A time; one that was extrapolated is marked, one that is never reached is a dash."""
-    if not isinstance(value, int | float):
-        return "—"
-    return [duration(value), " ", Piece("extrapolated", "soft small")] if extrapolated else duration(value)
-
-
-#: What is drawn against time: its name in the records, and in words.
-_DRAWN = {"loss": "loss", "parameter_error": "parameter error"}
+def _error_diagram(points: Sequence[Entry], labels: Sequence[str], what: str, naming: Naming) -> tuple[str, Markup]:
+    floors = sorted(value for entry in points if is_number(value := entry.get("reference_rmse")) and value > 0)
+    curves = _curves(points, labels, naming, "elapsed_s", "relative_rmse")
+    drawing = diagram(curves, "time (s)", "relative error", 10, floors[len(floors) // 2 :][:1])
+    return {"all": "all parameters", "image": "the image"}.get(what, key(what)), drawing
 
 
 def whole_runs(points: Sequence[Entry], methods: Sequence[Entry], naming: Naming) -> Markup:
     """A diagram of the loss, one of the parameters' error where that is known, and a table; `naming` names a method."""
     labels = list(dict.fromkeys(map(naming, [*methods, *points])))
-    parts = legend(labels) + diagrams(*(_runs_diagram(points, labels, of, naming) for of in _DRAWN))
-    if points:
-        parts += soft("Whole optimisations at equal wall time, all costs counted. Medians over the seeds; bands "
-                      "and brackets go from the least to the greatest.")  # fmt: skip
-    return parts + _runs_table(methods, naming)
-
-
-def _runs_diagram(points: Sequence[Entry], labels: Sequence[str], of: str, naming: Naming) -> Titled:
-    curves = []
-    for place, name in enumerate(labels):
-        found: dict[float, list[float]] = {}
+    drawn = []
+    for of, words in (("loss", "loss"), ("parameter_error", "parameter error")):
+        found: dict[tuple[str, float], list[float]] = {}
         for entry in points:
-            if naming(entry) == name and _is_number(entry.get(of)) and _is_number(entry.get("elapsed_s")):
-                found.setdefault(float(entry["elapsed_s"]), []).append(float(entry[of]))
-        times = sorted(found)
-        medians = [statistics.median(found[time]) for time in times]
-        band = [min(found[time]) for time in times], [max(found[time]) for time in times]
-        curves.append(Curve(name, times, medians, place, band, points=True))
-    return Titled(diagram(curves, "time of a run (s)", _DRAWN[of]), _DRAWN[of])
-
-
-def _runs_table(methods: Sequence[Entry], naming: Naming) -> Markup:
-    rows: list[list[Words]] = []
-    for entry in methods:
-        ended, seconds = _ended(entry), entry.get("elapsed_s")
-        rows.append([
-            [key(naming(entry)), " ", ended or ""],
-            number(entry["runs"]) if _is_number(entry.get("runs")) else "",
-            duration(float(seconds)) if isinstance(seconds, int | float) else "",
-            *(_band(entry.get(what)) for what in ("iterations", "first_s", "loss", "parameter_error")),
-        ])  # fmt: skip
-    head = ["method", "runs", "time of each", "iterations", "s to the first", "final loss", "final error"]
-    return table(head, rows, "dense")
-
-
-def _band(value: Any) -> Words:
-    """A median, and the least and the greatest."""
-    if not isinstance(value, Mapping) or not all(_is_number(value.get(end)) for end in ("median", "low", "high")):
-        return ""
-    return _with_ends(number(value["median"], 3), value)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+            if is_number(entry.get(of)) and is_number(entry.get("elapsed_s")):
+                found.setdefault((naming(entry), float(entry["elapsed_s"])), []).append(float(entry[of]))
+        spreads = [{"name": name, "s": time, of: asdict(Spread.of(values))} for (name, time), values in found.items()]
+        curves = _curves(spreads, labels, itemgetter("name"), "s", of)
+        drawn.append((words, diagram(curves, "time of a run (s)", words)))
+    rows = [{"name": naming(entry), "entry": entry} for entry in methods]
+    return lay_out("legend", labels) + lay_out("diagrams", drawn) + lay_out("measured.runs", rows, bool(points))
 
 
 #: Names in the title of a page.
@@ -340,33 +184,20 @@ def run_comparison(runs: Sequence[Run]) -> Parts:
         "Images": lambda: _each(runs, image_rows),
         "Errors as people see them": lambda: seen_tables(runs),
         "Parameters": lambda: _each(runs, lambda run: parameter_table(run.results)),
-        "Textures": lambda: _each(runs, lambda run: texture_pictures(run.path / "parameters", run.results)),
+        "Textures": lambda: _each(runs, texture_pictures),
     }
     return [(title, guarded(make)) for title, make in made.items()]
 
 
 def overview(runs: Sequence[Run]) -> Markup:
     """A line for each run: how it ended, what it came to, and what an iteration took."""
-    head = ("run", "status", "estimator", "iterations", "time", "loss", "parameter error", "an iteration",
-            "peak memory")  # fmt: skip
-    return table(head, [_line(run, place) for place, run in enumerate(runs)], "overview")
-
-
-def _line(run: Run, place: int) -> list[Words]:
-    records, results, step = run.records, run.results, StepParts.of(run.records)
-    losses = [record["loss"] for record in records if record["loss"] is not None]
-    loss = results["loss"] if results.get("loss") is not None else losses[-1] if losses else None
-    return [
-        [Piece(place, "mark"), key(run.name)],
-        str(run.manifest.get("status", "unknown")),
-        _estimator(run),
-        str(len(records)),
-        duration(records[-1]["elapsed_s"]) if records else "",
-        number(loss),
-        _final_error(run),
-        "" if step is None else duration(step.step / 1e3),
-        f"{max(record['peak_mib'] for record in records):.4g} MiB" if records else "",
-    ]
+    rows = [
+        {"run": run, "place": place, "estimator": _estimator(run), "error": _final_error(run),
+         "loss": run.last("loss") if (loss := run.results.get("loss")) is None else loss,
+         "step": StepParts.of(run.records)}
+        for place, run in enumerate(runs)
+    ]  # fmt: skip
+    return lay_out("run.overview", rows)
 
 
 def _estimator(run: Run) -> str:
@@ -385,8 +216,8 @@ def _final_error(run: Run) -> str:
     key = worst(run.results)
     if key is not None:
         return f"{number(run.results['relative_error'][key]['final'], 3)} of the truth at worst"
-    known = [record["parameter_rmse"] for record in run.records if record["parameter_rmse"] is not None]
-    return f"RMSE {number(known[-1], 3)}" if known else ""
+    known = run.last("parameter_rmse")
+    return "" if known is None else f"RMSE {number(known, 3)}"
 
 
 def _each(runs: Sequence[Run], make: Callable[[Run], Markup]) -> Markup:
@@ -399,37 +230,31 @@ def _each(runs: Sequence[Run], make: Callable[[Run], Markup]) -> Markup:
 HEADINGS = {"bench": "Cost of a step", "gradcheck": "Gradients against references",
             "convergence": "Error against run time", "maps": "Maps of gradients"}  # fmt: skip
 
-#: Verdicts that are told as a failure is.
-_BAD = (Verdict.FAILS,)
-
 
 def measured(source: Measurements | Maps) -> Markup:
     """Everything that there is to show of it."""
     if isinstance(source, Maps):
         return gradient_maps(source.files)
-    makers: dict[str, Callable[[Sequence[Mapping[str, Any]]], tuple[Markup, int]]] = {
-        "bench": bench, "gradcheck": gradcheck, "convergence": convergence,
-    }  # fmt: skip
-    markup, unknown = makers[source.kind](source.objects)
-    words = [f"{count(len(source.damaged), 'line')} could not be read (the first is line {source.damaged[0]})."] if (
-        source.damaged) else []  # fmt: skip
-    words += [f"{count(unknown, 'line')} of other kinds, or damaged, left out."] if unknown else []
-    return markup + Markup().join([*map(soft, words), *map(origin_facts, source.origins)])
+    make = {"bench": bench, "gradcheck": gradcheck, "convergence": convergence}[source.kind]
+    markup, unknown = make(source.objects)
+    if source.damaged:
+        markup += soft(
+            f"{count(len(source.damaged), 'line')} could not be read (the first is line {source.damaged[0]})."
+        )
+    if unknown:
+        markup += soft(f"{count(unknown, 'line')} of other kinds, or damaged, left out.")
+    return markup + Markup().join(lay_out("run.origin", origin) for origin in source.origins)
 
 
 def gradcheck(objects: Sequence[Mapping[str, Any]]) -> tuple[Markup, int]:
     """The comparisons as a table, what fails first, and what is missing; and how many lines are neither."""
     records = [record for entry in objects if (record := record_of(GradcheckRecord, entry)) is not None]
     missing = [found for entry in objects if (found := record_of(MissingRecord, entry)) is not None]
-    several = len({record.case for record in records}) > 1
-    head = ["case"] * several + list(HEAD)
-    rows: list[list[Words]] = []
-    for record in sorted(records, key=lambda record: record.verdict not in _BAD):
-        first, *rest, verdict = cells(record)
-        ended = Piece(verdict, "worse") if record.verdict in _BAD else verdict
-        rows.append([*[key(record.case)] * several, key(first), *rest, ended])
+    failed = [failure_line(record) for record in records if record.verdict is Verdict.FAILS]
+    ordered = sorted(records, key=lambda record: record.verdict is not Verdict.FAILS)
     lines = [line for line in summary_lines(records) if not line.startswith("FAILS")] if records else []
     lines += [found.line() for found in missing]
-    failed = [failure_line(record) for record in records if record.verdict in _BAD]
-    markup = lay_out("note", failed, "failed") + Markup().join(lay_out("paragraph", line) for line in lines)
-    return markup + table(head, rows, "dense"), len(objects) - len(records) - len(missing)
+    several = len({record.case for record in records}) > 1
+    rows = [{"case": record.case, "cells": cells(record)} for record in ordered]
+    markup = lay_out("measured.gradcheck", failed, lines, list(HEAD), several, rows)
+    return markup, len(objects) - len(records) - len(missing)

@@ -1,188 +1,113 @@
-"""The parameters on the page, with their errors, and curves of loss and errors.
-
-Parameters are numbers with swatches, and textures as pictures (`parameter_table`, `texture_pictures`). Curves are loss
-and errors of one run, or of several in one picture, against iterations and time (`convergence`, `convergence_of_all`).
-"""
+"""The parameters on the page as numbers, swatches and pictures, and curves of loss and errors of one run or several."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
-from reslrb_cli.records.images import finite_range, read_mask, read_parameters
+from reslrb_cli.records.images import finite_range, in_range, read_mask, read_parameters
 from reslrb_cli.report.format import number
-from reslrb_cli.report.page.images import Picture, gallery, show
-from reslrb_cli.report.page.layout import (
-    COLORS,
-    MOST_POINTS,
-    Curve,
-    Piece,
-    Titled,
-    Words,
-    diagram,
-    diagrams,
-    key,
-    lay_out,
-    legend,
-    points_together,
-    soft,
-    table,
-    titled,
-)
+from reslrb_cli.report.page.images import show
+from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
 from reslrb_cli.report.perceptual import PLACES, is_color
-from reslrb_cli.report.run_summary import is_settled, spread_words, units_differ, verdict_words
+from reslrb_cli.report.plots import COLORS, MOST_POINTS, Curve, points_together
+from reslrb_cli.report.run_summary import MOMENTS, is_settled, spread_words, units_differ, verdict_words
 from reslrb_cli.report.sources import Run
 from reslrb_cli.report.tonemap import encode, exposure_for, exposure_words
 
 Array = np.ndarray[Any, Any]
 
 #: Where a run folder has the values of a moment, below `parameters/`.
-MOMENTS = (("start", "initial"), ("end", "final"), ("true", "true"))
 _FOLDERS = {"initial": "initial", "final": "", "true": "true"}
 
 
-def parameter_table(results: Mapping[str, Any], end: str = "end") -> Markup:
-    """Value and error of each parameter at the start and at the end, and the true value where it is known."""
+def parameter_table(results: Mapping[str, Any], end: str = "end", notes: bool = False) -> Markup:
+    """Value and error of each parameter at the start and at the end, and the true value where it is known.
+
+    With `notes` it says what errors are taken over.
+    """
     parameters = results.get("parameters") or {}
     has_truth = any(about.get("true") for about in parameters.values())
     relative = units_differ(results)
-    head = ["parameter", "start", end] + ["true"] * has_truth + ["RMSE"] * has_truth
-    head += ["relative error"] * (has_truth and relative)
-    judged = any(verdict_words(results, name) for name in parameters)
-    head += ["spread", "verdict"] * judged
-    rows: list[list[Words]] = []
-    for name, about in parameters.items():
-        swatches = _swatches(name, about)
-        cells = [_value(about.get(moment), swatches.get(moment)) for _, moment in MOMENTS]
-        row = [_name(name, about), *cells[: 2 + has_truth]]
-        row += [_error(results, "parameter_rmse", name)] * has_truth
-        row += [_error(results, "relative_error", name)] * (has_truth and relative)
-        row += [Piece(spread_words(results, name, "±"), "number"), _verdict(results, name)] if judged else []
-        rows.append(row)
-    return table(head, rows, "parameters")
+    kinds = {"RMSE": "parameter_rmse"} | ({"relative error": "relative_error"} if relative else {})
+    errors = kinds if has_truth else {}
+    rows = [
+        {
+            "name": name, "about": about, "swatches": _swatches(name, about),
+            "errors": [(results.get(kind) or {}).get(name) for kind in errors.values()],
+            "worse": name in (results.get("worse") or ()), "spread": spread_words(results, name, "±"),
+            "verdict": verdict_words(results, name), "settled": is_settled(results, name),
+        }
+        for name, about in parameters.items()
+    ]  # fmt: skip
+    moments = {"initial": "start", "final": end} | ({"true": "true"} if has_truth else {})
+    noted = notes and bool(results.get("parameter_rmse"))
+    return lay_out("run.parameters", rows, moments, list(errors), noted, relative)
 
 
-def texture_pictures(
-    folder: Path, results: Mapping[str, Any], current: Mapping[str, Array] | None = None
-) -> Markup:  # fmt: skip
-    """Each texture at the start and at the end, the true one where it is known, and what of it light and sensor reach.
-
-    `folder` is a run's `parameters/`; `current` are the values now, by key, of a run that has no end yet.
-    """
-    parts = Markup()
+def texture_pictures(run: Run) -> Markup:
+    """Each texture at the start and at the end, or now, the true one where it is known, and what of it light and sensor
+    reach."""
+    folder = run.path / "parameters"
     archives = {moment: read_parameters(folder / sub) for moment, sub in _FOLDERS.items()}
-    if current is not None:
-        archives["final"] = dict(current)
-    titles = {moment: "now" if moment == "final" and current is not None else title for title, moment in MOMENTS}
-    for name, about in (results.get("parameters") or {}).items():
-        arrays = {moment: _texture(archive, name) for moment, archive in archives.items()}
-        exposure, words = _exposure(arrays), ""
-        if about.get("quantity") in PLACES:
-            arrays, words = _as_relief(arrays)
-            exposure = 1.0
-        shown = [
-            _picture(titles[moment], name, array, about.get(moment), exposure)
-            for _, moment in MOMENTS
-            if (array := arrays[moment]) is not None
-        ]
-        mask = _texture_mask(folder, name)
-        if shown and mask is not None and not mask.all():
-            share = titled("reached", f" by light and sensor (white): {100 * mask.mean():.3g} %")
+    titles = {moment: title for title, moment in MOMENTS}
+    if run.current is not None:
+        archives["final"], titles["final"] = dict(run.current), "now"
+    parts = Markup()
+    for name, about in (run.results.get("parameters") or {}).items():
+        found = {moment: archive[name] for moment, archive in archives.items() if name in archive}
+        arrays = {moment: array for moment, array in found.items() if array.ndim == 3 and array.size}
+        if not arrays:
+            continue
+        arrays, words = _visible(arrays, about.get("quantity") in PLACES)
+        shown = []
+        for moment, array in arrays.items():
+            value = [lay_out("run.value", about[moment])] if about.get(moment) else []
+            size = lay_out("titled", titles[moment], f", {array.shape[1]}×{array.shape[0]}")
+            shown.append(show(array, f"{titles[moment]}: {name}", size, *value))
+        mask = read_mask(folder, name)
+        if mask is not None and mask.ndim == 2 and not mask.all():
+            share = lay_out("titled", "reached", f" by light and sensor (white): {100 * mask.mean():.3g} %")
             shown.append(show(mask[:, :, None].astype(np.float32), f"reached: {name}", share))
-        if shown:
-            parts += gallery(shown, key(name), words or exposure_words(exposure))
+        parts += lay_out("gallery", shown, key(name), words)
     return parts
 
 
-def _as_relief(arrays: Mapping[str, Array | None]) -> tuple[dict[str, Array | None], str]:
-    """Heights, which may be negative, from black to white, at all moments alike; and words that say so."""
-    low, high = finite_range(array for array in arrays.values() if array is not None)
-    span = (high - low) or 1.0
-    shown = {moment: None if array is None else (array - low) / span for moment, array in arrays.items()}
-    return shown, f"black is {number(low, 3)}, white is {number(high, 3)}"
+def _visible(arrays: Mapping[str, Array], heights: bool) -> tuple[dict[str, Array], str]:
+    """The same so that they can be seen, at all moments alike, and words that say how.
 
-
-def _exposure(arrays: Mapping[str, Array | None]) -> float:
-    """What is emitted may be far beyond 1, and has one exposure at all moments: by the truth, where that is known."""
-    true, final = arrays["true"], arrays["final"]
-    known = true if true is not None else final
-    return exposure_for(known) if known is not None and float(np.nanmax(known)) > 1 else 1.0
-
-
-def _picture(title: str, name: str, array: Array, about: Mapping[str, Any] | None, exposure: float) -> Picture:
-    caption: list[Words] = [titled(title, f", {array.shape[1]}×{array.shape[0]}")]
-    return show(array * exposure, f"{title}: {name}", *caption, *([_value(about)] if about else []))
-
-
-def _name(name: str, about: Mapping[str, Any]) -> Words:
-    shape = "×".join(str(size) for size in about.get("shape") or ())
-    notes = [about.get("quantity") or "", shape if shape != "3" else ""]
-    reached = about.get("reached")
-    notes += [f"{100 * reached:.3g} % reached"] if reached is not None and reached < 1 else []
-    return [key(name), Piece(", ".join(note for note in notes if note), "below")]
-
-
-def _value(about: Mapping[str, Any] | None, swatch: str | None = None) -> Words:
-    if not about:
-        return ""
-    shown = [Piece(swatch, "swatch")] if swatch else []
-    if "value" in about:
-        values = about["value"] if isinstance(about["value"], list) else [about["value"]]
-        return [*shown, _numbers(values)]
-    if about["min"] == about["max"]:
-        return [*shown, _numbers([about["min"]]), " throughout"]
-    ends = Piece(Piece(" to ".join(number(about[end], 3) for end in ("min", "max")), "numbers"), "below")
-    return [*shown, "mean ", _numbers(about["mean"]), ends]
-
-
-def _numbers(values: Iterable[float | None]) -> Piece:
-    return Piece(" ".join(number(value, 3) for value in values), "numbers")
-
-
-def _error(results: Mapping[str, Any], kind: str, name: str) -> Words:
-    pair = (results.get(kind) or {}).get(name)
-    if pair is None:
-        return ""
-    known = [number(pair[moment], 3) for moment in ("initial", "final") if pair.get(moment) is not None]
-    words = Piece(" → ".join(known), "numbers")
-    return Piece([words, ", worse"], "worse") if name in (results.get("worse") or ()) else words
-
-
-def _verdict(results: Mapping[str, Any], name: str) -> Words:
-    words = verdict_words(results, name)
-    return words if is_settled(results, name) else Piece(words, "worse")
+    Heights, which may be negative, go from black to white; what is emitted may be far beyond 1, and has the exposure
+    of the truth, where that is known.
+    """
+    if heights:
+        low, high = finite_range(arrays.values())
+        words = f"black is {number(low, 3)}, white is {number(high, 3)}"
+        return {moment: in_range(array, low, high) for moment, array in arrays.items()}, words
+    known = arrays.get("true", arrays.get("final"))
+    exposure = exposure_for(known) if known is not None and float(np.nanmax(known)) > 1 else 1.0
+    return {moment: array * exposure for moment, array in arrays.items()}, exposure_words(exposure)
 
 
 def _swatches(key: str, about: Mapping[str, Any]) -> dict[str, str]:
     """The colours of a parameter in CSS, by moment, with one exposure: what is emitted, or beyond 1, is at most 1."""
-    colors = {}
-    for _, moment in MOMENTS:
-        found = about.get(moment) or {}
-        values = found.get("mean", found.get("value"))
-        if isinstance(values, list) and len(values) == 3 and None not in values:
-            colors[moment] = np.array(values, dtype=np.float64)
+    moments = {moment: about.get(moment) or {} for _, moment in MOMENTS}
+    values = {moment: found.get("mean", found.get("value")) for moment, found in moments.items()}
+    colors = {
+        moment: np.array(color, dtype=np.float64)
+        for moment, color in values.items()
+        if isinstance(color, list) and len(color) == 3 and None not in color
+    }
     if not is_color(key, about.get("quantity") or "") or not colors:
         return {}
     brightest = max(float(color.max()) for color in colors.values())
     unit = brightest if brightest > 1 or (about.get("quantity") and brightest > 0) else 1.0
-    shown = {moment: encode(np.clip(color / unit, 0, 1)) for moment, color in colors.items()}
-    return {moment: f"rgb({','.join(f'{255 * c:.0f}' for c in color)})" for moment, color in shown.items()}
-
-
-def _texture(archive: Mapping[str, Array], key: str) -> Array | None:
-    array = archive.get(key)
-    return array if array is not None and array.ndim == 3 and array.size else None
-
-
-def _texture_mask(folder: Path, key: str) -> Array | None:
-    mask = read_mask(folder, key)
-    return mask if mask is not None and mask.ndim == 2 else None
+    shown = {moment: 255 * encode(np.clip(color / unit, 0, 1)) for moment, color in colors.items()}
+    return {moment: f"rgb({','.join(f'{channel:.0f}' for channel in color)})" for moment, color in shown.items()}
 
 
 #: Curves in one diagram of one run, at most: those of the parameters that are the farthest off at the end.
@@ -191,31 +116,25 @@ MOST_CURVES = len(COLORS)
 #: Parameters of several runs that have diagrams of their own, at most.
 MOST_SHARED = 6
 ABSCISSAE = (("iteration", "iteration"), ("elapsed_s", "time in steps and updates (s)"))
-Record = Mapping[str, Any]
+Figures = list[float | None]
 
 
 def convergence(run: Run) -> Markup:
     """Loss, and errors by parameter where they are known, against iterations and against time."""
     if not run.records:
-        when = (
-            "has been completed yet; the first one also compiles what the others use"
-            if run.at_work
-            else "was completed"
-        )
-        return lay_out("paragraph", f"No iteration {when}.")
-    scales, relative = run.scales, units_differ(run.results)
-    last = run.records[-1]["parameter_errors"]
-    ends = {
-        name: error / (scales.get(name) or 1.0 if relative else 1.0)
-        for name, error in last.items()
-        if error is not None
-    }
-    names = [name for name in sorted(ends, key=lambda name: -ends[name]) if not relative or scales.get(name)]
+        yet = "has been completed yet; the first one also compiles what the others use"
+        return lay_out("paragraph", f"No iteration {yet if run.at_work else 'was completed'}.")
+    relative = units_differ(run.results)
+    scales = run.scales if relative else {}
+    errors = {name: _errors(run, name, scales.get(name)) for name in run.records[-1]["parameter_errors"]}
+    ends = {name: curve[-1] for name, curve in errors.items() if not relative or scales.get(name)}
+    known = {name: end for name, end in ends.items() if end is not None}
+    names = sorted(known, key=lambda name: -known[name])
     drawn = names[:MOST_CURVES]
-    errors = [(run, name, place, _error_curve(name, scales.get(name) if relative else None))
-              for place, name in enumerate(drawn)]  # fmt: skip
     what = "relative error" if relative else "RMSE"
-    curves = _both([(run, "loss", 0, _loss)], "loss") + _both(errors, f"{what} by parameter") + legend(drawn)
+    curves = _both("loss", [(run, "loss", 0, _column(run, "loss"))])
+    curves += _both(f"{what} by parameter", [(run, name, k, errors[name]) for k, name in enumerate(drawn)])
+    curves += lay_out("legend", drawn)
     more, words = len(names) - len(drawn), f"The {MOST_CURVES} parameters that are the farthest off at the end; "
     return curves + soft(f"{words}{more} more are not drawn." if more else "") + _thinning([run])
 
@@ -225,16 +144,18 @@ def convergence_of_all(runs: Sequence[Run]) -> Markup:
     begun = [(place, run) for place, run in enumerate(runs) if run.records]
     if not begun:
         return lay_out("paragraph", "No iteration was completed.")
-    parts = legend([run.name if run.records else "" for run in runs])
-    parts += _both([(run, run.name, place, _loss) for place, run in begun], "loss")
-    absolute = not any(units_differ(run.results) for run in runs)
-    total = _total_rmse if absolute else _total_relative
-    label = "parameter RMSE" if absolute else "relative error"
-    parts += _both([(run, run.name, place, total(run)) for place, run in begun], f"{label}, all parameters")
+    parts = lay_out("legend", [run.name if run.records else "" for run in runs])
+    parts += _both("loss", [(run, run.name, place, _column(run, "loss")) for place, run in begun])
+    if any(units_differ(run.results) for run in runs):
+        totals, label = [_total_relative(run) for _, run in begun], "relative error"
+    else:
+        totals, label = [_column(run, "parameter_rmse") for _, run in begun], "parameter RMSE"
+    curves = [(run, run.name, place, total) for (place, run), total in zip(begun, totals, strict=True)]
+    parts += _both(f"{label}, all parameters", curves)
     counts = Counter(name for _, run in begun for name in run.records[-1]["parameter_errors"])
     shared = [name for name, count in counts.items() if count > 1] if len(counts) > 1 else []
     for name in shared[:MOST_SHARED]:
-        drawn = _both([(run, run.name, place, _error_curve(name, None)) for place, run in begun], "RMSE")
+        drawn = _both("RMSE", [(run, run.name, place, _errors(run, name, None)) for place, run in begun])
         parts += lay_out("heading", key(name)) + drawn if drawn else drawn
     if len(shared) > MOST_SHARED:
         parts += soft(f"{len(shared) - MOST_SHARED} more parameters that several runs have are not drawn.")
@@ -243,16 +164,13 @@ def convergence_of_all(runs: Sequence[Run]) -> Markup:
     return parts + _thinning(runs)
 
 
-def _both(curves: Sequence[tuple[Run, str, int, Callable[[Record], float | None]]], label: str) -> Markup:
+def _both(label: str, curves: Sequence[tuple[Run, str, int, Figures]]) -> Markup:
     """The same curves in two diagrams beside each other, against iterations and against time."""
-    drawn = []
-    for name, caption in ABSCISSAE:
-        made = [
-            Curve(title, [record[name] for record in run.records], [value(record) for record in run.records], place)
-            for run, title, place, value in curves
-        ]
-        drawn.append(Titled(diagram(made, caption, label)))
-    return diagrams(*drawn)
+    drawn = [
+        ("", diagram([Curve(title, _column(run, name), ys, k) for run, title, k, ys in curves], caption, label))
+        for name, caption in ABSCISSAE
+    ]
+    return lay_out("diagrams", drawn)
 
 
 def _thinning(runs: Sequence[Run]) -> Markup:
@@ -264,31 +182,19 @@ def _thinning(runs: Sequence[Run]) -> Markup:
     return soft(f"Of runs with more than {MOST_POINTS} iterations each point is the mean of some, at most {most}.")
 
 
-def _loss(record: Record) -> float | None:
-    return record["loss"]
+def _column(run: Run, name: str) -> Figures:
+    return [record[name] for record in run.records]
 
 
-def _error_curve(key: str, scale: float | None) -> Callable[[Record], float | None]:
-    """The error of one parameter, over `scale` where that is given."""
-
-    def error(record: Record) -> float | None:
-        value = record["parameter_errors"].get(key)
-        return None if value is None else value / (scale or 1.0)
-
-    return error
+def _errors(run: Run, name: str, scale: float | None) -> Figures:
+    """The errors of one parameter, over `scale` where that is given."""
+    errors = [record["parameter_errors"].get(name) for record in run.records]
+    return [None if error is None else error / (scale or 1.0) for error in errors]
 
 
-def _total_rmse(run: Run) -> Callable[[Record], float | None]:
-    return lambda record: record["parameter_rmse"]
-
-
-def _total_relative(run: Run) -> Callable[[Record], float | None]:
+def _total_relative(run: Run) -> Figures:
     """The root mean square over the parameters of their errors as shares of the truth."""
-    scales = run.scales
-
-    def total(record: Record) -> float | None:
-        errors = record["parameter_errors"].items()
-        shares = [value / scale for key, value in errors if value is not None and (scale := scales.get(key))]
-        return math.sqrt(sum(share**2 for share in shares) / len(shares)) if shares else None
-
-    return total
+    curves = [_errors(run, name, scale) for name, scale in run.scales.items() if scale]
+    known = [[error for error in errors if error is not None] for errors in zip(*curves, strict=True)]
+    return [math.sqrt(sum(error**2 for error in errors) / len(errors)) if errors else None for errors in known] or (
+        [None] * len(run.records))  # fmt: skip
