@@ -18,7 +18,7 @@ import click
 
 from reslrb_cli.cli.inspect import LISTED_SENSORS
 from reslrb_cli.cli.options import check_writable, writing
-from reslrb_cli.cli.terminal import echo
+from reslrb_cli.cli.terminal import echo, fill
 from reslrb_cli.config.loader import loads, parse_override
 from reslrb_cli.config.yaml_text import write
 from reslrb_cli.errors import ConfigError, UnsupportedScene, printable
@@ -65,22 +65,16 @@ def _first_config(
     `options` are the scene file's variables that the user has set, `variables` all that it has, as text; `sensors` the
     ids of its sensors, of which the one with the index `sensor` is used; `known` is what the template has besides.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    made = Environment(
-        loader=PackageLoader("reslrb_cli.cli"), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )  # fmt: skip
-    made.filters |= {"path": partial(_path, folder=path.absolute().parent), "comment": _comment}
-    made.filters |= {"entry": _entry, "note": _note}
     first = [proposal for proposal in proposals if proposal.first]
     # Steps have to be measured where something that may be of any size is to begin with.
     is_scaled = not all(proposal.is_bounded for proposal in first)
     others = [f"{_word(name)}: {_word(text)}" for name, text in variables.items() if name not in options]
     listed = [text for text in others if len(text) <= _LONGEST][:_MOST_VARIABLES]
     named = [f"{number} is {_word(name)}" for number, name in enumerate(sensors[:_MOST_SENSORS])]
-    return made.get_template("first_config.yaml.j2").render(
-        known,
+    return fill(
+        "first_config.yaml.j2",
+        {"path": partial(_path, folder=path.absolute().parent), "comment": _comment, "entry": _entry, "note": _note},
+        **known,
         file=path.name,
         given=", ".join(f"{_word(name)}: {json.dumps(value)}" for name, value in options.items()),
         rest=", ".join([*listed, "..."] if len(listed) < len(others) else listed),
@@ -97,10 +91,9 @@ def _first_config(
     )
 
 
-def _comment(text: str) -> str:
-    """Lines of a comment below a section."""
-    lines = wrap(printable(text), _COMMENT, initial_indent="  # ", subsequent_indent="  # ", break_long_words=False)
-    return "\n".join(lines)
+def _comment(text: str) -> list[str]:
+    """The lines of a comment."""
+    return wrap(printable(text), _COMMENT - len("  # "), break_long_words=False)
 
 
 def _entry(proposal: Proposal, is_scaled: bool) -> str:
