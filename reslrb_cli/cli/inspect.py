@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from pydantic_core import to_jsonable_python
 
 from reslrb_cli.cli.options import overrides_option, start_variant
 from reslrb_cli.cli.terminal import fill, without_nan
@@ -201,17 +202,6 @@ def _flags(info: ParameterInfo) -> str:
     return ("" if info.differentiable else "not ") + "differentiable" + ", discontinuous" * info.discontinuous
 
 
-def plain(value: object) -> Any:
-    """What a dataclass holds as JSON can have it; objects of the scene, which cannot be copied, by their ids."""
-    if dataclasses.is_dataclass(value):
-        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, dict):
-        return {key: plain(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(entry) for entry in value]
-    return value.id() if hasattr(value, "id") else value
-
-
 #: Gradients that `--conditioning` takes.
 SAMPLES = 8
 
@@ -280,10 +270,13 @@ def command(
     edges = [] if selection is None or isinstance(selection, str) else edges_of(scene, selection)
     measured = measure(subject, overrides, samples or SAMPLES) if conditioning else None
     if as_json:
-        report = {"obstacle": plan} if isinstance(plan, str) else plan and dataclasses.asdict(plan)
-        extra = {} if measured is None else {"conditioning": measured.to_json()}
-        everything_known = {"run": subject.run} | plain(summary) | {"plan": report, "edges": edges} | extra
-        click.echo(json.dumps(without_nan(everything_known), indent=2, allow_nan=False))
+        known = {"run": subject.run, **vars(summary)}
+        known |= {"plan": {"obstacle": plan} if isinstance(plan, str) else plan, "edges": edges}
+        if measured is not None:
+            known["conditioning"] = measured.to_json()
+        # Objects of the scene are told by their ids.
+        data = to_jsonable_python(known, inf_nan_mode="constants", fallback=lambda item: item.id())
+        click.echo(json.dumps(without_nan(data), indent=2, allow_nan=False))
         return None
     from reslrb_cli.report.tables import chain_lines, conditioning_lines
 
