@@ -312,16 +312,13 @@ def _integrator(scene: mi.Scene, sensor: mi.Sensor, hides_emitters: bool, file: 
     """
     from reslrb_cli.scene.needs import camera_obstacle, check_supported, light_obstacle
 
-    obstacle = light_obstacle(scene, sensor, hides_emitters)
-    if obstacle is None:
-        return "reslrb", None
-    if camera_obstacle(scene, sensor) is None:
-        return "prb", obstacle
     try:
-        check_supported(scene, sensor, hides_emitters)  # which has words for both
+        check_supported(scene, sensor, hides_emitters)
     except UnsupportedScene as error:
-        raise ConfigError(file, "", str(error)) from None
-    raise AssertionError("was refused a moment ago")
+        if camera_obstacle(scene, sensor) is None:
+            return "prb", light_obstacle(scene, sensor, hides_emitters)
+        raise ConfigError(file, "", str(error)) from None  # which has words for both
+    return "reslrb", None
 
 
 def _check_free(path: Path, force: bool) -> None:

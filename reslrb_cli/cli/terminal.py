@@ -34,6 +34,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, NoReturn, TextIO
 
@@ -150,11 +151,12 @@ def echo(line: object) -> None:
 
 def fill(template: str, filters: Mapping[str, Callable[..., object]], **values: object) -> str:
     """The text of a template in `templates/`; what is not printable in `values` is escaped, and ends no line."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+    loader = FileSystemLoader(Path(__file__).with_name("templates"))
     made = Environment(
-        loader=PackageLoader("reslrb_cli.cli"), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-        keep_trailing_newline=True, finalize=printable,
+        loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
+        finalize=printable,
     )  # fmt: skip
     made.filters.update(filters)
     return made.get_template(template).render(values)
