@@ -26,13 +26,10 @@ LLVM_LANES, LARGE_GPU = 16, 132 * 2048
 
 
 def device_name(variant: str) -> str:
-    """The device that the Mitsuba variant `variant` runs on."""
-    return gpu_name() if variant.startswith("cuda") else f"{cpu_name()}, {os.cpu_count()} threads"
-
-
-def gpu_name() -> str:
-    """The NVIDIA GPU and its driver's version, as far as `nvidia-smi` tells."""
-    return "; ".join(ask_gpu("name,driver_version")) or "NVIDIA GPU"
+    """The device that the Mitsuba variant `variant` runs on: GPU and driver's version, or processor and threads."""
+    if variant.startswith("cuda"):
+        return "; ".join(ask_gpu("name,driver_version")) or "NVIDIA GPU"
+    return f"{of_system('/proc/cpuinfo', 'model name') or platform.machine()}, {os.cpu_count()} threads"
 
 
 def ask_gpu(query: str) -> list[str]:
@@ -47,11 +44,6 @@ def ask_gpu(query: str) -> list[str]:
 def gpu_bytes(kind: str, most: int) -> int:
     """The least `memory.total`, `memory.free` of the GPUs; `most` where that is less, or nothing tells."""
     return min([most, *(int(line) * 2**20 for line in ask_gpu(kind) if line.isdigit())])
-
-
-def cpu_name() -> str:
-    """The processor's model, or at least its architecture."""
-    return of_system("/proc/cpuinfo", "model name") or platform.machine()
 
 
 def of_system(file: str, name: str) -> str | None:
@@ -122,7 +114,9 @@ class Report:
 
 def examine() -> Report:
     """Looks at this machine; takes a few seconds, and never raises for what is missing."""
-    backends = (_cuda(), _llvm())
+    missing = missing_cuda()
+    device, trial = ("", Probe(missing)) if missing else (device_name("cuda_ad_rgb"), probe("cuda_ad_rgb"))
+    backends = (Backend("cuda_ad_rgb", missing, device, "", trial), _llvm())
     return Report(
         variant=next((backend.variant for backend in backends if not backend.missing), None),
         python=f"{platform.python_version()} ({sys.executable})",
@@ -140,12 +134,6 @@ def _required() -> list[str]:
         return _WITHOUT_METADATA
     names = (re.match(r"[\w.-]+", need) for need in needs if "extra ==" not in need)
     return [name[0] for name in names if name]
-
-
-def _cuda() -> Backend:
-    missing = missing_cuda()
-    trial = Probe(missing) if missing else probe("cuda_ad_rgb")
-    return Backend("cuda_ad_rgb", missing, "" if missing else device_name("cuda_ad_rgb"), "", trial)
 
 
 def _llvm() -> Backend:

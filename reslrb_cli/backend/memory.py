@@ -63,13 +63,8 @@ def local_bytes() -> int:
     """
     stack, _ = resource.getrlimit(resource.RLIMIT_STACK)
     stack = _UNLIMITED_STACK if stack == resource.RLIM_INFINITY else stack
-    return max(stack - _IN_USE, 0) // _vector_lanes()
-
-
-def _vector_lanes() -> int:
-    """Lanes of a vector on this processor, each with a path of its own."""
     flags = (of_system("/proc/cpuinfo", "flags") or "").split()
-    return next((lanes for name, lanes in _LANES if name in flags), 4)
+    return max(stack - _IN_USE, 0) // next((lanes for name, lanes in _LANES if name in flags), 4)
 
 
 def own_memory(kind: type[Any], array: np.ndarray[Any, Any]) -> Any:

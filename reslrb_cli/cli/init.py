@@ -1,6 +1,6 @@
 """`reslrb init`: a configuration for a scene, to begin with.
 
-`FirstConfig` has its text: what is set, what could be, and why, in comments.
+Its text, with what could be set and why in comments, is `templates/first_config.yaml.j2`.
 """
 
 from __future__ import annotations
@@ -9,16 +9,16 @@ import json
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from textwrap import wrap
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from reslrb_cli.cli.inspect import LISTED_SENSORS
 from reslrb_cli.cli.options import check_writable, writing
-from reslrb_cli.cli.terminal import echo
+from reslrb_cli.cli.terminal import echo, fill
 from reslrb_cli.config.loader import loads, parse_override
 from reslrb_cli.config.yaml_text import write
 from reslrb_cli.errors import ConfigError, UnsupportedScene, printable
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from reslrb_cli.scene.proposal import Photograph, Proposal
-    from reslrb_cli.scene.visibility import Depth
     from reslrb_cli.scene.xml.read import Description
 
 
@@ -52,118 +51,49 @@ _NUMBER = re.compile(r"-?\d{1,15}(\.\d{1,15})?")
 _PLAIN = re.compile(r"(\.\./)*[A-Za-z_][\w.\-]*(/[\w.\-]+)*")
 
 
-@dataclass(frozen=True)
-class FirstConfig:
-    """What a configuration is written from; `target` is the image that exists, or None. Sizes are (width, height).
+def _first_config(
+    path: Path,
+    options: Mapping[str, bool | int | float | str],
+    variables: Mapping[str, str],
+    sensors: Sequence[str],
+    sensor: int,
+    proposals: Sequence[Proposal],
+    **known: Any,
+) -> str:
+    """The YAML of a configuration in the file `path`, by the template `first_config.yaml.j2`.
 
     `options` are the scene file's variables that the user has set, `variables` all that it has, as text; `sensors` the
-    ids of its sensors, of which the one with the index `sensor` is used; `reason` says why the integrator is not
-    `reslrb`, None where it is.
+    ids of its sensors, of which the one with the index `sensor` is used; `known` is what the template has besides.
     """
+    first = [proposal for proposal in proposals if proposal.first]
+    # Steps have to be measured where something that may be of any size is to begin with.
+    is_scaled = not all(proposal.is_bounded for proposal in first)
+    others = [f"{_word(name)}: {_word(text)}" for name, text in variables.items() if name not in options]
+    listed = [text for text in others if len(text) <= _LONGEST][:_MOST_VARIABLES]
+    named = [f"{number} is {_word(name)}" for number, name in enumerate(sensors[:_MOST_SENSORS])]
+    return fill(
+        "first_config.yaml.j2",
+        {"path": partial(_path, folder=path.absolute().parent), "comment": _comment, "entry": _entry, "note": _note},
+        **known,
+        file=path.name,
+        given=", ".join(f"{_word(name)}: {json.dumps(value)}" for name, value in options.items()),
+        rest=", ".join([*listed, "..."] if len(listed) < len(others) else listed),
+        sensor=sensor,
+        sensors=", ".join(named) + " ..." * (len(sensors) > _MOST_SENSORS) if len(sensors) > 1 else "",
+        recovers_lamps=any(proposal.info.kind == "emitter" for proposal in first),
+        first=first,
+        others=[proposal for proposal in proposals if not proposal.first],
+        most_others=_MOST_OTHERS,
+        is_scaled=is_scaled,
+        iterations=UNBOUNDED_ITERATIONS if is_scaled else ITERATIONS,
+        rate=UNBOUNDED_RATE if is_scaled else RATE,
+        spp=SPP,
+    )
 
-    scene: Path
-    options: Mapping[str, bool | int | float | str]
-    variables: Mapping[str, str]
-    sensors: Sequence[str]
-    sensor: int
-    target: Path | None
-    is_integer: bool
-    size: tuple[int, int]
-    film: tuple[int, int]
-    integrator: str
-    reason: str | None
-    hides_emitters: bool
-    depth: Depth
-    proposals: Sequence[Proposal]
 
-    def text(self, path: Path) -> str:
-        """The YAML of the configuration in the file `path`."""
-        folder, (width, height), missing = path.absolute().parent, self.film, self.depth.missing
-        longer = (
-            "light bounces on and on" if missing is None else f"longer paths have {missing:.1%} of the light in view"
-        )
-        lines = [
-            "# Every setting and its default: docs/config.md. Begin with",
-            f"#     reslrb optimize {path.name}",
-            "scene:",
-            f"  file: {_path(self.scene, folder)}",
-            *self._option_lines(),
-        ]
-        if self.size != self.film:
-            lines += [f"  size: {list(self.size)}  # runs in minutes; the scene's own film has {width}x{height}"]
-        if len(self.sensors) > 1:
-            listed = [f"{number} is {_word(name)}" for number, name in enumerate(self.sensors[:_MOST_SENSORS])]
-            named = ", ".join(listed) + (" ..." if len(self.sensors) > _MOST_SENSORS else "")
-            lines += [f"  sensors: [{self.sensor}]  # {named}; `views` take several, each with its photograph"]
-        lines += ["target:", *self._target_lines(folder)]
-        lines += ["parameters:  # by their share of the picture; bounds are the usual ones", *self._parameter_lines()]
-        lines += ["integrator:"]
-        if self.reason is not None:
-            words = f"by paths from the sensor, since light paths cannot render this: {printable(self.reason)}"
-            lines += wrap(words, _COMMENT, initial_indent="  # ", subsequent_indent="  # ", break_long_words=False)
-        lines += [
-            f"  type: {self.integrator}",
-            f"  max_depth: {self.depth.segments}  # {longer}; depth costs time alone, no memory",
-            *["  hide_emitters: true  # as the scene's own integrator has it"] * self.hides_emitters,
-            "loss:",
-            "  type: relative_l2  # by l2 the noise of the brightest parts would drown what the others say",
-            "optimizer:",
-        ]
-        iterations, rate, unit = ITERATIONS, RATE, ""
-        if self._is_scaled:  # between bounds the size of steps is known beforehand, of a lamp it has to be measured
-            iterations, rate, unit = UNBOUNDED_ITERATIONS, UNBOUNDED_RATE, "of its unit "
-            lines += [
-                "  scale: auto  # a lamp may be of any brightness: in what units each parameter moves is measured first"
-            ]
-        lines += [
-            f"  learning_rate: {rate}  # by so much {unit}a value moves in an iteration, at first",
-            "  schedule: cosine  # to next to nothing, so that the noise of the last iterations counts little",
-            "run:",
-            f"  iterations: {iterations}",
-            f"  spp: {SPP}",
-        ]
-        return "\n".join(lines) + "\n"
-
-    @property
-    def _is_scaled(self) -> bool:
-        """Whether steps have to be measured: something that may be of any size is to begin with."""
-        return any(item.first and not item.is_bounded for item in self.proposals)
-
-    def _option_lines(self) -> list[str]:
-        given = ", ".join(f"{_word(name)}: {json.dumps(value)}" for name, value in self.options.items())
-        others = [
-            f"{_word(name)}: {_word(self.variables[name])}" for name in self.variables if name not in self.options
-        ]
-        listed = [text for text in others if len(text) <= _LONGEST][:_MOST_VARIABLES]
-        rest = ", ".join([*listed, "..."] if len(listed) < len(others) else listed)
-        if given:
-            return [f"  options: {{{given}}}" + (f"  # the scene file also has {rest}" if rest else "")]
-        return [f"  # options: {{{rest}}}  # variables of the scene file, and what they are there"] if rest else []
-
-    def _target_lines(self, folder: Path) -> list[str]:
-        """A photograph of 8 or 16 bits has an exposure that is not known. `mask: auto` is the default."""
-        if self.target is not None:
-            exposure = "  exposure: auto  # one factor for the whole image, recovered beside the parameters"
-            if any(item.first and item.info.kind == "emitter" for item in self.proposals):  # not told from one
-                exposure = "  # exposure: auto  # one factor for the whole image; the lamps below make up for it"
-            return [f"  file: {_path(self.target, folder)}", *[exposure] * self.is_integer]
-        width, height = self.size
-        return [
-            f"  file: photo.png  # put your photograph there, of {width}x{height} pixels, or have it made by",
-            "  # reslrb init --target PHOTO from one of any size in that ratio. To try without, in place of `file`:",
-            "  # render: {spp: 1024, parameters: {KEY: VALUE}}  # the scene itself with other values",
-        ]
-
-    def _parameter_lines(self) -> list[str]:
-        first = [proposal for proposal in self.proposals if proposal.first]
-        others = [proposal for proposal in self.proposals if not proposal.first]
-        lines = [f"  - {_entry(proposal, True)}  # {_note(proposal)}" for proposal in first]
-        if others:
-            lines.append("  # What else can be recovered; take away the # of what is to be:")
-        lines += [f"  # - {_entry(item, self._is_scaled)}  # {_note(item)}" for item in others[:_MOST_OTHERS]]
-        if len(others) > _MOST_OTHERS:
-            lines.append(f"  # and {len(others) - _MOST_OTHERS} more, as reslrb inspect --all lists them")
-        return lines
+def _comment(text: str) -> list[str]:
+    """The lines of a comment."""
+    return wrap(printable(text), _COMMENT - len("  # "), break_long_words=False)
 
 
 def _entry(proposal: Proposal, is_scaled: bool) -> str:
@@ -295,23 +225,11 @@ def command(
     if photo is not None and copied:
         image = path.with_name(f"{photo.path.stem}-{size[0]}x{size[1]}{'.png' if photo.is_integer else '.exr'}")
         _check_free(image, force)
-    first = FirstConfig(
-        scene=scene_file,
-        options=options,
-        variables=description.variables,
-        sensors=sensors,
-        sensor=index,
-        target=image,
-        is_integer=is_integer,
-        size=size,
-        film=own,
-        integrator=integrator,
-        reason=reason,
-        hides_emitters=description.hides_emitters,
-        depth=find_depth(scene, index),
-        proposals=proposals,
-    )
-    text = first.text(path)
+    text = _first_config(
+        path, options, description.variables, sensors, index, proposals, scene=scene_file, target=image,
+        is_integer=is_integer, size=size, film=own, integrator=integrator, reason=reason,
+        hides_emitters=description.hides_emitters, depth=find_depth(scene, index),
+    )  # fmt: skip
     specs = loads(text, path).parameters
     scene = read_as_floats(scene, description, [key for spec in specs for key in spec.keys])
     select_parameters(scene, specs, path)  # what is wrong is to show before anything is written
@@ -394,16 +312,13 @@ def _integrator(scene: mi.Scene, sensor: mi.Sensor, hides_emitters: bool, file: 
     """
     from reslrb_cli.scene.needs import camera_obstacle, check_supported, light_obstacle
 
-    obstacle = light_obstacle(scene, sensor, hides_emitters)
-    if obstacle is None:
-        return "reslrb", None
-    if camera_obstacle(scene, sensor) is None:
-        return "prb", obstacle
     try:
-        check_supported(scene, sensor, hides_emitters)  # which has words for both
+        check_supported(scene, sensor, hides_emitters)
     except UnsupportedScene as error:
-        raise ConfigError(file, "", str(error)) from None
-    raise AssertionError("was refused a moment ago")
+        if camera_obstacle(scene, sensor) is None:
+            return "prb", light_obstacle(scene, sensor, hides_emitters)
+        raise ConfigError(file, "", str(error)) from None  # which has words for both
+    return "reslrb", None
 
 
 def _check_free(path: Path, force: bool) -> None:

@@ -1,7 +1,7 @@
 """`reslrb inspect`: what a scene contains, and which of its parameters can be recovered.
 
 It is given a scene file, a configuration (complete or not), or the folder of a run (`read_subject`), and says in lines
-what it finds of the scene, its sensors, the plan of a step and the parameters (`scene_lines` and those after it).
+what it finds of the scene, its sensors, the plan of a step and the parameters (`templates/inspect.txt.j2`).
 """
 
 from __future__ import annotations
@@ -9,16 +9,17 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from pydantic_core import to_jsonable_python
 
 from reslrb_cli.cli.options import overrides_option, start_variant
-from reslrb_cli.cli.terminal import echo
+from reslrb_cli.cli.terminal import fill
 from reslrb_cli.config.loader import loads, parse_override, read_text
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse, write
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from reslrb_cli.integrators.plan_report import PlanReport
     from reslrb_cli.measure.conditioning import Conditioning
     from reslrb_cli.scene.catalog import MovableSummary, ParameterInfo, SceneSummary, SensorSummary
+    from reslrb_cli.scene.needs import SceneNeeds
     from reslrb_cli.scene.parameters import Selection
 
 
@@ -96,33 +98,19 @@ LISTED_SENSORS, _LISTED = 3, 30
 _MOVED = 10
 
 
-def scene_lines(summary: SceneSummary) -> list[str]:
-    """What the scene contains."""
-    lines = [
-        f"{name}: {', '.join(f'{count} {kind}' for kind, count in counts.items()) or 'none'}"
-        for name, counts in (("emitters", summary.emitters), ("bsdfs", summary.bsdfs), ("shapes", summary.shapes))
-    ]
-    return [*lines, f"triangles: {summary.triangles}"]
+def _counted(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {kind}" for kind, count in counts.items()) or "none"
 
 
-def sensor_lines(sensor: SensorSummary) -> list[str]:
-    """What one sensor is and sees."""
+def _sized(sensor: SensorSummary) -> str:
     (x, y), (width, height) = sensor.crop
     crop = "" if (x, y) == (0, 0) and (width, height) == sensor.size else f", crop {width}x{height} at ({x}, {y})"
-    lines = [f"{sensor.type}, {sensor.film} {sensor.size[0]}x{sensor.size[1]}{crop}, {sensor.filter}"]
-    if sensor.view is not None:
-        shares = dataclasses.asdict(sensor.view)
-        lines.append("sees " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares.items()))
-    needs = [field.name for field in dataclasses.fields(sensor.needs) if getattr(sensor.needs, field.name) is True]
-    lines.append(
-        f"needs {', '.join(name.removeprefix('has_').replace('_', ' ') for name in needs) or 'nothing special'}"
-    )
-    if sensor.obstacle is not None and sensor.obstacle == sensor.camera_obstacle:
-        lines.append(f"cannot be rendered: {sensor.obstacle}")
-    else:
-        lines += [f"no light tracing: {sensor.obstacle}"] if sensor.obstacle is not None else []
-        lines += [f"no prb: {sensor.camera_obstacle}"] if sensor.camera_obstacle is not None else []
-    return lines
+    return f"{sensor.size[0]}x{sensor.size[1]}{crop}"
+
+
+def _needed(needs: SceneNeeds) -> str:
+    names = [name for name, value in vars(needs).items() if value is True]
+    return ", ".join(name.removeprefix("has_").replace("_", " ") for name in names) or "nothing special"
 
 
 def plan_lines(report: PlanReport) -> list[str]:
@@ -215,17 +203,6 @@ def _flags(info: ParameterInfo) -> str:
     return ("" if info.differentiable else "not ") + "differentiable" + ", discontinuous" * info.discontinuous
 
 
-def plain(value: object) -> Any:
-    """What a dataclass holds as JSON can have it; objects of the scene, which cannot be copied, by their ids."""
-    if dataclasses.is_dataclass(value):
-        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, dict):
-        return {key: plain(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(entry) for entry in value]
-    return value.id() if hasattr(value, "id") else value
-
-
 #: Gradients that `--conditioning` takes.
 SAMPLES = 8
 
@@ -294,58 +271,48 @@ def command(
     edges = [] if selection is None or isinstance(selection, str) else edges_of(scene, selection)
     measured = measure(subject, overrides, samples or SAMPLES) if conditioning else None
     if as_json:
-        report = {"obstacle": plan} if isinstance(plan, str) else plan and dataclasses.asdict(plan)
-        extra = {} if measured is None else {"conditioning": measured.to_json()}
-        everything_known = {"run": subject.run} | plain(summary) | {"plan": report, "edges": edges} | extra
-        click.echo(json.dumps(finite(everything_known, str), indent=2, allow_nan=False))
+        known = {"run": subject.run, **vars(summary)}
+        known |= {"plan": {"obstacle": plan} if isinstance(plan, str) else plan, "edges": edges}
+        if measured is not None:
+            known["conditioning"] = measured.to_json()
+        # Objects of the scene are told by their ids.
+        data = to_jsonable_python(known, inf_nan_mode="constants", fallback=lambda item: item.id())
+        click.echo(json.dumps(finite(data, str), indent=2, allow_nan=False))
         return None
-    if subject.run is not None:
-        echo(run_line(subject))
-    echo(f"scene {config.scene.file}")
-    for line in scene_lines(summary):
-        echo(f"  {line}")
-    sensors = summary.sensors if everything else summary.sensors[:LISTED_SENSORS]
-    for sensor in sensors:
-        echo(f"sensor {sensor.index} ({sensor.id})")
-        for line in sensor_lines(sensor):
-            echo(f"  {line}")
-    if len(sensors) < len(summary.sensors):
-        echo(f"and {len(summary.sensors) - len(sensors)} more sensors; --all lists them")
-    if plan is not None:
-        echo("plan")
-        for line in [f"none: {plan}"] if isinstance(plan, str) else plan_lines(plan):
-            echo(f"  {line}")
-    echo("parameters")
-    wanted = [] if "parameters" in subject.missing else [key for spec in config.parameters for key in spec.keys]
-    for line in [*parameter_lines(summary.parameters, wanted, everything), *moving_lines(summary.movable, everything)]:
-        echo(f"  {line}")
-    for name in edges:
-        echo(f"  silhouettes and shadow edges of {name} are not in its derivatives")
-    if measured is not None:
-        from reslrb_cli.report.tables import chain_lines, conditioning_lines
+    from reslrb_cli.report.tables import chain_lines, conditioning_lines
 
-        echo(f"conditioning ({measured.samples} gradients of {measured.spp} spp, seed {measured.seed})")
-        for line in conditioning_lines(measured):
-            echo(f"  {line}")
-        if measured.chains:
-            echo("chains of Jacobians, as estimator reservoir inverts them: condition numbers by number of vertices")
-            for line in chain_lines(measured):
-                echo(f"  {line}")
-    else:
-        echo(f"next: {next_step(subject, summary)}")
+    wanted = [] if "parameters" in subject.missing else [key for spec in config.parameters for key in spec.keys]
+    parameters = parameter_lines(summary.parameters, wanted, everything)
+    text = fill(
+        "inspect.txt.j2",
+        {
+            "counted": _counted,
+            "sized": _sized,
+            "needed": _needed,
+            "shares": lambda view: ", ".join(f"{name} {100 * share:.0f} %" for name, share in vars(view).items()),
+            "conditioning": conditioning_lines,
+            "chains": chain_lines,
+        },
+        path=path,
+        run=None if subject.run is None else run_words(subject.run),
+        scene=config.scene.file,
+        summary=summary,
+        sensors=summary.sensors if everything else summary.sensors[:LISTED_SENSORS],
+        plan=[f"none: {plan}"] if isinstance(plan, str) else plan and plan_lines(plan),
+        parameters=[*parameters, *moving_lines(summary.movable, everything)],
+        edges=edges,
+        measured=measured,
+        next=None if measured else next_step(subject, summary),
+    )
+    click.echo(text, nl=False)
     return None
 
 
-def run_line(subject: Subject) -> str:
-    """How far the run came whose folder was named."""
-    run = subject.run or {}
+def run_words(run: Mapping[str, Any]) -> str:
+    """How far a run came, by its manifest."""
     iterations = run.get("results", {}).get("iterations")
-    words = [
-        str(run.get("status")),
-        "" if iterations is None else f"{iterations} iterations",
-        str(run.get("error") or ""),
-    ]
-    return f"run {subject.path}: {', '.join(word for word in words if word)}"
+    words = [str(run.get("status")), "" if iterations is None else f"{iterations} iterations"]
+    return ", ".join(word for word in [*words, str(run.get("error") or "")] if word)
 
 
 def next_step(subject: Subject, summary: SceneSummary) -> str:

@@ -1,6 +1,6 @@
 """`reslrb optimize`: from a configuration to recovered parameters, or from a run to more of it.
 
-With `--dry-run` it prints the forecast of a run, in lines (`show_forecast`).
+With `--dry-run` it prints the forecast of a run (`show_forecast`, `templates/forecast.txt.j2`).
 """
 
 from __future__ import annotations
@@ -9,22 +9,20 @@ import contextlib
 import logging
 import os
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from reslrb_cli.cli.options import optional_experiment_arguments, read_config, start_variant
-from reslrb_cli.cli.terminal import echo
+from reslrb_cli.cli.terminal import echo, fill
 from reslrb_cli.config.files import in_words, rough_duration
 from reslrb_cli.config.loader import dump
-from reslrb_cli.errors import ExitCode, printable
+from reslrb_cli.errors import ExitCode
 
 if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
-    from reslrb_cli.optimization.forecast import Forecast
     from reslrb_cli.optimization.problem import Problem
     from reslrb_cli.records.manifest import Manifest
     from reslrb_cli.records.run_folder import RunFolder
@@ -34,82 +32,41 @@ if TYPE_CHECKING:
 def show_forecast(config: Config) -> None:
     """Measure what a run of `config` will take, and print it; a variant must be set, and nothing is written but the
     caches of kernels and pilots."""
+    from reslrb_cli.backend.memory import resident_bytes
     from reslrb_cli.measure.prb_comparison import RIVAL, measure_rival
     from reslrb_cli.optimization.correlated_bias import measure_correlated_bias
     from reslrb_cli.optimization.forecast import make_forecast
     from reslrb_cli.records.cache import PilotCache
 
     cache, say = PilotCache(), logging.getLogger(__name__).info
-    measured: list[Before] = []
+    measured: list[tuple[str, float, bool]] = []
 
     def measure_before(problem: Problem) -> None:
         begin = time.perf_counter()
         if measure_correlated_bias(problem) is not None:
-            measured.append(Before("bias of correlated", time.perf_counter() - begin, kept=False))
+            measured.append(("bias of correlated", time.perf_counter() - begin, False))
         begin = time.perf_counter()
         rival = measure_rival(problem, cache, say)
         rival_s = 0.0 if rival is None or rival.cached else time.perf_counter() - begin
-        measured.append(Before(f"{RIVAL} beside it", rival_s, cache.keeps))
+        measured.append((f"{RIVAL} beside it", rival_s, cache.keeps))
 
     forecast = make_forecast(config, say, cache, measure_before)
-    before = [Before("pilot", forecast.pilot_s, cache.keeps), *measured]
-    echo(f"forecast of {printable(config.source)}; nothing was written")
-    for line in [*memory_lines(forecast, config.run.budget_bytes), *time_lines(forecast, before)]:
-        echo(line)
-
-
-@dataclass(frozen=True)
-class Before:
-    """What is measured once, before the first iteration: it took `seconds` now (0: nothing was to be measured), and the
-    run finds it where it was `kept`."""
-
-    name: str
-    seconds: float
-    kept: bool
-
-    @property
-    def run_s(self) -> float:
-        """Seconds of the run."""
-        return 0.0 if self.kept else self.seconds
-
-    def line(self) -> str:
-        """What of it the run has still to do."""
-        took = rough_duration(self.seconds)
-        if not self.seconds:
-            return f"{'none, or kept from before':>10}  {self.name}"
-        return f"{took + ', done now and kept':>10}  {self.name}" if self.kept else f"{took:>10}  {self.name}"
-
-
-def memory_lines(forecast: Forecast, budget: int | None) -> list[str]:
-    """What the iterations take, by part, beside what is free, and what `memory_budget` allows."""
-    from reslrb_cli.backend.memory import resident_bytes
-
-    allowed = "" if budget is None else f", run.memory_budget allows {in_words(budget)}"
-    lines = [
-        f"memory of the iterations: {in_words(forecast.peak)} at the most; {in_words(forecast.free)} are free{allowed}"
-    ]
-    lines += [f"  {in_words(size):>10}  {part}" for part, size in forecast.parts.items()]
-    return [
-        *lines,
-        f"  {in_words(forecast.scratch):>10}  thread-local memory of paths (stack), beside it",
-        f"  {in_words(resident_bytes()):>10}  this process as a whole: Python, libraries, kernels' code, and all above",
-    ]
-
-
-def time_lines(forecast: Forecast, before: Sequence[Before]) -> list[str]:
-    """What the parts of the run take."""
-    compiled = f"and {rough_duration(forecast.compile_s)} of compiling, which is done now and kept"
+    # What took so many seconds now (0: nothing was to be measured), and a run finds where it is kept.
+    before = [("pilot", forecast.pilot_s, cache.keeps), *measured]
     sums = f"{forecast.iterations} x {1e3 * forecast.iteration_s:.3g} ms"
     sums += f" + {rough_duration(forecast.start_s)}" if forecast.start_s > 0.01 * forecast.elapsed_s else ""
-    return [
-        f"time of the iterations: {rough_duration(forecast.elapsed_s)} ({sums}), {compiled}",
-        f"  by steps of {forecast.spp} samples per pixel",
-        f"  {rough_duration(forecast.target_s):>10}  rendering the target",
-        *(f"  {each.line()}" for each in before),
-        f"  {rough_duration(forecast.images_s):>10}  saved images",
-        f"  {rough_duration(forecast.verdicts_s):>10}  verdicts on the values, or so",
-        f"time of the whole run: about {rough_duration(forecast.whole_s + sum(each.run_s for each in before))}",
-    ]
+    text = fill(
+        "forecast.txt.j2",
+        {"bytes": in_words, "time": rough_duration},
+        source=config.source,
+        forecast=forecast,
+        budget=config.run.budget_bytes,
+        resident=resident_bytes(),
+        sums=sums,
+        before=before,
+        whole_s=forecast.whole_s + sum(seconds for _, seconds, kept in before if not kept),
+    )
+    click.echo(text, nl=False)
 
 
 NOTICE = "stopping after this iteration; once more, and it ends at once"

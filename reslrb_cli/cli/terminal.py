@@ -31,8 +31,9 @@ import select
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, TextIO
 
@@ -143,6 +144,19 @@ def _say(line: str) -> None:
 def echo(line: object) -> None:
     """Print one line on standard output, with what is not printable in it escaped."""
     click.echo(printable(line))
+
+
+def fill(template: str, filters: Mapping[str, Callable[..., object]], **values: object) -> str:
+    """The text of a template in `templates/`; what is not printable in `values` is escaped, and ends no line."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    loader = FileSystemLoader(Path(__file__).with_name("templates"))
+    made = Environment(
+        loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
+        finalize=printable,
+    )  # fmt: skip
+    made.filters.update(filters)
+    return made.get_template(template).render(values)
 
 
 class Forgiving:

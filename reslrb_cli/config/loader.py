@@ -189,9 +189,7 @@ def _validate(raw: dict[str, Any], path: Path) -> tuple[Config | None, list[Prob
     if isinstance(run, dict) and run.get("name") is None:
         data["run"] = {**run, "name": path.stem.encode(errors="replace").decode()}  # bytes that are no UTF-8 as `?`
     try:
-        config = Config.model_validate(
-            data, context={"folder": path.absolute().parent, "working_directory": Path.cwd()}
-        )
+        config = Config.model_validate(data, context={"folder": path.absolute().parent})
     except ValidationError as error:
         return None, problems(error, data)
     config._source = path

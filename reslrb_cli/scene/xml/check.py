@@ -67,8 +67,9 @@ def check(description: Description) -> None:
             _check_plugin(description.root, element)
         elif element.tag in _NUMBERS:
             _check_numbers(element)
-        if element.tag == "film":
-            _check_film(element)
+        if element.tag == "film" and (size := _size_of(element)).width * size.height > PIXELS:
+            why = f"it must have at most {PIXELS}, since each image of a step takes 12 bytes or more of every one"
+            raise element.fail("", f"a film of {size.width}x{size.height} pixels; {why}")
     _check_chains(description.root)
     check_files(description)
 
@@ -164,20 +165,13 @@ class FilmSize:
     channels: int
 
 
-def _check_film(film: Element) -> None:
-    """Refuse a film of more pixels than an image may have; what is no number, Mitsuba refuses."""
-    size = _size_of(film)
-    if size.width * size.height > PIXELS:
-        why = f"it must have at most {PIXELS}, since each image of a step takes 12 bytes or more of every one"
-        raise film.fail("", f"a film of {size.width}x{size.height} pixels; {why}")
-
-
 def film_sizes(description: Description) -> list[FilmSize]:
     """What the scene's films say of their sizes."""
     return [_size_of(film) for film in description.root.walk("film")]
 
 
 def _size_of(film: Element) -> FilmSize:
+    """What a film says of its size; what is no number there, Mitsuba refuses."""
     values = {child.name: child.value.strip() for child in film.children}
     numbers = {name: int(value[:20]) for name, value in values.items() if value.isdecimal()}
     width, height = numbers.get("width", 0), numbers.get("height", 0)
