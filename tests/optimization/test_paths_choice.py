@@ -1,0 +1,115 @@
+"""`paths: auto`: which paths a run traces, decided on steps of a small scene, and what it makes of its target."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from optimization.deciding import SMALL, begin, fix_times
+from runs.going_on import optimize
+
+from reslrb_cli.config.loader import load
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.autotune.sampling import FIRST_SHARE, SHARES
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.records.cache import PilotCache
+from reslrb_cli.records.manifest import read_manifest
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+AUTO = ["integrator.paths=auto", "integrator.estimator=stack", *SMALL]
+RUN = Path("runs/tiny")
+
+
+@pytest.fixture(autouse=True)
+def experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    return begin(tmp_path, monkeypatch)
+
+
+def decided(
+    monkeypatch: pytest.MonkeyPatch, other_ms: float, *settings: str, cache: PilotCache | None = None
+) -> Problem:
+    """The problem, where steps of another share take so many times as long as those of the best so far."""
+    shares = [share for side in SHARES for share in side]
+    fix_times(monkeypatch, {f"paths {share:g}": other_ms for share in shares})
+    return assemble(load("tiny.yaml", [*AUTO, *settings]), cache=cache)
+
+
+def share_of(problem: Problem) -> tuple[str, float]:
+    return problem.integrator.paths, problem.integrator.light_share
+
+
+def test_what_is_faster_is_taken_as_far_as_it_goes(monkeypatch: pytest.MonkeyPatch):
+    """All surfaces are diffuse: fewer light paths, until there are none."""
+    problem = decided(monkeypatch, 0.01)
+    assert problem.sides is not None
+    assert (problem.sides.paths, problem.sides.light_share) == ("camera", 0.0)
+    assert share_of(problem)[0] == "camera"
+    assert problem.sides.low > 1
+
+
+def test_what_is_slower_is_left(monkeypatch: pytest.MonkeyPatch):
+    problem = decided(monkeypatch, 100.0)
+    assert share_of(problem) == ("both", FIRST_SHARE)
+    assert problem.sides.gain < 1
+
+
+def test_a_share_alone_is_measured_too(monkeypatch: pytest.MonkeyPatch):
+    problem = decided(monkeypatch, 100.0, "integrator.paths=both", "integrator.light_share=auto")
+    assert share_of(problem) == ("both", FIRST_SHARE)
+    assert problem.sides is not None
+    problem = decided(monkeypatch, 100.0, "integrator.paths=both", "integrator.light_share=0.25")
+    assert share_of(problem) == ("both", 0.25)
+    assert problem.sides is None
+
+
+def test_without_time_half_of_the_paths_are_light_paths(monkeypatch: pytest.MonkeyPatch):
+    problem = decided(monkeypatch, 1.0, "run.measuring=0")
+    assert share_of(problem) == ("both", FIRST_SHARE)
+    assert "not measured" in problem.sides.note
+
+
+def test_it_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    cache = PilotCache(tmp_path / "kept")
+    first, second = (decided(monkeypatch, 0.01, cache=cache) for _ in range(2))
+    assert not first.sides.cached
+    assert second.sides.cached
+    assert share_of(first) == share_of(second)
+
+
+def test_what_moves_light_has_light_paths():
+    motion = "parameters=[{motion: {of: [lamp], free: [translation]}}]"
+    problem = assemble(load("tiny.yaml", ["integrator.paths=both", motion, *SMALL]))
+    assert (problem.paths, problem.moves, problem.integrator.paths) == ("light", True, "light")
+
+
+def test_a_run_goes_on_with_the_paths_that_it_had():
+    settings = [word for setting in (*AUTO, "run.iterations=4") for word in ("--set", setting)]
+    whole = optimize("tiny.yaml", *settings, "--set", "run.name=whole")
+    assert whole.returncode == 0, whole.stderr
+    first = optimize("tiny.yaml", *settings, "--set", "run.name=parts", "--set", "run.iterations=2")
+    assert first.returncode == 0, first.stderr
+    again = optimize("--resume", "runs/parts", "--set", "run.iterations=4")
+    assert again.returncode == 0, again.stderr
+    found = [read_manifest(Path("runs") / name)["paths"] for name in ("whole", "parts")]
+    assert all(each["paths"] in ("both", "camera") for each in found)
+
+
+@pytest.mark.parametrize("paths", ["camera", "both"])
+def test_targets_and_images_have_the_same_light(paths: str):
+    """At the film's border, too, where light paths alone lack what falls off it."""
+    problem = assemble(load("tiny.yaml", [f"integrator.paths={paths}", "target.render.spp=256", *SMALL]))
+    problem.selection.set_arrays(problem.truth)
+    [view] = problem.views
+    image, target = problem.render(view.sensor, 256, 0, "test"), np.array(view.target)
+    border = np.ones(image.shape[:2], bool)
+    border[1:-1, 1:-1] = False
+    assert image[border].mean() == pytest.approx(target[border].mean(), rel=0.05)
+    assert not view.masked.left_out
+
+
+def test_paths_that_cannot_be_are_located():
+    with pytest.raises(ConfigError, match=r"tiny.yaml: integrator.*gather"):
+        load("tiny.yaml", ["integrator.paths=camera", "integrator.estimator=gather"])
