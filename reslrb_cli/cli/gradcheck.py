@@ -26,9 +26,9 @@ from reslrb_cli.cli.options import (
     allowance,
     check_writable,
     is_given,
+    look_at,
     optional_experiment_arguments,
     origin_of,
-    read_earlier,
     resume_option,
 )
 from reslrb_cli.cli.terminal import Interrupts, echo
@@ -59,10 +59,9 @@ def _given(options: Mapping[str, str]) -> str | None:
 
 def _earlier(kind: str, resumed: Path | None, now: Mapping[str, Any]) -> Earlier | None:
     """The session that left the file `resumed`. Raises ConfigError where its settings are not those of `now`."""
-    if resumed is None:
-        return None
-    earlier = Earlier(kind, resumed, *read_earlier(resumed))
-    earlier.check(now)
+    earlier = Earlier.read(kind, resumed)
+    if earlier is not None:
+        earlier.check(now)
     return earlier
 
 
@@ -323,7 +322,7 @@ def _run(
             drawn = drawn or result.maps is not None
         keeper.finish(records)
     if folder is not None and drawn:
-        echo(f"look at {os.path.relpath(folder)}")
+        look_at(folder)
     return records, interrupts.requested
 
 

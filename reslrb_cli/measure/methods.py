@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 from reslrb_cli.config.base import SEED_END
 from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, UNDECIDED, Prb, Ptracer, Trajectory, WalkAd
@@ -203,9 +203,9 @@ def usual_values(swept: str, config: Config) -> list[int]:
 class Measurement:
     """What every measurement by processes has; `memory_limit` is of each, None: none.
 
-    `memory` is what the machine has, in bytes. `rounds` is None where `budget_s` decides their number; else there are
-    so many, whatever time they take. Of the `cases`, those that cannot do what the scene asks for are left out where
-    they are the `default` ones.
+    `memory` is what the machine has, in bytes, `device` what computes, in words. `rounds` is None where `budget_s`
+    decides their number; else there are so many, whatever time they take. Of the `cases`, those that cannot do what the
+    scene asks for are left out where they are the `default` ones.
     """
 
     config: Config
@@ -217,22 +217,25 @@ class Measurement:
     budget_s: float
     rounds: int | None = None
     default: bool = False
+    device: str = ""
+
+    #: What is kept says that it is of this.
+    KIND: ClassVar[str]
 
     def first(self, config: Config) -> dict[str, Any]:
         """What a process is told first, to measure `config`."""
         return {"config": dump(config), "source": str(config.source), "variant": self.variant,
                 "memory_limit": self.memory_limit}  # fmt: skip
 
-    def settings(self, device: str, **options: Any) -> dict[str, Any]:
+    def settings(self) -> dict[str, Any]:
         """What has to be the same in all sessions, as JSON has it; see `resume_store.settings`."""
-        return resume_store.settings(
-            self.config,
-            self.variant,
-            device,
-            integrators=[case.label for case in self.cases],
-            **options,
-            **{"memory limit": self.memory_limit},
-        )
+        labels = [case.label for case in self.cases]
+        options = {"integrators": labels, **self._options(), "memory limit": self.memory_limit}
+        return resume_store.settings(self.config, self.variant, self.device, **options)
+
+    def _options(self) -> dict[str, Any]:
+        """Those of the command that count among the settings."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,6 +245,12 @@ class Sweep(Measurement):
     baseline: Case
     values: Sequence[int]
     swept: str = "depth"
+
+    KIND = "bench"
+
+    def _options(self) -> dict[str, Any]:
+        values = {"values": list(self.values), "objective": self.objective, "sweep": self.swept}
+        return {"baseline": self.baseline.label} | values
 
     def may_refuse(self, case: Case) -> bool:
         """Whether the rest goes on without this case, where it refuses the scene."""
@@ -298,6 +307,11 @@ class Plan(Measurement):
 
     reference: Case
     spps: Sequence[int] = ()
+
+    KIND = "convergence"
+
+    def _options(self) -> dict[str, Any]:
+        return {"objective": self.objective, "reference": self.reference.label, "spp": list(self.spps)}
 
     @property
     def known(self) -> bool:
@@ -374,6 +388,11 @@ class RunsPlan(Plan):
 
     runs: int = 3
     rates: Sequence[float] = ()
+
+    KIND = "convergence --runs"
+
+    def _options(self) -> dict[str, Any]:
+        return {"reference": self.reference.label, "spp": list(self.spps), "rates": list(self.rates)}
 
     @property
     def sides(self) -> list[Side]:

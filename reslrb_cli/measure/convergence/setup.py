@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import enum
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,14 +19,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.loader import loads
+from reslrb_cli.config.loader import dump, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.integrators.step import gradient_step, known_step, render_image
 from reslrb_cli.measure.gradients import moves_light
 from reslrb_cli.measure.methods import IMAGES
 from reslrb_cli.measure.participants import ALIKE
-from reslrb_cli.measure.processes import Contestant
+from reslrb_cli.measure.processes import Ended, Stepping
 from reslrb_cli.measure.references import Situation, prb_gradient, prb_image, ptracer_gradient, ptracer_image
 from reslrb_cli.measure.workers import Begun
 from reslrb_cli.optimization.assemble import assemble_scene
@@ -39,9 +38,6 @@ from reslrb_cli.records.measurements import Method, Reference
 from reslrb_cli.scene.catalog import value_shape
 from reslrb_cli.scene.visibility import interior
 from reslrb_cli.seeds import seed
-
-#: Steps after the first until no new kernel comes, at most.
-MAX_WARM_UPS = 4
 
 #: A turn of one that compares is as long as a step of the slowest, but no longer than so many seconds.
 TURN_S = 2.0
@@ -71,7 +67,7 @@ class Role(str, enum.Enum):
 
 
 @dataclass(kw_only=True)
-class Member(Contestant):
+class Member(Stepping):
     """One process, the steps that it is to take, and those that it has taken.
 
     `rows` are samples (P,), `turns` says in which round each was taken, `seconds` are those of one step in each turn.
@@ -85,7 +81,6 @@ class Member(Contestant):
     out: Path
     count: int = 1
     taken: int = 0
-    cold: dict[str, Any] | None = None
     step_s: float = 0.0
     rows: list[np.ndarray] = field(default_factory=list)
     turns: list[int] = field(default_factory=list)
@@ -102,25 +97,19 @@ class Member(Contestant):
         """Seconds of the first step, which compiles."""
         return None if self.cold is None else self.cold["step_ms"][0] / 1e3
 
-    def warm_up(self, tight: bool, stop: Callable[[], bool], over: Callable[[], bool]) -> bool:
-        """Take steps until nothing is compiled any more; whether it came to that."""
-        self.cold = self._steps(1, 0, True, False, stop, over)
-        answer = self.cold
-        for _ in range(MAX_WARM_UPS):
-            if answer is None:
-                return False
-            answer = self._steps(1, 0, False, tight, stop, over)
-            if answer is not None:
-                self.step_s = answer["step_ms"][0] / 1e3
-                if not answer["new_kernels"]:
-                    return True
-        return answer is not None
+    @property
+    def name(self) -> str:
+        """Its role and label."""
+        return f"{self.role.value} {self.label}"
 
-    def turn(self, round: int, tight: bool, stop: Callable[[], bool]) -> None:
-        """Take a turn's steps and keep them. Raises Stopped."""
-        answer = self._steps(self.count, round, False, tight, stop)
-        if answer is None:
-            return
+    def question(self, round: int | None) -> dict[str, Any]:
+        """What asks for the steps of a turn, with the round's dL/dI; one step while it is getting warm."""
+        start, count = self.taken, 1 if round is None else self.count
+        self.taken += count
+        return {"start": start, "count": count, "spp": self.spp, "image": round or 0, "out": str(self.out)}
+
+    def keep(self, round: int, answer: dict[str, Any]) -> None:
+        """Take note of a turn's steps."""
         rows = np.load(self.out)
         if not np.isfinite(rows).all() and not self.message:
             self.message = f"{np.count_nonzero(~np.isfinite(rows))} entries of step {len(self.rows) + 1} are not finite"
@@ -129,13 +118,24 @@ class Member(Contestant):
         times = answer["step_ms"]
         self.seconds.append(float(np.mean(times[1:] if len(times) > 1 else times)) / 1e3)
 
-    def _steps(
-        self, count: int, image: int, cold: bool, release: bool, stop: Callable[[], bool],
-        over: Callable[[], bool] = lambda: False,
-    ) -> dict[str, Any] | None:  # fmt: skip
-        question = {"start": self.taken, "count": count, "spp": self.spp, "image": image, "out": str(self.out)}
-        self.taken += count
-        return self.ask(question | {"cold": cold, "release": release}, stop, over)
+    def kept(self, rounds: int) -> tuple[dict[str, Any], np.ndarray]:
+        """What a later session needs, as JSON has it, and the samples (N, P) of so many rounds.
+
+        A round that was broken off is not among them: the next session begins it anew, with other seeds.
+        """
+        turns = [turn for turn in self.turns if turn < rounds]
+        entry = {"name": self.name, "config": dump(self.config), "taken": self.taken, "turns": turns,
+                 "seconds": self.seconds[: len(set(turns))], "message": self.message, "cold": self.cold,
+                 "end": self.end and vars(self.end)}  # fmt: skip
+        return entry, np.array(self.rows[: len(turns)], np.float32)
+
+    def restore(self, entry: dict[str, Any], rows: np.ndarray) -> None:
+        """Have what `kept` returned; what has ended, or refused, is not asked again."""
+        for name in ("taken", "turns", "seconds", "message", "cold"):
+            setattr(self, name, entry[name])
+        self.rows, self.end = list(rows), entry["end"] and Ended(**entry["end"])
+        if self.end is not None:
+            self.close()
 
     def means(self, key: slice, groups: int | None = None) -> np.ndarray:
         """Means over turns, or over every so many-th of them together, of some entries: (K, P)."""
