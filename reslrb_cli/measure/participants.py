@@ -17,19 +17,18 @@ from reslrb_cli.measure.gradients import (
     Case,
     all_directions,
     choose_step,
-    moves_light,
     seeds,
     smooth_weights,
 )
 from reslrb_cli.measure.methods import Case as Listed
 from reslrb_cli.measure.references import (
     Situation,
+    choose,
     ends,
     known_gradient,
+    of_gradient,
     path_image,
-    prb_gradient,
     prb_image,
-    ptracer_gradient,
     ptracer_image,
 )
 from reslrb_cli.measure.scenes import small
@@ -120,8 +119,8 @@ class Participants:
         self.spp = settings.spp or _samples(self.film, config.run.spp, problem.samples_per_pass)
         options = first.integrator.options()
         depth = config.integrator.max_depth
-        moved = tuple(key for key in problem.selection.scene_keys if moves_light(self.case.params, key))
-        self.attached = options.get("attached") is True or bool(moved)
+        self._situation = Situation.of_problem(problem, sensor)
+        self.attached, moved = self._situation.attached, self._situation.moved
         #: Whether there is a forward mode: of emitters that move there is none.
         self.forward_mode = not any(_emits(self.case.params.properties[key][2]) for key in moved)
         self.listed = self._able(settings)
@@ -138,8 +137,6 @@ class Participants:
             "prb": make_integrator("prb", **shared),
             "path": make_integrator("path", **shared),
         }
-        hidden = config.integrator.hide_emitters
-        self._situation = Situation.of(scene, self.sensor, self.case.params, depth, hidden, self.attached, moved)
         self._choose_references()
         self._weigh()
         self.directions = all_directions(self.case, problem.selection, MOVING_DIRECTIONS, DIRECTIONS)
@@ -183,14 +180,9 @@ class Participants:
         self.stock: dict[str, Reference | None] = {}
         self.why: dict[str, str] = {}
         for key in self.case.keys:
-            reasons = {Reference.PTRACER: ptracer_gradient(at, key), Reference.PRB: prb_gradient(at, key)}
-            self.stock[key], self.why[key] = _first(reasons)
-        reasons = {
-            Reference.PTRACER: ptracer_image(at),
-            Reference.PATH: path_image(at),
-            Reference.PRB: prb_image(at),
-        }
-        self.image, self.why_no_image = _first(reasons)
+            self.stock[key], self.why[key] = choose(of_gradient(at, key))
+        by_camera = {Reference.PATH: path_image(at), Reference.PRB: prb_image(at)}
+        self.image, self.why_no_image = choose({Reference.PTRACER: ptracer_image(at)} | by_camera)
 
     def _weigh(self) -> None:
         """Random weights of mean 1, so that entries do not cancel, a sixth negative; 0 where the border lacks light.
@@ -266,10 +258,3 @@ def _samples(film: tuple[int, int], most: int, multiple: int | None) -> int:
     """Samples per pixel of one gradient: as many paths as PATHS, no more than in a step of the run."""
     spp = max(min(PATHS // (film[0] * film[1]), most), 1)
     return spp if multiple is None else max(spp // multiple, 1) * multiple
-
-
-def _first(reasons: dict[Reference, str | None]) -> tuple[Reference | None, str]:
-    """The first that counts, and why those before it do not."""
-    refused = {name: reason for name, reason in reasons.items() if reason is not None}
-    chosen = next((name for name in reasons if name not in refused), None)
-    return chosen, "; ".join(f"not {name.value}: {reason}" for name, reason in refused.items())

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Any
 
 from reslrb_cli.integrators.step import make_integrator
-from reslrb_cli.measure.gradients import moves_light
 from reslrb_cli.measure.references import Situation, prb_gradient
 from reslrb_cli.optimization.autotune import race
 from reslrb_cli.optimization.decisions import Allowance
@@ -30,44 +29,10 @@ NEEDS = (2.0, 2.0)
 LONGER = 2.0
 
 
-def measure_rival(problem: Problem, cache: PilotCache | None, say: Callable[[str], None]) -> RivalRecord | None:
-    """Measure `prb` beside the estimator that a pilot chose; None where no pilot did, or `prb` does not apply.
-
-    `say` is told what takes long, `cache` holds what earlier runs measured. Leaves neither gradient nor change behind.
-    """
-    pilot, guided, sequence = problem.pilot, problem.guided, problem.sequence
-    # A budget of memory is kept by passes, of which `prb` has none.
-    if pilot is None or problem.samples_per_pass is not None or why_not(problem) is not None:
-        return None
-
-    def measure(allowance: Allowance) -> RivalRecord:
-        left = allowance.iterations_left(NEEDS[0])
-        spp, run = pilot.spp or _samples(problem, left), problem.config.run
-        planned = float(run.spp * MOST_ROUNDS)  # as many samples as there are
-        sizes = race.Sizes(run.spp, spp, spp, False, MOST_ROUNDS, 0.0, LONGER, planned)
-        share, most = (min(each, left / race.ITERATIONS) for each in (SHARE, MOST_SHARE))
-        return RivalTurns(RivalTrial(problem), sizes, 1.0, share, most).run()
-
-    beside = [pilot.chosen, guided and guided.guided, sequence and sequence.low_discrepancy]
-    return race.Tuner(problem, say, cache).decide(
-        RivalRecord,
-        of={"rival": RIVAL, "beside": beside},
-        needs=[NEEDS],
-        integrator=problem.integrator,
-        measure=measure,
-        unmeasured=lambda note: RivalRecord(integrator=RIVAL, note=note),
-    )
-
-
 def why_not(problem: Problem) -> str | None:
     """Why `prb` has no such gradient of some parameter, or no such image of some view; None where it has all."""
-    options, params = problem.config.integrator.options(), problem.selection.params
-    moved = tuple(key for key in problem.selection.scene_keys if moves_light(params, key))
-    for index in problem.sensors:
-        sensor = problem.scene.sensors()[index]
-        at = Situation.of(
-            problem.scene, sensor, params, options["max_depth"], options["hide_emitters"], bool(moved), moved
-        )
+    for sensor in problem.sensors:
+        at = Situation.of_problem(problem, sensor)
         for key in problem.selection.scene_keys:
             reason = prb_gradient(at, key)
             if reason is not None:
@@ -108,3 +73,32 @@ class RivalTurns(race.Turns[RivalRecord]):
     def _record(self, other: bool, images: bool, gain: race.Gain, picture: race.Gain, note: str) -> RivalRecord:
         found: dict[str, Any] = dict(zip(("advantage", "low", "high"), gain, strict=True)) | self._cost()
         return RivalRecord(integrator=RIVAL, rounds=len(self._steps[True]), spp=self._sizes.trial, note=note, **found)
+
+
+def measure_rival(problem: Problem, cache: PilotCache | None, say: Callable[[str], None]) -> RivalRecord | None:
+    """Measure `prb` beside the estimator that a pilot chose; None where no pilot did, or `prb` does not apply.
+
+    `say` is told what takes long, `cache` holds what earlier runs measured. Leaves neither gradient nor change behind.
+    """
+    pilot, guided, sequence = problem.pilot, problem.guided, problem.sequence
+    # A budget of memory is kept by passes, of which `prb` has none.
+    if pilot is None or problem.samples_per_pass is not None or why_not(problem) is not None:
+        return None
+
+    def measure(allowance: Allowance) -> RivalRecord:
+        left = allowance.iterations_left(NEEDS[0])
+        spp, run = pilot.spp or _samples(problem, left), problem.config.run
+        planned = float(run.spp * MOST_ROUNDS)  # as many samples as there are
+        sizes = race.Sizes(run.spp, spp, spp, False, MOST_ROUNDS, 0.0, LONGER, planned)
+        share, most = (min(each, left / race.ITERATIONS) for each in (SHARE, MOST_SHARE))
+        return RivalTurns(RivalTrial(problem), sizes, 1.0, share, most).run()
+
+    beside = [pilot.chosen, guided and guided.guided, sequence and sequence.low_discrepancy]
+    return race.Tuner(problem, say, cache).decide(
+        RivalRecord,
+        of={"rival": RIVAL, "beside": beside},
+        needs=[NEEDS],
+        integrator=problem.integrator,
+        measure=measure,
+        unmeasured=lambda note: RivalRecord(integrator=RIVAL, note=note),
+    )

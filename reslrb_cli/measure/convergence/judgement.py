@@ -16,7 +16,7 @@ from reslrb_cli.measure.comparison import (
 )
 from reslrb_cli.measure.convergence.session import Session
 from reslrb_cli.measure.convergence.setup import Member, Role
-from reslrb_cli.measure.convergence.statistics import FEWEST, Estimate, Reference, Samples
+from reslrb_cli.measure.convergence.statistics import FEWEST, Reference, Samples
 from reslrb_cli.measure.methods import ALL, IMAGES
 from reslrb_cli.records.measurements import (
     TARGETS,
@@ -24,7 +24,6 @@ from reslrb_cli.records.measurements import (
     Comparison,
     MethodRecord,
     PointRecord,
-    Range,
     ReferenceRecord,
     Verdict,
 )
@@ -178,11 +177,8 @@ class Judgement:
     def _points(self, member: Member, key: str, place: slice) -> list[PointRecord]:
         if not self._measured(member) or self._whole[key].floor is None:
             return []
-        floor = self._whole[key].floor
-        return [
-            PointRecord(member.method, key, p.steps, p.elapsed_s, p.relative_rmse, floor, p.repeats)
-            for p in self._samples(member, key, place).points()
-        ]
+        points = self._samples(member, key, place).points()
+        return [PointRecord(member.method, key, reference_rmse=self._whole[key].floor, **vars(p)) for p in points]
 
     def _method(
         self, member: Member, key: str, place: slice, bias: _Bias, references: dict[str, _Bias] | None = None
@@ -203,7 +199,7 @@ class Judgement:
         if not message and tail_weight(samples.deviations) > TAIL:
             message = HEAVY
         times = {f"{target:g}": magnitude.seconds_to(target, biased) for target in TARGETS}
-        slope = samples.slope()
+        slope, efficiency = samples.slope(), magnitude.efficiency(biased)
         return MethodRecord(
             method=member.method,
             parameter=key,
@@ -213,8 +209,8 @@ class Judgement:
             cold_s=member.cold_s,
             relative_rmse=float(np.sqrt(samples.variance)),
             reference_rmse=samples.reference.floor,
-            slope=None if slope is None else Range(**vars(slope.interval())),
-            efficiency=_efficiency(magnitude.efficiency(biased)),
+            slope=None if slope is None else slope.interval(),
+            efficiency=None if efficiency is None else efficiency.exponential(),
             bias_z=bias.z,
             bias_z_limit=bias.limit,
             bias=float(np.sqrt(magnitude.squared_bias)) if biased else None,
@@ -245,7 +241,3 @@ def _kin(member: Member) -> str:
 
 def _words(figures: Comparison) -> str:
     return figures.message or ("gradient and reference differ" if figures.verdict is Verdict.FAILS else "")
-
-
-def _efficiency(estimate: Estimate | None) -> Range | None:
-    return None if estimate is None else Range(**vars(estimate.exponential()))

@@ -22,18 +22,18 @@ import numpy as np
 from reslrb_cli.config.loader import dump, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.protocol import first_channels
-from reslrb_cli.integrators.step import gradient_step, known_step, render_image
-from reslrb_cli.measure.gradients import moves_light
+from reslrb_cli.integrators.step import render_image
 from reslrb_cli.measure.methods import IMAGES
 from reslrb_cli.measure.participants import ALIKE
 from reslrb_cli.measure.processes import Ended, Stepping
-from reslrb_cli.measure.references import Situation, prb_gradient, prb_image, ptracer_gradient, ptracer_image
+from reslrb_cli.measure.references import Situation, choose, of_gradient, of_image
+from reslrb_cli.measure.stepper import Steps
 from reslrb_cli.measure.workers import Begun
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.views import View, set_targets, target_arrays, to_tensor
-from reslrb_cli.records.clock import StepClock, StepTimes, peak_mib, reset_peak
+from reslrb_cli.records.clock import StepTimes, reset_peak
 from reslrb_cli.records.measurements import Method, Reference
 from reslrb_cli.scene.catalog import value_shape
 from reslrb_cli.scene.visibility import interior
@@ -252,29 +252,20 @@ def masked_loss(view: View, image: mi.TensorXf, mask: mi.TensorXf | None) -> mi.
 
 def find_references(problem: Problem, objective: str) -> dict[str, Any]:
     """Keys, shapes, and which stock integrator counts for each."""
-    params, config = problem.selection.params, problem.config
-    moved = tuple(key for key in problem.selection.scene_keys if moves_light(params, key))
-    attached = config.integrator.options().get("attached") is True or bool(moved)
-    sensor = problem.scene.sensors()[problem.sensors[0]]
-    at = Situation.of(
-        problem.scene, sensor, params, config.integrator.max_depth, config.integrator.hide_emitters, attached, moved
-    )
+    at = Situation.of_problem(problem, problem.sensors[0])
     keys = ["image"] if objective == "image" else list(problem.selection.keys)
-    independent: dict[str, str | None] = {}
-    why, reasons = {}, {}
+    found: dict[str, dict[Reference, str | None]] = {}
     for key in keys:
-        if objective == "image":
-            found = {"ptracer": ptracer_image(at), "prb": prb_image(at)}
-        else:
-            unlike = _unlike(config) if attached else None
-            found = {"ptracer": unlike or ptracer_gradient(at, key), "prb": prb_gradient(at, key)}
-        reasons[key] = found
-        independent[key] = next((name for name, reason in found.items() if reason is None), None)
-        why[key] = "; ".join(f"not {name}: {reason}" for name, reason in found.items() if reason is not None)
+        found[key] = of_image(at) if objective == "image" else of_gradient(at, key)
+        if objective != "image" and at.attached:
+            found[key][Reference.PTRACER] = _unlike(problem.config) or found[key][Reference.PTRACER]
+    chosen = {key: choose(reasons) for key, reasons in found.items()}
+    independent = {key: None if name is None else name.value for key, (name, _) in chosen.items()}
+    why = {key: reason for key, (_, reason) in chosen.items()}
     without = {
-        name: str(reasons[keys[0]][name])
-        for name in ("ptracer", "prb")
-        if all(found[name] is not None for found in reasons.values())
+        name.value: reason
+        for name, reason in found[keys[0]].items()
+        if all(reasons[name] is not None for reasons in found.values())
     }
     shapes = {key: list(value_shape(problem.selection.value(key))) for key in keys if key != "image"}
     return {"keys": keys, "shapes": shapes, "independent": independent, "why": why, "without": without}
@@ -319,17 +310,16 @@ def multiple_of(spp: int, unit: int | None) -> int:
     return max(spp // unit, 1) * unit
 
 
-class Sampler:
-    """Takes steps through the first sensor; the parameters keep their initial values.
+class Sampler(Steps):
+    """Steps as `convergence` takes them.
 
     `mode` says what is sampled: `known`, the gradient with dL/dI held at one of `adjoints`; `loss`, the gradient of the
     experiment's own loss with its `run.adjoint`; `image`. `arrays` are the survey's.
     """
 
-    def __init__(self, config: Any, mode: str, arrays: dict[str, np.ndarray]) -> None:
-        self.problem, self.mode, self.clock = assemble_scene(config.with_exposures_fixed()), mode, StepClock()
-        self.sensor = self.problem.sensors[0]
-        self.view = self.problem.views[0]
+    def __init__(self, config: Config, mode: str, arrays: dict[str, np.ndarray]) -> None:
+        super().__init__(config)
+        self.mode, self.view = mode, self.problem.views[0]
         if "adjoints" in arrays:
             set_targets([self.view], arrays)
         self.mask = None if arrays["mask"].all() else to_tensor(arrays["mask"])
@@ -344,28 +334,12 @@ class Sampler:
                 picture = render_image(problem.integrator, problem.scene, self.sensor, seed, spp)
                 dr.eval(picture)
             return (np.array(picture, np.float32) * self.inside).ravel(), times
-        problem.apply()
-        for key in problem.selection.keys:
-            dr.clear_grad(problem.optimizer[key])
-        with self.clock.step() as times:
-            result = self._gradient(seed, spp, image)
-            gradients = problem.gradients()
-            dr.eval(result.image, result.loss, gradients)
+        if self.mode == "known":
+            gradients, times = self.gradient(seed, self.adjoints[image % len(self.adjoints)], spp)
+        else:
+            gradients, times = self.gradient(seed, lambda seen: masked_loss(self.view, seen, self.mask), spp)
         row = [np.array(gradients[key], np.float32).ravel() for key in problem.selection.keys]
         return np.concatenate(row), times
-
-    def _gradient(self, seed: int, spp: int, image: int) -> Any:
-        problem = self.problem
-        common: dict[str, Any] = {"seed": seed, "params": problem.selection.params}
-        if self.mode == "known":
-            adjoint = self.adjoints[image % len(self.adjoints)]
-            return known_step(problem.integrator, problem.scene, self.sensor, adjoint, spp=spp, **common)
-
-        def loss(picture: mi.TensorXf) -> mi.Float:
-            return masked_loss(self.view, picture, self.mask)
-
-        options = problem.config.step_options() | {"spp": spp}
-        return gradient_step(problem.integrator, problem.scene, self.sensor, loss, **options, **common)
 
 
 def begin_sampling(first: dict[str, Any]) -> Begun:
@@ -388,15 +362,7 @@ def begin_sampling(first: dict[str, Any]) -> Begun:
             rows.append(row)
             taken.append(times)
         np.save(question["out"], np.stack(rows))
-        reply: dict[str, Any] = {
-            "step_ms": [times.wall_ms for times in taken],
-            "new_kernels": sum(times.new_kernels for times in taken),
-        }
-        if question["cold"]:
-            reply["peak_mib"] = peak_mib(dr.backend_v(mi.Float))
-        sampler.clock.history = []
-        if question["release"]:
-            dr.flush_malloc_cache()
-        return reply
+        reply = {"step_ms": [times.wall_ms for times in taken], "new_kernels": sum(t.new_kernels for t in taken)}
+        return sampler.told(reply, question["cold"], question["release"])
 
     return {}, answer
