@@ -178,7 +178,7 @@ class Gradcheck:
         if row.key is None:
             shape = tuple(parts.case.weights.shape)
         else:
-            place, chosen = parts.slices()[row.key], parts.directions[row.key]
+            place, chosen = parts.case.places[row.key], parts.directions[row.key]
             ours = ours[:, place]
             if row.reference in ALONG_DIRECTIONS:
                 ours = ours @ np.array([direction.vector[place] for direction in chosen]).T

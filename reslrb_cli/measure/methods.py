@@ -40,10 +40,7 @@ _TYPES = {str(kind.model_fields["type"].default): kind for kind in (ReslrbConfig
 
 #: Options that make an estimator another one, in records.
 _ESTIMATOR_OPTIONS = {option for options in ESTIMATOR_OPTIONS.values() for option in options} - {"capacity"}
-
-
 _ESTIMATOR_OPTIONS |= set(UNDECIDED)
-
 
 _OPTION = "--integrators"
 _ITEM = re.compile(r"(?P<type>\w+)(?::(?P<estimator>\w+))?(?:\((?P<options>.*)\))?")
@@ -104,12 +101,12 @@ def parse_cases(text: str, source: str = _OPTION, deep: bool = True) -> list[Cas
     `source` is the option that the list was given by; `deep`: depths are what is varied. What an option means is not
     looked at here, but in `Case.at`.
     """
-    return _parse(_split(text), source, "", "integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)]", deep)
+    return _parse(text, source, "", "integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)]", deep)
 
 
 def parse_estimators(text: str) -> list[Case]:
     """The cases in a list of estimators of `reslrb`, such as `stack,reservoir(capacity=4)`; raises as `parse_cases`."""
-    return _parse(_split(text), "--estimators", "reslrb:", "estimator; write ESTIMATOR[(OPTION=VALUE,...)]", False)
+    return _parse(text, "--estimators", "reslrb:", "estimator; write ESTIMATOR[(OPTION=VALUE,...)]", False)
 
 
 def all_estimators(config: Config) -> list[Case]:
@@ -126,23 +123,23 @@ def all_estimators(config: Config) -> list[Case]:
     return cases
 
 
-def _parse(items: list[str], source: str, prefix: str, wanted: str, deep: bool) -> list[Case]:
+def _parse(text: str, source: str, prefix: str, wanted: str, deep: bool) -> list[Case]:
     cases: list[Case] = []
-    for item in items:
+    for item in _split(text):
         match = _ITEM.fullmatch(prefix + item)
         if match is None or (prefix and not match["estimator"]):
             raise ConfigError(source, "", f"`{item}` is no {wanted}")
         options = {} if match["estimator"] is None else {"estimator": match["estimator"]}
-        for pair in _split(match["options"] or "") if match["options"] else []:
-            name, equals, value = pair.partition("=")
-            if not equals or not name.strip():
+        for pair in _split(match["options"]) if match["options"] else []:
+            name, equals, value = (part.strip() for part in pair.partition("="))
+            if not equals or not name:
                 raise ConfigError(source, item, f"`{pair}` must be OPTION=VALUE")
-            if name.strip() == "max_depth" and deep:
+            if name == "max_depth" and deep:
                 raise ConfigError(source, item, "max_depth is what is varied; --max-depth says how far")
-            if name.strip() == "max_depth" or (name.strip() in ADJOINT and prefix):
-                section = "run" if name.strip() in ADJOINT else "integrator"
-                raise ConfigError(source, item, f"all share one {name.strip()}; take --set {section}.{pair}")
-            options[name.strip()] = parse(value, f"{source} {item}", name_line=False)
+            if name == "max_depth" or (name in ADJOINT and prefix):
+                section = "run" if name in ADJOINT else "integrator"
+                raise ConfigError(source, item, f"all share one {name}; take --set {section}.{pair}")
+            options[name] = parse(value, f"{source} {item}", name_line=False)
         case = Case(prefix + item, match["type"], options, source)
         if case.label in [other.label for other in cases]:
             raise ConfigError(source, "", f"`{item}` is named twice")
@@ -197,6 +194,11 @@ def usual_values(swept: str, config: Config) -> list[int]:
     if swept == "spp":
         return sorted({max(round(share * config.run.spp), 1) for share in SHARES})
     return list(WIDTHS[swept])
+
+
+def with_run(config: Config, **changes: Any) -> Config:
+    """The experiment with other settings of `run`."""
+    return config.model_copy(update={"run": config.run.model_copy(update=changes)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,10 +260,9 @@ class Sweep(Measurement):
 
     def at(self, case: Case, value: int) -> Config:
         """The experiment of one case, all but the sizes of film and textures. Raises ConfigError."""
-        config, depth = self.config, self.config.integrator.max_depth
-        if self.swept == "spp":
-            config = config.model_copy(update={"run": config.run.model_copy(update={"spp": value})})
-        return case.at(config, value if self.swept == "depth" else depth, known=self.objective == "fixed")
+        config = with_run(self.config, spp=value) if self.swept == "spp" else self.config
+        depth = value if self.swept == "depth" else config.integrator.max_depth
+        return case.at(config, depth, known=self.objective == "fixed")
 
     def name(self, *values: int) -> str:
         """Some values of what is swept, in words: `depth 2, 4`."""
@@ -331,9 +332,7 @@ class Plan(Measurement):
 
     def config_of(self, case: Case, spp: int) -> Config:
         """The experiment with the integrator of a case, and so many samples per pixel. Raises ConfigError."""
-        run = self.config.run.model_copy(update={"spp": spp})
-        config = self.config.model_copy(update={"run": run})
-        return case.at(config, config.integrator.max_depth, self.known)
+        return case.at(with_run(self.config, spp=spp), self.config.integrator.max_depth, self.known)
 
     @property
     def reference_config(self) -> Config:
@@ -344,10 +343,8 @@ class Plan(Measurement):
         """The experiment with a stock integrator: without roulette, which naive AD does not differentiate rightly."""
         depth = self.config.integrator.max_depth
         roulette = depth < 0 or self.config.integrator.rr_depth <= depth
-        case = Case(
-            name, name, {"rr_depth": NEVER} if name == "ptracer" and roulette else {}, "the independent reference"
-        )
-        return case.at(self.config, depth, True)
+        options = {"rr_depth": NEVER} if name == "ptracer" and roulette else {}
+        return Case(name, name, options, "the independent reference").at(self.config, depth, True)
 
     def check(self) -> None:
         """Raise ConfigError where an integrator of the list, or the reference, cannot be."""
@@ -414,13 +411,7 @@ class RunsPlan(Plan):
 
         Raises ConfigError.
         """
-        run = self.config.run.model_copy(update={"spp": spp})
-        config = self.config.model_copy(update={"run": run})
-        return case.at(config, config.integrator.max_depth, False, auto=True)
-
-    def seeded(self, config: Config, seed: int) -> Config:
-        """The same experiment with another `run.seed`."""
-        return config.model_copy(update={"run": config.run.model_copy(update={"seed": seed})})
+        return case.at(with_run(self.config, spp=spp), self.config.integrator.max_depth, False, auto=True)
 
     def config_at(self, side: Side) -> Config:
         """The experiment as a side has it. Raises ConfigError."""

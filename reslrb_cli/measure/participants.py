@@ -202,14 +202,6 @@ class Participants:
         """Shape of a parameter."""
         return value_shape(self.case.values.value(key))
 
-    def slices(self) -> dict[str, slice]:
-        """Where each parameter stands in a gradient."""
-        found, at = {}, 0
-        for key, values in self.case.initial.items():
-            found[key] = slice(at, at + len(values))
-            at += len(values)
-        return found
-
     def stock_labels(self) -> list[str]:
         """The stock integrators that are references of gradients."""
         return sorted({reference.value for reference in self.stock.values() if reference is not None})

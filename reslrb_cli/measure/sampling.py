@@ -198,8 +198,7 @@ class Sampling:
         return most
 
     def _seeds_in_memory(self) -> int:
-        size = sum(len(values) for values in self.participants.case.initial.values())
-        return MEMORY // (4 * size * (len(self.participants.integrators) + 2))
+        return MEMORY // (4 * self.participants.case.size * (len(self.participants.integrators) + 2))
 
     def _sample(self, name: Name, seed: int) -> np.ndarray:
         parts, (kind, of) = self.participants, name

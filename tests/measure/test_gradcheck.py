@@ -388,7 +388,7 @@ def test_forward_mode_of_what_is_a_function(name: str):
     small = ["scene.options={resx: 16, resy: 16}", "run.spp=4", "target.render.spp=4"]
     parts = Participants(Settings(load(CONFIGS / f"{name}.yaml", small), parse_estimators("stack"), 0, 3))
     [label] = (case.label for case in parts.listed)
-    gradient, slices = parts.gradient(label, 1), parts.slices()
+    gradient, slices = parts.gradient(label, 1), parts.case.places
     for key in parts.case.keys:
         along = [gradient @ direction.vector for direction in parts.directions[key]]
         print(key, along, parts.tangents(label, key, 1))

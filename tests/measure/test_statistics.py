@@ -300,7 +300,7 @@ class Pretended:
 
     def __init__(self, settings: Any) -> None:
         self.now, self.known, self.exact = settings.clock, set(), {}
-        self.case = SimpleNamespace(initial={"a": np.zeros(3)})
+        self.case = SimpleNamespace(size=3)
         self.listed = [SimpleNamespace(label="reslrb:event"), SimpleNamespace(label="reslrb:stack")]
         self.integrators = dict.fromkeys(label for _, label in NAMES)
         self.directions = {"a": [Direction(np.ones(3), "both")]}

@@ -18,7 +18,7 @@ from optimization.deciding import begin, fix_times
 from reslrb_cli.cli.convergence import _runs_exit_code
 from reslrb_cli.config.loader import dump, load, loads
 from reslrb_cli.errors import ConfigError, ExitCode
-from reslrb_cli.measure.methods import RunsPlan, at_rate, parse_cases
+from reslrb_cli.measure.methods import RunsPlan, at_rate, parse_cases, with_run
 from reslrb_cli.measure.optimization_benchmark import evaluate, rank
 from reslrb_cli.measure.optimization_benchmark.evaluate import Advance, State
 from reslrb_cli.measure.optimization_benchmark.rank import (
@@ -192,7 +192,7 @@ def test_auto_says_what_its_pilot_chose_and_is_allowed(tmp_path: Path) -> None:
 def test_seeds_follow_that_of_the_configuration() -> None:
     config = loads(CONFIG, Path("x.yaml"), ["run.seed=4294967295"])
     assert plan(config=config).seeds == [4294967295, 0, 1]
-    assert plan(config=config).seeded(config, 7).run.seed == 7
+    assert with_run(config, seed=7).run.seed == 7
 
 
 def test_a_state_stands_from_its_end_on_and_copies_of_values_take_no_time() -> None:

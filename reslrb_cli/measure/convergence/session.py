@@ -19,6 +19,7 @@ from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.arena import Arena
 from reslrb_cli.measure.convergence.setup import Member, Role, share_turns
 from reslrb_cli.measure.convergence.statistics import FEWEST, FEWEST_FOR_SLOPE
+from reslrb_cli.measure.gradients import places
 from reslrb_cli.measure.methods import Case, Plan
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import Kept
@@ -45,12 +46,7 @@ class Session(Arena[Plan, Member]):
 
     def slices(self) -> dict[str, slice]:
         """Where each parameter (or the image) stands in a sample."""
-        found, at = {}, 0
-        for key, shape in self.facts["shapes"].items():
-            size = int(np.prod(shape, dtype=int))
-            found[key] = slice(at, at + size)
-            at += size
-        return found
+        return places({key: int(np.prod(shape, dtype=int)) for key, shape in self.facts["shapes"].items()})
 
     def of(self, role: Role) -> list[Member]:
         """The members of one role."""

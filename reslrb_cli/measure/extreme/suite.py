@@ -118,7 +118,7 @@ class Extrapolated:
     reference = Reference.FINITE_DIFFERENCE
 
     def samples(self, case: ExtremeCase, setup: Case) -> Samples:
-        along = np.eye(sum(len(value) for value in setup.initial.values()))
+        along = np.eye(setup.size)
         tracer = integrator("reslrb", **without_roulette(case))
         chosen, steps = seeds_of(case.seeds), (self.step, 2 * self.step)
         near, far = (setup.differences(tracer, along, chosen, case.spp, step) for step in steps)
@@ -146,7 +146,7 @@ class Zero:
     reference = Reference.ANALYTIC
 
     def samples(self, case: ExtremeCase, setup: Case) -> Samples:
-        return Samples(np.zeros(sum(len(value) for value in setup.initial.values())))
+        return Samples(np.zeros(setup.size))
 
 
 Source = Stock | Twin | Differences | Extrapolated | Exact | Zero
@@ -356,11 +356,9 @@ def _comparisons(
 
 def _parameters(setup: Case) -> Iterator[tuple[str, slice, tuple[int, ...]]]:
     """Each parameter: its name, where it stands in a gradient, and its shape."""
-    at = 0
-    for key, value in setup.initial.items():
-        shape = np.shape(setup.values.value(key))
-        yield key, slice(at, at + len(value)), shape if np.prod(shape, dtype=int) == len(value) else (len(value),)
-        at += len(value)
+    for key, place in setup.places.items():
+        shape, size = np.shape(setup.values.value(key)), len(setup.initial[key])
+        yield key, place, shape if np.prod(shape, dtype=int) == size else (size,)
 
 
 def _settled(case: ExtremeCase, parameter: str | None, found: Comparison, ours: np.ndarray) -> Comparison:

@@ -18,7 +18,7 @@ import numpy as np
 from reslrb_cli.config.schema import Config
 from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.arena import Arena, in_turn
-from reslrb_cli.measure.methods import RunsPlan, Side
+from reslrb_cli.measure.methods import RunsPlan, Side, with_run
 from reslrb_cli.measure.optimization_benchmark.rank import POINTS, Run, times
 from reslrb_cli.measure.processes import NO_TIME
 from reslrb_cli.measure.resume_store import Earlier
@@ -185,9 +185,8 @@ class RunsSession(Arena[RunsPlan, Run]):
             wave = []
             for side in sides:
                 run = self._run(side, seed)
-                run.process = self._start(
-                    self._start_message(self.plan.seeded(self.plan.config_at(side), seed)), "whole_runs"
-                )
+                config = with_run(self.plan.config_at(side), seed=seed)
+                run.process = self._start(self._start_message(config), "whole_runs")
                 wave.append(run)
                 self._load(run)
             for turn, until_s in enumerate(times(self.limit_s)):
