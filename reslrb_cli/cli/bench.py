@@ -23,6 +23,7 @@ from reslrb_cli.cli.options import (
     memory_limit_option,
     optional_experiment_arguments,
     origin_of,
+    read_or_box,
     resume_option,
 )
 from reslrb_cli.cli.terminal import echo
@@ -91,17 +92,12 @@ def command(
     """
     began = time.monotonic()
     from reslrb_cli.backend.installation import load_packages
-    from reslrb_cli.config.loader import load, loads
 
     load_packages()  # before what follows asks for them
     from reslrb_cli.measure.methods import SWEPT, Sweep, choose_baseline, depths, parse_cases, usual_values
-    from reslrb_cli.measure.scenes import small
     from reslrb_cli.records.measurements import BenchStatus
 
-    if config_file is None:
-        config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, overrides)
-    else:
-        config = load(config_file, overrides)
+    config = read_or_box(config_file, overrides)
     if (swept != "depth" or values is not None) and is_given("max_depth"):
         reason = "goes with --sweep depth" if values is None else "does not go with --values"
         raise ConfigError("--max-depth", "", f"{reason}; take --set integrator.max_depth={max_depth}")

@@ -29,11 +29,11 @@ from reslrb_cli.cli.options import (
     look_at,
     optional_experiment_arguments,
     origin_of,
+    read_or_box,
     resume_option,
 )
 from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
-from reslrb_cli.config.loader import load, loads
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.measure.methods import all_estimators, parse_estimators
 from reslrb_cli.measure.resume_store import Earlier, settings
@@ -239,7 +239,6 @@ def command(
     from reslrb_cli.measure.participants import Settings
     from reslrb_cli.measure.sampling import KIND
     from reslrb_cli.measure.sampling import settings as settings_to_keep
-    from reslrb_cli.measure.scenes import small
 
     if missing and (option := _given(COMPARING)):
         raise ConfigError(option, "", "does not go with --missing, which compares no estimators; leave out one")
@@ -257,10 +256,7 @@ def command(
         return run_suite_command(cases, estimators, seeds, json_file, markdown_file, resumed)
     if cases:
         raise ConfigError("--case", "", "names a case of a suite; take --suite extreme with it")
-    if config_file is None:
-        config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, overrides)
-    else:
-        config = load(config_file, overrides)
+    config = read_or_box(config_file, overrides)
     if missing:
         variant = set_variant(config.variant)
         echo(f"{device_name(variant)}, {variant}")

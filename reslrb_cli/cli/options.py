@@ -23,7 +23,7 @@ import click
 
 from reslrb_cli.backend.doctor import device_name, memory_bytes
 from reslrb_cli.cli.terminal import Interrupts, echo
-from reslrb_cli.config.loader import load
+from reslrb_cli.config.loader import load, loads
 from reslrb_cli.config.parameters import RunValue
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode, is_machine_fault
@@ -293,6 +293,15 @@ def is_given(name: str) -> bool:
 def read_config(config_file: Path, overrides: tuple[str, ...]) -> Config:
     """Load and check the configuration. Raises ConfigError."""
     return load(config_file, list(overrides))
+
+
+def read_or_box(config_file: Path | None, overrides: tuple[str, ...]) -> Config:
+    """The configuration, or that of the built-in Cornell box where no file is given. Raises ConfigError."""
+    if config_file is not None:
+        return read_config(config_file, overrides)
+    from reslrb_cli.measure.scenes import small
+
+    return loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, overrides)
 
 
 def start_variant(config: Config) -> str:

@@ -17,14 +17,14 @@ from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.methods import Measurement, Plan
 from reslrb_cli.measure.processes import Contestant, Pace, Process, Refused, Stepping, Stopped
 from reslrb_cli.measure.resume_store import Earlier
-from reslrb_cli.measure.workers import Begin, Begun
+from reslrb_cli.measure.workers import Begin
 from reslrb_cli.records.measurements import BenchStatus
 
 #: Where all together hold more than this share of the memory, each releases its own after a step.
 MEMORY_SHARE = 0.7
 MIB = 2**20
 
-#: Starts a process by its first message and the name of what it does, a function of this file.
+#: Starts a process by its first message and the name of what it does.
 Start = Callable[[dict[str, Any], str], Any]
 Worker = TypeVar("Worker", bound=Contestant)
 Item = TypeVar("Item")
@@ -37,10 +37,10 @@ def in_turn(workers: Sequence[Item], round: int) -> list[Item]:
     return [*workers[start:], *workers[:start]]
 
 
-def start_process(first: dict[str, Any], does: str = "measured_steps") -> Process:
-    """A process that does what the function `does` of this file returns; `first` is its first message."""
-    imports = f"from reslrb_cli.measure.arena import {does}\nfrom reslrb_cli.measure.workers import run"
-    return Process(first, python_command(f"{imports}\nrun({does})"))
+def start_process(first: dict[str, Any], does: str) -> Process:
+    """A process that does what `load` finds by this name; `first` is its first message."""
+    imports = "from reslrb_cli.measure.arena import load\nfrom reslrb_cli.measure.workers import run"
+    return Process(first, python_command(f"{imports}\nrun(lambda: load({does!r}))"))
 
 
 class Arena(Generic[Measured, Worker]):
@@ -94,12 +94,10 @@ class Arena(Generic[Measured, Worker]):
         except Stopped:
             return
         finally:
-            self._close_referee()
-            self._close_members()
-
-    def _close_members(self) -> None:
-        for member in self.members:
-            member.close()
+            for member in self.members:
+                member.close()
+            if self._referee is not None:
+                self._referee.close()
 
     def _alive(self) -> list[Worker]:
         """Those that can be asked for more."""
@@ -147,10 +145,6 @@ class Arena(Generic[Measured, Worker]):
             memory = end.status is BenchStatus.OUT_OF_MEMORY
             raise Refused(line, ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED)
 
-    def _close_referee(self) -> None:
-        if self._referee is not None:
-            self._referee.close()
-
     def _open(self, member: Contestant) -> dict[str, Any] | None:
         """What a worker says first, its scene loaded; None where it ended over that, or time was up."""
         opening = member.answer(self._stop, self._pace.over)
@@ -191,43 +185,16 @@ class Arena(Generic[Measured, Worker]):
         return not self.plan.default or type not in self.facts["without"]
 
 
-def measured_steps() -> Begin:
-    """Steps as `bench` measures them. Whatever is imported for it is, here and in the function below."""
-    from reslrb_cli.config.loader import loads
-    from reslrb_cli.measure.stepper import Stepper
+def load(does: str) -> Begin:
+    """What begins a process, by the name of what it does. Whatever is imported for it is, here and in that function."""
+    if does == "measured_steps":
+        from reslrb_cli.measure.stepper import begin_steps
 
-    def begin(first: dict[str, Any]) -> Begun:
-        config = loads(first["config"], first["source"])
-        stepper = Stepper(config, first["objective"], first.get("film_width"), first.get("texture_width"))
-        size = {"width": stepper.size[0], "height": stepper.size[1], "texels": stepper.texels}
-        return size, lambda question: stepper.step(question["round"], question["cold"], question["release"])
+        return begin_steps
+    if does in ("surveyed", "sampled_steps"):
+        from reslrb_cli.measure.convergence.setup import begin_sampling, begin_survey
 
-    return begin
+        return begin_survey if does == "surveyed" else begin_sampling
+    from reslrb_cli.measure.optimization_benchmark.evaluate import begin_judging, begin_run
 
-
-def surveyed() -> Begin:
-    """What `convergence` asks before it measures."""
-    from reslrb_cli.measure.convergence.setup import begin_survey
-
-    return begin_survey
-
-
-def sampled_steps() -> Begin:
-    """Steps as `convergence` measures them, with what they estimate."""
-    from reslrb_cli.measure.convergence.setup import begin_sampling
-
-    return begin_sampling
-
-
-def judged_runs() -> Begin:
-    """What whole optimisations are judged by."""
-    from reslrb_cli.measure.optimization_benchmark.evaluate import begin_judging
-
-    return begin_judging
-
-
-def whole_runs() -> Begin:
-    """A whole optimisation, bit by bit."""
-    from reslrb_cli.measure.optimization_benchmark.evaluate import begin_run
-
-    return begin_run
+    return begin_judging if does == "judged_runs" else begin_run

@@ -1,21 +1,14 @@
 """Time and memory of a step against path depth, for several integrators side by side; or against something else.
 
-- `Run`: one case at one value of what is swept: what is measured of it, its record, and what is kept of it
-- `Bench`: the measurement, with everything that it has measured so far, in this session and in earlier ones
-
-At each depth (or number of samples, or size of the film or of textures: `sweep` says which) every case has a process
-of its own, and all live at once. They load the scene, take a cold step each, then as many as it takes until no new
-kernel comes (stock integrators need a few), and then steps in rounds, one each in turn, so that a drift of the machine
-hits all alike; only one computes at a time. Ratios are taken within a round, whose steps also share a seed. The order
-turns from round to round.
+At each depth (or number of samples, or size of the film or of textures: `sweep` says which) every case (`Run`) has a
+process of its own, and all live at once (`Bench`). They take a cold step each, then as many as it takes until no new
+kernel comes, and then steps in rounds, one each in turn, from round to round in another order. Ratios are taken within
+a round, whose steps also share a seed.
 
 A case that runs out of memory is tried again at greater depths: what is recorded was seen, and a failure costs no more
-time than it takes to fill the memory once.
-
-A case that nobody named, but the default list, and that refuses the scene, is left out, and named with its reason.
-
-The budget covers loading and compiling. Once it is spent, what is not warm is left out, and named, with what it would
-take; what is takes one round, if it had none.
+time than it takes to fill the memory once. One that nobody named, but the default list, and that refuses the scene, is
+left out, and named with its reason. Once the budget is spent, which covers loading and compiling, what is not warm is
+left out, and named, with what it would take; what is takes one round, if it had none.
 """
 
 from __future__ import annotations
@@ -97,9 +90,15 @@ def results(runs: Sequence[Run], value: int, sweep: Sweep) -> list[Result]:
 
 
 def _result(run: Run, value: int, sweep: Sweep, runs: Sequence[Run]) -> Result:
-    options, ok = run.config.integrator.options(), run.end is None
+    options, figures = run.config.integrator.options(), dict[str, Any]()
     baseline = next(other for other in runs if other.case == sweep.baseline)
     width, height = next((other.size for other in runs if other.size is not None), (None, None))
+    if run.end is None:
+        figures = {name: Spread.of([step[name] for step in run.steps.values()]) for name in TIMES}
+        figures["repeats"] = len(run.steps)
+        if run.cold:
+            figures |= {"cold_ms": run.cold["step_ms"], "cold_codegen_ms": run.cold["codegen_ms"]}
+            figures |= {name: run.cold[name] for name in ("peak_mib", "scratch_bytes")}
     record = BenchRecord(
         integrator=run.case.type,
         estimator=run.case.estimator,
@@ -110,33 +109,18 @@ def _result(run: Run, value: int, sweep: Sweep, runs: Sequence[Run]) -> Result:
         width=width,
         height=height,
         status=BenchStatus.OK if run.end is None else run.end.status,
-        **{name: Spread.of([step[name] for step in run.steps.values()]) if ok else None for name in TIMES},
-        cold_ms=run.cold["step_ms"] if ok and run.cold else None,
-        cold_codegen_ms=run.cold["codegen_ms"] if ok and run.cold else None,
-        peak_mib=run.cold["peak_mib"] if ok and run.cold else None,
-        scratch_bytes=run.cold["scratch_bytes"] if ok and run.cold else None,
-        repeats=len(run.steps) if ok else 0,
         texels=next((other.texels for other in runs if other.texels is not None), None),
+        **figures,
     )
-    comparable = ok and baseline.end is None
-    return Result(
-        run.case,
-        value,
-        record,
-        _ratio(run, baseline, "kernel_ms") if comparable else None,
-        _ratio(run, baseline, "step_ms") if comparable else None,
-        "" if run.end is None else run.end.reason,
-    )
+    kernel, step = (_ratio(run, baseline, key) for key in ("kernel_ms", "step_ms"))
+    return Result(run.case, value, record, kernel, step, "" if run.end is None else run.end.reason)
 
 
 def _ratio(run: Run, baseline: Run, key: str) -> Spread | None:
-    """Ratios of the rounds that both have; None where there is none."""
-    rounds = [
-        run.steps[round][key] / baseline.steps[round][key]
-        for round in run.steps
-        if baseline.steps.get(round, {}).get(key)
-    ]
-    return Spread.of(rounds) if rounds else None
+    """Ratios of the rounds that both have; None where there is none, or one of them has ended."""
+    both = [(step[key], baseline.steps[round][key]) for round, step in run.steps.items() if round in baseline.steps]
+    ratios = [own / its for own, its in both if its and run.end is None and baseline.end is None]
+    return Spread.of(ratios) if ratios else None
 
 
 #: First steps that take longer are told of as they are done, in seconds.
@@ -217,8 +201,8 @@ class Bench(Arena[Sweep, Run]):
                 stopped = True
             late = [run for run in self.members if run.late and not run.steps]
             needed = self._needed(len(values) - number)
-            self._close_members()
             for run in self.members:
+                run.close()
                 if run.refusal is not None:
                     self._say_end(run, run.case.label)
                     self.left_out.append(run.case)

@@ -1,12 +1,10 @@
-"""Gradients of a scene over many seeds, in forward mode and by finite differences; what of it moves light.
+"""Gradients of a scene over many seeds, in forward mode and by finite differences.
 
-Parameters that move light, as a gradient check needs them (`moves_light`, `smooth_rows`): which do, by what, and how
-smoothly.
+`Case`: a scene, its parameters and its objective, sum(image * weights) with fixed weights, so that dL/dI is the same
+for every estimator. A gradient is one flat vector over all parameters of a case.
 
-The values that a measurement varies, and the way between them and a scene (`Values`).
-
-Finite differences of the objective at common random numbers, along a few directions of one parameter (`Direction`). The
-step h is chosen by a sweep (`choose_step`). Central differences, and the one-sided ones of three nodes, are wrong by
+Finite differences are taken at common random numbers, along a few directions of one parameter (`Direction`). The step h
+is chosen by a sweep (`choose_step`). Central differences, and the one-sided ones of three nodes, are wrong by
 c h^2 + ..., so that two steps tell the truncation error of the smaller one (L. F. Richardson, 1911),
 
     D(h) - F' ~ (D(r h) - D(h)) / (r^2 - 1),
@@ -14,10 +12,6 @@ c h^2 + ..., so that two steps tell the truncation error of the smaller one (L. 
 while noise that grows as h shrinks, from paths that flip, shows in how much D(r h) - D(h) varies between seeds. Where
 light is moved, rounding can be the same for all seeds, for it is the scene that is rounded: a change that does not
 shrink with h is no truncation, and counts in full. The step with the least sum is taken, and its error comes with it.
-
-A scene, its parameters and its objective (`Case`), of which gradients over many seeds, derivatives in forward mode and
-finite differences are taken. An objective is sum(image * weights) with fixed random weights, so dL/dI is the same for
-every estimator. A gradient is one flat vector over all parameters of a case.
 """
 
 from __future__ import annotations

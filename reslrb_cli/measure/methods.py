@@ -1,10 +1,7 @@
-"""The methods that measurements compare, and what they vary, as their options say it. Knows no Mitsuba.
+"""The methods that measurements compare (`Case`), and what these measure, as their options say it. Knows no Mitsuba.
 
-- `Case`: what a measurement compares, by a list such as `ptracer,reslrb:reservoir(capacity=4)`; and the depths of a
-  bench.
-- `Sweep`: what `bench` varies, and over which values.
-- `Plan`: what `convergence` measures, and what it takes its errors from.
-- `RunsPlan`: what `convergence --runs` measures.
+A list is written as `ptracer,reslrb:reservoir(capacity=4)`. `Sweep` is of `bench`, `Plan` of `convergence`, `RunsPlan`
+of `convergence --runs`.
 """
 
 from __future__ import annotations

@@ -122,7 +122,10 @@ class Participants:
         self._situation = Situation.of_problem(problem, sensor)
         self.attached, moved = self._situation.attached, self._situation.moved
         #: Whether there is a forward mode: of emitters that move there is none.
-        self.forward_mode = not any(_emits(self.case.params.properties[key][2]) for key in moved)
+        nodes = [self.case.params.properties[key][2] for key in moved]
+        self.forward_mode = not any(
+            isinstance(node, mi.Emitter) or (isinstance(node, mi.Shape) and node.is_emitter()) for node in nodes
+        )
         self.listed = self._able(settings)
         shared = {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
         naive = {"samples_per_pass": options.get("samples_per_pass")}
@@ -236,10 +239,6 @@ class Participants:
         if self.image in CAMERA_PATHS:
             image *= interior(image.shape, self.sensor)[:, :, None]
         return image.ravel()
-
-
-def _emits(node: mi.Object) -> bool:
-    return isinstance(node, mi.Emitter) or (isinstance(node, mi.Shape) and node.is_emitter())
 
 
 def _alike(label: str, reference: Reference) -> str:

@@ -1,5 +1,4 @@
-"""Workers as they are from without: each case in a process of its own, so that the end of one is seen, and said, and is
-not the end of the sweep.
+"""Workers as they are from without: each in a process of its own, whose end is seen, and said, and ends nothing else.
 
 - `Process`: one worker, asked and answered by lines of JSON (`workers.py` is its other end).
 - `Contestant`: one of several that are measured side by side, and how it came to its end; `Stepping`: that takes steps.

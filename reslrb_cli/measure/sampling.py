@@ -189,16 +189,14 @@ class Sampling:
     def _most_more(self, name: Name) -> int:
         if not self._is_cheap(name):
             return LEAST_SEEDS
-        most = max(LEAST_SEEDS, min(MOST_SEEDS, self._seeds_in_memory()))
+        fitting = MEMORY // (4 * self.participants.case.size * (len(self.participants.integrators) + 2))
+        most = max(LEAST_SEEDS, min(MOST_SEEDS, fitting))
         if name[0] == "gradient" and not self.participants.exact:
             # More than the stock reference has are compared with nothing.
             names = [("gradient", label) for label in self.participants.stock_labels()]
             stock = [len(self._samples[name]) - self._before.get(name, 0) for name in names if name in self._taken]
             most = min(most, max(LEAST_SEEDS, *stock)) if any(stock) else most
         return most
-
-    def _seeds_in_memory(self) -> int:
-        return MEMORY // (4 * self.participants.case.size * (len(self.participants.integrators) + 2))
 
     def _sample(self, name: Name, seed: int) -> np.ndarray:
         parts, (kind, of) = self.participants, name

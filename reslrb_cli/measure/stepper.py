@@ -10,12 +10,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.config.loader import loads
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.step import gradient_step, known_step
 from reslrb_cli.measure.scenes import small
-from reslrb_cli.measure.workers import scratch_bytes
+from reslrb_cli.measure.workers import Begun, scratch_bytes
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.loading import choose_sensors, load_configured
 from reslrb_cli.optimization.problem import Problem
@@ -32,11 +33,6 @@ def shrink(scene: Any, sensor: int, pixels: int) -> None:
     factor = (pixels / (width * height)) ** 0.5
     if factor < 1:
         scale(scene, sensor, factor)
-
-
-def widen(scene: Any, sensor: int, width: int) -> None:
-    """Make the part of a sensor's film that is rendered about so many pixels wide; its view stays the same."""
-    scale(scene, sensor, width / int(scene.sensors()[sensor].film().crop_size()[0]))
 
 
 def scale(scene: Any, sensor: int, factor: float) -> None:
@@ -142,7 +138,8 @@ class Stepper(Steps):
             config = with_textures(assemble_scene(config, _load(config)), texture_width)
         scene = _load(config)
         if film_width is not None:
-            widen(scene, choose_sensors(config, scene)[0], film_width)
+            sensor = choose_sensors(config, scene)[0]
+            scale(scene, sensor, film_width / int(scene.sensors()[sensor].film().crop_size()[0]))
         super().__init__(config, scene)
         film = self.problem.scene.sensors()[self.sensor].film()
         width, height = film.crop_size()
@@ -174,6 +171,14 @@ class Stepper(Steps):
         if cold:
             answer["scratch_bytes"] = scratch_bytes(self.clock.history)
         return self.told(answer, cold, release)
+
+
+def begin_steps(first: dict[str, Any]) -> Begun:
+    """Begin the process. It says the size of film and textures first; questions and answers are those of a step."""
+    config = loads(first["config"], first["source"])
+    stepper = Stepper(config, first["objective"], first.get("film_width"), first.get("texture_width"))
+    size = {"width": stepper.size[0], "height": stepper.size[1], "texels": stepper.texels}
+    return size, lambda question: stepper.step(question["round"], question["cold"], question["release"])
 
 
 def _load(config: Config) -> Any:

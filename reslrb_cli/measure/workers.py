@@ -1,9 +1,7 @@
-"""Workers: processes that measure, as they are from within.
+"""Workers as they are from within: processes that measure, started and told what to do by `processes.py`.
 
-- `scratch_bytes`: thread-local memory of kernels, which the allocator does not see, read off the kernels themselves.
-- `run`: the process of one case, in a Python of its own, started and told what to do by `processes.py` (`arena.py`). It
-  reads one JSON object a line from standard input and answers each with one on standard output. The first describes the
-  case; each other one asks for a step. What else is printed goes to standard error.
+Each (`run`) reads one JSON object a line from standard input and answers each with one on standard output. The first
+describes the case; each other one asks for a step. What else is printed goes to standard error.
 """
 
 from __future__ import annotations

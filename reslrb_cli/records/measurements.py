@@ -67,15 +67,15 @@ class BenchRecord(Line):
     width: int | None
     height: int | None
     status: BenchStatus
-    step_ms: Spread | None
-    kernel_ms: Spread | None
-    codegen_ms: Spread | None
-    tracing_ms: Spread | None
-    cold_ms: float | None
-    cold_codegen_ms: float | None
-    peak_mib: float | None
-    scratch_bytes: int | None
-    repeats: int
+    step_ms: Spread | None = None
+    kernel_ms: Spread | None = None
+    codegen_ms: Spread | None = None
+    tracing_ms: Spread | None = None
+    cold_ms: float | None = None
+    cold_codegen_ms: float | None = None
+    peak_mib: float | None = None
+    scratch_bytes: int | None = None
+    repeats: int = 0
     texels: int | None = None
 
 

@@ -47,12 +47,12 @@ class Results:
 
 @dataclass(frozen=True)
 class _Bias:
-    """What is known of a bias: of one parameter, or the worst of all of them."""
+    """What is known of a bias, of one parameter or the worst of all of them; fields are as in a `MethodRecord`."""
 
     biased: bool | None = None
-    z: float | None = None
-    limit: float | None = None
-    judge: str | None = None
+    bias_z: float | None = None
+    bias_z_limit: float | None = None
+    bias_reference: str | None = None
     independent: bool = False
     message: str = ""
 
@@ -136,11 +136,11 @@ class Judgement:
         if "image" in found:
             return found
         biases = list(found.values())
-        worst = max(biases, key=lambda bias: -1.0 if bias.z is None else bias.z)
+        worst = max(biases, key=lambda bias: -1.0 if bias.bias_z is None else bias.bias_z)
         biased = True if any(b.biased for b in biases) else None if any(b.biased is None for b in biases) else False
-        judges = ", ".join(dict.fromkeys(bias.judge for bias in biases if bias.judge is not None)) or None
-        message = next((bias.message for bias in biases if bias.message), "")
-        found[ALL] = _Bias(biased, worst.z, worst.limit, judges, all(b.independent for b in biases), message)
+        judges = ", ".join(dict.fromkeys(b.bias_reference for b in biases if b.bias_reference is not None)) or None
+        message, independent = next((b.message for b in biases if b.message), ""), all(b.independent for b in biases)
+        found[ALL] = replace(worst, biased=biased, bias_reference=judges, independent=independent, message=message)
         return found
 
     def _bias(self, member: Member, key: str) -> _Bias:
@@ -211,23 +211,18 @@ class Judgement:
             reference_rmse=samples.reference.floor,
             slope=None if slope is None else slope.interval(),
             efficiency=None if efficiency is None else efficiency.exponential(),
-            bias_z=bias.z,
-            bias_z_limit=bias.limit,
             bias=float(np.sqrt(magnitude.squared_bias)) if biased else None,
-            bias_reference=bias.judge,
-            independent=bias.independent,
-            biased=bias.biased,
             seconds_to={name: seconds for name, (seconds, _) in times.items()},
             extrapolated=[name for name, (_, beyond) in times.items() if beyond],
-            message=message,
+            **vars(replace(bias, message=message)),
         )
 
     def _stood(self, member: Member, key: str, bias: _Bias) -> ReferenceRecord:
-        floor = self._whole[key].floor
-        message = bias.message if floor is not None else _UNSEEN
-        return ReferenceRecord(
-            member.method, key, len(member.rows), floor, bias.z, bias.limit, bias.judge, bias.biased, message
-        )
+        floor, known = self._whole[key].floor, vars(bias).copy()
+        del known["independent"]
+        if floor is None:
+            known["message"] = _UNSEEN
+        return ReferenceRecord(member.method, key, len(member.rows), floor, **known)
 
 
 _UNSEEN = "nothing of it stands out of the reference's noise"

@@ -1,9 +1,7 @@
-"""The processes of a `convergence`, side by side: each compiles, then they take turns, one computing at a time.
+"""The processes of a `convergence`: what is compared, what errors are taken from, and what biases are judged by.
 
-A session may go on from the steps that an earlier one has taken, with the same dL/dI.
-
-As they take turns, a drift of the machine hits all alike. What errors are taken from takes its turns too, and so does
-what biases are judged by, where it is not among what is compared. All have seeds of their own: no two share noise.
+All take turns (`Arena`), with seeds of their own: no two share noise. A session may go on from the steps that an
+earlier one has taken, with the same dL/dI.
 """
 
 from __future__ import annotations
@@ -113,7 +111,8 @@ class Session(Arena[Plan, Member]):
         if opening is not None:
             ask = {**plan.camera, "budget_s": plan.budget_s if plan.rounds is None else None}
             answer = self._ask_referee({"out": first["arrays"], "ask": ask})
-        self._close_referee()
+        if self._referee is not None:
+            self._referee.close()
         self.facts = answer or {}
         if answer is None:
             self._say(

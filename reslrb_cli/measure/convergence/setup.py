@@ -1,10 +1,6 @@
-"""The members of a `convergence`, what is found out before it measures, and the steps of one.
+"""The members of a `convergence`, what is found out before it measures (`survey`), and the steps of one (`Sampler`).
 
-- `Member`: one of those that take steps: the methods compared, what errors are taken from, and what biases are judged
-  by.
-- `begin_survey`, before anything is measured: the images that dL/dI is held at, and which stock integrators count as
-  references. It runs in a process of its own (`workers.py`), with the integrator that errors are taken from.
-- `begin_sampling`: steps of one method, timed and kept: gradients or images, in a process of its own.
+Both run in processes of their own (`workers.py`), which `begin_survey` and `begin_sampling` begin.
 """
 
 from __future__ import annotations

@@ -1,11 +1,4 @@
-"""The extreme suite: what a case is, and how its estimators are run against references.
-
-- `ExtremeCase`: a scene, its parameters, and what their gradient is known by (`Source`).
-- `residual`: what `gather`'s replay leaves of its sum: nothing but rounding, once every contribution has been taken off
-  again.
-- `restore`, `kept`: going on with a suite, whose cases are whole or not there.
-- `run_case`: every estimator of a case against naive AD of the same paths, and against the case's reference.
-"""
+"""The extreme suite: what a case is (`ExtremeCase`), and how its estimators are run against references (`run_case`)."""
 
 from __future__ import annotations
 
@@ -283,7 +276,10 @@ def run_case(
     attached = {} if case.moves is None else {"attached": True}
     walk_ad = integrator("walk_ad", **{**case.options, **case.ours, **attached})
     naive = setup.gradients(walk_ad, seeds_of(case.seeds), case.spp) if case.naive else None
-    stock = _stock_images(case, setup) if case.image else None
+    stock = None
+    if case.image:
+        tracer = integrator(case.image, **without_roulette(case))
+        stock = np.stack([setup.image(tracer, seed, case.spp) for seed in seeds_of(case.seeds, 2)])
     setup.weights = type(setup.weights)(weights)
     for name in ESTIMATORS if estimators is None else estimators:
         if case.moves is not None and not ESTIMATORS[name].attaches:
@@ -321,11 +317,6 @@ def _refusals(weights: np.ndarray, refused: list[int]) -> Comparison:
     expected, counts = int(np.count_nonzero(~np.isfinite(weights))), sorted(set(refused))
     message = f"refused {', '.join(map(str, counts))} entries of dL/dI, of {expected} not finite"
     return Comparison(Verdict.HOLDS if counts == [expected] else Verdict.FAILS, message=message)
-
-
-def _stock_images(case: ExtremeCase, setup: Case) -> np.ndarray:
-    tracer = integrator(case.image, **without_roulette(case))
-    return np.stack([setup.image(tracer, seed, case.spp) for seed in seeds_of(case.seeds, 2)])
 
 
 def _comparisons(

@@ -1,10 +1,4 @@
-"""The results of whole optimisations: each method at its best learning rate, and which is the best.
-
-- `Run`: one run of one method, as the session sees it; `times` are those at which all of them are looked at.
-- `best_of`, `ratio`: of several learning rates of a method, which is the best, and how methods compare at theirs.
-- `method_records`, `find_best`: a record of each method, and which of them is the best, by a test.
-- `outcome`: all that whole runs come to.
-"""
+"""The results of whole optimisations: each method at its best learning rate, and which is the best (`outcome`)."""
 
 from __future__ import annotations
 

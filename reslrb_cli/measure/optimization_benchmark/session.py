@@ -1,9 +1,8 @@
-"""The processes of whole optimisations: seed after seed, the methods of one seed take turns, one computing at a time.
+"""The processes of whole optimisations: seed after seed, the methods of one seed take turns (`Arena`).
 
-A drift of the machine so hits all methods of a seed alike. Each run starts from an empty cache of kernels, and has the
-same time as every other; where it stands at some times, which all have in common, is judged by another process
-meanwhile. That the others wait for this costs them nothing but what it does to the caches. It makes
-the target too, or takes over an earlier one's.
+Each run starts from an empty cache of kernels, and has the same time as every other; where it stands at some times,
+which all have in common, is judged by another process meanwhile, which makes the target too, or takes over an earlier
+one's. That the others wait for this costs them nothing but what it does to the caches.
 """
 
 from __future__ import annotations
@@ -108,18 +107,17 @@ class RunsSession(Arena[RunsPlan, Run]):
         opening, answer = self._open_referee(plan, self._start_message(plan.reference_config), "judged_runs"), None
         if opening is not None:
             self._startup_s = max(self._now() - began - opening["loading_s"], 0.0)
-            answer = self._make_targets() if self._earlier is None else self._take_over(self._earlier)
+            image_s = JUDGED * self._budget_s / (len(plan.sides) * plan.runs * POINTS)
+            ask = {"budget_s": self._budget_s, "image_s": image_s, **plan.camera}
+            if self._earlier is not None:
+                answer = self._take_over(self._earlier)
+            else:
+                answer = self._ask_referee({"prepare": ask, "out": str(self._targets)})
         if answer is None:
             self._say(f"the budget of {plan.budget_s:g} s was spent before there was a target; allow several times it")
             return False
         self.facts = self.facts | answer
         return True
-
-    def _make_targets(self) -> dict[str, Any] | None:
-        """The facts of `evaluate.prepare`; None where time was up."""
-        image_s = JUDGED * self._budget_s / (len(self.plan.sides) * self.plan.runs * POINTS)
-        ask = {"budget_s": self._budget_s, "image_s": image_s, **self.plan.camera}
-        return self._ask_referee({"prepare": ask, "out": str(self._targets)})
 
     def _take_over(self, earlier: Earlier) -> dict[str, Any] | None:
         """What a judgement takes now, by an earlier session's targets; None where time was up.
