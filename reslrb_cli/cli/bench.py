@@ -68,21 +68,10 @@ INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,
 @click.option("--plot", "plot_file", type=click.Path(path_type=Path, dir_okay=False),
               help="PNG of time and memory against what is varied; default: beside the JSON file.")  # fmt: skip
 def command(
-    config_file: Path | None,
-    overrides: tuple[str, ...],
-    swept: str,
-    values: tuple[int, ...] | None,
-    max_depth: int,
-    integrators: str | None,
-    baseline: str | None,
-    objective: str,
-    memory_limit: int | None,
-    budget: float,
-    rounds: int | None,
-    resumed: Path | None,
-    json_file: Path | None,
-    plot_file: Path | None,
-) -> int:
+    config_file: Path | None, overrides: tuple[str, ...], swept: str, values: tuple[int, ...] | None, max_depth: int,
+    integrators: str | None, baseline: str | None, objective: str, memory_limit: int | None, budget: float,
+    rounds: int | None, resumed: Path | None, json_file: Path | None, plot_file: Path | None,
+) -> int:  # fmt: skip
     """Measure time and peak memory of gradient steps against path depth, or what else --sweep names.
 
     A step is image, loss and gradient of every parameter of CONFIG, seen through its first sensor. Without CONFIG the

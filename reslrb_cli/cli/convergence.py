@@ -156,21 +156,10 @@ MOST_RUNS = 100
 @click.option("--plot", "plot_file", type=click.Path(path_type=Path, dir_okay=False),
               help="PNG of error against run time; default: beside the JSON file.")  # fmt: skip
 def command(
-    config_file: Path,
-    overrides: tuple[str, ...],
-    integrators: str | None,
-    objective: str,
-    runs: int | None,
-    rates: tuple[float, ...] | None,
-    budget: float,
-    rounds: int | None,
-    spps: tuple[int, ...] | None,
-    reference: str,
-    resumed: Path | None,
-    memory_limit: int | None,
-    json_file: Path | None,
-    plot_file: Path | None,
-) -> int:
+    config_file: Path, overrides: tuple[str, ...], integrators: str | None, objective: str, runs: int | None,
+    rates: tuple[float, ...] | None, budget: float, rounds: int | None, spps: tuple[int, ...] | None, reference: str,
+    resumed: Path | None, memory_limit: int | None, json_file: Path | None, plot_file: Path | None,
+) -> int:  # fmt: skip
     """Measure how fast the error of each method falls on CONFIG, at its initial values, seen through its first sensor.
 
     Each method takes steps of run.spp samples per pixel in a process of its own, all in turn. Errors are relative to

@@ -108,23 +108,18 @@ class Values(Protocol):
     @property
     def params(self) -> mi.SceneParameters:
         """All of the scene's `mi.traverse`."""
-        ...
 
     def value(self, key: str) -> Any:
         """The current value of `key`, as Dr.Jit has it."""
-        ...
 
     def hand_over(self, values: Mapping[str, Any]) -> None:
         """Give the scene these values, and evaluate what follows from them, derivatives included."""
-        ...
 
     def collect(self) -> None:
         """Bring the gradients of what is in the scene on to the values that were handed over."""
-        ...
 
     def push(self) -> None:
         """Bring tangents of the values that were handed over, once propagated, on to what is in the scene."""
-        ...
 
 
 #: Steps that are tried, in units of the direction.

@@ -13,13 +13,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.step import make_integrator
-from reslrb_cli.measure.gradients import (
-    Case,
-    all_directions,
-    choose_step,
-    seeds,
-    smooth_weights,
-)
+from reslrb_cli.measure.gradients import Case, all_directions, choose_step, seeds, smooth_weights
 from reslrb_cli.measure.methods import Case as Listed
 from reslrb_cli.measure.references import (
     Situation,

@@ -66,9 +66,17 @@ class Earlier:
             raise self.other(found)
 
     @classmethod
-    def read(cls, kind: str, json_file: Path | None) -> Earlier | None:
-        """What lies beside a JSON file that another call has written; None for no file. Raises ConfigError."""
-        return None if json_file is None else cls(kind, json_file, *read_samples(samples_file(json_file)))
+    def read(cls, kind: str, json_file: Path | None, now: Mapping[str, Any] | None = None) -> Earlier | None:
+        """What lies beside a JSON file that another call has written; None for no file.
+
+        Raises ConfigError, also where its settings are not those of `now`, if these are known yet.
+        """
+        if json_file is None:
+            return None
+        earlier = cls(kind, json_file, *read_samples(samples_file(json_file)))
+        if now is not None:
+            earlier.check(now)
+        return earlier
 
     def error(self, reason: str) -> ConfigError:
         """What is raised where it cannot be gone on from."""

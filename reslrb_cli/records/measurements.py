@@ -287,12 +287,6 @@ class Comparison:
 class GradcheckRecord(Comparison, Compared, Line):
     """One comparison: what was compared, and what was found."""
 
-    @classmethod
-    def of(cls, values: Mapping[str, Any]) -> GradcheckRecord:
-        """The record of these values, by name. Raises ValueError where they are none of a record."""
-        found: GradcheckRecord = _READERS[cls].validate_python(values)
-        return found
-
     def to_json(self) -> str:
         """The record as one line of JSON; figures that are not finite become null."""
         return json.dumps(finite(asdict(self)) | {"holds": self.holds}, allow_nan=False)

@@ -6,14 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reslrb_cli.measure.comparison import (
-    ROUNDING,
-    TAIL,
-    Family,
-    compare_expectations,
-    entry_count,
-    tail_weight,
-)
+from reslrb_cli.measure.comparison import ROUNDING, TAIL, Family, compare_expectations, entry_count, tail_weight
 from reslrb_cli.measure.convergence.session import Session
 from reslrb_cli.measure.convergence.setup import Member, Role
 from reslrb_cli.measure.convergence.statistics import FEWEST, Reference, Samples

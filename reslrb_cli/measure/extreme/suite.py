@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.estimators.base import Pass
@@ -242,10 +243,12 @@ def settings(estimators: Sequence[str] | None, seeds: int | None, variant: str, 
 
 def restore(before: Earlier) -> dict[str, list[GradcheckRecord]]:
     """The records of an earlier session, by case. Raises ConfigError where they are none."""
+    reader = TypeAdapter(dict[str, list[GradcheckRecord]])
     try:
-        return {case: [GradcheckRecord.of(row) for row in rows] for case, rows in before.head["cases"].items()}
-    except (AttributeError, KeyError, TypeError, ValueError):
+        found: dict[str, list[GradcheckRecord]] = reader.validate_python(before.head["cases"])
+    except (KeyError, ValueError):
         raise before.other("its cases are damaged") from None
+    return found
 
 
 def kept(settings: Mapping[str, Any], cases: Mapping[str, Sequence[GradcheckRecord]]) -> Kept | None:

@@ -14,16 +14,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reslrb_cli.measure.scenes.small import (
-    SIZE,
-    diffuse,
-    glass,
-    lit_square,
-    look_at,
-    pinhole,
-    rectangle,
-    rgb,
-)
+from reslrb_cli.measure.scenes.small import SIZE, diffuse, glass, lit_square, look_at, pinhole, rectangle, rgb
 
 Array = NDArray[np.float64]
 
