@@ -121,29 +121,17 @@ class Arena(Generic[Measured, Worker]):
         """The budget that leaves so many seconds for measuring, from the beginning on."""
         return (seconds + self.AFTERWARDS_S) / (1 - self.AFTERWARDS)
 
-    # --- the referee --------------------------------------------------------------------------------------------------
-
-    def _open_referee(self, plan: Plan, first: dict[str, Any], does: str) -> dict[str, Any] | None:
-        """Start it; what it says first, its scene loaded; None where time was up. Raises as `_ask_referee`."""
-        self._referee = Contestant(process=self._start(first, does), may_refuse=False)
-        self._referee_name = f"--reference {plan.reference.label}"
-        opening = self._open(self._referee)
-        self._check_referee()
-        return opening
-
-    def _ask_referee(self, question: dict[str, Any]) -> dict[str, Any] | None:
-        """An answer; None where the budget was spent over it. Raises Refused where the process ended."""
-        assert self._referee is not None, "it is opened first"
-        answer = self._referee.ask(question, self._stop, self._pace.over)
-        self._check_referee()
-        return answer
-
-    def _check_referee(self) -> None:
-        end = None if self._referee is None else self._referee.end
+    def _ask_referee(self, plan: Plan, question: dict[str, Any] | None = None) -> dict[str, Any] | None:
+        """An answer, or what it says first; None where the budget was spent over it. Raises Refused where it ended."""
+        assert self._referee is not None, "it is started first"
+        if question is not None:
+            self._referee.process.ask(question)
+        answer, end = self._open(self._referee), self._referee.end
         if end is not None:
-            line = f"{self._referee_name}: {end.reason}"
             memory = end.status is BenchStatus.OUT_OF_MEMORY
-            raise Refused(line, ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED)
+            code = ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED
+            raise Refused(f"--reference {plan.reference.label}: {end.reason}", code)
+        return answer
 
     def _open(self, member: Contestant) -> dict[str, Any] | None:
         """What a worker says first, its scene loaded; None where it ended over that, or time was up."""

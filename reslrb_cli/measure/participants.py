@@ -26,7 +26,7 @@ from reslrb_cli.measure.references import (
     ptracer_image,
 )
 from reslrb_cli.measure.scenes import small
-from reslrb_cli.measure.stepper import shrink
+from reslrb_cli.measure.stepper import multiple_of, shrink
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.measurements import Reference
 from reslrb_cli.scene.catalog import value_shape
@@ -199,40 +199,31 @@ class Participants:
         """Shape of a parameter."""
         return value_shape(self.case.values.value(key))
 
-    def stock_labels(self) -> list[str]:
-        """The stock integrators that are references of gradients."""
-        return sorted({reference.value for reference in self.stock.values() if reference is not None})
-
     def choose_steps(self, key: str) -> None:
         """Choose the steps of the finite differences of a parameter."""
         image, pilot = self.integrators[DIFFERENCED], seeds(PILOT_SEEDS, 9)
         self.directions[key] = [choose_step(self.case, image, d, pilot, self.spp) for d in self.directions[key]]
 
-    # --- one seed -----------------------------------------------------------------------------------------------------
+    def sample(self, kind: str, of: str, seed: int) -> np.ndarray:
+        """One sample in a row: by an integrator, `gradient` or `image`, or along the directions of a parameter, `of`.
 
-    def gradient(self, label: str, seed: int) -> np.ndarray:
-        """The gradient of all parameters in a row, by a step such as the experiment takes."""
-        integrator = self.integrators[label]
-        if not self.known:
-            return self.case.gradient(integrator, seed, self.spp)
-        return self.case.gradient(integrator, seed, self.spp, step=self.case.known_step)
-
-    def differences(self, key: str, seed: int) -> list[float]:
-        """Finite differences of the image's objective along the directions of a parameter."""
-        image = self.integrators[DIFFERENCED]
-        return [direction.difference(self.case, image, seed, self.spp) for direction in self.directions[key]]
-
-    def tangents(self, label: str, key: str, seed: int) -> list[float]:
-        """Forward derivatives along the same directions."""
-        integrator = self.integrators[label]
-        return [self.case.tangent(integrator, d.vector, seed, self.spp) for d in self.directions[key]]
-
-    def picture(self, label: str, seed: int) -> np.ndarray:
-        """The image in a row; black along the border where it is compared with one that loses no light there."""
-        image = self.case.image(self.integrators[label], seed, self.spp)
-        if self.image in CAMERA_PATHS:
-            image *= interior(image.shape, self.sensor)[:, :, None]
-        return image.ravel()
+        Gradients are of all parameters, by a step such as the experiment takes; images are black along the border where
+        they are compared with one that loses no light there. Along directions there are finite `differences`, and
+        `tangents`, forward derivatives, which are the same for all estimators.
+        """
+        if kind == "gradient":
+            options = {"step": self.case.known_step} if self.known else {}
+            return self.case.gradient(self.integrators[of], seed, self.spp, **options)
+        if kind == "image":
+            image = self.case.image(self.integrators[of], seed, self.spp)
+            if self.image in CAMERA_PATHS:
+                image *= interior(image.shape, self.sensor)[:, :, None]
+            return image.ravel()
+        if kind == "differences":
+            tracer, along = self.integrators[DIFFERENCED], self.directions[of]
+            return np.array([direction.difference(self.case, tracer, seed, self.spp) for direction in along])
+        tracer = self.integrators[self.listed[0].label]
+        return np.array([self.case.tangent(tracer, d.vector, seed, self.spp) for d in self.directions[of]])
 
 
 def _alike(label: str, reference: Reference) -> str:
@@ -241,5 +232,4 @@ def _alike(label: str, reference: Reference) -> str:
 
 def _samples(film: tuple[int, int], most: int, multiple: int | None) -> int:
     """Samples per pixel of one gradient: as many paths as PATHS, no more than in a step of the run."""
-    spp = max(min(PATHS // (film[0] * film[1]), most), 1)
-    return spp if multiple is None else max(spp // multiple, 1) * multiple
+    return multiple_of(max(min(PATHS // (film[0] * film[1]), most), 1), multiple)

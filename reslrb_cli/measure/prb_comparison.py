@@ -11,6 +11,7 @@ from typing import Any
 
 from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.references import Situation, prb_gradient
+from reslrb_cli.measure.stepper import multiple_of
 from reslrb_cli.optimization.autotune import race
 from reslrb_cli.optimization.decisions import Allowance
 from reslrb_cli.optimization.problem import Problem
@@ -42,9 +43,8 @@ def why_not(problem: Problem) -> str | None:
 
 def _samples(problem: Problem, iterations: float) -> int:
     """Samples per pixel of steps, with which the rounds that there are to be take so many iterations' worth of time."""
-    run, unit = problem.config.run, race.sets_of(problem.config)
     share = min(iterations / ((1 + LONGER) * MOST_ROUNDS), 1.0)
-    return max(int(share * run.spp) // unit, 1) * unit
+    return multiple_of(int(share * problem.config.run.spp), race.sets_of(problem.config))
 
 
 class RivalTrial(race.Trial):

@@ -24,6 +24,12 @@ from reslrb_cli.records.clock import StepClock, StepTimes, peak_mib, reset_peak
 from reslrb_cli.seeds import seed
 
 
+def multiple_of(spp: int, unit: int | None) -> int:
+    """The greatest multiple of a pass's samples up to `spp`, at least one."""
+    unit = unit or 1
+    return max(spp // unit, 1) * unit
+
+
 def shrink(scene: Any, sensor: int, pixels: int) -> None:
     """Make the film of a sensor, given by its index, no larger than about so many pixels; its view stays the same.
 

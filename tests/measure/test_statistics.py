@@ -299,34 +299,20 @@ class Pretended:
 
     def __init__(self, settings: Any) -> None:
         self.now, self.known, self.exact = settings.clock, set(), {}
+        self.stock = {"a": Reference.PTRACER}
         self.case = SimpleNamespace(size=3)
         self.listed = [SimpleNamespace(label="reslrb:event"), SimpleNamespace(label="reslrb:stack")]
         self.integrators = dict.fromkeys(label for _, label in NAMES)
         self.directions = {"a": [Direction(np.ones(3), "both")]}
         self.now[0] += self.load_s
 
-    def _sample(self, *name: str) -> np.ndarray:
-        self.now[0] += self.sample_s + (0.0 if name in self.known else self.compile_s)
-        self.known.add(name)
+    def sample(self, kind: str, of: str, seed: int) -> np.ndarray:
+        self.now[0] += self.sample_s + (0.0 if (kind, of) in self.known else self.compile_s)
+        self.known.add((kind, of))
         return np.zeros(3)
 
-    def gradient(self, label: str, seed: int) -> np.ndarray:
-        return self._sample("gradient", label)
-
-    def picture(self, label: str, seed: int) -> np.ndarray:
-        return self._sample("image", label)
-
-    def differences(self, key: str, seed: int) -> np.ndarray:
-        return self._sample("differences", key)
-
-    def tangents(self, label: str, key: str, seed: int) -> np.ndarray:
-        return self._sample("tangents", key)
-
     def choose_steps(self, key: str) -> None:
-        self._sample("choose", key)
-
-    def stock_labels(self) -> list[str]:
-        return ["ptracer"]
+        self.sample("choose", key, 0)
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from reslrb_cli.measure.convergence.setup import Member, Role, share_turns
 from reslrb_cli.measure.convergence.statistics import FEWEST, FEWEST_FOR_SLOPE
 from reslrb_cli.measure.gradients import places
 from reslrb_cli.measure.methods import Case, Plan
+from reslrb_cli.measure.processes import Contestant
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import Kept
 
@@ -107,12 +108,11 @@ class Session(Arena[Plan, Member]):
             self.facts = self._earlier.head["facts"]
             return True
         first = self._first(plan.reference_config, "arrays") | {"objective": plan.objective}
-        opening, answer = self._open_referee(plan, first, "surveyed"), None
-        if opening is not None:
+        self._referee, answer = Contestant(process=self._start(first, "surveyed"), may_refuse=False), None
+        if self._ask_referee(plan) is not None:
             ask = {**plan.camera, "budget_s": plan.budget_s if plan.rounds is None else None}
-            answer = self._ask_referee({"out": first["arrays"], "ask": ask})
-        if self._referee is not None:
-            self._referee.close()
+            answer = self._ask_referee(plan, {"out": first["arrays"], "ask": ask})
+        self._referee.close()
         self.facts = answer or {}
         if answer is None:
             self._say(

@@ -23,7 +23,7 @@ from reslrb_cli.measure.methods import IMAGES
 from reslrb_cli.measure.participants import ALIKE
 from reslrb_cli.measure.processes import Ended, Stepping
 from reslrb_cli.measure.references import Situation, choose, of_gradient, of_image
-from reslrb_cli.measure.stepper import Steps
+from reslrb_cli.measure.stepper import Steps, multiple_of
 from reslrb_cli.measure.workers import Begun
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.problem import Problem
@@ -298,12 +298,6 @@ def shorten_target(problem: Problem, most: int) -> tuple[Problem, str]:
     target = problem.config.target.model_copy(update={"render": render.model_copy(update={"spp": spp})})
     shorter = replace(problem, config=problem.config.model_copy(update={"target": target}))
     return shorter, f", the target of {spp}, not {render.spp}"
-
-
-def multiple_of(spp: int, unit: int | None) -> int:
-    """The greatest multiple of a pass's samples up to `spp`, at least one."""
-    unit = unit or 1
-    return max(spp // unit, 1) * unit
 
 
 class Sampler(Steps):

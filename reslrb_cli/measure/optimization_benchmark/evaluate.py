@@ -22,8 +22,9 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config.loader import loads
-from reslrb_cli.measure.convergence.setup import affordable_paths, find_references, multiple_of, shorten_target
+from reslrb_cli.measure.convergence.setup import affordable_paths, find_references, shorten_target
 from reslrb_cli.measure.references import leave_out_border
+from reslrb_cli.measure.stepper import multiple_of
 from reslrb_cli.measure.workers import Begun
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.autotune.estimators import find_options

@@ -19,7 +19,7 @@ from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.arena import Arena, in_turn
 from reslrb_cli.measure.methods import RunsPlan, Side, with_run
 from reslrb_cli.measure.optimization_benchmark.rank import POINTS, Run, times
-from reslrb_cli.measure.processes import NO_TIME
+from reslrb_cli.measure.processes import NO_TIME, Contestant
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import BenchStatus, Method, RunPointRecord
@@ -104,7 +104,9 @@ class RunsSession(Arena[RunsPlan, Run]):
     def _prepare(self) -> bool:
         """Start what judges, and have it make the target; False where time is up over it."""
         plan, began = self.plan, self._now()
-        opening, answer = self._open_referee(plan, self._start_message(plan.reference_config), "judged_runs"), None
+        process, answer = self._start(self._start_message(plan.reference_config), "judged_runs"), None
+        self._referee = Contestant(process=process, may_refuse=False)
+        opening = self._ask_referee(plan)
         if opening is not None:
             self._startup_s = max(self._now() - began - opening["loading_s"], 0.0)
             image_s = JUDGED * self._budget_s / (len(plan.sides) * plan.runs * POINTS)
@@ -112,7 +114,7 @@ class RunsSession(Arena[RunsPlan, Run]):
             if self._earlier is not None:
                 answer = self._take_over(self._earlier)
             else:
-                answer = self._ask_referee({"prepare": ask, "out": str(self._targets)})
+                answer = self._ask_referee(plan, {"prepare": ask, "out": str(self._targets)})
         if answer is None:
             self._say(f"the budget of {plan.budget_s:g} s was spent before there was a target; allow several times it")
             return False
@@ -126,7 +128,7 @@ class RunsSession(Arena[RunsPlan, Run]):
         """
         np.savez(self._targets, **earlier.arrays)  # type: ignore[arg-type]
         ask = {name: self.facts[name] for name in ("spp", "masked")}
-        found = self._ask_referee({"restore": ask, "targets": str(self._targets)})
+        found = self._ask_referee(self.plan, {"restore": ask, "targets": str(self._targets)})
         if found is None:
             return None
         loss, then = found["loss"], self.facts["loss"]
@@ -260,7 +262,7 @@ class RunsSession(Arena[RunsPlan, Run]):
                        "raise run.iterations to have it go on")  # fmt: skip
         if answer["iteration"] == run.state.iteration:
             return True
-        judged = self._ask_referee({"values": str(run.out)})
+        judged = self._ask_referee(self.plan, {"values": str(run.out)})
         if judged is None:
             return False
         run.state = replace(
