@@ -1,8 +1,4 @@
-"""`reslrb gradcheck`: whether the gradients of a scene can be trusted.
-
-- `--missing` (`run_missing`): what of a scene's derivatives is in no attached gradient.
-- `--suite` (`run_suite_command`): cases of its own in place of a configuration.
-"""
+"""`reslrb gradcheck`: whether gradients of a scene can be trusted, and what of derivatives they lack (`--missing`)."""
 
 from __future__ import annotations
 

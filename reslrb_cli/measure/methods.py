@@ -388,6 +388,10 @@ class RunsPlan(Plan):
     def _options(self) -> dict[str, Any]:
         return {"reference": self.reference.label, "spp": list(self.spps), "rates": list(self.rates)}
 
+    def settings(self) -> dict[str, Any]:
+        """What has to be the same in all sessions; files of such runs name the variant with the device, always have."""
+        return super().settings() | {"device": f"{self.device}, {self.variant}"}
+
     @property
     def sides(self) -> list[Side]:
         """What has runs of its own, all rates of a method beside each other."""

@@ -1,8 +1,4 @@
-"""Whether `prb` would have been the better choice: its gradients beside those of the run's integrator, in turns.
-
-Steps are those of the run's own loss and adjoint, so that both estimate the same; `race.compare` says how much more
-efficient it is.
-"""
+"""Whether `prb` would have been the better choice: steps of the run's own loss beside those of its integrator."""
 
 from __future__ import annotations
 

@@ -1,11 +1,5 @@
 """The records that measuring commands write with `--json`, one object a line.
 
-`reslrb bench`                one line a case and depth, or what else is swept
-`reslrb convergence`          measured points, methods, and the references of their errors
-`reslrb gradcheck`            one line for each comparison of a gradient with a reference
-`reslrb convergence --runs`   whole optimisations against run time, and methods
-`reslrb gradcheck --missing`  what it finds of one parameter
-
 Lines of `gradcheck` are read back as the records that they were, where they are whole.
 """
 

@@ -549,6 +549,7 @@ def test_only_the_same_is_gone_on_from(tmp_path: Path, change: dict[str, Any], l
         play_again(tmp_path / "b", Stage(), plan(**({"runs": 2} | change)), earlier)
     with pytest.raises(ConfigError, match=r"c\.jsonl has 1 run of each already; name more with --runs"):
         play_again(tmp_path / "b", Stage(), plan(runs=1), earlier)
+    assert plan(device="x").settings()["device"] == "x, llvm_ad_rgb"  # as in the files of earlier versions
 
 
 def test_another_loss_of_the_initial_values_is_another_scene(tmp_path: Path) -> None:
