@@ -134,7 +134,12 @@ class Participants:
             "prb": make_integrator("prb", **shared),
             "path": make_integrator("path", **shared),
         }
-        self._choose_references()
+        at = self._situation
+        chosen = {key: choose(of_gradient(at, key)) for key in self.case.keys}
+        self.stock = {key: reference for key, (reference, _) in chosen.items()}
+        self.why = {key: reason for key, (_, reason) in chosen.items()}
+        by_camera = {Reference.PATH: path_image(at), Reference.PRB: prb_image(at)}
+        self.image, self.why_no_image = choose({Reference.PTRACER: ptracer_image(at)} | by_camera)
         self._weigh()
         self.directions = all_directions(self.case, problem.selection, MOVING_DIRECTIONS, DIRECTIONS)
         weights = np.array(self.case.weights, np.float64)
@@ -149,11 +154,8 @@ class Participants:
             return list(settings.integrators)
         if settings.named or not able:
             names = ", ".join(name for name, kind in ESTIMATORS.items() if kind.attaches)
-            raise ConfigError(
-                "--estimators",
-                "",
-                f"{others[0].options['estimator']} has no derivatives of what moves light; take {names}",
-            )
+            without = others[0].options["estimator"]
+            raise ConfigError("--estimators", "", f"{without} has no derivatives of what moves light; take {names}")
         return able
 
     def _configured(self, configs: dict[str, Config]) -> dict[str, StepIntegrator]:
@@ -171,15 +173,6 @@ class Participants:
         """The integrator whose gradients stand for those of `label` beside this reference (`ALIKE`)."""
         alike = _alike(label, reference)
         return alike if alike in self.integrators else label
-
-    def _choose_references(self) -> None:
-        at = self._situation
-        self.stock: dict[str, Reference | None] = {}
-        self.why: dict[str, str] = {}
-        for key in self.case.keys:
-            self.stock[key], self.why[key] = choose(of_gradient(at, key))
-        by_camera = {Reference.PATH: path_image(at), Reference.PRB: prb_image(at)}
-        self.image, self.why_no_image = choose({Reference.PTRACER: ptracer_image(at)} | by_camera)
 
     def _weigh(self) -> None:
         """Random weights of mean 1, so that entries do not cancel, a sixth negative; 0 where the border lacks light.

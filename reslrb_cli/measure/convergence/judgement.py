@@ -56,14 +56,11 @@ class Judgement:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._slices = session.slices() if session.facts else {}
-        self._whole = {key: Reference(rows) for key, rows in self._reference_rows().items()}
-
-    def _reference_rows(self) -> dict[str, np.ndarray]:
-        """Rows of what errors are taken from, by parameter and of all; nothing where there are too few."""
-        found = self._session.of(Role.REFERENCE)
-        if not found or len(set(found[0].turns)) < FEWEST or found[0].message:
-            return {}
-        return {key: self._rows(found[0], place) for key, place in self._places().items()}
+        #: What errors are taken from, by parameter and of all; nothing where there are too few steps of it.
+        self._whole: dict[str, Reference] = {}
+        for found in session.of(Role.REFERENCE):
+            if len(set(found.turns)) >= FEWEST and not found.message:
+                self._whole = {key: Reference(self._rows(found, place)) for key, place in self._places().items()}
 
     def _places(self) -> dict[str, slice]:
         """Where each parameter stands, and all together, unless the image is what is estimated."""
