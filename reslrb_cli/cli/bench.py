@@ -3,92 +3,41 @@
 from __future__ import annotations
 
 import logging
-import os
-import re
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from reslrb_cli.cli.options import (
     COUNT,
     Counts,
-    allowance,
-    check_writable,
+    Keeper,
+    budget_option,
+    exit_code,
+    files_of,
     is_given,
+    look_at,
+    machine_of,
+    measuring,
+    memory_limit_option,
     optional_experiment_arguments,
+    origin_of,
+    read_or_box,
     resume_option,
 )
 from reslrb_cli.cli.terminal import echo
-from reslrb_cli.errors import ConfigError, ExitCode
+from reslrb_cli.errors import ConfigError
 
 if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
-    from reslrb_cli.measure.bench import Book, Result
+    from reslrb_cli.measure.bench import Result
     from reslrb_cli.measure.methods import Sweep
-    from reslrb_cli.records.measurements import BenchRecord, BenchStatus
+    from reslrb_cli.records.measurements import BenchRecord
 
 
 #: What is compared where the user names nothing.
 INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,trajectory"
-_UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
-
-
-class Size(click.ParamType):
-    """A number of bytes such as `2GiB`."""
-
-    name = "size"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(|k|M|G|Ki|Mi|Gi)B?", str(value).strip())
-        size = 0.0 if match is None else float(match[1]) * _UNITS[match[2]]
-        if not 1 <= size < 2**63:
-            self.fail(f"`{value}` is no size; write it as in 2GiB or 500MB", param, ctx)
-        return int(size)
-
-
-budget_option = click.option(
-    "--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
-    help="Time for the whole, loading and compiling included; what it does not suffice for is named, with what it "
-         "would take.",
-)  # fmt: skip
-
-memory_limit_option = click.option(
-    "--memory-limit", type=Size(),
-    help="Address space of each process, e.g. 2GiB (CPU only); default: the machine's memory.",
-)  # fmt: skip
-
-
-def files_of(resumed: Path | None, json_file: Path | None, plot_file: Path | None) -> tuple[Path | None, Path | None]:
-    """The files of `--json` and `--plot`, by default that of `--resume` and one beside it. Raises ConfigError."""
-    json_file = json_file or resumed
-    if json_file is not None and plot_file is None:
-        plot_file = json_file.with_suffix(".png")
-    for option, path in (("--json", json_file), ("--plot", plot_file)):
-        check_writable(option, path)
-    return json_file, plot_file
-
-
-def machine_of(config: Config, memory_limit: int | None) -> dict[str, Any]:
-    """What computes, as a `Measurement` has it: variant, memory, and the limit of each process. Raises ConfigError."""
-    from reslrb_cli.backend.doctor import memory_bytes
-    from reslrb_cli.backend.variant import choose
-
-    variant, _ = choose(config.variant)
-    on_gpu, memory = variant.startswith("cuda"), memory_bytes(variant)
-    if on_gpu and memory_limit is not None:
-        raise ConfigError("--memory-limit", "", f"bounds address space, which says nothing of {variant}'s memory")
-    return {"variant": variant, "memory": memory, "memory_limit": memory_limit or (None if on_gpu else memory)}
-
-
-def exit_code(done: bool, states: set[BenchStatus]) -> ExitCode:
-    """A comparison in which something could be measured is `done`; else what kept it from that decides."""
-    from reslrb_cli.records.measurements import BenchStatus
-
-    if done:
-        return ExitCode.DONE
-    return ExitCode.OUT_OF_MEMORY if states == {BenchStatus.OUT_OF_MEMORY} else ExitCode.CHECK_FAILED
 
 
 @click.command("bench")
@@ -119,21 +68,10 @@ def exit_code(done: bool, states: set[BenchStatus]) -> ExitCode:
 @click.option("--plot", "plot_file", type=click.Path(path_type=Path, dir_okay=False),
               help="PNG of time and memory against what is varied; default: beside the JSON file.")  # fmt: skip
 def command(
-    config_file: Path | None,
-    overrides: tuple[str, ...],
-    swept: str,
-    values: tuple[int, ...] | None,
-    max_depth: int,
-    integrators: str | None,
-    baseline: str | None,
-    objective: str,
-    memory_limit: int | None,
-    budget: float,
-    rounds: int | None,
-    resumed: Path | None,
-    json_file: Path | None,
-    plot_file: Path | None,
-) -> int:
+    config_file: Path | None, overrides: tuple[str, ...], swept: str, values: tuple[int, ...] | None, max_depth: int,
+    integrators: str | None, baseline: str | None, objective: str, memory_limit: int | None, budget: float,
+    rounds: int | None, resumed: Path | None, json_file: Path | None, plot_file: Path | None,
+) -> int:  # fmt: skip
     """Measure time and peak memory of gradient steps against path depth, or what else --sweep names.
 
     A step is image, loss and gradient of every parameter of CONFIG, seen through its first sensor. Without CONFIG the
@@ -142,22 +80,13 @@ def command(
     --json has written can be gone on from, however the process ended.
     """
     began = time.monotonic()
-    from reslrb_cli.backend.doctor import device_name
     from reslrb_cli.backend.installation import load_packages
-    from reslrb_cli.config.loader import load, loads
 
     load_packages()  # before what follows asks for them
-    from reslrb_cli.cli.options import read_earlier
-    from reslrb_cli.measure.bench import KIND, Book
     from reslrb_cli.measure.methods import SWEPT, Sweep, choose_baseline, depths, parse_cases, usual_values
-    from reslrb_cli.measure.resume_store import Earlier
-    from reslrb_cli.measure.scenes import small
     from reslrb_cli.records.measurements import BenchStatus
 
-    if config_file is None:
-        config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, overrides)
-    else:
-        config = load(config_file, overrides)
+    config = read_or_box(config_file, overrides)
     if (swept != "depth" or values is not None) and is_given("max_depth"):
         reason = "goes with --sweep depth" if values is None else "does not go with --values"
         raise ConfigError("--max-depth", "", f"{reason}; take --set integrator.max_depth={max_depth}")
@@ -176,29 +105,21 @@ def command(
         swept=swept,
     )
     sweep.check()
-    earlier = None if resumed is None else Earlier(KIND, resumed, *read_earlier(resumed))
-    device = device_name(sweep.variant)
-    book = Book(sweep, device, earlier)
-    echo(f"{device}, {sweep.variant}; {allowance(budget, rounds, 'round')}")
-    echo(_conditions(config, sweep))
-    results, interrupted = _run(sweep, book, json_file, began)
+    results, interrupted = _run(sweep, resumed, json_file, began)
     if plot_file is not None and results:
         from reslrb_cli.report.plots import plot_bench
 
         series = [(case.label, [(r.value, r.record) for r in results if r.case == case]) for case in cases]
         abscissa = "path depth" if swept == "depth" else SWEPT[swept]
-        plot_bench(series, plot_file, f"{device}\n{_conditions(config, sweep)}", abscissa)
-        echo(f"look at {os.path.relpath(plot_file)}")
+        plot_bench(series, plot_file, f"{sweep.device}\n{_conditions(config, sweep)}", abscissa)
+        look_at(plot_file)
     states = {result.record.status for result in results}
-    return ExitCode.INTERRUPTED if interrupted else exit_code(BenchStatus.OK in states, states)
+    return exit_code(interrupted, BenchStatus.OK in states, states)
 
 
-def _run(sweep: Sweep, book: Book, json_file: Path | None, began: float) -> tuple[list[Result], bool]:
+def _run(sweep: Sweep, resumed: Path | None, json_file: Path | None, began: float) -> tuple[list[Result], bool]:
     """Measure, print and write; returns all results, and whether the user interrupted."""
-    from reslrb_cli.cli.options import Keeper, origin_of
-    from reslrb_cli.cli.terminal import Interrupts
-    from reslrb_cli.measure.bench import bench
-    from reslrb_cli.measure.processes import abandon_all
+    from reslrb_cli.measure.bench import Bench
     from reslrb_cli.report.tables import bench_cells, bench_columns
 
     table, notes = bench_columns([case.label for case in sweep.cases], sweep.swept), []
@@ -209,23 +130,22 @@ def _run(sweep: Sweep, book: Book, json_file: Path | None, began: float) -> tupl
             if row.reason:
                 notes.append(f"{sweep.name(row.value)}, {row.case.label}: {row.reason}")
 
-    def under_way() -> list[BenchRecord]:
-        return [row.record for row in book.results(set(book.runs) - book.done)]
+    def lines(done: bool | None = None) -> list[BenchRecord]:
+        return [row.record for row in session.results(done)]
 
-    origin = origin_of(sweep.variant)
-    keeper = Keeper(json_file, origin, lambda: [row.record for row in book.results(book.done)], under_way, book.kept)
-    with Interrupts(last_act=abandon_all) as interrupts:
+    say = logging.getLogger(__name__).info
+    with measuring(Bench, sweep, resumed, began, "round", say) as (session, interrupts):
+        keeper = Keeper(json_file, origin_of(sweep.variant), lambda: lines(True), lambda: lines(False), session.kept)
+        echo(_conditions(sweep.config, sweep))
         echo(table.head())
-        show(book.results(book.done))
-        say = logging.getLogger(__name__).info
-        spent_s = time.monotonic() - began
-        for rows in bench(sweep, lambda: interrupts.requested, say, book=book, between=keeper.refresh, spent_s=spent_s):
+        show(session.results(True))
+        for rows in session.run():
             show(rows)
             keeper.refresh()
-        keeper.finish([row.record for row in book.results()])
+        keeper.finish(lines())
         for note in notes:
             echo(note)
-        return book.results(), interrupts.requested
+        return session.results(), interrupts.requested
 
 
 def _conditions(config: Config, sweep: Sweep) -> str:

@@ -5,32 +5,32 @@ With `--runs` it is whole optimisations, printed and written as they come (`meas
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from reslrb_cli.cli.bench import budget_option, exit_code, files_of, machine_of, memory_limit_option
 from reslrb_cli.cli.options import (
     COUNT,
     Counts,
     Factors,
     Keeper,
-    allowance,
+    budget_option,
+    exit_code,
     experiment_arguments,
+    files_of,
     is_given,
+    look_at,
+    machine_of,
+    measuring,
+    memory_limit_option,
     origin_of,
-    read_earlier,
     resume_option,
 )
-from reslrb_cli.cli.terminal import Interrupts, echo
+from reslrb_cli.cli.terminal import echo
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.report.format import WITHOUT_BORDER, Columns, count
 
@@ -39,36 +39,19 @@ if TYPE_CHECKING:
     from reslrb_cli.measure.convergence.session import Session
     from reslrb_cli.measure.methods import Plan, RunsPlan
     from reslrb_cli.measure.optimization_benchmark.session import RunsSession
-    from reslrb_cli.measure.resume_store import Earlier
     from reslrb_cli.records.measurement_files import Line
     from reslrb_cli.records.measurements import MethodRecord, RunBestRecord, RunMethodRecord, RunPointRecord
 
 
-@contextmanager
-def _workplace() -> Iterator[tuple[Path, Interrupts]]:
-    """A folder for what processes write, and the user's wish to stop; neither outlives what is done in it."""
-    from reslrb_cli.measure.processes import abandon_all
-
-    with tempfile.TemporaryDirectory(prefix="reslrb-convergence-") as name:
-
-        def tidy() -> None:
-            abandon_all()
-            shutil.rmtree(name, ignore_errors=True)
-
-        with Interrupts(last_act=tidy) as interrupts:
-            yield Path(name), interrupts
-
-
 def measure_runs(
-    plan: RunsPlan, resumed: Path | None, json_file: Path | None, plot_file: Path | None, began: float, where: str
+    plan: RunsPlan, resumed: Path | None, json_file: Path | None, plot_file: Path | None, began: float
 ) -> int:
     """Measure, print, write and draw; returns the exit code. `began` is when the command was called, by `monotonic`.
 
     `resumed` is the JSON file that is gone on from, if any.
     """
-    from reslrb_cli.measure.optimization_benchmark.rank import KIND, check, outcome
+    from reslrb_cli.measure.optimization_benchmark.rank import outcome
     from reslrb_cli.measure.optimization_benchmark.session import RunsSession
-    from reslrb_cli.measure.resume_store import Earlier
     from reslrb_cli.records.measurements import SummaryRecord
     from reslrb_cli.report.convergence_tables import (
         best_line,
@@ -78,20 +61,10 @@ def measure_runs(
         runs_columns,
         runs_notes,
     )
-    from reslrb_cli.report.plots import plot_runs
 
-    points: list[RunPointRecord] = []
-    earlier = None if resumed is None else Earlier(KIND, resumed, *read_earlier(resumed))
-    if earlier is not None:
-        check(plan, earlier, where)
-    echo(f"{where}; {allowance(plan.budget_s, None, 'run')}")
-    with _workplace() as (folder, interrupts):
+    with measuring(RunsSession, plan, resumed, began, "run") as (session, interrupts):
         table = runs_columns(list(plan.names))
-        spent_s = time.monotonic() - began
-        session = RunsSession(
-            plan, folder, lambda: interrupts.requested, echo, spent_s=spent_s, earlier=earlier, device=where
-        )
-        points += [point for run in session.members for point in run.points]  # of earlier sessions
+        points = [point for run in session.members for point in run.points]  # of earlier sessions
 
         def show(point: RunPointRecord) -> None:
             if point.elapsed_s == session.limit_s:
@@ -106,7 +79,7 @@ def measure_runs(
             records, bests, sentence = found()
             return [*records, *bests, SummaryRecord(sentence)]
 
-        keeper = Keeper(json_file, origin_of(plan.variant), lambda: points, outcome_lines, session.keep)
+        keeper = Keeper(json_file, origin_of(plan.variant), lambda: points, outcome_lines, session.kept)
         headed = False
         for point in session.run():
             if not headed:
@@ -125,11 +98,13 @@ def measure_runs(
             echo(table.line(runs_cells(record)))
         for line in [*runs_notes(records), *(best.line for best in bests), sentence]:
             echo(line)
-        conditions = _runs_conditions(plan, session)
     if plot_file is not None and points:
-        plot_runs(points, session.facts.get("error_of", ""), plot_file, f"{where}\n{conditions}")
-        echo(f"look at {os.path.relpath(plot_file)}")
-    return ExitCode.INTERRUPTED if interrupts.requested else _runs_exit_code(records)
+        from reslrb_cli.report.plots import plot_runs
+
+        title = f"{plan.device}, {plan.variant}\n{_runs_conditions(plan, session)}"
+        plot_runs(points, session.facts.get("error_of", ""), plot_file, title)
+        look_at(plot_file)
+    return _runs_exit_code(records, interrupts.requested)
 
 
 def _runs_conditions(plan: RunsPlan, session: RunsSession) -> str:
@@ -147,10 +122,10 @@ def _runs_conditions(plan: RunsPlan, session: RunsSession) -> str:
     return ", ".join(part for part in parts if part)
 
 
-def _runs_exit_code(records: list[RunMethodRecord]) -> ExitCode:
+def _runs_exit_code(records: list[RunMethodRecord], interrupted: bool = False) -> ExitCode:
     """A comparison in which something was optimised is done; else what kept it from that decides."""
     done = any(record.iterations is not None and record.iterations.high > 0 for record in records)
-    return exit_code(done, {record.status for record in records})
+    return exit_code(interrupted, done, {record.status for record in records})
 
 
 #: The most seeds of --runs.
@@ -187,21 +162,10 @@ MOST_RUNS = 100
 @click.option("--plot", "plot_file", type=click.Path(path_type=Path, dir_okay=False),
               help="PNG of error against run time; default: beside the JSON file.")  # fmt: skip
 def command(
-    config_file: Path,
-    overrides: tuple[str, ...],
-    integrators: str | None,
-    objective: str,
-    runs: int | None,
-    rates: tuple[float, ...] | None,
-    budget: float,
-    rounds: int | None,
-    spps: tuple[int, ...] | None,
-    reference: str,
-    resumed: Path | None,
-    memory_limit: int | None,
-    json_file: Path | None,
-    plot_file: Path | None,
-) -> int:
+    config_file: Path, overrides: tuple[str, ...], integrators: str | None, objective: str, runs: int | None,
+    rates: tuple[float, ...] | None, budget: float, rounds: int | None, spps: tuple[int, ...] | None, reference: str,
+    resumed: Path | None, memory_limit: int | None, json_file: Path | None, plot_file: Path | None,
+) -> int:  # fmt: skip
     """Measure how fast the error of each method falls on CONFIG, at its initial values, seen through its first sensor.
 
     Each method takes steps of run.spp samples per pixel in a process of its own, all in turn. Errors are relative to
@@ -210,14 +174,11 @@ def command(
     ended. docs/convergence.md explains the columns.
     """
     began = time.monotonic()
-    from reslrb_cli.backend.doctor import device_name
     from reslrb_cli.backend.installation import load_packages
     from reslrb_cli.config.loader import load
 
     load_packages()  # before what follows asks for them
-    from reslrb_cli.measure.convergence.session import KIND, check
     from reslrb_cli.measure.methods import DEFAULT, DEFAULTS, Plan, RunsPlan, parse_cases
-    from reslrb_cli.measure.resume_store import Earlier
 
     config = load(config_file, overrides)
     if runs is not None:
@@ -240,27 +201,21 @@ def command(
         "default": integrators is None,
         "spps": spps or (),
     }
-    device = device_name(settings["variant"])
-    where = f"{device}, {settings['variant']}"
     if runs is not None:
         whole = RunsPlan(**settings, runs=runs, rates=rates or ())
         whole.check()
-        return measure_runs(whole, resumed, json_file, plot_file, began, where)
+        return measure_runs(whole, resumed, json_file, plot_file, began)
     plan = Plan(**settings)
     plan.check()
-    earlier = None if resumed is None else Earlier(KIND, resumed, *read_earlier(resumed))
-    if earlier is not None:
-        check(plan, earlier, device)
-    echo(f"{where}; {allowance(budget, rounds, 'round')}")
-    results, conditions, interrupted = _run(plan, json_file, began, earlier, device)
+    results, conditions, interrupted = _run(plan, resumed, json_file, began)
     if plot_file is not None and results.points:
         from reslrb_cli.report.plots import plot_convergence
 
-        plot_convergence(results.points, results.methods, plot_file, f"{where}\n{conditions}")
-        echo(f"look at {os.path.relpath(plot_file)}")
+        title = f"{plan.device}, {plan.variant}\n{conditions}"
+        plot_convergence(results.points, results.methods, plot_file, title)
+        look_at(plot_file)
     done = any(record.relative_rmse is not None for record in results.methods)
-    states = {record.status for record in results.methods}
-    return ExitCode.INTERRUPTED if interrupted else exit_code(done, states)
+    return exit_code(interrupted, done, {record.status for record in results.methods})
 
 
 def _refuse_with_runs() -> None:
@@ -274,9 +229,7 @@ def _refuse_with_runs() -> None:
             raise ConfigError(f"--{name}", "", f"does not go with --runs: {reason}")
 
 
-def _run(
-    plan: Plan, json_file: Path | None, began: float, earlier: Earlier | None, device: str
-) -> tuple[Results, str, bool]:
+def _run(plan: Plan, resumed: Path | None, json_file: Path | None, began: float) -> tuple[Results, str, bool]:
     """Measure, print and write; returns the results, the conditions in words, and whether the user interrupted."""
     from reslrb_cli.measure.convergence.judgement import Judgement
     from reslrb_cli.measure.convergence.session import Session
@@ -284,17 +237,13 @@ def _run(
     from reslrb_cli.records.measurements import SummaryRecord
     from reslrb_cli.report.convergence_tables import closing_sentence, method_cells, notes, reference_line
 
-    with _workplace() as (folder, interrupts):
-        spent_s = time.monotonic() - began
-        session = Session(
-            plan, folder, lambda: interrupts.requested, echo, spent_s=spent_s, earlier=earlier, device=device
-        )
+    with measuring(Session, plan, resumed, began, "round") as (session, interrupts):
 
         def lines(now: Results) -> list[Line]:
             return [*now.points, *now.methods, *now.references, SummaryRecord(closing_sentence(now.methods))]
 
         origin = origin_of(plan.variant)
-        keeper = Keeper(json_file, origin, lambda: [], lambda: lines(Judgement(session).results()), session.keep)
+        keeper = Keeper(json_file, origin, lambda: [], lambda: lines(Judgement(session).results()), session.kept)
         table: Columns | None = None
         for rounds in session.run():
             keeper.refresh()

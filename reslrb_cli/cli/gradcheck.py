@@ -1,8 +1,4 @@
-"""`reslrb gradcheck`: whether the gradients of a scene can be trusted.
-
-- `--missing` (`run_missing`): what of a scene's derivatives is in no attached gradient.
-- `--suite` (`run_suite_command`): cases of its own in place of a configuration.
-"""
+"""`reslrb gradcheck`: whether gradients of a scene can be trusted, and what of derivatives they lack (`--missing`)."""
 
 from __future__ import annotations
 
@@ -10,7 +6,7 @@ import difflib
 import logging
 import os
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,14 +22,14 @@ from reslrb_cli.cli.options import (
     allowance,
     check_writable,
     is_given,
+    look_at,
     optional_experiment_arguments,
     origin_of,
-    read_earlier,
+    read_or_box,
     resume_option,
 )
 from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
-from reslrb_cli.config.loader import load, loads
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.measure.methods import all_estimators, parse_estimators
 from reslrb_cli.measure.resume_store import Earlier, settings
@@ -52,18 +48,9 @@ COMPARING = {"suite": "--suite", "cases": "--case", "estimators": "--estimators"
 CONFIGURED = {"config_file": "CONFIG", "overrides": "--set", "budget": "--budget", "spp": "--spp", "folder": "--images"}
 
 
-def _given(options: Mapping[str, str]) -> str | None:
+def _given(options: dict[str, str]) -> str | None:
     """The first of `options`, written by their parameters' names, that the user gave."""
     return next((option for name, option in options.items() if is_given(name)), None)
-
-
-def _earlier(kind: str, resumed: Path | None, now: Mapping[str, Any]) -> Earlier | None:
-    """The session that left the file `resumed`. Raises ConfigError where its settings are not those of `now`."""
-    if resumed is None:
-        return None
-    earlier = Earlier(kind, resumed, *read_earlier(resumed))
-    earlier.check(now)
-    return earlier
 
 
 def run_missing(
@@ -74,7 +61,7 @@ def run_missing(
     from reslrb_cli.measure.missing import KIND, MissingCheck
 
     to_keep = settings(config, variant, device_name(variant), spp=spp, directions=along)
-    check = MissingCheck(config, budget, seeds, spp, along, _earlier(KIND, resumed, to_keep))
+    check = MissingCheck(config, budget, seeds, spp, along, Earlier.read(KIND, resumed, to_keep))
     echo(check.conditions())
     records: list[MissingRecord] = []
     keeper = Keeper(
@@ -101,6 +88,7 @@ def run_suite_command(
     variant = set_variant("auto")
 
     from reslrb_cli.measure.extreme import CASES, run_suite, suite
+    from reslrb_cli.report.tables import summary_lines
 
     for name in names:
         if name not in CASES:
@@ -108,7 +96,7 @@ def run_suite_command(
             raise ConfigError("--case", "", f"there is no case `{name}`; did you mean {near[0]}?")
     machine = f"{device_name(variant)}, {variant}"
     to_keep = suite.settings(chosen, seeds, variant, device_name(variant))
-    earlier = _earlier(suite.KIND, resumed, to_keep)
+    earlier = Earlier.read(suite.KIND, resumed, to_keep)
     done = {} if earlier is None else suite.restore(earlier)
     to_do = [name for name in names or CASES if name not in done]
     if earlier is not None and not to_do:
@@ -131,7 +119,8 @@ def run_suite_command(
             echo(_case_line(name, rows))
         interrupted = interrupts.requested
         keeper.finish(lines())
-    _say(lines())
+    for line in summary_lines(lines()):
+        echo(line)
     if markdown_file is not None:
         about = {name: case.about for name, case in CASES.items()}
         markdown_file.write_text(_document(lines(), about, machine), encoding="utf-8")
@@ -212,21 +201,10 @@ logger = logging.getLogger(__name__)
               help="Write maps of the gradients of textures, their references and z into this folder, as PNG and as "
                    "layers of EXR files.")  # fmt: skip
 def command(
-    config_file: Path | None,
-    overrides: tuple[str, ...],
-    suite: str | None,
-    cases: tuple[str, ...],
-    estimators: str | None,
-    budget: float,
-    seeds: int | None,
-    resumed: Path | None,
-    spp: int | None,
-    missing: bool,
-    directions: int | None,
-    json_file: Path | None,
-    markdown_file: Path | None,
-    folder: Path | None,
-) -> int:
+    config_file: Path | None, overrides: tuple[str, ...], suite: str | None, cases: tuple[str, ...],
+    estimators: str | None, budget: float, seeds: int | None, resumed: Path | None, spp: int | None, missing: bool,
+    directions: int | None, json_file: Path | None, markdown_file: Path | None, folder: Path | None,
+) -> int:  # fmt: skip
     """Compare the gradients of every parameter of CONFIG with references, at its initial values.
 
     Each estimator is compared with naive AD of the same paths (walk_ad), with a stock integrator where one counts as a
@@ -240,7 +218,7 @@ def command(
     from reslrb_cli.measure.participants import Settings
     from reslrb_cli.measure.sampling import KIND
     from reslrb_cli.measure.sampling import settings as settings_to_keep
-    from reslrb_cli.measure.scenes import small
+    from reslrb_cli.report.tables import markdown_table, summary_lines
 
     if missing and (option := _given(COMPARING)):
         raise ConfigError(option, "", "does not go with --missing, which compares no estimators; leave out one")
@@ -258,10 +236,7 @@ def command(
         return run_suite_command(cases, estimators, seeds, json_file, markdown_file, resumed)
     if cases:
         raise ConfigError("--case", "", "names a case of a suite; take --suite extreme with it")
-    if config_file is None:
-        config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, overrides)
-    else:
-        config = load(config_file, overrides)
+    config = read_or_box(config_file, overrides)
     if missing:
         variant = set_variant(config.variant)
         echo(f"{device_name(variant)}, {variant}")
@@ -272,17 +247,14 @@ def command(
     checked.configs()  # before anything is loaded
     variant = set_variant(config.variant)
     to_keep = settings_to_keep(checked, variant, device_name(variant))
-    check = Gradcheck(checked, earlier=_earlier(KIND, resumed, to_keep))
+    check = Gradcheck(checked, earlier=Earlier.read(KIND, resumed, to_keep))
     echo(f"{device_name(variant)}, {variant}; {allowance(budget, seeds, 'seed')}")
     echo(check.conditions())
     records, interrupted = _run(check, variant, to_keep, json_file, folder)
-    if records:
-        _say(records)
-    else:
-        echo("interrupted before there were enough seeds to compare")
+    none = "interrupted before there were enough seeds to compare"
+    for line in summary_lines(records) if records else [none]:
+        echo(line)
     if markdown_file is not None:
-        from reslrb_cli.report.tables import markdown_table
-
         markdown_file.write_text(markdown_table(records), encoding="utf-8")
     nothing = all(record.verdict in (Verdict.NOT_MEASURED, Verdict.NO_REFERENCE) for record in records)
     if interrupted:
@@ -292,14 +264,6 @@ def command(
 
 def _exit_code(records: Iterable[GradcheckRecord]) -> int:
     return ExitCode.CHECK_FAILED if any(record.holds is False for record in records) else ExitCode.DONE
-
-
-def _say(records: list[GradcheckRecord]) -> None:
-    """Print what the records come to."""
-    from reslrb_cli.report.tables import summary_lines
-
-    for line in summary_lines(records):
-        echo(line)
 
 
 def _run(
@@ -323,7 +287,7 @@ def _run(
             drawn = drawn or result.maps is not None
         keeper.finish(records)
     if folder is not None and drawn:
-        echo(f"look at {os.path.relpath(folder)}")
+        look_at(folder)
     return records, interrupts.requested
 
 

@@ -1,8 +1,4 @@
-"""`reslrb inspect --nonfinite`: where a run first met a value that is not finite.
-
-`load_replay` makes the problem of the run as it stood in the first iteration with such a value; `show_offenders` says
-what is found there.
-"""
+"""`reslrb inspect --nonfinite`: where a run first met a value that is not finite."""
 
 from __future__ import annotations
 

@@ -10,19 +10,23 @@ from __future__ import annotations
 import errno
 import math
 import os
+import re
+import shutil
+import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from reslrb_cli.backend.doctor import device_name
-from reslrb_cli.cli.terminal import echo
-from reslrb_cli.config.loader import load
+from reslrb_cli.backend.doctor import device_name, memory_bytes
+from reslrb_cli.cli.terminal import Interrupts, echo
+from reslrb_cli.config.loader import load, loads
 from reslrb_cli.config.parameters import RunValue
 from reslrb_cli.config.schema import Config
-from reslrb_cli.errors import ConfigError, is_machine_fault
+from reslrb_cli.errors import ConfigError, ExitCode, is_machine_fault
 from reslrb_cli.records.atomic import remove_parts_of
 from reslrb_cli.records.measurement_files import (
     Kept,
@@ -31,10 +35,14 @@ from reslrb_cli.records.measurement_files import (
     LivePage,
     Origin,
     are_kept,
-    read_samples,
     samples_file,
     write_samples,
 )
+from reslrb_cli.records.measurements import BenchStatus
+
+if TYPE_CHECKING:
+    from reslrb_cli.measure.arena import Arena
+    from reslrb_cli.measure.methods import Measurement
 
 
 def origin_of(variant: str) -> Origin:
@@ -95,9 +103,47 @@ class Keeper:
         return fits
 
 
-def read_earlier(json_file: Path) -> Kept:
-    """What lies beside a JSON file that another call has written. Raises ConfigError."""
-    return read_samples(samples_file(json_file))
+A = TypeVar("A", bound="Arena[Any, Any]")
+
+
+@contextmanager
+def measuring(
+    kind: type[A], plan: Measurement, resumed: Path | None, began: float, of: str,
+    say: Callable[[str], None] = echo,
+) -> Iterator[tuple[A, Interrupts]]:  # fmt: skip
+    """A session that measures `plan`, and the user's wish to stop; neither its folder nor its workers outlive it.
+
+    It goes on from the JSON file `resumed`, if any. `began` is when the command was called, by `monotonic`; rounds are
+    made `of` what allowance names. Raises ConfigError.
+    """
+    from reslrb_cli.measure.processes import abandon_all
+    from reslrb_cli.measure.resume_store import Earlier
+
+    earlier = Earlier.read(plan.KIND, resumed)
+    with tempfile.TemporaryDirectory(prefix="reslrb-measuring-") as name:
+
+        def tidy() -> None:
+            abandon_all()
+            shutil.rmtree(name, ignore_errors=True)
+
+        with Interrupts(last_act=tidy) as interrupts:
+            spent_s = time.monotonic() - began
+            session = kind(plan, Path(name), lambda: interrupts.requested, say, spent_s=spent_s, earlier=earlier)
+            echo(f"{plan.device}, {plan.variant}; {allowance(plan.budget_s, plan.rounds, of)}")
+            yield session, interrupts
+
+
+def look_at(path: Path) -> None:
+    """Say where a picture is, or a folder of them."""
+    echo(f"look at {os.path.relpath(path)}")
+
+
+def exit_code(interrupted: bool, done: bool, states: set[BenchStatus]) -> ExitCode:
+    """A comparison in which something could be measured is `done`; else what kept it from that decides."""
+    if interrupted:
+        return ExitCode.INTERRUPTED
+    memory = states == {BenchStatus.OUT_OF_MEMORY}
+    return ExitCode.DONE if done else ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED
 
 
 def read_recovered(run: Path, overrides: tuple[str, ...]) -> Config:
@@ -147,6 +193,34 @@ class Factors(click.ParamType):
         return tuple(sorted(factors))
 
 
+_UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
+
+
+class Size(click.ParamType):
+    """A number of bytes such as `2GiB`."""
+
+    name = "size"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(|k|M|G|Ki|Mi|Gi)B?", str(value).strip())
+        size = 0.0 if match is None else float(match[1]) * _UNITS[match[2]]
+        if not 1 <= size < 2**63:
+            self.fail(f"`{value}` is no size; write it as in 2GiB or 500MB", param, ctx)
+        return int(size)
+
+
+budget_option = click.option(
+    "--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
+    help="Time for the whole, loading and compiling included; what it does not suffice for is named, with what it "
+         "would take.",
+)  # fmt: skip
+
+memory_limit_option = click.option(
+    "--memory-limit", type=Size(),
+    help="Address space of each process, e.g. 2GiB (CPU only); default: the machine's memory.",
+)  # fmt: skip
+
+
 def overrides_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add `--set` (`overrides`) to a command."""
     return click.option(
@@ -168,6 +242,28 @@ def resume_option(function: Callable[..., Any]) -> Callable[..., Any]:
         help="Go on from what another call has written with --json FILE, all else as it was; that call may also have "
         "been killed. FILE is written anew unless --json names another.",
     )(function)
+
+
+def files_of(resumed: Path | None, json_file: Path | None, plot_file: Path | None) -> tuple[Path | None, Path | None]:
+    """The files of `--json` and `--plot`, by default that of `--resume` and one beside it. Raises ConfigError."""
+    json_file = json_file or resumed
+    if json_file is not None and plot_file is None:
+        plot_file = json_file.with_suffix(".png")
+    for option, path in (("--json", json_file), ("--plot", plot_file)):
+        check_writable(option, path)
+    return json_file, plot_file
+
+
+def machine_of(config: Config, memory_limit: int | None) -> dict[str, Any]:
+    """What computes, as a `Measurement` has it: variant, memory, and the limit of each process. Raises ConfigError."""
+    from reslrb_cli.backend.variant import choose
+
+    variant, _ = choose(config.variant)
+    on_gpu, memory = variant.startswith("cuda"), memory_bytes(variant)
+    if on_gpu and memory_limit is not None:
+        raise ConfigError("--memory-limit", "", f"bounds address space, which says nothing of {variant}'s memory")
+    limit = memory_limit or (None if on_gpu else memory)
+    return {"variant": variant, "memory": memory, "memory_limit": limit, "device": device_name(variant)}
 
 
 def allowance(budget_s: float, number: int | None, of: str) -> str:
@@ -197,6 +293,15 @@ def is_given(name: str) -> bool:
 def read_config(config_file: Path, overrides: tuple[str, ...]) -> Config:
     """Load and check the configuration. Raises ConfigError."""
     return load(config_file, list(overrides))
+
+
+def read_or_box(config_file: Path | None, overrides: tuple[str, ...]) -> Config:
+    """The configuration, or that of the built-in Cornell box where no file is given. Raises ConfigError."""
+    if config_file is not None:
+        return read_config(config_file, overrides)
+    from reslrb_cli.measure.scenes import small
+
+    return loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, overrides)
 
 
 def start_variant(config: Config) -> str:

@@ -1,13 +1,13 @@
-"""Workers that take turns: what `convergence` and its `--runs` have in common, from their start to their end.
+"""Workers that take turns: what `bench`, `convergence` and its `--runs` have in common, from their start to their end.
 
-As they take turns, one computing at a time, a drift of the machine hits all alike. One more worker, the referee, is
-there for all of them: it makes what they are compared by, and nothing is measured where it fails.
+As they take turns, one computing at a time, a drift of the machine hits all alike. One more worker may be there for all
+of them, the referee: it makes what they are compared by, and nothing is measured where it fails.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -15,26 +15,20 @@ from reslrb_cli.backend.installation import python_command
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.methods import Measurement, Plan
-from reslrb_cli.measure.processes import Contestant, Pace, Process, Refused, Stopped
+from reslrb_cli.measure.processes import Contestant, Pace, Process, Refused, Stepping, Stopped
 from reslrb_cli.measure.resume_store import Earlier
-from reslrb_cli.measure.workers import Begin, Begun
+from reslrb_cli.measure.workers import Begin
 from reslrb_cli.records.measurements import BenchStatus
-
-#: The most rounds.
-MOST_ROUNDS = 256
-
-#: Share of the budget, and seconds beside it, that are left for the statistics and the picture.
-AFTERWARDS, AFTERWARDS_S = 0.03, 2.0
 
 #: Where all together hold more than this share of the memory, each releases its own after a step.
 MEMORY_SHARE = 0.7
 MIB = 2**20
 
-#: Starts a process by its first message and the name of what it does, a function of this file.
+#: Starts a process by its first message and the name of what it does.
 Start = Callable[[dict[str, Any], str], Any]
 Worker = TypeVar("Worker", bound=Contestant)
 Item = TypeVar("Item")
-Measured = TypeVar("Measured", bound=Plan)
+Measured = TypeVar("Measured", bound=Measurement)
 
 
 def in_turn(workers: Sequence[Item], round: int) -> list[Item]:
@@ -43,23 +37,24 @@ def in_turn(workers: Sequence[Item], round: int) -> list[Item]:
     return [*workers[start:], *workers[:start]]
 
 
-def is_tight(plan: Measurement, held_mib: Iterable[float]) -> bool:
-    """Whether workers that hold so many MiB each have to release what they can after a step."""
-    return sum(held_mib) * MIB > MEMORY_SHARE * plan.memory
-
-
-def start_process(first: dict[str, Any], does: str = "measured_steps") -> Process:
-    """A process that does what the function `does` of this file returns; `first` is its first message."""
-    imports = f"from reslrb_cli.measure.arena import {does}\nfrom reslrb_cli.measure.workers import run"
-    return Process(first, python_command(f"{imports}\nrun({does})"))
+def start_process(first: dict[str, Any], does: str) -> Process:
+    """A process that does what `load` finds by this name; `first` is its first message."""
+    imports = "from reslrb_cli.measure.arena import load\nfrom reslrb_cli.measure.workers import run"
+    return Process(first, python_command(f"{imports}\nrun(lambda: load({does!r}))"))
 
 
 class Arena(Generic[Measured, Worker]):
     """Workers under way, `members`; what they write goes to `folder`, which is the caller's to remove.
 
-    `facts` are the referee's; of the budget `spent_s` have gone before. What an `earlier` session, which `check` has
-    accepted, has measured counts, and is gone on from. `device` is what computes, in words.
+    `facts` are the referee's; of the budget `spent_s` have gone before. What an `earlier` session has measured counts,
+    and is gone on from. Raises ConfigError where that is of another measurement, or leaves nothing to do.
     """
+
+    #: The most rounds.
+    MOST_ROUNDS = 256
+
+    #: Share of the budget, and seconds beside it, that are left for the statistics and the picture.
+    AFTERWARDS, AFTERWARDS_S = 0.03, 2.0
 
     def __init__(
         self,
@@ -71,65 +66,78 @@ class Arena(Generic[Measured, Worker]):
         now: Callable[[], float] = time.monotonic,
         spent_s: float = 0.0,
         earlier: Earlier | None = None,
-        device: str = "",
     ) -> None:
-        self.plan, self.folder, self.device, self._earlier = plan, folder, device, earlier
+        self.plan, self.folder, self.settings, self._earlier = plan, folder, plan.settings(), earlier
         self.members: list[Worker] = []
         self.facts: dict[str, Any] = {}
         self._stop, self._say, self._start, self._now, self._began = stop, say, start, now, now() - spent_s
-        self._budget_s = max((1 - AFTERWARDS) * plan.budget_s - AFTERWARDS_S - spent_s, 0.0)
-        self._pace, self._end = Pace(self._budget_s, 1, plan.rounds, now, MOST_ROUNDS), now() + self._budget_s
         self._referee: Contestant | None = None
         self._said: set[str] = set()
-        self._set_up()
+        if earlier is not None:
+            earlier.check(self.settings)
+        depths = self._set_up(earlier)
+        self._budget_s = max((1 - self.AFTERWARDS) * plan.budget_s - self.AFTERWARDS_S - spent_s, 0.0)
+        self._pace = Pace(self._budget_s, depths, plan.rounds, now, self.MOST_ROUNDS)
+        self._end = now() + self._budget_s
 
-    def _set_up(self) -> None:
-        """Begin what a kind of session has beside all this."""
+    def _set_up(self, earlier: Earlier | None) -> int:
+        """Begin what a kind of session has beside all this, with what it has of an earlier one.
+
+        Returns how many depths there are to share the time. Raises ConfigError where there is nothing to add.
+        """
+        raise NotImplementedError
 
     def _taking_turns(self, course: Iterator[Item]) -> Iterator[Item]:
         """What `course` yields, until it ends or `stop()`; no worker is left then."""
-        self._pace.begin_depth()
         try:
             yield from course
         except Stopped:
             return
         finally:
-            self._close_referee()
             for member in self.members:
-                if member.process is not None:
-                    member.process.close()
+                member.close()
+            if self._referee is not None:
+                self._referee.close()
+
+    def _alive(self) -> list[Worker]:
+        """Those that can be asked for more."""
+        return [member for member in self.members if member.alive]
+
+    def _tight(self) -> bool:
+        """Whether workers that hold so much together have to release what they can after a step."""
+        return sum(member.peak_mib for member in self._alive()) * MIB > MEMORY_SHARE * self.plan.memory
+
+    def _take_rounds(self, workers: Callable[[], Sequence[Stepping]], first: int, before: int) -> Iterator[int]:
+        """The number of rounds after each of them, from number `first` on, of which `before` are known already."""
+        tight, done = self._tight(), 0
+        self._pace.begin_rounds(before)
+        while workers() and self._pace.another(done):
+            for worker in in_turn(workers(), first + done):
+                worker.turn(first + done, tight, self._stop)
+            done += 1
+            yield first + done
 
     def _budget_for(self, seconds: float) -> float:
         """The budget that leaves so many seconds for measuring, from the beginning on."""
-        return (seconds + AFTERWARDS_S) / (1 - AFTERWARDS)
+        return (seconds + self.AFTERWARDS_S) / (1 - self.AFTERWARDS)
 
-    # --- the referee --------------------------------------------------------------------------------------------------
-
-    def _open_referee(self, first: dict[str, Any], does: str) -> dict[str, Any] | None:
-        """Start it; what it says first, its scene loaded; None where time was up. Raises as `_ask_referee`."""
-        self._referee = Contestant(self._start(first, does), False)
-        opening = self._referee.answer(self._stop, self._pace.over)
-        self._check_referee()
-        self._warn(opening or {})
-        return opening
-
-    def _ask_referee(self, question: dict[str, Any]) -> dict[str, Any] | None:
-        """An answer; None where the budget was spent over it. Raises Refused where the process ended."""
-        assert self._referee is not None, "it is opened first"
-        answer = self._referee.ask(question, self._stop, self._pace.over)
-        self._check_referee()
+    def _ask_referee(self, plan: Plan, question: dict[str, Any] | None = None) -> dict[str, Any] | None:
+        """An answer, or what it says first; None where the budget was spent over it. Raises Refused where it ended."""
+        assert self._referee is not None, "it is started first"
+        if question is not None:
+            self._referee.process.ask(question)
+        answer, end = self._open(self._referee), self._referee.end
+        if end is not None:
+            memory = end.status is BenchStatus.OUT_OF_MEMORY
+            code = ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED
+            raise Refused(f"--reference {plan.reference.label}: {end.reason}", code)
         return answer
 
-    def _check_referee(self) -> None:
-        end = None if self._referee is None else self._referee.end
-        if end is not None:
-            line = f"--reference {self.plan.reference.label}: {end.reason}"
-            memory = end.status is BenchStatus.OUT_OF_MEMORY
-            raise Refused(line, ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED)
-
-    def _close_referee(self) -> None:
-        if self._referee is not None:
-            self._referee.process.close()
+    def _open(self, member: Contestant) -> dict[str, Any] | None:
+        """What a worker says first, its scene loaded; None where it ended over that, or time was up."""
+        opening = member.answer(self._stop, self._pace.over)
+        self._warn(opening or {})
+        return opening
 
     # --- what is said -------------------------------------------------------------------------------------------------
 
@@ -147,6 +155,13 @@ class Arena(Generic[Measured, Worker]):
             self._said.add(line)
             self._say(line)
 
+    def _say_end(self, member: Worker, label: str, more: str = "") -> None:
+        """Say how a worker came to its end, if it did."""
+        if member.refusal is not None:
+            self._say(f"left out: {label}: {member.refusal}")
+        elif member.end is not None:
+            self._say(f"{label}{more}: {member.end.status.value}: {member.end.reason}")
+
     def _say_left_out(self) -> None:
         """Name what nobody named and cannot do the scene: of the default list alone."""
         for case in self.plan.cases:
@@ -158,43 +173,16 @@ class Arena(Generic[Measured, Worker]):
         return not self.plan.default or type not in self.facts["without"]
 
 
-def measured_steps() -> Begin:
-    """Steps as `bench` measures them. Whatever is imported for it is, here and in the function below."""
-    from reslrb_cli.config.loader import loads
-    from reslrb_cli.measure.stepper import Stepper
+def load(does: str) -> Begin:
+    """What begins a process, by the name of what it does. Whatever is imported for it is, here and in that function."""
+    if does == "measured_steps":
+        from reslrb_cli.measure.stepper import begin_steps
 
-    def begin(first: dict[str, Any]) -> Begun:
-        config = loads(first["config"], first["source"])
-        stepper = Stepper(config, first["objective"], first.get("film_width"), first.get("texture_width"))
-        size = {"width": stepper.size[0], "height": stepper.size[1], "texels": stepper.texels}
-        return size, lambda question: stepper.step(question["round"], question["cold"], question["release"])
+        return begin_steps
+    if does in ("surveyed", "sampled_steps"):
+        from reslrb_cli.measure.convergence.setup import begin_sampling, begin_survey
 
-    return begin
+        return begin_survey if does == "surveyed" else begin_sampling
+    from reslrb_cli.measure.optimization_benchmark.evaluate import begin_judging, begin_run
 
-
-def surveyed() -> Begin:
-    """What `convergence` asks before it measures."""
-    from reslrb_cli.measure.convergence.setup import begin_survey
-
-    return begin_survey
-
-
-def sampled_steps() -> Begin:
-    """Steps as `convergence` measures them, with what they estimate."""
-    from reslrb_cli.measure.convergence.setup import begin_sampling
-
-    return begin_sampling
-
-
-def judged_runs() -> Begin:
-    """What whole optimisations are judged by."""
-    from reslrb_cli.measure.optimization_benchmark.evaluate import begin_judging
-
-    return begin_judging
-
-
-def whole_runs() -> Begin:
-    """A whole optimisation, bit by bit."""
-    from reslrb_cli.measure.optimization_benchmark.evaluate import begin_run
-
-    return begin_run
+    return begin_judging if does == "judged_runs" else begin_run

@@ -1,11 +1,9 @@
 """The conditioning of an experiment where it starts: chains of Jacobians, and sensitivities of its parameters.
 
-How well conditioned the chains of Jacobians are that `reservoir` inverts where parameters move light
-(`measure_chains`): the inverse of a chain with condition number kappa has lost log10(kappa) of the 16 digits of double
-precision; and where that number is large, small noise in a connection's derivatives becomes large at the first vertex.
-Coordinates are those of `estimators.jacobian`, lengths in units of the scene's diagonal, angles in radians.
-
-How far apart the sensitivities of the parameters lie (`measure_conditioning`).
+How well conditioned the chains are that `reservoir` inverts where parameters move light (`measure_chains`): the inverse
+of a chain with condition number kappa has lost log10(kappa) of the 16 digits of double precision; and where that number
+is large, small noise in a connection's derivatives becomes large at the first vertex. Coordinates are those of
+`estimators.jacobian`, lengths in units of the scene's diagonal, angles in radians.
 """
 
 from __future__ import annotations

@@ -1,11 +1,8 @@
 """Whether the gradients of an experiment can be trusted: each estimator against everything that counts as a reference.
 
 The objective is sum(G * I) with a fixed random image G, some of it negative, so that every integrator estimates the
-same gradient; the configuration's loss would have each add a bias of its own, which the noise of its image makes. A
-seed gives one gradient of each integrator, finite differences, and forward derivatives along the same directions; all
-comparisons are of estimates at equal seeds. Comparisons are made one after the other, each as soon as it has what it
-needs, and what one needs is there for those that follow. Of what is cheap there are more seeds while the budget lasts:
-of the estimators and the stock reference, whose comparisons are the noisiest.
+same gradient; the configuration's loss would have each add a bias of its own, which the noise of its image makes. All
+comparisons are of estimates at equal seeds, one after the other, each as soon as it has what it needs.
 """
 
 from __future__ import annotations
@@ -178,7 +175,7 @@ class Gradcheck:
         if row.key is None:
             shape = tuple(parts.case.weights.shape)
         else:
-            place, chosen = parts.slices()[row.key], parts.directions[row.key]
+            place, chosen = parts.case.places[row.key], parts.directions[row.key]
             ours = ours[:, place]
             if row.reference in ALONG_DIRECTIONS:
                 ours = ours @ np.array([direction.vector[place] for direction in chosen]).T

@@ -1,12 +1,10 @@
-"""Gradients of a scene over many seeds, in forward mode and by finite differences; what of it moves light.
+"""Gradients of a scene over many seeds, in forward mode and by finite differences.
 
-Parameters that move light, as a gradient check needs them (`moves_light`, `smooth_rows`): which do, by what, and how
-smoothly.
+`Case`: a scene, its parameters and its objective, sum(image * weights) with fixed weights, so that dL/dI is the same
+for every estimator. A gradient is one flat vector over all parameters of a case.
 
-The values that a measurement varies, and the way between them and a scene (`Values`).
-
-Finite differences of the objective at common random numbers, along a few directions of one parameter (`Direction`). The
-step h is chosen by a sweep (`choose_step`). Central differences, and the one-sided ones of three nodes, are wrong by
+Finite differences are taken at common random numbers, along a few directions of one parameter (`Direction`). The step h
+is chosen by a sweep (`choose_step`). Central differences, and the one-sided ones of three nodes, are wrong by
 c h^2 + ..., so that two steps tell the truncation error of the smaller one (L. F. Richardson, 1911),
 
     D(h) - F' ~ (D(r h) - D(h)) / (r^2 - 1),
@@ -14,10 +12,6 @@ c h^2 + ..., so that two steps tell the truncation error of the smaller one (L. 
 while noise that grows as h shrinks, from paths that flip, shows in how much D(r h) - D(h) varies between seeds. Where
 light is moved, rounding can be the same for all seeds, for it is the scene that is rounded: a change that does not
 shrink with h is no truncation, and counts in full. The step with the least sum is taken, and its error comes with it.
-
-A scene, its parameters and its objective (`Case`), of which gradients over many seeds, derivatives in forward mode and
-finite differences are taken. An objective is sum(image * weights) with fixed random weights, so dL/dI is the same for
-every estimator. A gradient is one flat vector over all parameters of a case.
 """
 
 from __future__ import annotations
@@ -114,23 +108,18 @@ class Values(Protocol):
     @property
     def params(self) -> mi.SceneParameters:
         """All of the scene's `mi.traverse`."""
-        ...
 
     def value(self, key: str) -> Any:
         """The current value of `key`, as Dr.Jit has it."""
-        ...
 
     def hand_over(self, values: Mapping[str, Any]) -> None:
         """Give the scene these values, and evaluate what follows from them, derivatives included."""
-        ...
 
     def collect(self) -> None:
         """Bring the gradients of what is in the scene on to the values that were handed over."""
-        ...
 
     def push(self) -> None:
         """Bring tangents of the values that were handed over, once propagated, on to what is in the scene."""
-        ...
 
 
 #: Steps that are tried, in units of the direction.
@@ -224,7 +213,9 @@ def natural_bounds(kind: str, values: np.ndarray) -> tuple[float, float]:
 
 def _embed(case: Case, key: str, row: np.ndarray) -> np.ndarray:
     """A row of one parameter among zeros for the others."""
-    return np.concatenate([row if other == key else np.zeros(len(v)) for other, v in case.initial.items()])
+    whole = np.zeros(case.size)
+    whole[case.places[key]] = row
+    return whole
 
 
 class Case:
@@ -242,6 +233,8 @@ class Case:
         self.values, self.params = values, values.params
         self.keys = list(keys)
         self.initial = {key: self.flat(key) for key in self.keys}
+        self.places = places({key: len(row) for key, row in self.initial.items()})
+        self.size = sum(map(len, self.initial.values()))
         film = self.scene.sensors()[sensor].film()
         width, height = film.crop_size()
         self.channels = int(film.base_channels_count())
@@ -336,12 +329,10 @@ class Case:
 
         For forward mode: `tangent` is to render the derivative of the image along that direction.
         """
-        leaves, at = self.leaves(), 0
+        leaves = self.leaves()
         for key, leaf in leaves.items():
-            size = len(self.initial[key])
-            dr.set_grad(leaf, self.shaped(key, direction[at : at + size]))
+            dr.set_grad(leaf, self.shaped(key, direction[self.places[key]]))
             dr.enqueue(dr.ADMode.Forward, leaf)
-            at += size
         dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
         self.values.push()
         image = np.array(tangent(), dtype=np.float64)
@@ -357,9 +348,8 @@ class Case:
 
     def directions(self, count: int, seed: int = 3) -> np.ndarray:
         """Random directions in the space of parameters, (count, P): entries of size 0.5 to 1, either sign."""
-        random = np.random.default_rng(seed)
-        size = sum(len(value) for value in self.initial.values())
-        return random.uniform(0.5, 1.0, (count, size)) * random.choice([-1.0, 1.0], (count, size))
+        random, shape = np.random.default_rng(seed), (count, self.size)
+        return random.uniform(0.5, 1.0, shape) * random.choice([-1.0, 1.0], shape)
 
     def difference(self, integrator: Any, direction: np.ndarray, seed: int, spp: int, step: float, sides: str = "both"
                    ) -> float:  # fmt: skip
@@ -371,11 +361,7 @@ class Case:
         coefficients = {"both": (0.5, -0.5), "up": (-1.5, 2, -0.5), "down": (1.5, -2, 0.5)}[sides]
         total = 0.0
         for node, coefficient in zip(nodes, coefficients, strict=True):
-            at, values = 0, {}
-            for key, value in self.initial.items():
-                values[key] = value + step * node * direction[at : at + len(value)]
-                at += len(value)
-            self.set(values)
+            self.set({key: self.initial[key] + step * node * direction[at] for key, at in self.places.items()})
             total += coefficient * self.value(integrator, seed, spp)
         self.set(self.initial)
         return total / step
@@ -386,6 +372,12 @@ class Case:
         """Finite differences along each of K directions at each of N seeds: (N, K)."""
         fixed = spp, step, sides
         return np.array([[self.difference(integrator, d, seed, *fixed) for d in directions] for seed in seeds])
+
+
+def places(sizes: Mapping[str, int]) -> dict[str, slice]:
+    """Where things of these sizes stand in a row, one behind the other."""
+    ends = np.cumsum([0, *sizes.values()]).tolist()
+    return {key: slice(*ends[number : number + 2]) for number, key in enumerate(sizes)}
 
 
 def seeds(count: int, block: int = 0) -> range:

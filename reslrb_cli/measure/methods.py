@@ -1,10 +1,7 @@
-"""The methods that measurements compare, and what they vary, as their options say it. Knows no Mitsuba.
+"""The methods that measurements compare (`Case`), and what these measure, as their options say it. Knows no Mitsuba.
 
-- `Case`: what a measurement compares, by a list such as `ptracer,reslrb:reservoir(capacity=4)`; and the depths of a
-  bench.
-- `Sweep`: what `bench` varies, and over which values.
-- `Plan`: what `convergence` measures, and what it takes its errors from.
-- `RunsPlan`: what `convergence --runs` measures.
+A list is written as `ptracer,reslrb:reservoir(capacity=4)`. `Sweep` is of `bench`, `Plan` of `convergence`, `RunsPlan`
+of `convergence --runs`.
 """
 
 from __future__ import annotations
@@ -12,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 from reslrb_cli.config.base import SEED_END
 from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, UNDECIDED, Prb, Ptracer, Trajectory, WalkAd
@@ -40,10 +37,7 @@ _TYPES = {str(kind.model_fields["type"].default): kind for kind in (ReslrbConfig
 
 #: Options that make an estimator another one, in records.
 _ESTIMATOR_OPTIONS = {option for options in ESTIMATOR_OPTIONS.values() for option in options} - {"capacity"}
-
-
 _ESTIMATOR_OPTIONS |= set(UNDECIDED)
-
 
 _OPTION = "--integrators"
 _ITEM = re.compile(r"(?P<type>\w+)(?::(?P<estimator>\w+))?(?:\((?P<options>.*)\))?")
@@ -104,12 +98,12 @@ def parse_cases(text: str, source: str = _OPTION, deep: bool = True) -> list[Cas
     `source` is the option that the list was given by; `deep`: depths are what is varied. What an option means is not
     looked at here, but in `Case.at`.
     """
-    return _parse(_split(text), source, "", "integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)]", deep)
+    return _parse(text, source, "", "integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)]", deep)
 
 
 def parse_estimators(text: str) -> list[Case]:
     """The cases in a list of estimators of `reslrb`, such as `stack,reservoir(capacity=4)`; raises as `parse_cases`."""
-    return _parse(_split(text), "--estimators", "reslrb:", "estimator; write ESTIMATOR[(OPTION=VALUE,...)]", False)
+    return _parse(text, "--estimators", "reslrb:", "estimator; write ESTIMATOR[(OPTION=VALUE,...)]", False)
 
 
 def all_estimators(config: Config) -> list[Case]:
@@ -126,23 +120,23 @@ def all_estimators(config: Config) -> list[Case]:
     return cases
 
 
-def _parse(items: list[str], source: str, prefix: str, wanted: str, deep: bool) -> list[Case]:
+def _parse(text: str, source: str, prefix: str, wanted: str, deep: bool) -> list[Case]:
     cases: list[Case] = []
-    for item in items:
+    for item in _split(text):
         match = _ITEM.fullmatch(prefix + item)
         if match is None or (prefix and not match["estimator"]):
             raise ConfigError(source, "", f"`{item}` is no {wanted}")
         options = {} if match["estimator"] is None else {"estimator": match["estimator"]}
-        for pair in _split(match["options"] or "") if match["options"] else []:
-            name, equals, value = pair.partition("=")
-            if not equals or not name.strip():
+        for pair in _split(match["options"]) if match["options"] else []:
+            name, equals, value = (part.strip() for part in pair.partition("="))
+            if not equals or not name:
                 raise ConfigError(source, item, f"`{pair}` must be OPTION=VALUE")
-            if name.strip() == "max_depth" and deep:
+            if name == "max_depth" and deep:
                 raise ConfigError(source, item, "max_depth is what is varied; --max-depth says how far")
-            if name.strip() == "max_depth" or (name.strip() in ADJOINT and prefix):
-                section = "run" if name.strip() in ADJOINT else "integrator"
-                raise ConfigError(source, item, f"all share one {name.strip()}; take --set {section}.{pair}")
-            options[name.strip()] = parse(value, f"{source} {item}", name_line=False)
+            if name == "max_depth" or (name in ADJOINT and prefix):
+                section = "run" if name in ADJOINT else "integrator"
+                raise ConfigError(source, item, f"all share one {name}; take --set {section}.{pair}")
+            options[name] = parse(value, f"{source} {item}", name_line=False)
         case = Case(prefix + item, match["type"], options, source)
         if case.label in [other.label for other in cases]:
             raise ConfigError(source, "", f"`{item}` is named twice")
@@ -199,13 +193,18 @@ def usual_values(swept: str, config: Config) -> list[int]:
     return list(WIDTHS[swept])
 
 
+def with_run(config: Config, **changes: Any) -> Config:
+    """The experiment with other settings of `run`."""
+    return config.model_copy(update={"run": config.run.model_copy(update=changes)})
+
+
 @dataclass(frozen=True, kw_only=True)
 class Measurement:
     """What every measurement by processes has; `memory_limit` is of each, None: none.
 
-    `memory` is what the machine has, in bytes. `rounds` is None where `budget_s` decides their number; else there are
-    so many, whatever time they take. Of the `cases`, those that cannot do what the scene asks for are left out where
-    they are the `default` ones.
+    `memory` is what the machine has, in bytes, `device` what computes, in words. `rounds` is None where `budget_s`
+    decides their number; else there are so many, whatever time they take. Of the `cases`, those that cannot do what the
+    scene asks for are left out where they are the `default` ones.
     """
 
     config: Config
@@ -217,22 +216,25 @@ class Measurement:
     budget_s: float
     rounds: int | None = None
     default: bool = False
+    device: str = ""
+
+    #: What is kept says that it is of this.
+    KIND: ClassVar[str]
 
     def first(self, config: Config) -> dict[str, Any]:
         """What a process is told first, to measure `config`."""
         return {"config": dump(config), "source": str(config.source), "variant": self.variant,
                 "memory_limit": self.memory_limit}  # fmt: skip
 
-    def settings(self, device: str, **options: Any) -> dict[str, Any]:
+    def settings(self) -> dict[str, Any]:
         """What has to be the same in all sessions, as JSON has it; see `resume_store.settings`."""
-        return resume_store.settings(
-            self.config,
-            self.variant,
-            device,
-            integrators=[case.label for case in self.cases],
-            **options,
-            **{"memory limit": self.memory_limit},
-        )
+        labels = [case.label for case in self.cases]
+        options = {"integrators": labels, **self._options(), "memory limit": self.memory_limit}
+        return resume_store.settings(self.config, self.variant, self.device, **options)
+
+    def _options(self) -> dict[str, Any]:
+        """Those of the command that count among the settings."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,16 +245,21 @@ class Sweep(Measurement):
     values: Sequence[int]
     swept: str = "depth"
 
+    KIND = "bench"
+
+    def _options(self) -> dict[str, Any]:
+        values = {"values": list(self.values), "objective": self.objective, "sweep": self.swept}
+        return {"baseline": self.baseline.label} | values
+
     def may_refuse(self, case: Case) -> bool:
         """Whether the rest goes on without this case, where it refuses the scene."""
         return self.default and case != self.baseline
 
     def at(self, case: Case, value: int) -> Config:
         """The experiment of one case, all but the sizes of film and textures. Raises ConfigError."""
-        config, depth = self.config, self.config.integrator.max_depth
-        if self.swept == "spp":
-            config = config.model_copy(update={"run": config.run.model_copy(update={"spp": value})})
-        return case.at(config, value if self.swept == "depth" else depth, known=self.objective == "fixed")
+        config = with_run(self.config, spp=value) if self.swept == "spp" else self.config
+        depth = value if self.swept == "depth" else config.integrator.max_depth
+        return case.at(config, depth, known=self.objective == "fixed")
 
     def name(self, *values: int) -> str:
         """Some values of what is swept, in words: `depth 2, 4`."""
@@ -299,6 +306,11 @@ class Plan(Measurement):
     reference: Case
     spps: Sequence[int] = ()
 
+    KIND = "convergence"
+
+    def _options(self) -> dict[str, Any]:
+        return {"objective": self.objective, "reference": self.reference.label, "spp": list(self.spps)}
+
     @property
     def known(self) -> bool:
         """Whether dL/dI is known before the image, or not asked for."""
@@ -317,9 +329,7 @@ class Plan(Measurement):
 
     def config_of(self, case: Case, spp: int) -> Config:
         """The experiment with the integrator of a case, and so many samples per pixel. Raises ConfigError."""
-        run = self.config.run.model_copy(update={"spp": spp})
-        config = self.config.model_copy(update={"run": run})
-        return case.at(config, config.integrator.max_depth, self.known)
+        return case.at(with_run(self.config, spp=spp), self.config.integrator.max_depth, self.known)
 
     @property
     def reference_config(self) -> Config:
@@ -330,10 +340,8 @@ class Plan(Measurement):
         """The experiment with a stock integrator: without roulette, which naive AD does not differentiate rightly."""
         depth = self.config.integrator.max_depth
         roulette = depth < 0 or self.config.integrator.rr_depth <= depth
-        case = Case(
-            name, name, {"rr_depth": NEVER} if name == "ptracer" and roulette else {}, "the independent reference"
-        )
-        return case.at(self.config, depth, True)
+        options = {"rr_depth": NEVER} if name == "ptracer" and roulette else {}
+        return Case(name, name, options, "the independent reference").at(self.config, depth, True)
 
     def check(self) -> None:
         """Raise ConfigError where an integrator of the list, or the reference, cannot be."""
@@ -375,6 +383,15 @@ class RunsPlan(Plan):
     runs: int = 3
     rates: Sequence[float] = ()
 
+    KIND = "convergence --runs"
+
+    def _options(self) -> dict[str, Any]:
+        return {"reference": self.reference.label, "spp": list(self.spps), "rates": list(self.rates)}
+
+    def settings(self) -> dict[str, Any]:
+        """What has to be the same in all sessions; files of such runs name the variant with the device, always have."""
+        return super().settings() | {"device": f"{self.device}, {self.variant}"}
+
     @property
     def sides(self) -> list[Side]:
         """What has runs of its own, all rates of a method beside each other."""
@@ -395,13 +412,7 @@ class RunsPlan(Plan):
 
         Raises ConfigError.
         """
-        run = self.config.run.model_copy(update={"spp": spp})
-        config = self.config.model_copy(update={"run": run})
-        return case.at(config, config.integrator.max_depth, False, auto=True)
-
-    def seeded(self, config: Config, seed: int) -> Config:
-        """The same experiment with another `run.seed`."""
-        return config.model_copy(update={"run": config.run.model_copy(update={"seed": seed})})
+        return case.at(with_run(self.config, spp=spp), self.config.integrator.max_depth, False, auto=True)
 
     def config_at(self, side: Side) -> Config:
         """The experiment as a side has it. Raises ConfigError."""

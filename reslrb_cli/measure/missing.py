@@ -12,10 +12,7 @@ D(h), the difference by a step h, is wrong by c h^2 + ..., which two steps cance
 Of steps that halve, the one is taken around which E changes least: at larger ones E is truncated, at smaller ones it is
 lost in rounding, which is the same for all seeds where it is the scene that is rounded, or in paths that flip. By how
 much E changes there counts as error where it stands out of its noise. What noise adds to the squares is subtracted; the
-standard error is that of the mean over seeds.
-
-`MissingCheck` is `gradcheck --missing` on an experiment: its scene, the dL/dI of its own loss, and directions for each
-parameter.
+standard error is that of the mean over seeds. `MissingCheck` is `gradcheck --missing` on an experiment.
 """
 
 from __future__ import annotations

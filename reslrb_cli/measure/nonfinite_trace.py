@@ -1,14 +1,8 @@
 """The trace of a value that is not finite: the path, its vertex and the factor, or the loss's pixel.
 
-The paths of the step that came upon it are traced again from their seeds, and every factor is looked at, with its
-derivative in the direction in which all entries of the parameters grow alike: what is not finite in one direction is
-not in this one.
-
-- `Witness`: which tables the samples of a guided step were drawn from, noted while the step is taken again.
-- `SearchHooks`: a walk that looks for the first value on each path that is not finite, and that reaches the image or a
-  gradient.
-- `search_paths`: the first such value along the paths of one set of samples.
-- `find_offenders`: where the step came upon one, an `Offender`.
+The paths of the step that came upon it are traced again from their seeds (`find_offenders`), and every factor is looked
+at (`SearchHooks`), with its derivative in the direction in which all entries of the parameters grow alike: what is not
+finite in one direction is not in this one.
 """
 
 from __future__ import annotations

@@ -13,27 +13,20 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.step import make_integrator
-from reslrb_cli.measure.gradients import (
-    Case,
-    all_directions,
-    choose_step,
-    moves_light,
-    seeds,
-    smooth_weights,
-)
+from reslrb_cli.measure.gradients import Case, all_directions, choose_step, seeds, smooth_weights
 from reslrb_cli.measure.methods import Case as Listed
 from reslrb_cli.measure.references import (
     Situation,
+    choose,
     ends,
     known_gradient,
+    of_gradient,
     path_image,
-    prb_gradient,
     prb_image,
-    ptracer_gradient,
     ptracer_image,
 )
 from reslrb_cli.measure.scenes import small
-from reslrb_cli.measure.stepper import shrink
+from reslrb_cli.measure.stepper import multiple_of, shrink
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.measurements import Reference
 from reslrb_cli.scene.catalog import value_shape
@@ -120,10 +113,13 @@ class Participants:
         self.spp = settings.spp or _samples(self.film, config.run.spp, problem.samples_per_pass)
         options = first.integrator.options()
         depth = config.integrator.max_depth
-        moved = tuple(key for key in problem.selection.scene_keys if moves_light(self.case.params, key))
-        self.attached = options.get("attached") is True or bool(moved)
+        self._situation = Situation.of_problem(problem, sensor)
+        self.attached, moved = self._situation.attached, self._situation.moved
         #: Whether there is a forward mode: of emitters that move there is none.
-        self.forward_mode = not any(_emits(self.case.params.properties[key][2]) for key in moved)
+        nodes = [self.case.params.properties[key][2] for key in moved]
+        self.forward_mode = not any(
+            isinstance(node, mi.Emitter) or (isinstance(node, mi.Shape) and node.is_emitter()) for node in nodes
+        )
         self.listed = self._able(settings)
         shared = {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
         naive = {"samples_per_pass": options.get("samples_per_pass")}
@@ -138,9 +134,12 @@ class Participants:
             "prb": make_integrator("prb", **shared),
             "path": make_integrator("path", **shared),
         }
-        hidden = config.integrator.hide_emitters
-        self._situation = Situation.of(scene, self.sensor, self.case.params, depth, hidden, self.attached, moved)
-        self._choose_references()
+        at = self._situation
+        chosen = {key: choose(of_gradient(at, key)) for key in self.case.keys}
+        self.stock = {key: reference for key, (reference, _) in chosen.items()}
+        self.why = {key: reason for key, (_, reason) in chosen.items()}
+        by_camera = {Reference.PATH: path_image(at), Reference.PRB: prb_image(at)}
+        self.image, self.why_no_image = choose({Reference.PTRACER: ptracer_image(at)} | by_camera)
         self._weigh()
         self.directions = all_directions(self.case, problem.selection, MOVING_DIRECTIONS, DIRECTIONS)
         weights = np.array(self.case.weights, np.float64)
@@ -155,11 +154,8 @@ class Participants:
             return list(settings.integrators)
         if settings.named or not able:
             names = ", ".join(name for name, kind in ESTIMATORS.items() if kind.attaches)
-            raise ConfigError(
-                "--estimators",
-                "",
-                f"{others[0].options['estimator']} has no derivatives of what moves light; take {names}",
-            )
+            without = others[0].options["estimator"]
+            raise ConfigError("--estimators", "", f"{without} has no derivatives of what moves light; take {names}")
         return able
 
     def _configured(self, configs: dict[str, Config]) -> dict[str, StepIntegrator]:
@@ -177,20 +173,6 @@ class Participants:
         """The integrator whose gradients stand for those of `label` beside this reference (`ALIKE`)."""
         alike = _alike(label, reference)
         return alike if alike in self.integrators else label
-
-    def _choose_references(self) -> None:
-        at = self._situation
-        self.stock: dict[str, Reference | None] = {}
-        self.why: dict[str, str] = {}
-        for key in self.case.keys:
-            reasons = {Reference.PTRACER: ptracer_gradient(at, key), Reference.PRB: prb_gradient(at, key)}
-            self.stock[key], self.why[key] = _first(reasons)
-        reasons = {
-            Reference.PTRACER: ptracer_image(at),
-            Reference.PATH: path_image(at),
-            Reference.PRB: prb_image(at),
-        }
-        self.image, self.why_no_image = _first(reasons)
 
     def _weigh(self) -> None:
         """Random weights of mean 1, so that entries do not cancel, a sixth negative; 0 where the border lacks light.
@@ -210,52 +192,31 @@ class Participants:
         """Shape of a parameter."""
         return value_shape(self.case.values.value(key))
 
-    def slices(self) -> dict[str, slice]:
-        """Where each parameter stands in a gradient."""
-        found, at = {}, 0
-        for key, values in self.case.initial.items():
-            found[key] = slice(at, at + len(values))
-            at += len(values)
-        return found
-
-    def stock_labels(self) -> list[str]:
-        """The stock integrators that are references of gradients."""
-        return sorted({reference.value for reference in self.stock.values() if reference is not None})
-
     def choose_steps(self, key: str) -> None:
         """Choose the steps of the finite differences of a parameter."""
         image, pilot = self.integrators[DIFFERENCED], seeds(PILOT_SEEDS, 9)
         self.directions[key] = [choose_step(self.case, image, d, pilot, self.spp) for d in self.directions[key]]
 
-    # --- one seed -----------------------------------------------------------------------------------------------------
+    def sample(self, kind: str, of: str, seed: int) -> np.ndarray:
+        """One sample in a row: by an integrator, `gradient` or `image`, or along the directions of a parameter, `of`.
 
-    def gradient(self, label: str, seed: int) -> np.ndarray:
-        """The gradient of all parameters in a row, by a step such as the experiment takes."""
-        integrator = self.integrators[label]
-        if not self.known:
-            return self.case.gradient(integrator, seed, self.spp)
-        return self.case.gradient(integrator, seed, self.spp, step=self.case.known_step)
-
-    def differences(self, key: str, seed: int) -> list[float]:
-        """Finite differences of the image's objective along the directions of a parameter."""
-        image = self.integrators[DIFFERENCED]
-        return [direction.difference(self.case, image, seed, self.spp) for direction in self.directions[key]]
-
-    def tangents(self, label: str, key: str, seed: int) -> list[float]:
-        """Forward derivatives along the same directions."""
-        integrator = self.integrators[label]
-        return [self.case.tangent(integrator, d.vector, seed, self.spp) for d in self.directions[key]]
-
-    def picture(self, label: str, seed: int) -> np.ndarray:
-        """The image in a row; black along the border where it is compared with one that loses no light there."""
-        image = self.case.image(self.integrators[label], seed, self.spp)
-        if self.image in CAMERA_PATHS:
-            image *= interior(image.shape, self.sensor)[:, :, None]
-        return image.ravel()
-
-
-def _emits(node: mi.Object) -> bool:
-    return isinstance(node, mi.Emitter) or (isinstance(node, mi.Shape) and node.is_emitter())
+        Gradients are of all parameters, by a step such as the experiment takes; images are black along the border where
+        they are compared with one that loses no light there. Along directions there are finite `differences`, and
+        `tangents`, forward derivatives, which are the same for all estimators.
+        """
+        if kind == "gradient":
+            options = {"step": self.case.known_step} if self.known else {}
+            return self.case.gradient(self.integrators[of], seed, self.spp, **options)
+        if kind == "image":
+            image = self.case.image(self.integrators[of], seed, self.spp)
+            if self.image in CAMERA_PATHS:
+                image *= interior(image.shape, self.sensor)[:, :, None]
+            return image.ravel()
+        if kind == "differences":
+            tracer, along = self.integrators[DIFFERENCED], self.directions[of]
+            return np.array([direction.difference(self.case, tracer, seed, self.spp) for direction in along])
+        tracer = self.integrators[self.listed[0].label]
+        return np.array([self.case.tangent(tracer, d.vector, seed, self.spp) for d in self.directions[of]])
 
 
 def _alike(label: str, reference: Reference) -> str:
@@ -264,12 +225,4 @@ def _alike(label: str, reference: Reference) -> str:
 
 def _samples(film: tuple[int, int], most: int, multiple: int | None) -> int:
     """Samples per pixel of one gradient: as many paths as PATHS, no more than in a step of the run."""
-    spp = max(min(PATHS // (film[0] * film[1]), most), 1)
-    return spp if multiple is None else max(spp // multiple, 1) * multiple
-
-
-def _first(reasons: dict[Reference, str | None]) -> tuple[Reference | None, str]:
-    """The first that counts, and why those before it do not."""
-    refused = {name: reason for name, reason in reasons.items() if reason is not None}
-    chosen = next((name for name in reasons if name not in refused), None)
-    return chosen, "; ".join(f"not {name.value}: {reason}" for name, reason in refused.items())
+    return multiple_of(max(min(PATHS // (film[0] * film[1]), most), 1), multiple)

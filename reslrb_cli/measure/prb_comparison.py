@@ -1,16 +1,12 @@
-"""Whether `prb` would have been the better choice: its gradients beside those of the run's integrator, in turns.
-
-Steps are those of the run's own loss and adjoint, so that both estimate the same; `race.compare` says how much more
-efficient it is.
-"""
+"""Whether `prb` would have been the better choice: steps of the run's own loss beside those of its integrator."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 from reslrb_cli.integrators.step import make_integrator
-from reslrb_cli.measure.gradients import moves_light
 from reslrb_cli.measure.references import Situation, prb_gradient
+from reslrb_cli.measure.stepper import multiple_of
 from reslrb_cli.optimization.autotune import race
 from reslrb_cli.optimization.decisions import Allowance
 from reslrb_cli.optimization.problem import Problem
@@ -27,6 +23,36 @@ SHARE, MOST_SHARE = 0.05, 0.1
 NEEDS = (2.0, 2.0)
 #: A step of `prb` may take so many times as long as one of the run.
 LONGER = 2.0
+
+
+def why_not(problem: Problem) -> str | None:
+    """Why `prb` has no such gradient of some parameter, or no such image of some view; None where it has all."""
+    for sensor in problem.sensors:
+        at = Situation.of_problem(problem, sensor)
+        for key in problem.selection.scene_keys:
+            reason = prb_gradient(at, key)
+            if reason is not None:
+                return reason
+    return None
+
+
+def _samples(problem: Problem, iterations: float) -> int:
+    """Samples per pixel of steps, with which the rounds that there are to be take so many iterations' worth of time."""
+    share = min(iterations / ((1 + LONGER) * MOST_ROUNDS), 1.0)
+    return multiple_of(int(share * problem.config.run.spp), race.sets_of(problem.config))
+
+
+class RivalTurns(race.Turns[RivalRecord]):
+    """One decision: whether `prb` is the more efficient. What Python takes beside the kernels is left out."""
+
+    LEAST, LOOKS = LEAST_ROUNDS, 1
+
+    def _times(self, other: bool, images: bool) -> list[float]:
+        return [step.kernel_ms for step in self._steps[other]]
+
+    def _record(self, note: str, gain: race.Gain = race.NOTHING, *others: object) -> RivalRecord:
+        found = dict(zip(("advantage", "low", "high"), gain, strict=True)) | self._found(note)
+        return RivalRecord(integrator=RIVAL, **found)
 
 
 def measure_rival(problem: Problem, cache: PilotCache | None, say: Callable[[str], None]) -> RivalRecord | None:
@@ -64,39 +90,3 @@ def measure_rival(problem: Problem, cache: PilotCache | None, say: Callable[[str
         measure=measure,
         unmeasured=lambda note: RivalRecord(integrator=RIVAL, note=note),
     )
-
-
-def why_not(problem: Problem) -> str | None:
-    """Why `prb` has no such gradient of some parameter, or no such image of some view; None where it has all."""
-    options, params = problem.config.integrator.options(), problem.selection.params
-    moved = tuple(key for key in problem.selection.scene_keys if moves_light(params, key))
-    for index in problem.sensors:
-        sensor = problem.scene.sensors()[index]
-        at = Situation.of(
-            problem.scene, sensor, params, options["max_depth"], options["hide_emitters"], bool(moved), moved
-        )
-        for key in problem.selection.scene_keys:
-            reason = prb_gradient(at, key)
-            if reason is not None:
-                return reason
-    return None
-
-
-def _samples(problem: Problem, iterations: float) -> int:
-    """Samples per pixel of steps, with which the rounds that there are to be take so many iterations' worth of time."""
-    run, unit = problem.config.run, race.sets_of(problem.config)
-    share = min(iterations / ((1 + LONGER) * MOST_ROUNDS), 1.0)
-    return max(int(share * run.spp) // unit, 1) * unit
-
-
-class RivalTurns(race.Turns[RivalRecord]):
-    """One decision: whether `prb` is the more efficient. What Python takes beside the kernels is left out."""
-
-    LEAST, LOOKS = LEAST_ROUNDS, 1
-
-    def _times(self, other: bool, images: bool) -> list[float]:
-        return [step.kernel_ms for step in self._steps[other]]
-
-    def _record(self, note: str, gain: race.Gain = race.NOTHING, *others: object) -> RivalRecord:
-        found = dict(zip(("advantage", "low", "high"), gain, strict=True)) | self._found(note)
-        return RivalRecord(integrator=RIVAL, **found)

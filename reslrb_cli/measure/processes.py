@@ -1,8 +1,7 @@
-"""Workers as they are from without: each case in a process of its own, so that the end of one is seen, and said, and is
-not the end of the sweep.
+"""Workers as they are from without: each in a process of its own, whose end is seen, and said, and ends nothing else.
 
 - `Process`: one worker, asked and answered by lines of JSON (`workers.py` is its other end).
-- `Contestant`: one of several that are measured side by side, and how it came to its end.
+- `Contestant`: one of several that are measured side by side, and how it came to its end; `Stepping`: that takes steps.
 - `Pace`: how the time of a sweep is spent: so much for each depth, and as many rounds there as fit.
 """
 
@@ -19,7 +18,7 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,18 +41,9 @@ _CRASHES = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS)
 class Ended(Exception):
     """A process ended before it answered; `status` and `reason` say how."""
 
-    def __init__(self, status: BenchStatus, reason: str) -> None:
+    def __init__(self, status: BenchStatus | str, reason: str) -> None:
         super().__init__(reason)
-        self.status, self.reason = status, reason
-
-    def kept(self) -> dict[str, str]:
-        """What a later session needs, as JSON has it."""
-        return {"status": self.status.value, "reason": self.reason}
-
-    @classmethod
-    def restored(cls, entry: Mapping[str, str] | None) -> Ended | None:
-        """The end that `kept` returned; None where there was none."""
-        return None if entry is None else cls(BenchStatus(entry["status"]), entry["reason"])
+        self.status, self.reason = BenchStatus(status), reason
 
 
 class Stopped(Exception):
@@ -181,20 +171,24 @@ def last_words(text: str) -> str:
     return (marked[-1].lstrip("> ") if marked else lines[-1] if lines else "")[:300]
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Contestant:
-    """A process under way (`processes.Process`); whoever may not refuse ends the whole where it does."""
+    """One of several that are measured side by side; whoever may not refuse ends the whole where it does.
+
+    `process` is None where none is under way, `peak_mib` the memory that it holds.
+    """
 
     process: Any
     may_refuse: bool
     end: Ended | None = None
     refusal: Refused | None = None
     late: bool = False
+    peak_mib: float = 0.0
 
     @property
     def alive(self) -> bool:
         """Whether it can be asked for more."""
-        return self.end is None and self.refusal is None and not self.late
+        return self.process is not None and self.end is None and self.refusal is None and not self.late
 
     def ask(
         self, question: dict[str, Any], stop: Callable[[], bool], over: Callable[[], bool] = lambda: False
@@ -218,8 +212,51 @@ class Contestant:
             if stop():
                 raise
             self.late = True
-        self.process.close()  # what it held is for the others
+        self.close()  # what it held is for the others
         return None
+
+    def close(self) -> None:
+        """End its process, if one is under way."""
+        if self.process is not None:
+            self.process.close()
+            self.process = None
+
+
+#: Steps after the cold one until no new kernel comes, at most.
+MAX_WARM_UPS = 4
+
+
+@dataclass(kw_only=True)
+class Stepping(Contestant):
+    """One that takes steps in rounds once it is warm; `cold` is what its first step took, which compiles."""
+
+    cold: dict[str, Any] | None = None
+
+    def question(self, round: int | None) -> dict[str, Any]:
+        """What asks for the steps of a round; None: for one that counts for nothing."""
+        raise NotImplementedError
+
+    def keep(self, round: int, answer: dict[str, Any]) -> None:
+        """Take note of the steps of a round."""
+        raise NotImplementedError
+
+    def warm_up(self, tight: Callable[[], bool], stop: Callable[[], bool], over: Callable[[], bool]) -> dict | None:
+        """Take a cold step, then others until nothing is compiled any more; the last answer, None where it ended."""
+        answer = self.ask(self.question(None) | {"cold": True, "release": False}, stop, over)
+        if answer is not None:
+            self.cold, self.peak_mib = answer, answer["peak_mib"]
+        for _ in range(MAX_WARM_UPS):
+            if answer is not None:
+                answer = self.ask(self.question(None) | {"cold": False, "release": tight()}, stop, over)
+            if answer is None or not answer["new_kernels"]:
+                break
+        return answer
+
+    def turn(self, round: int, release: bool, stop: Callable[[], bool]) -> None:
+        """Take the steps of a round, and `release` memory afterwards. Raises Stopped."""
+        answer = self.ask(self.question(round) | {"cold": False, "release": release}, stop)
+        if answer is not None:
+            self.keep(round, answer)
 
 
 MIN_ROUNDS = 3
@@ -248,7 +285,8 @@ class Pace:
         most: int = MAX_ROUNDS,
     ) -> None:
         self._now, self._end, self._left, self._rounds, self._most = now, now() + budget_s, depths, rounds, most
-        self._start = self._rounds_start = self._depth_start = self._depth_end = now()
+        self._start = self._rounds_start = self._depth_start = now()
+        self._depth_end = self._end
         self._before = 0
 
     @property

@@ -1,7 +1,7 @@
 """Stock integrators that count as references: of images `ptracer`, `path` and `prb`, of gradients `ptracer` and `prb`.
 
-Each public function after `Situation` returns why one does not count, or None where it does. docs/method.md, Baselines,
-has the reasons.
+Each public function after `of_gradient` returns why one does not count, or None where it does. docs/method.md,
+Baselines, has the reasons.
 
 Two things come before: `leave_out_border` leaves out the film's border where paths from the camera and paths from the
 lights are compared, since light tracing loses there what samples just outside of the film would have added
@@ -10,6 +10,7 @@ lights are compared, since light tracing loses there what samples just outside o
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +20,7 @@ import numpy as np
 from reslrb_cli.measure.gradients import moves_light
 from reslrb_cli.measure.scenes.analytic import furnace
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.records.measurements import Reference
 from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import PrimaryHits, SceneNeeds, look, scene_needs, stock_clip
@@ -107,6 +109,30 @@ class Situation:
         """The situation of a loaded scene, whose `mi.traverse` is `params`."""
         graph, needs, view = SceneGraph.of(scene), scene_needs(scene, sensor), look(scene, sensor)
         return cls(scene, params, graph, needs, view, max_depth, hide_emitters, attached, moved)
+
+    @classmethod
+    def of_problem(cls, problem: Problem, sensor: int) -> Situation:
+        """That of a problem, as the sensor of this index sees it."""
+        params, options = problem.selection.params, problem.config.integrator.options()
+        moved = tuple(key for key in problem.selection.scene_keys if moves_light(params, key))
+        attached, seen = options.get("attached") is True or bool(moved), problem.scene.sensors()[sensor]
+        return cls.of(problem.scene, seen, params, options["max_depth"], options["hide_emitters"], attached, moved)
+
+
+def choose(reasons: Mapping[Reference, str | None]) -> tuple[Reference | None, str]:
+    """The first reference that no reason speaks against, and, in words, why others do not count."""
+    refused = [f"not {name.value}: {reason}" for name, reason in reasons.items() if reason is not None]
+    return next((name for name, reason in reasons.items() if reason is None), None), "; ".join(refused)
+
+
+def of_image(at: Situation) -> dict[Reference, str | None]:
+    """Why stock integrators are no reference of the image."""
+    return {Reference.PTRACER: ptracer_image(at), Reference.PRB: prb_image(at)}
+
+
+def of_gradient(at: Situation, key: str) -> dict[Reference, str | None]:
+    """Why stock integrators are no reference of the gradient with respect to the parameter `key`."""
+    return {Reference.PTRACER: ptracer_gradient(at, key), Reference.PRB: prb_gradient(at, key)}
 
 
 def ptracer_image(at: Situation) -> str | None:

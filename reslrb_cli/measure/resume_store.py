@@ -12,6 +12,7 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.manifest import versions
+from reslrb_cli.records.measurement_files import read_samples, samples_file
 
 if TYPE_CHECKING:
     import numpy as np
@@ -64,13 +65,30 @@ class Earlier:
         if found is not None:
             raise self.other(found)
 
-    def other(self, reason: str) -> ConfigError:
+    @classmethod
+    def read(cls, kind: str, json_file: Path | None, now: Mapping[str, Any] | None = None) -> Earlier | None:
+        """What lies beside a JSON file that another call has written; None for no file.
+
+        Raises ConfigError, also where its settings are not those of `now`, if these are known yet.
+        """
+        if json_file is None:
+            return None
+        earlier = cls(kind, json_file, *read_samples(samples_file(json_file)))
+        if now is not None:
+            earlier.check(now)
+        return earlier
+
+    def error(self, reason: str) -> ConfigError:
         """What is raised where it cannot be gone on from."""
-        return ConfigError("--resume", "", f"{self.source} is of another measurement: {reason}")
+        return ConfigError("--resume", "", f"{self.source} {reason}")
+
+    def other(self, reason: str) -> ConfigError:
+        """The same where it is of another measurement."""
+        return self.error(f"is of another measurement: {reason}")
 
     def complete(self, what: str, advice: str) -> ConfigError:
-        """What is raised where it has `what` is asked for; `advice` says how to ask for more."""
-        return ConfigError("--resume", "", f"{self.source} has {what} already; name {advice}")
+        """The same where it has `what` is asked for; `advice` says how to ask for more."""
+        return self.error(f"has {what} already; name {advice}")
 
 
 def head(kind: str, settings: Mapping[str, Any], **content: Any) -> dict[str, Any]:

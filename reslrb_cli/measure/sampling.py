@@ -133,7 +133,7 @@ class Sampling:
         for seed in seeds(self._most(name))[begun:]:
             if stop():
                 break
-            samples.append(self._sample(name, seed).astype(np.float32))
+            samples.append(self.participants.sample(*name, seed).astype(np.float32))
             self.between()
             now = self._now()
             next_s = now - before
@@ -189,27 +189,15 @@ class Sampling:
     def _most_more(self, name: Name) -> int:
         if not self._is_cheap(name):
             return LEAST_SEEDS
-        most = max(LEAST_SEEDS, min(MOST_SEEDS, self._seeds_in_memory()))
+        fitting = MEMORY // (4 * self.participants.case.size * (len(self.participants.integrators) + 2))
+        most = max(LEAST_SEEDS, min(MOST_SEEDS, fitting))
         if name[0] == "gradient" and not self.participants.exact:
             # More than the stock reference has are compared with nothing.
-            names = [("gradient", label) for label in self.participants.stock_labels()]
-            stock = [len(self._samples[name]) - self._before.get(name, 0) for name in names if name in self._taken]
-            most = min(most, max(LEAST_SEEDS, *stock)) if any(stock) else most
+            stock = sorted({reference.value for reference in self.participants.stock.values() if reference is not None})
+            names = [("gradient", label) for label in stock]
+            counts = [len(self._samples[name]) - self._before.get(name, 0) for name in names if name in self._taken]
+            most = min(most, max(LEAST_SEEDS, *counts)) if any(counts) else most
         return most
-
-    def _seeds_in_memory(self) -> int:
-        size = sum(len(values) for values in self.participants.case.initial.values())
-        return MEMORY // (4 * size * (len(self.participants.integrators) + 2))
-
-    def _sample(self, name: Name, seed: int) -> np.ndarray:
-        parts, (kind, of) = self.participants, name
-        if kind == "gradient":
-            return parts.gradient(of, seed)
-        if kind == "image":
-            return parts.picture(of, seed)
-        # Forward mode is the same for all estimators.
-        first = parts.listed[0].label
-        return np.asarray(parts.differences(of, seed) if kind == "differences" else parts.tangents(first, of, seed))
 
 
 def _kind(name: Name) -> tuple[str, bool]:

@@ -1,7 +1,8 @@
-"""Steps of one experiment, measured one by one (`Stepper`), and films and textures of other sizes to measure with."""
+"""Steps of one experiment, measured one by one (`Steps`), and films and textures of other sizes to measure with."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -9,17 +10,24 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.config.loader import loads
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.step import gradient_step, known_step
 from reslrb_cli.measure.scenes import small
-from reslrb_cli.measure.workers import scratch_bytes
+from reslrb_cli.measure.workers import Begun, scratch_bytes
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.loading import choose_sensors, load_configured
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.clock import StepClock, StepTimes, peak_mib, reset_peak
 from reslrb_cli.seeds import seed
+
+
+def multiple_of(spp: int, unit: int | None) -> int:
+    """The greatest multiple of a pass's samples up to `spp`, at least one."""
+    unit = unit or 1
+    return max(spp // unit, 1) * unit
 
 
 def shrink(scene: Any, sensor: int, pixels: int) -> None:
@@ -31,11 +39,6 @@ def shrink(scene: Any, sensor: int, pixels: int) -> None:
     factor = (pixels / (width * height)) ** 0.5
     if factor < 1:
         scale(scene, sensor, factor)
-
-
-def widen(scene: Any, sensor: int, width: int) -> None:
-    """Make the part of a sensor's film that is rendered about so many pixels wide; its view stays the same."""
-    scale(scene, sensor, width / int(scene.sensors()[sensor].film().crop_size()[0]))
 
 
 def scale(scene: Any, sensor: int, factor: float) -> None:
@@ -90,8 +93,44 @@ def texture_shapes(problem: Problem) -> dict[str, tuple[int, ...]]:
     return {key: shape for key, shape in shapes.items() if len(shape) == 3}
 
 
-class Stepper:
-    """Takes steps of an experiment through its first sensor; the parameters keep their initial values.
+class Steps:
+    """Steps of an experiment through its first sensor, timed; the parameters keep their initial values."""
+
+    def __init__(self, config: Config, scene: Any = None) -> None:
+        self.problem, self.clock = assemble_scene(config.with_exposures_fixed(), scene), StepClock()
+        self.sensor = self.problem.sensors[0]
+
+    def gradient(
+        self, seed: int, given: mi.TensorXf | Callable[[mi.TensorXf], mi.Float], spp: int
+    ) -> tuple[dict[str, Any], StepTimes]:
+        """The gradients by key; what they took is of the step alone. `given` is dL/dI, or the loss of an image."""
+        problem = self.problem
+        problem.apply()
+        for key in problem.selection.keys:
+            dr.clear_grad(problem.optimizer[key])
+        seen = problem.integrator, problem.scene, self.sensor
+        common: dict[str, Any] = {"seed": seed, "spp": spp, "params": problem.selection.params}
+        with self.clock.step() as times:
+            if callable(given):
+                result = gradient_step(*seen, given, **(problem.config.step_options() | common))
+            else:
+                result = known_step(*seen, given, **common)
+            gradients = problem.gradients()
+            dr.eval(result.image, result.loss, gradients)
+        return gradients, times
+
+    def told(self, answer: dict[str, Any], cold: bool, release: bool) -> dict[str, Any]:
+        """An answer, of a `cold` step with the peak of Dr.Jit's arrays; `release` gives the allocator's cache back."""
+        if cold:
+            answer["peak_mib"] = peak_mib(dr.backend_v(mi.Float))
+        self.clock.history = []
+        if release:
+            dr.flush_malloc_cache()
+        return answer
+
+
+class Stepper(Steps):
+    """Steps as `bench` measures them.
 
     `objective` is `fixed`, sum(G * I) with a fixed image G, known before the image I, or `l2`, the mean of (I - G)^2
     with `run.adjoint`. G is noise: what it shows costs nothing. `film_width` and `texture_width`, in pixels and texels,
@@ -105,67 +144,47 @@ class Stepper:
             config = with_textures(assemble_scene(config, _load(config)), texture_width)
         scene = _load(config)
         if film_width is not None:
-            widen(scene, choose_sensors(config, scene)[0], film_width)
-        self.problem = assemble_scene(config.with_exposures_fixed(), scene)
-        self.sensor = self.problem.sensors[0]
-        self.known = objective == "fixed"
+            sensor = choose_sensors(config, scene)[0]
+            scale(scene, sensor, film_width / int(scene.sensors()[sensor].film().crop_size()[0]))
+        super().__init__(config, scene)
         film = self.problem.scene.sensors()[self.sensor].film()
         width, height = film.crop_size()
         self.size = (int(width), int(height))
         self.texels = sum(shape[0] * shape[1] for shape in texture_shapes(self.problem).values())
-        self.image = _noise(*self.size, int(film.base_channels_count()))
-        self.clock = StepClock()
+        image = _noise(*self.size, int(film.base_channels_count()))
+        self._given = image if objective == "fixed" else lambda seen: dr.mean(dr.square(seen - image).array)
 
     def step(self, round: int, cold: bool, release: bool) -> dict[str, Any]:
         """Take one step and measure it, `cold` ones also their memory; others are taken twice, and the second counts.
 
         `release` gives the allocator's cache back afterwards.
         """
-        new_kernels = 0
+        run, new_kernels = self.problem.config.run, 0
+        at = seed(run.seed, round, self.sensor, "image")
         if cold:
             reset_peak()
         else:
             # What other processes did since the last step, to caches above all, is to cost this one nothing.
-            new_kernels = self._timed(round).new_kernels
-        times = self._timed(round)
-        new_kernels += times.new_kernels
+            new_kernels = self.gradient(at, self._given, run.spp)[1].new_kernels
+        times = self.gradient(at, self._given, run.spp)[1]
         answer = {
             "step_ms": times.wall_ms,
             "kernel_ms": times.kernel_ms,
             "codegen_ms": times.codegen_ms,
             "tracing_ms": max(times.wall_ms - times.kernel_ms - times.codegen_ms, 0.0),
-            "new_kernels": new_kernels,
+            "new_kernels": new_kernels + times.new_kernels,
         }
         if cold:
-            answer["peak_mib"] = peak_mib(dr.backend_v(mi.Float))
             answer["scratch_bytes"] = scratch_bytes(self.clock.history)
-        self.clock.history = []
-        if release:
-            dr.flush_malloc_cache()
-        return answer
+        return self.told(answer, cold, release)
 
-    def _timed(self, round: int) -> StepTimes:
-        problem = self.problem
-        problem.apply()
-        for key in problem.selection.keys:
-            dr.clear_grad(problem.optimizer[key])
-        with self.clock.step() as times:
-            result = self._take(seed(problem.config.run.seed, round, self.sensor, "image"))
-            dr.eval(result.image, result.loss, problem.gradients())
-        return times
 
-    def _take(self, seed: int) -> Any:
-        problem, run = self.problem, self.problem.config.run
-        common = {"seed": seed, "params": problem.selection.params}
-        if self.known:
-            return known_step(problem.integrator, problem.scene, self.sensor, self.image, spp=run.spp, **common)
-
-        def loss(image: Any) -> Any:
-            return dr.mean(dr.square(image - self.image).array)
-
-        return gradient_step(
-            problem.integrator, problem.scene, self.sensor, loss, **problem.config.step_options(), **common
-        )
+def begin_steps(first: dict[str, Any]) -> Begun:
+    """Begin the process. It says the size of film and textures first; questions and answers are those of a step."""
+    config = loads(first["config"], first["source"])
+    stepper = Stepper(config, first["objective"], first.get("film_width"), first.get("texture_width"))
+    size = {"width": stepper.size[0], "height": stepper.size[1], "texels": stepper.texels}
+    return size, lambda question: stepper.step(question["round"], question["cold"], question["release"])
 
 
 def _load(config: Config) -> Any:

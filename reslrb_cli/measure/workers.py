@@ -1,9 +1,7 @@
-"""Workers: processes that measure, as they are from within.
+"""Workers as they are from within: processes that measure, started and told what to do by `processes.py`.
 
-- `scratch_bytes`: thread-local memory of kernels, which the allocator does not see, read off the kernels themselves.
-- `run`: the process of one case, in a Python of its own, started and told what to do by `processes.py` (`arena.py`). It
-  reads one JSON object a line from standard input and answers each with one on standard output. The first describes the
-  case; each other one asks for a step. What else is printed goes to standard error.
+Each (`run`) reads one JSON object a line from standard input and answers each with one on standard output. The first
+describes the case; each other one asks for a step. What else is printed goes to standard error.
 """
 
 from __future__ import annotations
@@ -30,11 +28,8 @@ _PTX_ARRAY = re.compile(r"\.local \.align \d+ \.[a-z]+(\d+) arr_\w+\[(\d+)\]")
 
 def scratch_bytes(history: Iterable[dict[str, Any]]) -> int:
     """The most thread-local bytes that a path has in any kernel of a `dr.kernel_history()`; `dr.Local` makes them."""
-    return max((_of_kernel(_text(entry["ir"])) for entry in history if entry.get("ir") is not None), default=0)
-
-
-def _text(ir: Any) -> str:
-    return ir if isinstance(ir, str) else str(ir.getvalue())
+    texts = [entry["ir"] for entry in history if entry.get("ir") is not None]
+    return max((_of_kernel(text if isinstance(text, str) else str(text.getvalue())) for text in texts), default=0)
 
 
 def _of_kernel(ir: str) -> int:
@@ -43,12 +38,9 @@ def _of_kernel(ir: str) -> int:
     if arrays:
         lanes = _LLVM_LANES.search(ir)
         assert lanes is not None, "a kernel says how many lanes it handles at a time"
-        bits += sum(_bits(kind) * int(count) for kind, count in arrays) // int(lanes[1])
+        sizes = [_BITS.get(kind) or int(kind.removeprefix("i")) for kind, _ in arrays]
+        bits += sum(size * int(count) for size, (_, count) in zip(sizes, arrays, strict=True)) // int(lanes[1])
     return bits // 8
-
-
-def _bits(kind: str) -> int:
-    return _BITS[kind] if kind in _BITS else int(kind.removeprefix("i"))
 
 
 #: A case that has begun: what it says first, and what answers each question.
@@ -56,21 +48,6 @@ Begun = tuple[dict[str, Any], Callable[[dict[str, Any]], dict[str, Any]]]
 
 #: Begins a case, by the message that describes it.
 Begin = Callable[[dict[str, Any]], Begun]
-
-
-def main(load: Callable[[], Begin]) -> int:
-    """Answer until standard input ends, or until something fails: the last answer then says what."""
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    limited = False
-    try:
-        first = json.loads(sys.stdin.readline())
-        limited = first["memory_limit"] is not None
-        _serve(first, load, sys.stdin, answers)
-    except Exception as error:
-        _answer(answers, _failure(error, limited))
-        return 1
-    return 0
 
 
 class Warnings(logging.Handler):
@@ -140,7 +117,16 @@ def _answer(answers: IO[str], message: dict[str, Any]) -> None:
 
 
 def run(load: Callable[[], Begin]) -> None:
-    """Answer, and end the process."""
-    code = main(load)
+    """Answer until standard input ends, or until something fails, which the last answer says; and end the process."""
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    limited, code = False, 0
+    try:
+        first = json.loads(sys.stdin.readline())
+        limited = first["memory_limit"] is not None
+        _serve(first, load, sys.stdin, answers)
+    except Exception as error:
+        _answer(answers, _failure(error, limited))
+        code = 1
     sys.stderr.flush()
     os._exit(code)  # what is left to tidy up may take long, or fail where memory is out

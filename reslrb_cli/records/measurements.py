@@ -1,11 +1,5 @@
 """The records that measuring commands write with `--json`, one object a line.
 
-`reslrb bench`                one line a case and depth, or what else is swept
-`reslrb convergence`          measured points, methods, and the references of their errors
-`reslrb gradcheck`            one line for each comparison of a gradient with a reference
-`reslrb convergence --runs`   whole optimisations against run time, and methods
-`reslrb gradcheck --missing`  what it finds of one parameter
-
 Lines of `gradcheck` are read back as the records that they were, where they are whole.
 """
 
@@ -67,15 +61,15 @@ class BenchRecord(Line):
     width: int | None
     height: int | None
     status: BenchStatus
-    step_ms: Spread | None
-    kernel_ms: Spread | None
-    codegen_ms: Spread | None
-    tracing_ms: Spread | None
-    cold_ms: float | None
-    cold_codegen_ms: float | None
-    peak_mib: float | None
-    scratch_bytes: int | None
-    repeats: int
+    step_ms: Spread | None = None
+    kernel_ms: Spread | None = None
+    codegen_ms: Spread | None = None
+    tracing_ms: Spread | None = None
+    cold_ms: float | None = None
+    cold_codegen_ms: float | None = None
+    peak_mib: float | None = None
+    scratch_bytes: int | None = None
+    repeats: int = 0
     texels: int | None = None
 
 
@@ -286,12 +280,6 @@ class Comparison:
 @dataclass(frozen=True)
 class GradcheckRecord(Comparison, Compared, Line):
     """One comparison: what was compared, and what was found."""
-
-    @classmethod
-    def of(cls, values: Mapping[str, Any]) -> GradcheckRecord:
-        """The record of these values, by name. Raises ValueError where they are none of a record."""
-        found: GradcheckRecord = _READERS[cls].validate_python(values)
-        return found
 
     def to_json(self) -> str:
         """The record as one line of JSON; figures that are not finite become null."""

@@ -19,7 +19,7 @@ import pytest
 from cli.tiny import COMPLETE, ROOT, faults, files, start, write_experiment
 from compilation import search_path
 
-from reslrb_cli.cli.options import Keeper, read_earlier
+from reslrb_cli.cli.options import Keeper
 from reslrb_cli.cli.terminal import SIGNALS
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records import measurement_files
@@ -269,19 +269,21 @@ def test_both_files_are_current_and_those_of_another_measurement_go(
     monkeypatch.setattr(measurement_files, "PAGE_SHARE", 0.0)
     file = tmp_path / "c.jsonl"
     file.write_text("old\n")
-    measurement_files.write_samples(measurement_files.samples_file(file), {"rows": 9}, {})
+    samples = measurement_files.samples_file(file)
+    measurement_files.write_samples(samples, {"rows": 9}, {})
     (tmp_path / ".c.samples.npz.999999999.part").write_bytes(b"what a killed process left")
     measured = Measurement(file)
-    assert (file.read_text(), read_earlier(file)[0]) == ("old\n", {"rows": 9})  # until there is something
+    # Until there is something.
+    assert (file.read_text(), measurement_files.read_samples(samples)[0]) == ("old\n", {"rows": 9})
     measured.now = lines("a")
     measured.keeper.refresh()
     assert read(file) == ["a"]
     with pytest.raises(ConfigError, match=r"c\.samples\.npz: no such file"):
-        read_earlier(file)
+        measurement_files.read_samples(samples)
     measured.final, measured.now, measured.rows = lines("a"), lines("b"), np.ones(3)
     measured.keeper.refresh()
     assert read(file) == ["a", "b"]
-    head, arrays = read_earlier(file)
+    head, arrays = measurement_files.read_samples(samples)
     assert (head, list(arrays["rows"])) == ({"rows": 3}, [1.0] * 3)
     measured.keeper.finish(lines("a", "c"))
     assert read(file) == ["a", "c"]

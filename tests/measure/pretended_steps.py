@@ -28,7 +28,8 @@ class Pretended:
     refusing: set[str] = set()  # noqa: RUF012
     alive = 0
 
-    def __init__(self, first: dict[str, Any]) -> None:
+    def __init__(self, first: dict[str, Any], does: str) -> None:
+        assert does == "measured_steps"
         config = loads(first["config"], "x.yaml")
         self.type, self.depth = config.integrator.type, config.integrator.max_depth
         self.asked, self.closed = 0, False

@@ -14,7 +14,7 @@ from measure.pretended_steps import Pretended
 from reslrb_cli.cli import main
 from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.bench import KIND, Book, Result, bench
+from reslrb_cli.measure.bench import Bench, Result
 from reslrb_cli.measure.methods import Sweep, choose_baseline, depths, parse_cases, usual_values
 from reslrb_cli.measure.processes import MAX_ROUNDS, MIN_ROUNDS, Pace, Refused, Stopped
 from reslrb_cli.measure.resume_store import Earlier
@@ -49,11 +49,17 @@ def sweep(list_of: str = LIST, baseline: str | None = None, **changes: Any) -> S
     return Sweep(**(values | changes))
 
 
-def run(what: Sweep, stop: Callable[[], bool] = lambda: False) -> list[Result]:
+def play(
+    what: Sweep, kind: type[Pretended] = Pretended, stop: Callable[[], bool] = lambda: False, **options: Any
+) -> tuple[list[Result], list[str]]:
     said: list[str] = []
-    rows = [row for depth in bench(what, stop, said.append, Pretended) for row in depth]
+    rows = [row for depth in Bench(what, Path(), stop, said.append, kind, **options).run() for row in depth]
     assert Pretended.alive == 0
-    return rows
+    return rows, said
+
+
+def run(what: Sweep, stop: Callable[[], bool] = lambda: False) -> list[Result]:
+    return play(what, stop=stop)[0]
 
 
 @pytest.mark.usefixtures("_clean")
@@ -134,8 +140,7 @@ def test_cases_that_need_the_memory_of_each_other_release_it() -> None:
             asked.append(question["release"])
             super().ask(question)
 
-    said: list[str] = []
-    list(bench(sweep(values=[2], memory=5 * 2**20), lambda: False, said.append, Noting))
+    _, said = play(sweep(values=[2], memory=5 * 2**20), Noting)
     assert asked[-1]
     assert "memory" in said[0]
 
@@ -179,14 +184,12 @@ def test_pace_divides_the_budget() -> None:
         (10.0, {}, ["depth 2, ptracer, reslrb:stack, walk_ad", "depth 4"]),
     ],
 )
-def test_the_budget_covers_compilation(
-    budget_s: float, measured: dict[int, list[str]], left: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_budget_covers_compilation(budget_s: float, measured: dict[int, list[str]], left: list[str]) -> None:
     """A first step takes 30 s, later ones a tenth; what is waited for ends when time is up.
 
     What all of it would take is said as soon as anything has compiled, and is enough.
     """
-    found, said, seconds = spent(budget_s, monkeypatch)
+    found, said, seconds = spent(budget_s)
     assert found == measured
     assert [line.partition("; allow more")[0] for line in said] == [
         f"not measured: {what}: the budget was spent" for what in left
@@ -195,14 +198,14 @@ def test_the_budget_covers_compilation(
     if found and left:
         enough = float(said[0].partition("all of it takes about ")[2].removesuffix(" s"))
         assert budget_s < enough < 260
-        assert spent(enough, monkeypatch)[0] == {2: LIST.split(","), 4: LIST.split(",")}
+        assert spent(enough)[0] == {2: LIST.split(","), 4: LIST.split(",")}
     elif left:
         assert said[0].endswith("; nothing had compiled by then, so allow several times as much")
 
 
-def spent(budget_s: float, monkeypatch: pytest.MonkeyPatch) -> tuple[dict[int, list[str]], list[str], float]:
+def spent(budget_s: float) -> tuple[dict[int, list[str]], list[str], float]:
     """What a budget suffices for, by depth, what is said, and the time that it takes."""
-    now, said = [0.0], list[str]()
+    now = [0.0]
 
     class Slow(Pretended):
         def answer(self, stop: Callable[[], bool]) -> dict[str, Any]:
@@ -212,9 +215,7 @@ def spent(budget_s: float, monkeypatch: pytest.MonkeyPatch) -> tuple[dict[int, l
                     raise Stopped
             return super().answer(stop)
 
-    monkeypatch.setattr("reslrb_cli.measure.bench.Pace", lambda *arguments: Pace(*arguments, now=lambda: now[0]))
-    limited = sweep(rounds=None, budget_s=budget_s)
-    rows = [row for depth in bench(limited, lambda: False, said.append, Slow) for row in depth]
+    rows, said = play(sweep(rounds=None, budget_s=budget_s), Slow, now=lambda: now[0])
     found: dict[int, list[str]] = {}
     for row in rows:
         found.setdefault(row.record.max_depth, []).append(row.case.label)
@@ -230,8 +231,7 @@ def test_what_every_process_warns_of_is_said_once() -> None:
             answer = super().answer(stop)
             return answer | ({"warnings": ["scene.xml:3: old"]} if "width" in answer else {})
 
-    said: list[str] = []
-    list(bench(sweep(), lambda: False, said.append, Warning))
+    _, said = play(sweep(), Warning)
     assert said == ["scene.xml:3: old"]
 
 
@@ -298,12 +298,10 @@ def test_an_unknown_baseline_is_located() -> None:
 @pytest.mark.usefixtures("_clean")
 def test_what_nobody_named_is_left_out_where_it_refuses():
     Pretended.refusing = {"reslrb"}
-    lines: list[str] = []
-    results = [r for rows in bench(sweep(default=True), lambda: False, lines.append, Pretended) for r in rows]
+    results, lines = play(sweep(default=True))
     assert {result.record.integrator for result in results} == {"ptracer", "walk_ad"}
     assert {result.record.max_depth for result in results} == set(sweep().values)
     assert lines == ["left out: reslrb:stack: no derivatives of what moves light"]
-    assert Pretended.alive == 0
 
 
 @pytest.mark.usefixtures("_clean")
@@ -311,7 +309,7 @@ def test_what_nobody_named_is_left_out_where_it_refuses():
 def test_what_somebody_named_or_divides_by_is_not_left_out(refusing: str, default: bool):
     Pretended.refusing = {refusing}
     with pytest.raises(Refused, match="what moves light"):
-        list(bench(sweep(default=default), lambda: False, lambda line: None, Pretended))
+        play(sweep(default=default))
     assert Pretended.alive == 0
 
 
@@ -323,8 +321,8 @@ class Sized(Pretended):
 
     firsts: list[dict[str, Any]] = []  # noqa: RUF012 (shared by all)
 
-    def __init__(self, first: dict[str, Any]) -> None:
-        super().__init__(first)
+    def __init__(self, first: dict[str, Any], does: str) -> None:
+        super().__init__(first, does)
         self.first, self.spp = first, loads(first["config"], "x.yaml").run.spp
         Sized.firsts.append(first)
 
@@ -342,7 +340,7 @@ def _clean_values() -> None:
 
 
 def run_swept(swept: str, values: list[int], **changes: Any) -> tuple[list[Result], list[str]]:
-    cases, said = parse_cases(LIST, deep=False), list[str]()
+    cases = parse_cases(LIST, deep=False)
     settings: dict[str, Any] = {
         "config": loads(CONFIG, Path("x.yaml"), ["integrator.max_depth=5"]), "variant": "llvm_ad_rgb", "cases": cases,
         "baseline": choose_baseline(cases, None), "values": values, "objective": "fixed", "memory_limit": None,
@@ -350,9 +348,7 @@ def run_swept(swept: str, values: list[int], **changes: Any) -> tuple[list[Resul
     }  # fmt: skip
     what = Sweep(**(settings | changes))
     what.check()
-    rows = [row for some in bench(what, lambda: False, said.append, Sized) for row in some]
-    assert Pretended.alive == 0
-    return rows, said
+    return play(what, Sized)
 
 
 @pytest.mark.usefixtures("_clean_values")
@@ -435,19 +431,23 @@ def test_bad_input_is_one_located_line(args: tuple[str, ...], line: str, capsys:
 # A `bench` that goes on from another one: what counts, what is measured again, and what is refused.
 
 
-def measure(what: Sweep, before: Earlier | None = None, stop: Callable[[], bool] = lambda: False) -> Book:
-    book = Book(what, "", before)
-    list(bench(what, stop, lambda line: None, Pretended, book))
+def session(what: Sweep, earlier: Earlier | None = None, stop: Callable[[], bool] = lambda: False) -> Bench:
+    return Bench(what, Path(), stop, lambda line: None, Pretended, earlier=earlier)
+
+
+def measure(what: Sweep, before: Earlier | None = None, stop: Callable[[], bool] = lambda: False) -> Bench:
+    made = session(what, before, stop)
+    list(made.run())
     assert Pretended.alive == 0
-    return book
+    return made
 
 
-def again(book: Book) -> Earlier:
-    """What a book keeps, as it comes back from the disk."""
-    kept = book.kept()
+def again(made: Bench) -> Earlier:
+    """What a session keeps, as it comes back from the disk."""
+    kept = made.kept()
     assert kept is not None
     head, arrays = kept
-    return Earlier(KIND, Path("b.jsonl"), json.loads(json.dumps(head)), arrays)
+    return Earlier("bench", Path("b.jsonl"), json.loads(json.dumps(head)), arrays)
 
 
 @pytest.mark.usefixtures("_clean")
@@ -517,9 +517,9 @@ def test_what_refused_stays_left_out() -> None:
 def test_only_the_same_is_gone_on_from(change: dict[str, Any], line: str) -> None:
     first = measure(sweep())
     with pytest.raises(ConfigError, match=re.escape(f"--resume: b.jsonl is of another measurement: {line}")):
-        Book(sweep(**({"rounds": 5} | change)), "", again(first))
+        session(sweep(**({"rounds": 5} | change)), again(first))
     with pytest.raises(ConfigError, match=r"b\.jsonl has all of it, 3 rounds each; more are measured with a larger"):
-        Book(sweep(), "", again(first))
+        session(sweep(), again(first))
 
 
 @pytest.mark.usefixtures("_clean")
@@ -529,18 +529,18 @@ def test_a_scene_that_has_changed_is_another_one(tmp_path: Path) -> None:
     first = again(measure(what))
     (tmp_path / "scene.xml").write_text("<scene></scene>")
     with pytest.raises(ConfigError, match=r"the content of scene\.file has changed"):
-        Book(what, "", first)
+        session(what, first)
 
 
 @pytest.mark.usefixtures("_clean")
-def test_what_is_under_way_is_in_the_book_between_rounds() -> None:
+def test_what_is_under_way_is_kept_between_rounds() -> None:
     """So that a process that is killed in the midst of a depth leaves all rounds but the last."""
-    book, seen = Book(sweep(values=[2])), []
-
-    def between() -> None:
-        kept = book.kept()
+    made, seen = session(sweep(values=[2])), []
+    for rows in made.run():
+        kept = made.kept()
         assert kept is not None
-        seen.append([len(run["steps"]) for run in kept[0]["values"][0][1]])
-
-    list(bench(book.sweep, lambda: False, lambda line: None, Pretended, book, between))
+        if not rows:
+            seen.append([len(run["steps"]) for run in kept[0]["values"][0][1]])
+            assert made.results(True) == []
+            assert len(made.results(False)) == 3
     assert seen == [[1] * 3, [2] * 3, [3] * 3]

@@ -12,8 +12,9 @@ from measure.pretended_steps import CONFIG, LIST, Pretence, Stage, of, plan, pla
 
 from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.convergence.session import KIND, check
+from reslrb_cli.measure.convergence.session import Session
 from reslrb_cli.measure.convergence.setup import MOST_REFERENCE_STEPS, MOST_STEPS, Role
+from reslrb_cli.measure.methods import Plan
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import read_samples, write_samples
 from reslrb_cli.records.measurements import BenchStatus
@@ -120,16 +121,19 @@ def test_only_what_nobody_named_is_left_out(tmp_path: Path, default: bool) -> No
     assert ("ptracer" in [m.label for m in session.of(Role.CASE)]) is not default
 
 
+def begin(what: Plan, earlier: Earlier) -> Session:
+    return Session(what, Path(), lambda: False, print, earlier=earlier)
+
+
 def test_going_on(tmp_path: Path) -> None:
     """Steps of both calls count, dL/dI is made once, and no seed comes twice."""
     stage = Stage()
     session, _, _ = play(tmp_path, stage, plan(rounds=4))
-    kept = session.keep()
+    kept = session.kept()
     assert kept is not None
     write_samples(tmp_path / "c.samples.npz", *kept)
     stage.asked.clear()
-    earlier = Earlier(KIND, Path("c.jsonl"), *read_samples(tmp_path / "c.samples.npz"))
-    check(plan(rounds=12), earlier)
+    earlier = Earlier("convergence", Path("c.jsonl"), *read_samples(tmp_path / "c.samples.npz"))
     more, results, _ = play(tmp_path, stage, plan(rounds=12), earlier=earlier)
     assert {question["of"] for question in stage.asked} == {"case " + c for c in LIST.split(",")} | {
         "reference reslrb:stack"
@@ -148,9 +152,9 @@ def test_a_round_that_was_broken_off_is_begun_anew(tmp_path: Path, after: int) -
     answers = iter(range(10**6))
     session, _, _ = play(tmp_path, Stage(), plan(rounds=8), stop=lambda: next(answers) > after)
     assert len({len(member.rows) // member.count for member in session.members}) == 2
-    kept = session.keep()
+    kept = session.kept()
     assert kept is not None
-    more, results, _ = play(tmp_path, Stage(), plan(rounds=8), earlier=Earlier(KIND, Path("c.jsonl"), *kept))
+    more, results, _ = play(tmp_path, Stage(), plan(rounds=8), earlier=Earlier("convergence", Path("c.jsonl"), *kept))
     for member in more.members:
         assert member.turns == [turn for turn in range(8) for _ in range(member.count)]
         assert len(member.seconds) == 8
@@ -160,10 +164,10 @@ def test_a_round_that_was_broken_off_is_begun_anew(tmp_path: Path, after: int) -
 
 def test_what_has_ended_stays_as_it_was_and_the_rest_goes_on(tmp_path: Path) -> None:
     first, _, _ = play(tmp_path, Stage(case_reslrb_stack=Pretence(ends=5)), plan(rounds=8))
-    kept = first.keep()
+    kept = first.kept()
     assert kept is not None
     stage = Stage()
-    _, results, _ = play(tmp_path, stage, plan(rounds=12), earlier=Earlier(KIND, Path("c.jsonl"), *kept))
+    _, results, _ = play(tmp_path, stage, plan(rounds=12), earlier=Earlier("convergence", Path("c.jsonl"), *kept))
     ended, sound = of(results, "reslrb:stack"), of(results, "ptracer")
     assert (ended.status, ended.message, sound.repeats) == (BenchStatus.OUT_OF_MEMORY, "ended by SIGKILL", 24)
     assert "case reslrb:stack" not in {question["of"] for question in stage.asked}
@@ -171,9 +175,9 @@ def test_what_has_ended_stays_as_it_was_and_the_rest_goes_on(tmp_path: Path) -> 
 
 def test_a_second_budget_without_room_for_a_round_says_so(tmp_path: Path) -> None:
     first, _, _ = play(tmp_path, Stage(), plan(rounds=None, budget_s=30.0))
-    kept = first.keep()
+    kept = first.kept()
     assert kept is not None
-    earlier = Earlier(KIND, Path("c.jsonl"), *kept)
+    earlier = Earlier("convergence", Path("c.jsonl"), *kept)
     again, results, said = play(tmp_path, Stage(), plan(rounds=None, budget_s=7.5), earlier=earlier)
     assert again.rounds == first.rounds
     assert of(results, "ptracer").efficiency is not None  # by what there was
@@ -197,16 +201,16 @@ def test_a_second_budget_without_room_for_a_round_says_so(tmp_path: Path) -> Non
 )
 def test_only_the_same_is_gone_on_from(tmp_path: Path, change: dict[str, Any], line: str) -> None:
     session, _, _ = play(tmp_path, Stage(), plan(rounds=4))
-    kept = session.keep()
+    kept = session.kept()
     assert kept is not None
-    earlier = Earlier(KIND, Path("c.jsonl"), *kept)
+    earlier = Earlier("convergence", Path("c.jsonl"), *kept)
     with pytest.raises(ConfigError, match=re.escape(f"--resume: c.jsonl is of another measurement: {line}")):
-        check(plan(**({"rounds": 8} | change)), earlier)
-    check(plan(rounds=8), earlier)
+        begin(plan(**({"rounds": 8} | change)), earlier)
+    begin(plan(rounds=8), earlier)
     with pytest.raises(ConfigError, match=r"c\.jsonl has 4 rounds already; name more with --rounds"):
-        check(plan(rounds=4), earlier)
+        begin(plan(rounds=4), earlier)
     with pytest.raises(ConfigError, match="by another version"):
-        Earlier(KIND, Path("c.jsonl"), kept[0] | {"version": 0}, kept[1])
+        Earlier("convergence", Path("c.jsonl"), kept[0] | {"version": 0}, kept[1])
     with pytest.raises(ConfigError, match="it is of `convergence`, this is `bench`"):
         Earlier("bench", Path("c.jsonl"), *kept)
 

@@ -287,7 +287,7 @@ def test_images_are_compared_without_the_border_that_paths_from_the_lights_leave
     case = Case(room(camera=camera("gaussian")), [])
     sensor, integrators = case.scene.sensors()[0], {"walk_ad": integrator("walk_ad", 4)}
     parts = SimpleNamespace(case=case, sensor=sensor, integrators=integrators, image=reference, spp=16)
-    image = Participants.picture(parts, "walk_ad", 1).reshape(16, 16, 3)
+    image = Participants.sample(parts, "image", "walk_ad", 1).reshape(16, 16, 3)
     inside = interior(image.shape, sensor)
     assert (image[~inside] == 0).all() == dark
     np.testing.assert_allclose(image[inside], case.image(integrators["walk_ad"], 1, 16)[inside], rtol=1e-3, atol=1e-5)
@@ -388,12 +388,12 @@ def test_forward_mode_of_what_is_a_function(name: str):
     small = ["scene.options={resx: 16, resy: 16}", "run.spp=4", "target.render.spp=4"]
     parts = Participants(Settings(load(CONFIGS / f"{name}.yaml", small), parse_estimators("stack"), 0, 3))
     [label] = (case.label for case in parts.listed)
-    gradient, slices = parts.gradient(label, 1), parts.slices()
+    gradient, slices = parts.sample("gradient", label, 1), parts.case.places
     for key in parts.case.keys:
         along = [gradient @ direction.vector for direction in parts.directions[key]]
-        print(key, along, parts.tangents(label, key, 1))
+        print(key, along, parts.sample("tangents", key, 1))
         assert gradient[slices[key]].any()
-        np.testing.assert_allclose(parts.tangents(label, key, 1), along, rtol=1e-3, atol=1e-4 * np.abs(along).max())
+        np.testing.assert_allclose(parts.sample("tangents", key, 1), along, rtol=1e-3, atol=1e-4 * np.abs(along).max())
 
 
 @pytest.mark.usefixtures("llvm")
@@ -492,9 +492,10 @@ class Directed(Pretended):
         super().__init__(settings)
         Directed.seeds = {}
 
-    def gradient(self, label: str, seed: int) -> np.ndarray:
-        Directed.seeds.setdefault(label, []).append(seed)
-        return super().gradient(label, seed)
+    def sample(self, kind: str, of: str, seed: int) -> np.ndarray:
+        if kind == "gradient":
+            Directed.seeds.setdefault(of, []).append(seed)
+        return super().sample(kind, of, seed)
 
     def choose_steps(self, key: str) -> None:
         super().choose_steps(key)

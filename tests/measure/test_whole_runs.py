@@ -18,14 +18,12 @@ from optimization.deciding import begin, fix_times
 from reslrb_cli.cli.convergence import _runs_exit_code
 from reslrb_cli.config.loader import dump, load, loads
 from reslrb_cli.errors import ConfigError, ExitCode
-from reslrb_cli.measure.methods import RunsPlan, at_rate, parse_cases
+from reslrb_cli.measure.methods import RunsPlan, at_rate, parse_cases, with_run
 from reslrb_cli.measure.optimization_benchmark import evaluate, rank
 from reslrb_cli.measure.optimization_benchmark.evaluate import Advance, State
 from reslrb_cli.measure.optimization_benchmark.rank import (
-    KIND,
     POINTS,
     best_of,
-    check,
     finals,
     find_best,
     method_records,
@@ -194,7 +192,7 @@ def test_auto_says_what_its_pilot_chose_and_is_allowed(tmp_path: Path) -> None:
 def test_seeds_follow_that_of_the_configuration() -> None:
     config = loads(CONFIG, Path("x.yaml"), ["run.seed=4294967295"])
     assert plan(config=config).seeds == [4294967295, 0, 1]
-    assert plan(config=config).seeded(config, 7).run.seed == 7
+    assert with_run(config, seed=7).run.seed == 7
 
 
 def test_a_state_stands_from_its_end_on_and_copies_of_values_take_no_time() -> None:
@@ -469,16 +467,15 @@ def play_again(
 
 
 def again(session: RunsSession, file: Path) -> Earlier:
-    kept = session.keep()
+    kept = session.kept()
     assert kept is not None
     write_samples(file, *kept)
-    return Earlier(KIND, Path("c.jsonl"), *read_samples(file))
+    return Earlier("convergence --runs", Path("c.jsonl"), *read_samples(file))
 
 
 def test_seeds_go_on_with_the_same_target_and_the_same_time(tmp_path: Path) -> None:
     first, _ = play_again(tmp_path / "a", Stage(), plan(runs=2, budget_s=80.0))
     earlier = again(first, tmp_path / "c.samples.npz")
-    check(plan(runs=4), earlier)
     stage = Stage()
     second, said = play_again(tmp_path / "b", stage, plan(runs=4, budget_s=300.0), earlier)
     assert said == ["old"]
@@ -500,7 +497,7 @@ def test_seeds_go_on_with_the_same_target_and_the_same_time(tmp_path: Path) -> N
 def test_a_seed_that_was_broken_off_is_made_anew(tmp_path: Path, after: int) -> None:
     whole, _ = play_again(tmp_path / "a", Stage(), plan())
     stopped, _ = play_again(tmp_path / "b", Stage(), plan(), after=after)
-    kept = stopped.keep()
+    kept = stopped.kept()
     over = sum(run.complete(stopped.limit_s) for run in stopped.members) // 2
     if over == 0:
         assert kept is None
@@ -530,7 +527,7 @@ def test_a_budget_without_room_for_one_seed_says_what_it_takes(tmp_path: Path) -
     second, said = play_again(tmp_path / "b", stage, plan(runs=3, budget_s=20.0), earlier)
     assert stage.now < 20
     assert len(second.members) == 4
-    kept = second.keep()
+    kept = second.kept()
     assert kept is not None
     assert kept[0]["runs"] == earlier.head["runs"]  # nothing is lost
     needed = float(said[-1].split("allow more than ")[1].split(" s")[0])
@@ -549,9 +546,10 @@ def test_a_budget_without_room_for_one_seed_says_what_it_takes(tmp_path: Path) -
 def test_only_the_same_is_gone_on_from(tmp_path: Path, change: dict[str, Any], line: str) -> None:
     earlier = again(play_again(tmp_path / "a", Stage(), plan(runs=1))[0], tmp_path / "c.samples.npz")
     with pytest.raises(ConfigError, match=re.escape(f"--resume: c.jsonl is of another measurement: {line}")):
-        check(plan(**({"runs": 2} | change)), earlier)
+        play_again(tmp_path / "b", Stage(), plan(**({"runs": 2} | change)), earlier)
     with pytest.raises(ConfigError, match=r"c\.jsonl has 1 run of each already; name more with --runs"):
-        check(plan(runs=1), earlier)
+        play_again(tmp_path / "b", Stage(), plan(runs=1), earlier)
+    assert plan(device="x").settings()["device"] == "x, llvm_ad_rgb"  # as in the files of earlier versions
 
 
 def test_another_loss_of_the_initial_values_is_another_scene(tmp_path: Path) -> None:

@@ -6,17 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reslrb_cli.measure.comparison import (
-    ROUNDING,
-    TAIL,
-    Family,
-    compare_expectations,
-    entry_count,
-    tail_weight,
-)
+from reslrb_cli.measure.comparison import ROUNDING, TAIL, Family, compare_expectations, entry_count, tail_weight
 from reslrb_cli.measure.convergence.session import Session
 from reslrb_cli.measure.convergence.setup import Member, Role
-from reslrb_cli.measure.convergence.statistics import FEWEST, Estimate, Reference, Samples
+from reslrb_cli.measure.convergence.statistics import FEWEST, Reference, Samples
 from reslrb_cli.measure.methods import ALL, IMAGES
 from reslrb_cli.records.measurements import (
     TARGETS,
@@ -24,7 +17,6 @@ from reslrb_cli.records.measurements import (
     Comparison,
     MethodRecord,
     PointRecord,
-    Range,
     ReferenceRecord,
     Verdict,
 )
@@ -48,12 +40,12 @@ class Results:
 
 @dataclass(frozen=True)
 class _Bias:
-    """What is known of a bias: of one parameter, or the worst of all of them."""
+    """What is known of a bias, of one parameter or the worst of all of them; fields are as in a `MethodRecord`."""
 
     biased: bool | None = None
-    z: float | None = None
-    limit: float | None = None
-    judge: str | None = None
+    bias_z: float | None = None
+    bias_z_limit: float | None = None
+    bias_reference: str | None = None
     independent: bool = False
     message: str = ""
 
@@ -64,14 +56,11 @@ class Judgement:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._slices = session.slices() if session.facts else {}
-        self._whole = {key: Reference(rows) for key, rows in self._reference_rows().items()}
-
-    def _reference_rows(self) -> dict[str, np.ndarray]:
-        """Rows of what errors are taken from, by parameter and of all; nothing where there are too few."""
-        found = self._session.of(Role.REFERENCE)
-        if not found or len(set(found[0].turns)) < FEWEST or found[0].message:
-            return {}
-        return {key: self._rows(found[0], place) for key, place in self._places().items()}
+        #: What errors are taken from, by parameter and of all; nothing where there are too few steps of it.
+        self._whole: dict[str, Reference] = {}
+        for found in session.of(Role.REFERENCE):
+            if len(set(found.turns)) >= FEWEST and not found.message:
+                self._whole = {key: Reference(self._rows(found, place)) for key, place in self._places().items()}
 
     def _places(self) -> dict[str, slice]:
         """Where each parameter stands, and all together, unless the image is what is estimated."""
@@ -137,11 +126,11 @@ class Judgement:
         if "image" in found:
             return found
         biases = list(found.values())
-        worst = max(biases, key=lambda bias: -1.0 if bias.z is None else bias.z)
+        worst = max(biases, key=lambda bias: -1.0 if bias.bias_z is None else bias.bias_z)
         biased = True if any(b.biased for b in biases) else None if any(b.biased is None for b in biases) else False
-        judges = ", ".join(dict.fromkeys(bias.judge for bias in biases if bias.judge is not None)) or None
-        message = next((bias.message for bias in biases if bias.message), "")
-        found[ALL] = _Bias(biased, worst.z, worst.limit, judges, all(b.independent for b in biases), message)
+        judges = ", ".join(dict.fromkeys(b.bias_reference for b in biases if b.bias_reference is not None)) or None
+        message, independent = next((b.message for b in biases if b.message), ""), all(b.independent for b in biases)
+        found[ALL] = replace(worst, biased=biased, bias_reference=judges, independent=independent, message=message)
         return found
 
     def _bias(self, member: Member, key: str) -> _Bias:
@@ -178,11 +167,8 @@ class Judgement:
     def _points(self, member: Member, key: str, place: slice) -> list[PointRecord]:
         if not self._measured(member) or self._whole[key].floor is None:
             return []
-        floor = self._whole[key].floor
-        return [
-            PointRecord(member.method, key, p.steps, p.elapsed_s, p.relative_rmse, floor, p.repeats)
-            for p in self._samples(member, key, place).points()
-        ]
+        points = self._samples(member, key, place).points()
+        return [PointRecord(member.method, key, reference_rmse=self._whole[key].floor, **vars(p)) for p in points]
 
     def _method(
         self, member: Member, key: str, place: slice, bias: _Bias, references: dict[str, _Bias] | None = None
@@ -203,7 +189,7 @@ class Judgement:
         if not message and tail_weight(samples.deviations) > TAIL:
             message = HEAVY
         times = {f"{target:g}": magnitude.seconds_to(target, biased) for target in TARGETS}
-        slope = samples.slope()
+        slope, efficiency = samples.slope(), magnitude.efficiency(biased)
         return MethodRecord(
             method=member.method,
             parameter=key,
@@ -213,25 +199,20 @@ class Judgement:
             cold_s=member.cold_s,
             relative_rmse=float(np.sqrt(samples.variance)),
             reference_rmse=samples.reference.floor,
-            slope=None if slope is None else Range(**vars(slope.interval())),
-            efficiency=_efficiency(magnitude.efficiency(biased)),
-            bias_z=bias.z,
-            bias_z_limit=bias.limit,
+            slope=None if slope is None else slope.interval(),
+            efficiency=None if efficiency is None else efficiency.exponential(),
             bias=float(np.sqrt(magnitude.squared_bias)) if biased else None,
-            bias_reference=bias.judge,
-            independent=bias.independent,
-            biased=bias.biased,
             seconds_to={name: seconds for name, (seconds, _) in times.items()},
             extrapolated=[name for name, (_, beyond) in times.items() if beyond],
-            message=message,
+            **vars(replace(bias, message=message)),
         )
 
     def _stood(self, member: Member, key: str, bias: _Bias) -> ReferenceRecord:
-        floor = self._whole[key].floor
-        message = bias.message if floor is not None else _UNSEEN
-        return ReferenceRecord(
-            member.method, key, len(member.rows), floor, bias.z, bias.limit, bias.judge, bias.biased, message
-        )
+        floor, known = self._whole[key].floor, vars(bias).copy()
+        del known["independent"]
+        if floor is None:
+            known["message"] = _UNSEEN
+        return ReferenceRecord(member.method, key, len(member.rows), floor, **known)
 
 
 _UNSEEN = "nothing of it stands out of the reference's noise"
@@ -245,7 +226,3 @@ def _kin(member: Member) -> str:
 
 def _words(figures: Comparison) -> str:
     return figures.message or ("gradient and reference differ" if figures.verdict is Verdict.FAILS else "")
-
-
-def _efficiency(estimate: Estimate | None) -> Range | None:
-    return None if estimate is None else Range(**vars(estimate.exponential()))

@@ -1,97 +1,27 @@
-"""The processes of a `convergence`, side by side: each compiles, then they take turns, one computing at a time.
+"""The processes of a `convergence`: what is compared, what errors are taken from, and what biases are judged by.
 
-A session may go on from the steps that an earlier one has taken, with the same dL/dI (`restore`, `kept`).
-
-As they take turns, a drift of the machine hits all alike. What errors are taken from takes its turns too, and so does
-what biases are judged by, where it is not among what is compared. All have seeds of their own: no two share noise.
+All take turns (`Arena`), with seeds of their own: no two share noise. A session may go on from the steps that an
+earlier one has taken, with the same dL/dI.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.measure import resume_store
-from reslrb_cli.measure.arena import Arena, in_turn, is_tight
+from reslrb_cli.measure.arena import Arena
 from reslrb_cli.measure.convergence.setup import Member, Role, share_turns
 from reslrb_cli.measure.convergence.statistics import FEWEST, FEWEST_FOR_SLOPE
+from reslrb_cli.measure.gradients import places
 from reslrb_cli.measure.methods import Case, Plan
-from reslrb_cli.measure.processes import Ended
+from reslrb_cli.measure.processes import Contestant
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import Kept
-
-#: What is kept says that it is of this.
-KIND = "convergence"
-
-
-def settings(plan: Plan, device: str = "") -> dict[str, Any]:
-    """What has to be the same in all sessions."""
-    return plan.settings(device, objective=plan.objective, reference=plan.reference.label, spp=list(plan.spps))
-
-
-def check(plan: Plan, before: Earlier, device: str = "") -> None:
-    """Raise ConfigError where a session cannot go on from an earlier one, or has nothing to add to it."""
-    before.check(settings(plan, device))
-    if plan.rounds is not None and before.head["rounds"] >= plan.rounds:
-        rounds = before.head["rounds"]
-        raise before.complete(f"{rounds} rounds", "more with --rounds")
-
-
-def restore_facts(before: Earlier, arrays_file: Path) -> dict[str, Any]:
-    """The survey's facts; its arrays are written to `arrays_file`."""
-    found = {name.removeprefix("survey/"): a for name, a in before.arrays.items() if name.startswith("survey/")}
-    np.savez(arrays_file, **found)  # type: ignore[arg-type]
-    facts: dict[str, Any] = before.head["facts"]
-    return facts
-
-
-def restore(before: Earlier, members: list[Member]) -> int:
-    """Hand the members their steps; returns the number of rounds. Raises ConfigError where they are others.
-
-    One whose process has ended, or refused, is not asked again.
-    """
-    entries = before.head["members"]
-    if [name_of(member) for member in members] != [entry["name"] for entry in entries]:
-        raise before.other("its methods are others: " + ", ".join(entry["name"] for entry in entries))
-    for number, (member, entry) in enumerate(zip(members, entries, strict=True)):
-        if entry["config"] != dump(member.config):
-            raise before.other(f"its settings are not those of {member.label} here")
-        member.taken, member.turns, member.seconds = entry["taken"], entry["turns"], entry["seconds"]
-        member.message, member.cold = entry["message"], entry["cold"]
-        member.rows = list(before.arrays[f"rows/{number}"])
-        member.end = Ended.restored(entry["end"])
-        if member.end is not None:
-            member.process.close()
-    rounds: int = before.head["rounds"]
-    return rounds
-
-
-def name_of(member: Member) -> str:
-    """A member's role and label."""
-    return f"{member.role.value} {member.label}"
-
-
-def kept(
-    settings: Mapping[str, Any], facts: dict[str, Any], arrays_file: Path, members: list[Member], rounds: int
-) -> Kept:
-    """What a later session needs to go on: a head that JSON can hold, and arrays."""
-    with np.load(arrays_file) as survey:
-        arrays = {f"survey/{name}": survey[name] for name in survey.files}
-    entries = []
-    for number, member in enumerate(members):
-        # A round that was broken off is not: the next session begins it anew, with other seeds.
-        turns = [turn for turn in member.turns if turn < rounds]
-        entries.append({"name": name_of(member), "config": dump(member.config), "taken": member.taken,
-                        "turns": turns, "seconds": member.seconds[: len(set(turns))], "message": member.message,
-                        "cold": member.cold, "end": member.end and member.end.kept()})  # fmt: skip
-        arrays[f"rows/{number}"] = np.array(member.rows[: len(turns)], np.float32)
-    return resume_store.head(KIND, settings, facts=facts, rounds=rounds, members=entries), arrays
-
 
 #: What the samples of all together may take in memory, in bytes.
 MEMORY = 2**30
@@ -106,18 +36,16 @@ class Session(Arena[Plan, Member]):
     `judges` has the members that stand for an independent stock integrator, by its name.
     """
 
-    def _set_up(self) -> None:
-        self.rounds = self._before = 0
+    def _set_up(self, earlier: Earlier | None) -> int:
+        self.rounds = self._before = 0 if earlier is None else earlier.head["rounds"]
         self.judges: dict[str, Member] = {}
+        if earlier is not None and self.plan.rounds is not None and self.rounds >= self.plan.rounds:
+            raise earlier.complete(f"{self.rounds} rounds", "more with --rounds")
+        return 1
 
     def slices(self) -> dict[str, slice]:
         """Where each parameter (or the image) stands in a sample."""
-        found, at = {}, 0
-        for key, shape in self.facts["shapes"].items():
-            size = int(np.prod(shape, dtype=int))
-            found[key] = slice(at, at + size)
-            at += size
-        return found
+        return places({key: int(np.prod(shape, dtype=int)) for key, shape in self.facts["shapes"].items()})
 
     def of(self, role: Role) -> list[Member]:
         """The members of one role."""
@@ -137,14 +65,36 @@ class Session(Arena[Plan, Member]):
             yield from self._take_turns()
         self._say_what_it_takes()
 
-    def keep(self) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
+    def kept(self) -> Kept | None:
         """What a later session needs to go on; None where nothing has been sampled.
 
         A method that was left out, or never came to a step, has none there: what it is kept for is to be asked again.
         """
         if not self.rounds or not any(member.rows for member in self.members):
             return None
-        return kept(settings(self.plan, self.device), self.facts, self.folder / "arrays.npz", self.members, self.rounds)
+        with np.load(self._arrays) as survey:
+            arrays = {f"survey/{name}": survey[name] for name in survey.files}
+        entries = []
+        for number, member in enumerate(self.members):
+            entry, arrays[f"rows/{number}"] = member.kept(self.rounds)
+            entries.append(entry)
+        content = {"facts": self.facts, "rounds": self.rounds, "members": entries}
+        return resume_store.head(self.plan.KIND, self.settings, **content), arrays
+
+    def _restore(self, earlier: Earlier) -> None:
+        """Hand the members their steps. Raises ConfigError where they are others."""
+        entries = earlier.head["members"]
+        if [member.name for member in self.members] != [entry["name"] for entry in entries]:
+            raise earlier.other("its methods are others: " + ", ".join(entry["name"] for entry in entries))
+        for number, (member, entry) in enumerate(zip(self.members, entries, strict=True)):
+            if entry["config"] != dump(member.config):
+                raise earlier.other(f"its settings are not those of {member.label} here")
+            member.restore(entry, earlier.arrays[f"rows/{number}"])
+
+    @property
+    def _arrays(self) -> Path:
+        """The file of the survey's arrays."""
+        return self.folder / "arrays.npz"
 
     # --- before the rounds --------------------------------------------------------------------------------------------
 
@@ -152,14 +102,17 @@ class Session(Arena[Plan, Member]):
         """Ask what stands as a reference, and have dL/dI made; False where time is up over it."""
         plan = self.plan
         if self._earlier is not None:
-            self.facts = restore_facts(self._earlier, self.folder / "arrays.npz")
+            arrays = self._earlier.arrays.items()
+            found = {name.removeprefix("survey/"): a for name, a in arrays if name.startswith("survey/")}
+            np.savez(self._arrays, **found)  # type: ignore[arg-type]
+            self.facts = self._earlier.head["facts"]
             return True
         first = self._first(plan.reference_config, "arrays") | {"objective": plan.objective}
-        opening, answer = self._open_referee(first, "surveyed"), None
-        if opening is not None:
+        self._referee, answer = Contestant(process=self._start(first, "surveyed"), may_refuse=False), None
+        if self._ask_referee(plan) is not None:
             ask = {**plan.camera, "budget_s": plan.budget_s if plan.rounds is None else None}
-            answer = self._ask_referee({"out": first["arrays"], "ask": ask})
-        self._close_referee()
+            answer = self._ask_referee(plan, {"out": first["arrays"], "ask": ask})
+        self._referee.close()
         self.facts = answer or {}
         if answer is None:
             self._say(
@@ -181,7 +134,7 @@ class Session(Arena[Plan, Member]):
                 same[0] if same else self._add(Role.INDEPENDENT, Case(name, name, {}), config, self._noise_free)
             )
         if self._earlier is not None:
-            self.rounds = self._before = restore(self._earlier, self.members)
+            self._restore(self._earlier)
         for key, reason in facts["why"].items():
             if facts["independent"][key] is None:
                 self._say(f"{key}: no independent reference ({reason}); biases are judged by {plan.reference.label}")
@@ -214,44 +167,33 @@ class Session(Arena[Plan, Member]):
     def _warm_up(self) -> None:
         for member in self.members:
             if member.alive:
-                self._warn(member.answer(self._stop, self._pace.over) or {})
+                self._open(member)
         for member in self.members:
-            warm = member.alive and member.warm_up(self._tight(), self._stop, self._pace.over)
-            if member.refusal is not None:
-                self._say(f"left out: {member.label}: {member.refusal}")
-            elif member.end is not None:
-                self._say(f"{member.label}: {member.end.status.value}: {member.end.reason}")
-            elif warm and member.cold is not None:
+            answer = member.warm_up(self._tight, self._stop, self._pace.over) if member.alive else None
+            self._say_end(member, member.label)
+            if answer is not None and member.cold is not None:
+                member.step_s = answer["step_ms"][0] / 1e3
                 what = "" if member.role is Role.CASE else f" ({member.role.value})"
                 took = (
                     f"first step {member.cold_s:.1f} s, then {member.step_s:.3g} s, {member.cold['peak_mib']:.0f} MiB"
                 )
                 self._say(f"{member.label}{what}: {took}")
-        share_turns([member for member in self.members if member.alive], self.plan.rounds is not None)
-
-    def _tight(self) -> bool:
-        return is_tight(self.plan, (m.cold["peak_mib"] for m in self.members if m.cold is not None and m.alive))
+        share_turns(self._alive(), self.plan.rounds is not None)
 
     # --- the rounds ---------------------------------------------------------------------------------------------------
 
     def _take_turns(self) -> Iterator[int]:
-        alive = [member for member in self.members if member.alive]
-        if not any(member.role is Role.CASE for member in alive) or not any(
-            member.role is Role.REFERENCE for member in alive
-        ):
+        alive = self._alive()
+        if not {Role.CASE, Role.REFERENCE} <= {member.role for member in alive}:
             return
         if not self._pace.fits(self._fewest * self._round_s):
             return
         size = sum(int(np.prod(shape, dtype=int)) for shape in self.facts["shapes"].values())
         most = max(MEMORY // (4 * size * sum(member.count for member in alive)), FEWEST + 1)
-        tight = self._tight()
-        self._pace.begin_rounds(self._before)
-        while alive and self.rounds < most and self._pace.another(self.rounds - self._before):
-            for member in in_turn(alive, self.rounds):
-                member.turn(self.rounds, tight, self._stop)
-            self.rounds += 1
-            alive = [member for member in self.members if member.alive]
-            yield self.rounds
+        rounds = self._take_rounds(self._alive, self._before, self._before)
+        while self.rounds < most and (now := next(rounds, None)) is not None:
+            self.rounds = now
+            yield now
 
     @property
     def _fewest(self) -> int:
@@ -261,7 +203,7 @@ class Session(Arena[Plan, Member]):
     @property
     def _round_s(self) -> float:
         """Seconds of a round, by what each took when it was warm."""
-        return sum(member.count * member.step_s for member in self.members if member.alive)
+        return sum(member.count * member.step_s for member in self._alive())
 
     def _say_what_it_takes(self) -> None:
         """Where the budget did not suffice for figures, or for slopes: what it would take."""
@@ -273,7 +215,7 @@ class Session(Arena[Plan, Member]):
         if late:
             names = ", ".join(member.label for member in late)
             self._say(f"not measured: {names}: the budget of {self.plan.budget_s:g} s was spent")
-        warm = [member for member in self.members if member.alive]
+        warm = self._alive()
         if late and not warm:
             advice = "allow several times as much with --budget, or name fewer --integrators"
             self._say(f"nothing had compiled by then: {advice}")

@@ -1,17 +1,12 @@
-"""The members of a `convergence`, what is found out before it measures, and the steps of one.
+"""The members of a `convergence`, what is found out before it measures (`survey`), and the steps of one (`Sampler`).
 
-- `Member`: one of those that take steps: the methods compared, what errors are taken from, and what biases are judged
-  by.
-- `begin_survey`, before anything is measured: the images that dL/dI is held at, and which stock integrators count as
-  references. It runs in a process of its own (`workers.py`), with the integrator that errors are taken from.
-- `begin_sampling`: steps of one method, timed and kept: gradients or images, in a process of its own.
+Both run in processes of their own (`workers.py`), which `begin_survey` and `begin_sampling` begin.
 """
 
 from __future__ import annotations
 
 import enum
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,28 +15,25 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.loader import loads
+from reslrb_cli.config.loader import dump, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.protocol import first_channels
-from reslrb_cli.integrators.step import gradient_step, known_step, render_image
-from reslrb_cli.measure.gradients import moves_light
+from reslrb_cli.integrators.step import render_image
 from reslrb_cli.measure.methods import IMAGES
 from reslrb_cli.measure.participants import ALIKE
-from reslrb_cli.measure.processes import Contestant
-from reslrb_cli.measure.references import Situation, prb_gradient, prb_image, ptracer_gradient, ptracer_image
+from reslrb_cli.measure.processes import Ended, Stepping
+from reslrb_cli.measure.references import Situation, choose, of_gradient, of_image
+from reslrb_cli.measure.stepper import Steps, multiple_of
 from reslrb_cli.measure.workers import Begun
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.views import View, set_targets, target_arrays, to_tensor
-from reslrb_cli.records.clock import StepClock, StepTimes, peak_mib, reset_peak
+from reslrb_cli.records.clock import StepTimes, reset_peak
 from reslrb_cli.records.measurements import Method, Reference
 from reslrb_cli.scene.catalog import value_shape
 from reslrb_cli.scene.visibility import interior
 from reslrb_cli.seeds import seed
-
-#: Steps after the first until no new kernel comes, at most.
-MAX_WARM_UPS = 4
 
 #: A turn of one that compares is as long as a step of the slowest, but no longer than so many seconds.
 TURN_S = 2.0
@@ -71,7 +63,7 @@ class Role(str, enum.Enum):
 
 
 @dataclass(kw_only=True)
-class Member(Contestant):
+class Member(Stepping):
     """One process, the steps that it is to take, and those that it has taken.
 
     `rows` are samples (P,), `turns` says in which round each was taken, `seconds` are those of one step in each turn.
@@ -85,7 +77,6 @@ class Member(Contestant):
     out: Path
     count: int = 1
     taken: int = 0
-    cold: dict[str, Any] | None = None
     step_s: float = 0.0
     rows: list[np.ndarray] = field(default_factory=list)
     turns: list[int] = field(default_factory=list)
@@ -102,25 +93,19 @@ class Member(Contestant):
         """Seconds of the first step, which compiles."""
         return None if self.cold is None else self.cold["step_ms"][0] / 1e3
 
-    def warm_up(self, tight: bool, stop: Callable[[], bool], over: Callable[[], bool]) -> bool:
-        """Take steps until nothing is compiled any more; whether it came to that."""
-        self.cold = self._steps(1, 0, True, False, stop, over)
-        answer = self.cold
-        for _ in range(MAX_WARM_UPS):
-            if answer is None:
-                return False
-            answer = self._steps(1, 0, False, tight, stop, over)
-            if answer is not None:
-                self.step_s = answer["step_ms"][0] / 1e3
-                if not answer["new_kernels"]:
-                    return True
-        return answer is not None
+    @property
+    def name(self) -> str:
+        """Its role and label."""
+        return f"{self.role.value} {self.label}"
 
-    def turn(self, round: int, tight: bool, stop: Callable[[], bool]) -> None:
-        """Take a turn's steps and keep them. Raises Stopped."""
-        answer = self._steps(self.count, round, False, tight, stop)
-        if answer is None:
-            return
+    def question(self, round: int | None) -> dict[str, Any]:
+        """What asks for the steps of a turn, with the round's dL/dI; one step while it is getting warm."""
+        start, count = self.taken, 1 if round is None else self.count
+        self.taken += count
+        return {"start": start, "count": count, "spp": self.spp, "image": round or 0, "out": str(self.out)}
+
+    def keep(self, round: int, answer: dict[str, Any]) -> None:
+        """Take note of a turn's steps."""
         rows = np.load(self.out)
         if not np.isfinite(rows).all() and not self.message:
             self.message = f"{np.count_nonzero(~np.isfinite(rows))} entries of step {len(self.rows) + 1} are not finite"
@@ -129,13 +114,24 @@ class Member(Contestant):
         times = answer["step_ms"]
         self.seconds.append(float(np.mean(times[1:] if len(times) > 1 else times)) / 1e3)
 
-    def _steps(
-        self, count: int, image: int, cold: bool, release: bool, stop: Callable[[], bool],
-        over: Callable[[], bool] = lambda: False,
-    ) -> dict[str, Any] | None:  # fmt: skip
-        question = {"start": self.taken, "count": count, "spp": self.spp, "image": image, "out": str(self.out)}
-        self.taken += count
-        return self.ask(question | {"cold": cold, "release": release}, stop, over)
+    def kept(self, rounds: int) -> tuple[dict[str, Any], np.ndarray]:
+        """What a later session needs, as JSON has it, and the samples (N, P) of so many rounds.
+
+        A round that was broken off is not among them: the next session begins it anew, with other seeds.
+        """
+        turns = [turn for turn in self.turns if turn < rounds]
+        entry = {"name": self.name, "config": dump(self.config), "taken": self.taken, "turns": turns,
+                 "seconds": self.seconds[: len(set(turns))], "message": self.message, "cold": self.cold,
+                 "end": self.end and vars(self.end)}  # fmt: skip
+        return entry, np.array(self.rows[: len(turns)], np.float32)
+
+    def restore(self, entry: dict[str, Any], rows: np.ndarray) -> None:
+        """Have what `kept` returned; what has ended, or refused, is not asked again."""
+        for name in ("taken", "turns", "seconds", "message", "cold"):
+            setattr(self, name, entry[name])
+        self.rows, self.end = list(rows), entry["end"] and Ended(**entry["end"])
+        if self.end is not None:
+            self.close()
 
     def means(self, key: slice, groups: int | None = None) -> np.ndarray:
         """Means over turns, or over every so many-th of them together, of some entries: (K, P)."""
@@ -252,29 +248,20 @@ def masked_loss(view: View, image: mi.TensorXf, mask: mi.TensorXf | None) -> mi.
 
 def find_references(problem: Problem, objective: str) -> dict[str, Any]:
     """Keys, shapes, and which stock integrator counts for each."""
-    params, config = problem.selection.params, problem.config
-    moved = tuple(key for key in problem.selection.scene_keys if moves_light(params, key))
-    attached = config.integrator.options().get("attached") is True or bool(moved)
-    sensor = problem.scene.sensors()[problem.sensors[0]]
-    at = Situation.of(
-        problem.scene, sensor, params, config.integrator.max_depth, config.integrator.hide_emitters, attached, moved
-    )
+    at = Situation.of_problem(problem, problem.sensors[0])
     keys = ["image"] if objective == "image" else list(problem.selection.keys)
-    independent: dict[str, str | None] = {}
-    why, reasons = {}, {}
+    found: dict[str, dict[Reference, str | None]] = {}
     for key in keys:
-        if objective == "image":
-            found = {"ptracer": ptracer_image(at), "prb": prb_image(at)}
-        else:
-            unlike = _unlike(config) if attached else None
-            found = {"ptracer": unlike or ptracer_gradient(at, key), "prb": prb_gradient(at, key)}
-        reasons[key] = found
-        independent[key] = next((name for name, reason in found.items() if reason is None), None)
-        why[key] = "; ".join(f"not {name}: {reason}" for name, reason in found.items() if reason is not None)
+        found[key] = of_image(at) if objective == "image" else of_gradient(at, key)
+        if objective != "image" and at.attached:
+            found[key][Reference.PTRACER] = _unlike(problem.config) or found[key][Reference.PTRACER]
+    chosen = {key: choose(reasons) for key, reasons in found.items()}
+    independent = {key: None if name is None else name.value for key, (name, _) in chosen.items()}
+    why = {key: reason for key, (_, reason) in chosen.items()}
     without = {
-        name: str(reasons[keys[0]][name])
-        for name in ("ptracer", "prb")
-        if all(found[name] is not None for found in reasons.values())
+        name.value: reason
+        for name, reason in found[keys[0]].items()
+        if all(reasons[name] is not None for reasons in found.values())
     }
     shapes = {key: list(value_shape(problem.selection.value(key))) for key in keys if key != "image"}
     return {"keys": keys, "shapes": shapes, "independent": independent, "why": why, "without": without}
@@ -313,23 +300,16 @@ def shorten_target(problem: Problem, most: int) -> tuple[Problem, str]:
     return shorter, f", the target of {spp}, not {render.spp}"
 
 
-def multiple_of(spp: int, unit: int | None) -> int:
-    """The greatest multiple of a pass's samples up to `spp`, at least one."""
-    unit = unit or 1
-    return max(spp // unit, 1) * unit
-
-
-class Sampler:
-    """Takes steps through the first sensor; the parameters keep their initial values.
+class Sampler(Steps):
+    """Steps as `convergence` takes them.
 
     `mode` says what is sampled: `known`, the gradient with dL/dI held at one of `adjoints`; `loss`, the gradient of the
     experiment's own loss with its `run.adjoint`; `image`. `arrays` are the survey's.
     """
 
-    def __init__(self, config: Any, mode: str, arrays: dict[str, np.ndarray]) -> None:
-        self.problem, self.mode, self.clock = assemble_scene(config.with_exposures_fixed()), mode, StepClock()
-        self.sensor = self.problem.sensors[0]
-        self.view = self.problem.views[0]
+    def __init__(self, config: Config, mode: str, arrays: dict[str, np.ndarray]) -> None:
+        super().__init__(config)
+        self.mode, self.view = mode, self.problem.views[0]
         if "adjoints" in arrays:
             set_targets([self.view], arrays)
         self.mask = None if arrays["mask"].all() else to_tensor(arrays["mask"])
@@ -344,28 +324,12 @@ class Sampler:
                 picture = render_image(problem.integrator, problem.scene, self.sensor, seed, spp)
                 dr.eval(picture)
             return (np.array(picture, np.float32) * self.inside).ravel(), times
-        problem.apply()
-        for key in problem.selection.keys:
-            dr.clear_grad(problem.optimizer[key])
-        with self.clock.step() as times:
-            result = self._gradient(seed, spp, image)
-            gradients = problem.gradients()
-            dr.eval(result.image, result.loss, gradients)
+        if self.mode == "known":
+            gradients, times = self.gradient(seed, self.adjoints[image % len(self.adjoints)], spp)
+        else:
+            gradients, times = self.gradient(seed, lambda seen: masked_loss(self.view, seen, self.mask), spp)
         row = [np.array(gradients[key], np.float32).ravel() for key in problem.selection.keys]
         return np.concatenate(row), times
-
-    def _gradient(self, seed: int, spp: int, image: int) -> Any:
-        problem = self.problem
-        common: dict[str, Any] = {"seed": seed, "params": problem.selection.params}
-        if self.mode == "known":
-            adjoint = self.adjoints[image % len(self.adjoints)]
-            return known_step(problem.integrator, problem.scene, self.sensor, adjoint, spp=spp, **common)
-
-        def loss(picture: mi.TensorXf) -> mi.Float:
-            return masked_loss(self.view, picture, self.mask)
-
-        options = problem.config.step_options() | {"spp": spp}
-        return gradient_step(problem.integrator, problem.scene, self.sensor, loss, **options, **common)
 
 
 def begin_sampling(first: dict[str, Any]) -> Begun:
@@ -388,15 +352,7 @@ def begin_sampling(first: dict[str, Any]) -> Begun:
             rows.append(row)
             taken.append(times)
         np.save(question["out"], np.stack(rows))
-        reply: dict[str, Any] = {
-            "step_ms": [times.wall_ms for times in taken],
-            "new_kernels": sum(times.new_kernels for times in taken),
-        }
-        if question["cold"]:
-            reply["peak_mib"] = peak_mib(dr.backend_v(mi.Float))
-        sampler.clock.history = []
-        if question["release"]:
-            dr.flush_malloc_cache()
-        return reply
+        reply = {"step_ms": [times.wall_ms for times in taken], "new_kernels": sum(t.new_kernels for t in taken)}
+        return sampler.told(reply, question["cold"], question["release"])
 
     return {}, answer

@@ -22,6 +22,7 @@ from functools import cached_property
 import numpy as np
 from scipy import stats
 
+from reslrb_cli.records.measurements import Range
 from reslrb_cli.statistics import jackknife_variance
 
 #: Of all intervals.
@@ -40,15 +41,6 @@ FEWEST_FOR_SLOPE = min(GROUPS)
 
 
 @dataclass(frozen=True)
-class Interval:
-    """An estimate with the ends of its interval."""
-
-    value: float
-    low: float
-    high: float
-
-
-@dataclass(frozen=True)
 class Estimate:
     """An estimate with its standard error and the degrees of freedom of that."""
 
@@ -56,16 +48,16 @@ class Estimate:
     error: float
     freedom: float
 
-    def interval(self, confidence: float = CONFIDENCE) -> Interval:
+    def interval(self, confidence: float = CONFIDENCE) -> Range:
         """By Student's t."""
         half = float(stats.t.isf((1 - confidence) / 2, self.freedom)) * self.error
-        return Interval(self.value, self.value - half, self.value + half)
+        return Range(self.value, self.value - half, self.value + half)
 
-    def exponential(self, confidence: float = CONFIDENCE) -> Interval:
+    def exponential(self, confidence: float = CONFIDENCE) -> Range:
         """The interval of the exponential, where this is of a logarithm."""
         own = self.interval(confidence)
         low, value, high = np.exp(np.clip([own.low, own.value, own.high], -700, 700))
-        return Interval(float(value), float(low), float(high))
+        return Range(float(value), float(low), float(high))
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,4 @@
-"""Cases of the extreme suite: glass, motion, places and roughness at the ends of their range.
-
-- `GLASS_CASES`, glass and masks: what light passes, straight or bent, wholly or not at all.
-- `MOTION_CASES`, what moves light: slopes from none to total reflection, grazing light, thin glass, indices, sizes of
-  scenes.
-- `PLACES_CASES`, where things stand: scale, distance from the origin, grazing views, sides and normals.
-- `ROUGHNESS_CASES`, microfacet BSDFs from fully rough to nearly smooth: a plate throws light on a floor, and the camera
-  sees that alone. The plate itself stays out of view: a nearly smooth lobe that is connected to the sensor has a
-  variance that no number of samples settles.
-"""
+"""Cases of the extreme suite: glass, motion, places and roughness at the ends of their range."""
 
 from __future__ import annotations
 
@@ -196,11 +187,6 @@ def surface(ior: float = 1.5, slope: float = 1, **rough: Any) -> Callable[[], di
     return lambda: pool(glass(ior) | rough, steep(), slope)
 
 
-def totally_reflected() -> dict:
-    """Light in glass that meets its surface from below, beyond the critical angle, and lights the receiver."""
-    return pool(glass(), beam((-1.87, 1.0), (-1.6, 1.2), 0.12), slope=0.1, height=1.2, cells=256)
-
-
 def grazing(degrees: float) -> dict:
     """Light at so many degrees from the surface's normal."""
     theta = float(np.deg2rad(degrees))
@@ -222,7 +208,8 @@ MOTION_CASES = [
     moved("slope_1e-6", "slopes of a millionth", surface(slope=1e-5)),
     moved("slope_0.3", "slopes of a third", surface(slope=3), 0.005),
     moved("sliding_faces", "a surface whose faces slide through the light", surface(), moves=sliding),
-    moved("total_reflection", "a surface with waves, beyond the critical angle", totally_reflected, 0.0015),
+    moved("total_reflection", "a surface with waves, beyond the critical angle",  # of light from within
+          lambda: pool(glass(), beam((-1.87, 1.0), (-1.6, 1.2), 0.12), slope=0.1, height=1.2, cells=256), 0.0015),
     moved("grazing_85", "light at 85 degrees on glass", lambda: grazing(85), 0.005, moves=bending(0.1)),
     moved("parallel_faces", "a slab with flat faces that begins to bend", moving_slab(0), depth=4),
     moved("thin_slab", "a slab of ten ray offsets", moving_slab(0, THIN), 0.1, depth=4, moves=bending(THIN), spp=256),
@@ -250,11 +237,6 @@ def placed(scale: float = 1, offset: Any = (0, 0, 0)) -> dict:
     view[:3, 3] = scale * view[:3, 3] + np.asarray(offset)
     scene["camera"] |= {"to_world": mi.ScalarTransform4f(view), "near_clip": 1e-2 * scale, "far_clip": 1e4 * scale}
     return scene
-
-
-def low_view() -> dict:
-    """A camera close above the floor, which looks along it."""
-    return room(camera=pinhole([0.9, -0.95, 0.9], [-0.9, -0.96, -0.2], [0, 1, 0], 25))
 
 
 def turned_panes() -> dict:
@@ -301,8 +283,9 @@ PLACES_CASES = [
                 Twin(room)),
     ExtremeCase("moved_100", "the room 100 from the origin, fifty times its own size", lambda: placed(1, AWAY),
                 (FLOOR, WALL, LAMP), Twin(room)),
-    ExtremeCase("grazing_sensor", "a camera that looks along the floor", low_view, (FLOOR, WALL, LAMP),
-                Stock("ptracer"), spp=512),
+    ExtremeCase("grazing_sensor", "a camera that looks along the floor",
+                lambda: room(camera=pinhole([0.9, -0.95, 0.9], [-0.9, -0.96, -0.2], [0, 1, 0], 25)),
+                (FLOOR, WALL, LAMP), Stock("ptracer"), spp=512),
     ExtremeCase("grazing_lamp", "a lamp on the floor's edge, at right angles to it", vertical_light,
                 (FLOOR, WALL, LAMP), Stock("ptracer"), spp=128),
     ExtremeCase("back_facing", "sheets that turn their backs on camera and lamp", turned_panes,
@@ -409,5 +392,7 @@ def _followed(kind: str, roughness: str) -> ExtremeCase:
     )  # fmt: skip
 
 
+#: A plate throws light on a floor, and the camera sees that alone. The plate itself stays out of view: a nearly smooth
+#: lobe that is connected to the sensor has a variance that no number of samples settles.
 ROUGHNESS_CASES = [_case(kind, roughness) for kind in KINDS for roughness in ROUGHNESS]
 ROUGHNESS_CASES += [_followed(kind, roughness) for kind, roughness in FOLLOWED]

@@ -1,12 +1,4 @@
-"""Cases of the extreme suite: colours, films, light and losses at the ends of their range.
-
-- `COLOURS_CASES`: albedos of 0 and 1, pure light on pure walls.
-- `FILMS_CASES`: films and textures of the least size, borders and crops.
-- `LIGHTS_CASES`: light very dim and very bright, small, grazing, seen a thousand times, or not at all.
-- `LOSSES_CASES`: losses whose derivative changes sign or is not finite, and sums over very many samples.
-- `UNFOUND_CASES`: lamps that no sample finds, or one in a thousand: smaller than a pixel in view, and with black
-  texels.
-"""
+"""Cases of the extreme suite: colours, films, light and losses at the ends of their range."""
 
 from __future__ import annotations
 
@@ -283,11 +275,6 @@ PLANE = "plane.bsdf.reflectance.value"
 TEXELS = {"albedo": PLANE, "texels": f"{RADIANCE}.data"}
 
 
-def unfound_speck() -> KnownScene:
-    """A lamp of a thousandth of a pixel, and bright enough to make that a grey one."""
-    return speck_in_view(side=0.0037, radiance=(300, 200, 400))
-
-
 def spots() -> KnownScene:
     """Three bright texels of sixteen, all others black."""
     texels = np.zeros((4, 4, 3))
@@ -295,9 +282,10 @@ def spots() -> KnownScene:
     return texels_over_plane(texels)
 
 
+#: Lamps that no sample finds, or one in a thousand.
 UNFOUND_CASES = [
-    exact("lamp_of_a_thousandth_of_a_pixel", "a lamp in view that one primary ray in a thousand hits", unfound_speck,
-          {"radiance": LAMP}, 1, image="ptracer"),
+    exact("lamp_of_a_thousandth_of_a_pixel", "a lamp in view that one primary ray in a thousand hits",
+          lambda: speck_in_view(side=0.0037, radiance=(300, 200, 400)), {"radiance": LAMP}, 1, image="ptracer"),
     exact("black_texels", "a lamp with texels that are black, and drawn in proportion to their radiance: never", spots,
           TEXELS, 2, spp=256),
     exact("black_lamp", "a lamp with nothing but black texels: there is no density in proportion to them",

@@ -1,11 +1,4 @@
-"""The extreme suite: what a case is, and how its estimators are run against references.
-
-- `ExtremeCase`: a scene, its parameters, and what their gradient is known by (`Source`).
-- `residual`: what `gather`'s replay leaves of its sum: nothing but rounding, once every contribution has been taken off
-  again.
-- `restore`, `kept`: going on with a suite, whose cases are whole or not there.
-- `run_case`: every estimator of a case against naive AD of the same paths, and against the case's reference.
-"""
+"""The extreme suite: what a case is (`ExtremeCase`), and how its estimators are run against references (`run_case`)."""
 
 from __future__ import annotations
 
@@ -14,6 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.estimators.base import Pass
@@ -118,7 +112,7 @@ class Extrapolated:
     reference = Reference.FINITE_DIFFERENCE
 
     def samples(self, case: ExtremeCase, setup: Case) -> Samples:
-        along = np.eye(sum(len(value) for value in setup.initial.values()))
+        along = np.eye(setup.size)
         tracer = integrator("reslrb", **without_roulette(case))
         chosen, steps = seeds_of(case.seeds), (self.step, 2 * self.step)
         near, far = (setup.differences(tracer, along, chosen, case.spp, step) for step in steps)
@@ -146,7 +140,7 @@ class Zero:
     reference = Reference.ANALYTIC
 
     def samples(self, case: ExtremeCase, setup: Case) -> Samples:
-        return Samples(np.zeros(sum(len(value) for value in setup.initial.values())))
+        return Samples(np.zeros(setup.size))
 
 
 Source = Stock | Twin | Differences | Extrapolated | Exact | Zero
@@ -249,10 +243,12 @@ def settings(estimators: Sequence[str] | None, seeds: int | None, variant: str, 
 
 def restore(before: Earlier) -> dict[str, list[GradcheckRecord]]:
     """The records of an earlier session, by case. Raises ConfigError where they are none."""
+    reader = TypeAdapter(dict[str, list[GradcheckRecord]])
     try:
-        return {case: [GradcheckRecord.of(row) for row in rows] for case, rows in before.head["cases"].items()}
-    except (AttributeError, KeyError, TypeError, ValueError):
+        found: dict[str, list[GradcheckRecord]] = reader.validate_python(before.head["cases"])
+    except (KeyError, ValueError):
         raise before.other("its cases are damaged") from None
+    return found
 
 
 def kept(settings: Mapping[str, Any], cases: Mapping[str, Sequence[GradcheckRecord]]) -> Kept | None:
@@ -283,7 +279,10 @@ def run_case(
     attached = {} if case.moves is None else {"attached": True}
     walk_ad = integrator("walk_ad", **{**case.options, **case.ours, **attached})
     naive = setup.gradients(walk_ad, seeds_of(case.seeds), case.spp) if case.naive else None
-    stock = _stock_images(case, setup) if case.image else None
+    stock = None
+    if case.image:
+        tracer = integrator(case.image, **without_roulette(case))
+        stock = np.stack([setup.image(tracer, seed, case.spp) for seed in seeds_of(case.seeds, 2)])
     setup.weights = type(setup.weights)(weights)
     for name in ESTIMATORS if estimators is None else estimators:
         if case.moves is not None and not ESTIMATORS[name].attaches:
@@ -323,11 +322,6 @@ def _refusals(weights: np.ndarray, refused: list[int]) -> Comparison:
     return Comparison(Verdict.HOLDS if counts == [expected] else Verdict.FAILS, message=message)
 
 
-def _stock_images(case: ExtremeCase, setup: Case) -> np.ndarray:
-    tracer = integrator(case.image, **without_roulette(case))
-    return np.stack([setup.image(tracer, seed, case.spp) for seed in seeds_of(case.seeds, 2)])
-
-
 def _comparisons(
     case: ExtremeCase, setup: Case, name: str, ours: np.ndarray, naive: np.ndarray | None, reference: Samples
 ) -> Iterator[tuple[str | None, Reference, Kind, Comparison]]:
@@ -356,11 +350,9 @@ def _comparisons(
 
 def _parameters(setup: Case) -> Iterator[tuple[str, slice, tuple[int, ...]]]:
     """Each parameter: its name, where it stands in a gradient, and its shape."""
-    at = 0
-    for key, value in setup.initial.items():
-        shape = np.shape(setup.values.value(key))
-        yield key, slice(at, at + len(value)), shape if np.prod(shape, dtype=int) == len(value) else (len(value),)
-        at += len(value)
+    for key, place in setup.places.items():
+        shape, size = np.shape(setup.values.value(key)), len(setup.initial[key])
+        yield key, place, shape if np.prod(shape, dtype=int) == size else (size,)
 
 
 def _settled(case: ExtremeCase, parameter: str | None, found: Comparison, ours: np.ndarray) -> Comparison:

@@ -1,12 +1,9 @@
-"""One whole optimisation, and what judges all of them: each in a process of its own (`workers.py`).
+"""One whole optimisation (`begin_run`), and what judges all of them (`begin_judging`): each in a process of its own.
 
-What all runs are judged by (`begin_judging`) has one target, and images of the same samples. A method's own loss is of
-the image that it renders itself: its noise, and where `run.adjoint` takes it from, are part of it. So losses are taken
-here, of images by one integrator with the same seeds for all values; none of it is in the time of any method.
-
-One whole optimisation by one method (`begin_run`) goes on as far as it is asked to. Its time is what a user of the
-method waits for: loading the scene, what is left to measurement, compiling, steps and updates. Starting Python is not
-in it, nor is the target, which all methods have from the one that judges them.
+A method's own loss is of the image that it renders itself: its noise, and where `run.adjoint` takes it from, are part
+of it. So losses are taken here, of images by one integrator with the same seeds for all values; none of it is in the
+time of any method, nor is the target, which all have in common. Their time is what a user waits for: loading the scene,
+what is left to measurement, compiling, steps and updates, but not starting Python.
 """
 
 from __future__ import annotations
@@ -22,8 +19,9 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config.loader import loads
-from reslrb_cli.measure.convergence.setup import affordable_paths, find_references, multiple_of, shorten_target
+from reslrb_cli.measure.convergence.setup import affordable_paths, find_references, shorten_target
 from reslrb_cli.measure.references import leave_out_border
+from reslrb_cli.measure.stepper import multiple_of
 from reslrb_cli.measure.workers import Begun
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.autotune.estimators import find_options
@@ -81,9 +79,8 @@ def joint_error(meter: ErrorMeter, values: dict[str, Array]) -> float | None:
 
 
 def begin_judging(first: dict[str, Any]) -> Begun:
-    """Begin the process. The first question is to `prepare`: it names the file for the targets, `out`; see `prepare`.
+    """Begin the process. The first question is to `prepare`, with a file for the targets, `out`, or to `restore` some.
 
-    Or it is to `restore` what an earlier process has prepared: it names the file of its `targets`; see `restore`.
     Each other one names a file of `values`; its answer has their `loss` and `error`.
     """
     start = time.perf_counter()
@@ -94,14 +91,13 @@ def begin_judging(first: dict[str, Any]) -> Begun:
     def answer(question: dict[str, Any]) -> dict[str, Any]:
         if "prepare" in question:
             judge, facts = prepare(problem, question["out"], **question["prepare"])
-            judges.append(judge)
-            return facts
-        if "restore" in question:
+        elif "restore" in question:
             judge, facts = restore(problem, question["targets"], **question["restore"])
-            judges.append(judge)
-            return facts
-        values = load(question["values"], problem.selection.keys)
-        return {"loss": judges[0].loss(values), "error": judges[0].error(values)}
+        else:
+            values = load(question["values"], problem.selection.keys)
+            return {"loss": judges[0].loss(values), "error": judges[0].error(values)}
+        judges.append(judge)
+        return facts
 
     return {"loading_s": loading_s}, answer
 
@@ -129,12 +125,10 @@ def prepare(
     affordable = affordable_paths(problem, pixels, image_s) // pixels
     spp = multiple_of(max(affordable, LEAST_SPP), problem.samples_per_pass)
     judge, facts = _judge(problem, spp, initial)
-    error = facts["error"]
-    kind = (
-        "" if error is None else "RMSE of the parameters" if judge.meter.one_unit else "relative RMSE of the parameters"
-    )
+    kind = "RMSE of the parameters" if judge.meter.one_unit else "relative RMSE of the parameters"
     pictures = f"losses of images of {spp} spp{shortened}"
-    return judge, facts | {"without": without, "error_of": kind, "pictures": pictures, "spp": spp, "masked": masked}
+    found = {"without": without, "error_of": kind if facts["error"] is not None else "", "pictures": pictures}
+    return judge, facts | found | {"spp": spp, "masked": masked}
 
 
 def restore(problem: Problem, targets: str, spp: int, masked: bool) -> tuple[Judge, dict[str, Any]]:

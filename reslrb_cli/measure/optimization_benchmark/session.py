@@ -1,34 +1,31 @@
-"""The processes of whole optimisations: seed after seed, the methods of one seed take turns, one computing at a time.
+"""The processes of whole optimisations: seed after seed, the methods of one seed take turns (`Arena`).
 
-A drift of the machine so hits all methods of a seed alike. Each run starts from an empty cache of kernels, and has the
-same time as every other; where it stands at some times, which all have in common, is judged by another process
-meanwhile. That the others wait for this costs them nothing but what it does to the caches. It makes
-the target too, or takes over an earlier one's.
+Each run starts from an empty cache of kernels, and has the same time as every other; where it stands at some times,
+which all have in common, is judged by another process meanwhile, which makes the target too, or takes over an earlier
+one's. That the others wait for this costs them nothing but what it does to the caches.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from reslrb_cli.config.schema import Config
-from reslrb_cli.measure.arena import Arena, in_turn, is_tight
-from reslrb_cli.measure.methods import RunsPlan, Side
-from reslrb_cli.measure.optimization_benchmark.rank import (
-    POINTS,
-    Run,
-    check_judge,
-    kept,
-    restore,
-    restore_targets,
-    settings,
-    times,
-)
-from reslrb_cli.measure.processes import NO_TIME
+from reslrb_cli.measure import resume_store
+from reslrb_cli.measure.arena import Arena, in_turn
+from reslrb_cli.measure.methods import RunsPlan, Side, with_run
+from reslrb_cli.measure.optimization_benchmark.rank import POINTS, Run, times
+from reslrb_cli.measure.processes import NO_TIME, Contestant
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import BenchStatus, Method, RunPointRecord
+
+#: Losses of the same values on the same samples differ by rounding alone, relatively: far less than this.
+ROUNDING = 1e-3
 
 #: The share of the time that judging is to take, unless that leaves images with too few samples.
 JUDGED = 0.15
@@ -51,24 +48,35 @@ class RunsSession(Arena[RunsPlan, Run]):
     `limit_s` is the time of each run, once it is known: that of an earlier session where there is one.
     """
 
-    def _set_up(self) -> None:
+    def _set_up(self, earlier: Earlier | None) -> int:
         self.limit_s = self._startup_s = self._wave_s = 0.0
         self._seeds = 0  # those of which all runs are over
         self._targets = self.folder / "targets.npz"
-        if self._earlier is not None:
-            head = self._earlier.head
-            self.facts, self.limit_s, self._seeds = head["facts"], head["limit_s"], head["seeds"]
-            self.members = restore(self._earlier, self.plan)
+        if earlier is not None:
+            self._restore(earlier)
+        return 1
 
-    def keep(self) -> Kept | None:
-        """What a later session needs to go on; None where no seed is over."""
+    def _restore(self, earlier: Earlier) -> None:
+        head, sides = earlier.head, {self.plan.method_of(side).label: side for side in self.plan.sides}
+        self.facts, self.limit_s, self._seeds = head["facts"], head["limit_s"], head["seeds"]
+        if self._seeds >= self.plan.runs:
+            plural = "" if self._seeds == 1 else "s"
+            raise earlier.complete(f"{self._seeds} run{plural} of each", "more with --runs")
+        for entry in head["runs"]:
+            self._run(sides[entry["label"]], entry["seed"]).restore(entry)
+
+    def kept(self) -> Kept | None:
+        """What a later session needs to go on: the runs of seeds that are over, and the targets; None of no seed."""
         if self._earlier is None and not self._seeds:
             return None
         if self._earlier is not None and not self._targets.exists():
             return self._earlier.head, self._earlier.arrays
-        return kept(
-            settings(self.plan, self.device), self.facts, self._targets, self.limit_s, self.members, self._seeds
-        )
+        with np.load(self._targets) as found:
+            arrays = {name: found[name] for name in found.files}
+        order = list(dict.fromkeys(run.seed for run in self.members))[: self._seeds]
+        runs = [run.kept() for run in self.members if run.seed in order]
+        content = {"facts": self.facts, "limit_s": self.limit_s, "seeds": self._seeds, "runs": runs}
+        return resume_store.head(self.plan.KIND, self.settings, **content), arrays
 
     def run(self) -> Iterator[RunPointRecord]:
         """Measure; yield where runs stand as it is known. Ends early, with what is done, once `stop()`.
@@ -96,33 +104,37 @@ class RunsSession(Arena[RunsPlan, Run]):
     def _prepare(self) -> bool:
         """Start what judges, and have it make the target; False where time is up over it."""
         plan, began = self.plan, self._now()
-        opening, answer = self._open_referee(self._start_message(plan.reference_config), "judged_runs"), None
+        process, answer = self._start(self._start_message(plan.reference_config), "judged_runs"), None
+        self._referee = Contestant(process=process, may_refuse=False)
+        opening = self._ask_referee(plan)
         if opening is not None:
             self._startup_s = max(self._now() - began - opening["loading_s"], 0.0)
-            answer = self._make_targets() if self._earlier is None else self._take_over(self._earlier)
+            image_s = JUDGED * self._budget_s / (len(plan.sides) * plan.runs * POINTS)
+            ask = {"budget_s": self._budget_s, "image_s": image_s, **plan.camera}
+            if self._earlier is not None:
+                answer = self._take_over(self._earlier)
+            else:
+                answer = self._ask_referee(plan, {"prepare": ask, "out": str(self._targets)})
         if answer is None:
             self._say(f"the budget of {plan.budget_s:g} s was spent before there was a target; allow several times it")
             return False
         self.facts = self.facts | answer
         return True
 
-    def _make_targets(self) -> dict[str, Any] | None:
-        """The facts of `evaluate.prepare`; None where time was up."""
-        image_s = JUDGED * self._budget_s / (len(self.plan.sides) * self.plan.runs * POINTS)
-        ask = {"budget_s": self._budget_s, "image_s": image_s, **self.plan.camera}
-        return self._ask_referee({"prepare": ask, "out": str(self._targets)})
-
     def _take_over(self, earlier: Earlier) -> dict[str, Any] | None:
         """What a judgement takes now, by an earlier session's targets; None where time was up.
 
         Raises ConfigError where the initial values have another loss.
         """
-        restore_targets(earlier, self._targets)
+        np.savez(self._targets, **earlier.arrays)  # type: ignore[arg-type]
         ask = {name: self.facts[name] for name in ("spp", "masked")}
-        found = self._ask_referee({"restore": ask, "targets": str(self._targets)})
+        found = self._ask_referee(self.plan, {"restore": ask, "targets": str(self._targets)})
         if found is None:
             return None
-        check_judge(earlier, found)
+        loss, then = found["loss"], self.facts["loss"]
+        if math.isfinite(loss) and math.isfinite(then) and not math.isclose(loss, then, rel_tol=ROUNDING):
+            reason = f"the initial loss is {then:.4g} there, {loss:.4g} here: has a file of the scene changed?"
+            raise earlier.other(reason)
         return {"judge_s": found["judge_s"]}
 
     def _divide(self, methods: int) -> bool:
@@ -172,19 +184,21 @@ class RunsSession(Arena[RunsPlan, Run]):
                 return
             wave = []
             for side in sides:
-                run = self._begin(side, seed)
+                run = self._run(side, seed)
+                config = with_run(self.plan.config_at(side), seed=seed)
+                run.process = self._start(self._start_message(config), "whole_runs")
                 wave.append(run)
-                self._open(run)
+                self._load(run)
             for turn, until_s in enumerate(times(self.limit_s)):
                 for run in in_turn(wave, turn):
-                    point = self._advance(run, until_s, wave)
+                    point = self._advance(run, until_s)
                     if point is not None:
                         run.points.append(point)
                         if all(other.complete(self.limit_s) or other.end or other.refusal for other in wave):
                             self._seeds = number + 1
                         yield point
             for run in wave:
-                run.process.close()
+                run.close()
             if self._pace.over() and any(not run.complete(self.limit_s) and run.end is None for run in wave):
                 self._say(f"not measured: runs from seed {seed} on: {NO_TIME}")
                 return
@@ -198,24 +212,20 @@ class RunsSession(Arena[RunsPlan, Run]):
         """The methods that need not be tried with another seed: they refused, or need more memory than there is."""
         return {run.method for run in runs if run.refusal or (run.end and run.end.status is BenchStatus.OUT_OF_MEMORY)}
 
-    def _begin(self, side: Side, seed: int) -> Run:
-        plan, config = self.plan, self.plan.seeded(self.plan.config_at(side), seed)
-        run = Run(
-            process=self._start(self._start_message(config), "whole_runs"),
-            may_refuse=plan.default,
-            method=plan.method_of(side),
-            seed=seed,
-            out=self.folder / f"values-{len(self.members)}.npz",
-            state=RunPointRecord(plan.method_of(side), seed, 0.0, 0, self.facts["loss"], self.facts["error"]),
-        )
+    def _run(self, side: Side, seed: int) -> Run:
+        """One more of the members, not under way yet."""
+        method = self.plan.method_of(side)
+        state = RunPointRecord(method, seed, 0.0, 0, self.facts["loss"], self.facts["error"])
+        out = self.folder / f"values-{len(self.members)}.npz"
+        run = Run(process=None, may_refuse=self.plan.default, method=method, seed=seed, out=out, state=state)
         self.members.append(run)
         return run
 
-    def _open(self, run: Run) -> None:
+    def _load(self, run: Run) -> None:
         """Have it load the scene, and measure where there is a pilot: before the next one starts, for that is timed."""
         opening = run.answer(self._stop, self._late(2 * self._startup_s + self.limit_s))
         if opening is None:
-            self._say_end(run)
+            self._say_how(run)
             return
         self._warn(opening)
         run.counted_s = opening["loading_s"]
@@ -227,11 +237,10 @@ class RunsSession(Arena[RunsPlan, Run]):
         allowed_s, began = left_s + grace * self.limit_s + GRACE_S, self._now()
         return lambda: self._pace.over() or self._now() - began > allowed_s
 
-    def _advance(self, run: Run, until_s: float, wave: list[Run]) -> RunPointRecord | None:
+    def _advance(self, run: Run, until_s: float) -> RunPointRecord | None:
         """Where a run stands at some time; None where that cannot be known any more."""
         if run.alive:
-            question = {"until_s": until_s, "limit_s": self.limit_s, "out": str(run.out),
-                        "release": is_tight(self.plan, (other.peak_mib for other in wave if other.alive))}  # fmt: skip
+            question = {"until_s": until_s, "limit_s": self.limit_s, "out": str(run.out), "release": self._tight()}
             left_s = max(self.limit_s - run.counted_s, 0.0)
             late = self._late(left_s, GRACE if run.first_s is None else CUT)
             answer = run.ask(question, self._stop, late)
@@ -239,7 +248,7 @@ class RunsSession(Arena[RunsPlan, Run]):
                 run.counted_s = max(run.counted_s, until_s)
                 taken = self._take(run, answer)
                 return replace(run.state, elapsed_s=until_s) if taken else None
-            self._say_end(run)
+            self._say_how(run)
         if run.end is not None or run.refusal is not None or self._pace.over():
             return None
         # One that was cut off has not come any further: what it was at was not done by the end of its time.
@@ -253,7 +262,7 @@ class RunsSession(Arena[RunsPlan, Run]):
                        "raise run.iterations to have it go on")  # fmt: skip
         if answer["iteration"] == run.state.iteration:
             return True
-        judged = self._ask_referee({"values": str(run.out)})
+        judged = self._ask_referee(self.plan, {"values": str(run.out)})
         if judged is None:
             return False
         run.state = replace(
@@ -261,10 +270,7 @@ class RunsSession(Arena[RunsPlan, Run]):
         )
         return True
 
-    def _say_end(self, run: Run) -> None:
-        if run.refusal is not None:
-            self._say(f"left out: {run.method.label}: {run.refusal}")
-        elif run.end is not None:
-            self._say(f"{run.method.label}, seed {run.seed}: {run.end.status.value}: {run.end.reason}")
-        elif not self._pace.over():
+    def _say_how(self, run: Run) -> None:
+        self._say_end(run, run.method.label, f", seed {run.seed}")
+        if run.late and not self._pace.over():
             self._say(f"{run.method.label}, seed {run.seed}: cut off in iteration {run.state.iteration + 1}")

@@ -2,11 +2,6 @@
 
 An image is what a box filter gives: the mean radiance over each pixel. All parameters here are colours, and each
 channel of the image depends on the same channel of a parameter alone.
-
-- `KnownScene`: a scene, as `mi.load_dict` takes it, beside its reference: `furnace_scene` and those after it.
-- `speck_in_view`, `texels_over_plane`: lamps that samples hardly find, or not at all, and whose images are known:
-  specks, and those with black texels.
-- `furnace`, `point_through_surface`, `beam_through_slab`: the images, in closed form.
 """
 
 from __future__ import annotations
@@ -19,16 +14,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reslrb_cli.measure.scenes.small import (
-    SIZE,
-    diffuse,
-    glass,
-    lit_square,
-    look_at,
-    pinhole,
-    rectangle,
-    rgb,
-)
+from reslrb_cli.measure.scenes.small import SIZE, diffuse, glass, lit_square, look_at, pinhole, rectangle, rgb
 
 Array = NDArray[np.float64]
 

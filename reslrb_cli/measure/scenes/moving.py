@@ -1,9 +1,4 @@
-"""Test scenes in which parameters move light, and what they are made of.
-
-- Smooth meshes, and fields that displace their vertices smoothly: `mesh`, `smooth_fields`.
-- Motions along a few directions: amplitudes as parameters, of which what moves is a function: `Displacement`, `Pose`,
-  `Number`, `moving_case`.
-"""
+"""Test scenes in which parameters move light: amplitudes, of which what moves is a function (`moving_case`)."""
 
 from __future__ import annotations
 
