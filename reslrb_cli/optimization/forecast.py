@@ -265,7 +265,7 @@ def _bytes(value: dr.ArrayBase) -> int:
 
 def _state_bytes(problem: Problem) -> int:
     """Bytes of the optimiser's state: values and moments."""
-    return sum(_bytes(value) for value in problem.optimizer.state().values() if isinstance(value, dr.ArrayBase))
+    return sum(_bytes(value) for kept in problem.optimizer.moments().values() for value in kept.values())
 
 
 def _scratch(problem: Problem) -> int:

@@ -49,25 +49,18 @@ class Best:
         self.iteration: int | None = None
         self.loss = math.inf
         self.values: dict[str, Any] = {}
-        self._recent: deque[float] = deque(maxlen=WINDOW)
+        #: The losses of the last WINDOW iterations.
+        self.recent: deque[float] = deque(maxlen=WINDOW)
 
     def see(self, record: Record, values: Mapping[str, Any]) -> None:
         """Take one iteration, and the values that it began with, by key; they are kept, not copied."""
         if self.held_out:
             loss = math.inf if record.held_out is None else record.held_out
         else:
-            self._recent.append(record.loss)
-            loss = sum(self._recent) / WINDOW if len(self._recent) == WINDOW else math.inf
+            self.recent.append(record.loss)
+            loss = sum(self.recent) / WINDOW if len(self.recent) == WINDOW else math.inf
         if loss < self.loss:  # which what is not finite is not
             self.iteration, self.loss, self.values = record.iteration, loss, dict(values)
-
-    def recall(self, records: list[Record]) -> None:
-        """Take note of the losses before, those of `records`, of a run that goes on."""
-        self._recent.extend(record.loss for record in records[-WINDOW:])
-
-    def restore(self, iteration: int, loss: float, values: Mapping[str, Any]) -> None:
-        """Go on from what was the best."""
-        self.iteration, self.loss, self.values = iteration, loss, dict(values)
 
     def to_json(self) -> dict[str, Any] | None:
         """For the manifest; None where there is none."""
@@ -195,13 +188,14 @@ class Results:
     """
 
     def __init__(self, problem: Problem) -> None:
-        self.problem, self.meter = problem, problem.error_meter()
+        self.problem, self.meter = problem, problem.meter
         self._first: dict[str, float] = {}
         self._last: dict[str, float] = {}
         self._values: dict[str, dict[str, Any]] = {key: {} for key in problem.selection.keys}
         self._losses: list[float] = []
-        self._image_losses: dict[str, list[float]] = {"initial": [], "final": []}
-        self._held_out: dict[str, list[float]] = {"initial": [], "final": []}
+        #: Of the saved images of views, at `initial` and `final`: of those that are trained on, and of those held out.
+        self.image_losses: dict[str, list[float]] = {"initial": [], "final": []}
+        self.held_out: dict[str, list[float]] = {"initial": [], "final": []}
         self._errors: dict[str, list[float]] = {}
 
     def begin(self) -> None:
@@ -210,14 +204,6 @@ class Results:
         self._take("initial")
         for key, true in self.problem.truth.items():
             self._values[key]["true"] = summary(true, self.problem.masks.get(key))
-
-    def recall(self, images: Mapping[str, list[float]]) -> None:
-        """Go on from what `images_seen` said of the start."""
-        self._image_losses["initial"], self._held_out["initial"] = images["trained"], images["held_out"]
-
-    def images_seen(self) -> dict[str, list[float]]:
-        """The losses of the images of the start: of views that are trained on, and of those held out."""
-        return {"trained": self._image_losses["initial"], "held_out": self._held_out["initial"]}
 
     def add(self, record: Record) -> None:
         """Take one iteration."""
@@ -232,9 +218,9 @@ class Results:
 
     def see(self, moment: str, view: View, image: Array) -> None:
         """Take the saved image (H, W, C) of a view, at `initial` or `final`; every view in turn."""
-        if moment in self._image_losses:
+        if moment in self.image_losses:
             loss = view.objective(mi.TensorXf(np.ascontiguousarray(image, dtype=np.float32)))
-            (self._held_out if view.held_out else self._image_losses)[moment].append(float(loss[0]))
+            (self.held_out if view.held_out else self.image_losses)[moment].append(float(loss[0]))
 
     def _take(self, moment: str) -> None:
         for key, value in self.problem.values().items():
@@ -265,9 +251,9 @@ class Results:
             "parameters": {key: self._about(key) | values for key, values in self._values.items()},
             "image_loss": {
                 moment: float(np.sum(losses)) if len(losses) == len(self.problem.trained) else None
-                for moment, losses in self._image_losses.items()
+                for moment, losses in self.image_losses.items()
             },
-            "held_out": {moment: float(np.mean(losses)) for moment, losses in self._held_out.items() if losses},
+            "held_out": {moment: float(np.mean(losses)) for moment, losses in self.held_out.items() if losses},
             "loss_trend": None if trend is None else trend.to_json(),
             "worse": worse,
             "samples": {"step": run.spp, "target": None if render is None else render.spp},

@@ -21,7 +21,7 @@ import numpy as np
 
 from reslrb_cli.errors import MachineError, NonFinite, describe, is_machine_fault, tell
 from reslrb_cli.optimization.decisions import Scaled
-from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.nonfinite import Findings
 from reslrb_cli.optimization.problem import Problem, saved_spp
 from reslrb_cli.optimization.sensitivity import step_line
@@ -282,11 +282,11 @@ class Recording:
         if stop():
             return
         with MetricsWriter(self.folder.path) as metrics:
-            for record in optimize(self.problem, self._on_nonfinite, self.course.state):
-                if not told and self.course.state.sensitivities is not None:
-                    note_scaling(self.manifest, self.problem, self.course.state.sensitivities)
+            for state, record in iterate(self.problem, self.course.state, self._on_nonfinite):
+                if not told and state.scaling is not None:
+                    note_scaling(self.manifest, self.problem, state.scaling)
                 told = True
-                self.course.add(record)
+                self.course.add(state, record)
                 metrics.write(record)
                 show(record)
                 check_memory(self.manifest, self.problem, record)
@@ -306,7 +306,8 @@ class Recording:
         """Keep what the first step that met a value that is not finite began with, and say how to look into it."""
         if self._saved_nonfinite:
             return
-        step = NonFiniteStep(found.iteration, self.problem.values(), *self.course.learned())
+        state = self.course.state  # what guided emission knew before this iteration, which may have taught it more
+        step = NonFiniteStep(found.iteration, self.problem.values(), state.guiding, state.learned)
         save_nonfinite(self.folder.checkpoint, step)
         self._saved_nonfinite = True
         if self.problem.config.run.on_nonfinite != "stop":  # which says so when it ends

@@ -115,14 +115,14 @@ def meter_of(truth, quantities=None):
 def test_errors_are_taken_over_the_mask(tmp_path):
     problem = make_problem(tmp_path)
     problem.truth["albedo"] = np.array(problem.optimizer["albedo"]) + np.array([[[1.0], [50.0]], [[2.0], [3.0]]])
-    meter = problem.error_meter()
+    meter = problem.meter
     errors = meter.errors(problem.selection.array)
     assert errors["albedo"] == pytest.approx(np.sqrt((1 + 4 + 9) / 3), rel=1e-5)
     assert meter.total(errors) == pytest.approx(np.sqrt((1 + 4 + 9) / 3), rel=1e-5)
     truth = problem.truth["albedo"][problem.masks["albedo"]]
     assert meter.scales["albedo"] == pytest.approx(np.sqrt(np.mean(truth**2)), rel=1e-5)
     problem.masks["albedo"][:] = False
-    meter = problem.error_meter()
+    meter = replace(problem).meter
     assert meter.errors(problem.selection.array) == {}
     assert meter.total({}) is None
 
@@ -261,9 +261,8 @@ def test_it_goes_on_from_what_it_was(at):
     whole, part = seen(losses), seen(losses[:at])
     again = Best(False)
     records = [replace(RECORD, iteration=number, loss=loss) for number, loss in enumerate(losses)]
-    again.recall(records[:at])
-    if part.iteration is not None:
-        again.restore(part.iteration, part.loss, part.values)
+    again.recent.extend(losses[:at])
+    again.iteration, again.loss, again.values = part.iteration, part.loss, part.values
     for record in records[at:]:
         again.see(record, {"a": record.iteration})
     assert again.to_json() == whole.to_json()
