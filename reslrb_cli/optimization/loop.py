@@ -34,26 +34,12 @@ from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.seeds import seed
 
-
-def constant(progress: float, final_fraction: float) -> float:
-    """1 throughout."""
-    return 1.0
-
-
-def cosine(progress: float, final_fraction: float) -> float:
-    """Half a period of a cosine (Loshchilov and Hutter 2017, without restarts)."""
-    return final_fraction + (1.0 - final_fraction) * 0.5 * (1.0 + math.cos(math.pi * progress))
-
-
-def exponential(progress: float, final_fraction: float) -> float:
-    """The same factor from each iteration to the next."""
-    return float(final_fraction**progress)
-
-
+#: Of a run's progress (0 to 1) and the final fraction. The cosine is half a period of one (Loshchilov and Hutter 2017,
+#: without restarts); exponential is the same factor from each iteration to the next.
 SCHEDULES: dict[str, Callable[[float, float], float]] = {
-    "constant": constant,
-    "cosine": cosine,
-    "exponential": exponential,
+    "constant": lambda progress, final: 1.0,
+    "cosine": lambda progress, final: final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * progress)),
+    "exponential": lambda progress, final: float(final**progress),
 }
 
 

@@ -13,6 +13,11 @@ of it. T is increasing, entry by entry.
 Updates (`Optimizer`): one optimiser for each parameter rather than one for all, so that a parameter whose gradient is
 not finite can sit an iteration out with its moments and its count of steps as they were.
 
+    adam      m, v running means of g and g²; p -= lr · √(1-β₂ᵗ)/(1-β₁ᵗ) · m / (√v + ε)    Kingma and Ba 2015
+    adamw     as adam, and p -= lr · weight_decay · p besides                              Loshchilov and Hutter 2019
+    rmsprop   v the running mean of g²; p -= lr · g / (√v + ε)                             Hinton 2012
+    sgd       v = momentum · v + g; p -= lr · v
+
 What a parameter must satisfy: finite values, within its bounds (`clamp`, `count_nonfinite`).
 
 A clamp against outliers in gradients (`clamp_gradients`): less variance, at the price of a bias, which is measured.
@@ -140,33 +145,12 @@ def _opaque(like: Any, number: float) -> Any:
     return dr.opaque(dr.leaf_t(like), number)
 
 
-def adam(learning_rate: float, beta_1: float = 0.9, beta_2: float = 0.999, epsilon: float = 1e-8) -> Any:
-    """Adam (Kingma and Ba 2015): m, v running means of g and g²; p -= lr · √(1-β₂ᵗ)/(1-β₁ᵗ) · m / (√v + ε)."""
-    return dropt.Adam(lr=learning_rate, beta_1=beta_1, beta_2=beta_2, epsilon=epsilon)
-
-
-def adamw(
-    learning_rate: float,
-    beta_1: float = 0.9,
-    beta_2: float = 0.999,
-    epsilon: float = 1e-8,
-    weight_decay: float = 0.01,
-) -> Any:
-    """Adam with decoupled weight decay (Loshchilov and Hutter 2019): p -= lr · weight_decay · p besides."""
-    return dropt.AdamW(lr=learning_rate, beta_1=beta_1, beta_2=beta_2, epsilon=epsilon, weight_decay=weight_decay)
-
-
-def rmsprop(learning_rate: float, decay: float = 0.99, epsilon: float = 1e-8) -> Any:
-    """RMSProp (Hinton 2012): v the running mean of g²; p -= lr · g / (√v + ε)."""
-    return dropt.RMSProp(lr=learning_rate, alpha=decay, epsilon=epsilon)
-
-
-def sgd(learning_rate: float, momentum: float = 0.0) -> Any:
-    """Gradient descent: v = momentum · v + g; p -= lr · v."""
-    return dropt.SGD(lr=learning_rate, momentum=momentum)
-
-
-OPTIMIZERS: dict[str, Callable[..., Any]] = {"adam": adam, "adamw": adamw, "rmsprop": rmsprop, "sgd": sgd}
+OPTIMIZERS: dict[str, Callable[..., Any]] = {
+    "adam": dropt.Adam,
+    "adamw": dropt.AdamW,
+    "rmsprop": dropt.RMSProp,
+    "sgd": dropt.SGD,
+}
 
 
 class Optimizer:
@@ -189,7 +173,8 @@ class Optimizer:
     ) -> None:
         self._rates = {key: float(rates[key] or learning_rate) for key in values}
         self._bounds = {key: bounds[key] for key in values}
-        self._own = {key: OPTIMIZERS[type](self._rates[key], **options) for key in values}
+        named = {"alpha" if name == "decay" else name: value for name, value in options.items()}
+        self._own = {key: OPTIMIZERS[type](lr=self._rates[key], **named) for key in values}
         self._variables: dict[str, Variable] = {}
         #: The scene's values of the parameters that have a variable.
         self._scene: dict[str, Any] = {}
@@ -222,10 +207,6 @@ class Optimizer:
         else:
             self._scene[key] = _leaf(value)
             self._own[key][key] = variable.from_scene(value)
-
-    def is_moved_apart(self, key: str) -> bool:
-        """Whether what is moved is not the parameter itself, but a variable that it follows from."""
-        return key in self._variables
 
     def set_variable(self, key: str, variable: Variable) -> None:
         """Move a parameter by way of `variable` from now on; to be called before the first step."""

@@ -113,7 +113,7 @@ def load(problem: Problem, stored: Stored) -> State:
     for key in keys:
         if key in told.units:
             optimizer.set_variable(key, replace(optimizer.variable(key), length=told.units[key][0]))
-        elif optimizer.is_moved_apart(key):
+        elif key in optimizer.units():
             raise stored.wrong(f"units.{key}", "is missing")
     learned: dict[str, None] = {}
     if guiding is not None:
@@ -123,10 +123,9 @@ def load(problem: Problem, stored: Stored) -> State:
         _check_known(stored, "guiding", told.guiding, sensors, "is of a sensor that the scene does not have")
         learned = dict.fromkeys(f"{number}/{name}" for number in told.guiding for name in KNOWN)
     sums = {key: dict.fromkeys(SUMS, dr.detach(optimizer[key])) for key in told.clamp}
-    values, halo = _expected(problem)
-    asked = replace(told, moments=optimizer.moments(), clamp_sums=sums, values=values, halo=halo, learned=learned)
-    state = stored.fill(asked)
-    state = replace(state, values=_from_file(problem, stored, "parameter", state.values, state.halo), halo={})
+    values = _stored_values(problem, stored, "parameter")
+    state = stored.fill(replace(told, moments=optimizer.moments(), clamp_sums=sums, learned=learned))
+    state = replace(state, values=values)
     wrong = put(problem, state)
     if wrong is not None:
         raise stored.wrong(f"guiding/{wrong}", "is not what was learned of this scene")
@@ -162,28 +161,18 @@ def on_file(problem: Problem, values: Mapping[str, Any]) -> tuple[dict[str, Arra
     return shown, {key: own for key, value in values.items() if (own := to_array(value)).size != shown[key].size}
 
 
-def _expected(problem: Problem) -> tuple[dict[str, Array], dict[str, Array]]:
-    """The arrays from which `_from_file` has the parameters' values."""
-    whole: dict[str, Array] = {}
-    halo: dict[str, Array] = {}
-    for key in problem.selection.keys:
-        shown, own = problem.selection.array(key).shape, tuple(dr.shape(problem.optimizer[key]))
-        if math.prod(shown) == math.prod(own):
-            whole[key] = expected(shown)
-        else:
-            halo[key] = expected(own)
-    return whole, halo
+def _stored_values(problem: Problem, stored: Stored, prefix: str) -> dict[str, Any]:
+    """What `on_file` made of values, as the optimiser has them; `prefix` is that of their entries.
 
-
-def _from_file(
-    problem: Problem, stored: Stored, name: str, values: Mapping[str, Array], halo: Mapping[str, Array]
-) -> dict[str, Any]:
-    """The inverse of `on_file`; `name` is that of the values. Raises ConfigError for one that is out of its bounds."""
+    Raises ConfigError for one that is out of its bounds.
+    """
     found = {}
     for key in problem.selection.keys:
-        now, array = dr.detach(problem.optimizer[key]), halo.get(key, values.get(key))
-        assert array is not None
-        check_bounds(problem, stored, f"{name}{' with halo' if key in halo else ''}/{key}", key, array)
+        now, name, shape = dr.detach(problem.optimizer[key]), f"{prefix}/{key}", problem.selection.array(key).shape
+        if math.prod(shape) != math.prod(dr.shape(now)):
+            name, shape = f"{prefix} with halo/{key}", tuple(dr.shape(now))
+        array = stored.take(name, expected(shape), "finite")
+        check_bounds(problem, stored, name, key, array)
         found[key] = like(now, array.reshape(dr.shape(now)))
     return found
 
@@ -231,9 +220,7 @@ def begin_as(problem: Problem, stored: Stored) -> None:
     found = [name for name in stored.archive.names("parameter/") if name not in keys]
     if found:
         raise stored.wrong(f"parameter/{found[0]}", "is no parameter of this run")
-    whole, halo = _expected(problem)
-    settled = stored.fill(replace(stored.read(Settled), initial=whole, initial_halo=halo))
-    values = _from_file(problem, stored, "initial", settled.initial, settled.initial_halo)
+    values = _stored_values(problem, stored, "initial")
     problem.selection.set_arrays({key: problem.selection.shown(key, value) for key, value in values.items()})
     for key in keys:
         problem.optimizer.set_value(key, values[key])
@@ -278,5 +265,5 @@ def _as_planned(stored: Stored, before: MemoryPlan | None, now: MemoryPlan) -> M
 def reach_as(problem: Problem, stored: Stored) -> Problem:
     """Take up what light and sensor reach, of the parameters whose true value is known."""
     shapes = {key: problem.selection.array(key).shape for key in problem.truth}
-    masks = {key: expected(shape[:2] if len(shape) == 3 else shape, bool) for key, shape in shapes.items()}
-    return replace(problem, masks=stored.fill(replace(stored.read(Settled), masks=masks)).masks)
+    asked = {key: expected(shape[:2] if len(shape) == 3 else shape, bool) for key, shape in shapes.items()}
+    return replace(problem, masks={key: stored.take(f"mask/{key}", mask) for key, mask in asked.items()})

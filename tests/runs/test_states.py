@@ -97,7 +97,7 @@ EVIL: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
     "objects": ({"mask/x": np.array([{}], dtype=object)}, {}, "is damaged, cut off, or not written by a run ("),
     "text": ({"mask/x": np.array("x")}, {}, "is damaged, cut off, or not written by a run ("),
     "no state": ({"state": None}, {}, ""),
-    "iterations": ({}, {"iteration": -1}, "iteration: Input should be greater than or equal to 0: not as a run writes it"),
+    "iterations": ({}, {"iteration": -1}, "iteration: Input should be greater than or equal to 0: not as"),
     "more iterations than lines": ({}, {"iteration": 6}, "metrics.jsonl: holds 4 of the 6 iterations"),
     "too many iterations": ({}, {"iteration": 7}, "run.iterations: is 6; the run has done 7 already"),
     "a time": ({}, {"elapsed_s": "long"}, "elapsed_s: Input should be a valid number"),
