@@ -13,7 +13,7 @@ which receive gradients, and the tables of guided emission. They follow from a s
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
@@ -89,14 +89,9 @@ def standing(problem: Problem, state: State | None = None) -> State:
 
 
 def put(problem: Problem, state: State) -> str | None:
-    """Bring optimiser, guided emission and scene to `state`.
-
-    Returns the name of what was not learned of this scene, as `Guiding.restore` does.
-    """
+    """Bring optimiser, guided emission and scene to `state`; what was not learned of this scene (`restore_tables`)."""
     problem.optimizer.restore(state.values, state.units, state.moments)
-    guiding, wrong = guiding_of(problem), None
-    if guiding is not None:
-        wrong = restore_tables(problem, guiding, state.guiding or {}, state.learned.__getitem__)
+    wrong = restore_tables(problem, state.guiding or {}, state.learned)
     problem.apply()
     problem.optimizer.stands_at = state
     return wrong
@@ -104,10 +99,11 @@ def put(problem: Problem, state: State) -> str | None:
 
 def load(problem: Problem, stored: Stored) -> State:
     """The state that was stored, to which `problem` is brought. Raises ConfigError where it is another experiment's."""
-    told, optimizer, guiding = stored.read(State), problem.optimizer, guiding_of(problem)
-    keys = problem.selection.keys
+    told, optimizer, keys = stored.read(State), problem.optimizer, problem.selection.keys
     for name, found in (("units", told.units), ("clamp", told.clamp)):
-        _check_known(stored, name, found, keys, "is of a parameter that the run does not have")
+        for key in found:
+            if key not in keys:
+                raise stored.wrong(f"{name}.{key}", "is of a parameter that the run does not have")
     if told.scaling is not None and [row.key for row in told.scaling] != list(keys):
         raise stored.wrong("scaling", "does not have the run's parameters")
     for key in keys:
@@ -115,27 +111,17 @@ def load(problem: Problem, stored: Stored) -> State:
             optimizer.set_variable(key, replace(optimizer.variable(key), length=told.units[key][0]))
         elif key in optimizer.units():
             raise stored.wrong(f"units.{key}", "is missing")
-    learned: dict[str, None] = {}
-    if guiding is not None:
-        if told.guiding is None:
-            raise stored.wrong("guiding", "is missing")
-        sensors = [str(number) for number in range(len(problem.scene.sensors()))]
-        _check_known(stored, "guiding", told.guiding, sensors, "is of a sensor that the scene does not have")
-        learned = dict.fromkeys(f"{number}/{name}" for number in told.guiding for name in KNOWN)
+    if guiding_of(problem) is not None and told.guiding is None:
+        raise stored.wrong("guiding", "is missing")
+    learned = dict.fromkeys(f"{number}/{name}" for number in told.guiding or () for name in KNOWN)
     sums = {key: dict.fromkeys(SUMS, dr.detach(optimizer[key])) for key in told.clamp}
     values = _stored_values(problem, stored, "parameter")
     state = stored.fill(replace(told, moments=optimizer.moments(), clamp_sums=sums, learned=learned))
     state = replace(state, values=values)
     wrong = put(problem, state)
     if wrong is not None:
-        raise stored.wrong(f"guiding/{wrong}", "is not what was learned of this scene")
+        raise stored.wrong(wrong, "is not what was learned of this scene")
     return state
-
-
-def _check_known(stored: Stored, name: str, found: Mapping[str, object], known: Collection[str], wrong: str) -> None:
-    for key in found:
-        if key not in known:
-            raise stored.wrong(f"{name}.{key}", wrong)
 
 
 def guiding_of(problem: Problem) -> Guiding | None:
@@ -143,12 +129,20 @@ def guiding_of(problem: Problem) -> Guiding | None:
     return problem.integrator.preparation.guiding if isinstance(problem.integrator, Reslrb) else None
 
 
-def restore_tables(
-    problem: Problem, guiding: Guiding, calls: Mapping[str, int], take: Callable[[str], Array]
-) -> str | None:
-    """Have the tables of the run's integrator go on from what is stored, as `Guiding.restore` does."""
+def restore_tables(problem: Problem, calls: Mapping[str, int], learned: Mapping[str, Array]) -> str | None:
+    """Have the tables of the run's integrator, where it has any, go on from what is stored (`State`).
+
+    Returns the name of what is not of this scene, and then nothing has changed.
+    """
+    guiding = guiding_of(problem)
+    if guiding is None:
+        return None
+    sensors = {str(number) for number in range(len(problem.scene.sensors()))}
+    if not set(calls) <= sensors or {f"{number}/{name}" for number in calls for name in KNOWN} != set(learned):
+        return "guiding"
     problem.integrator.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]])  # makes the grid
-    return guiding.restore(calls, take)
+    wrong = guiding.restore(calls, learned.__getitem__)
+    return None if wrong is None else f"guiding/{wrong}"
 
 
 # --- values of parameters in files ------------------------------------------------------------------------------------

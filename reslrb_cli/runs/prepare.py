@@ -10,15 +10,13 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.config.files import IMAGE_BYTES, read_file
@@ -33,9 +31,9 @@ from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.correlated_bias import measure_correlated_bias
 from reslrb_cli.optimization.moving import warn_of_border
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.results import WINDOW, Best, Results
-from reslrb_cli.optimization.state import Count, Number, Settled, State, check_bounds, load, on_file, standing
-from reslrb_cli.optimization.uncertainty.measuring import Certainty
+from reslrb_cli.optimization.results import WINDOW, Best, Images, Least, Results
+from reslrb_cli.optimization.state import Settled, State, check_bounds, load, on_file, standing
+from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
 from reslrb_cli.optimization.views import view_records
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.checkpoint import save_checkpoint
@@ -198,31 +196,6 @@ def digests(config: Config) -> dict[str, str]:
 
 
 Array = np.ndarray[Any, Any]
-Loss = Annotated[float, Field(lt=1e300)] | None
-
-
-@dataclass(frozen=True)
-class BestLoss:
-    """The least loss so far, and the iterations before it."""
-
-    iteration: Count
-    loss: Number
-
-
-@dataclass(frozen=True)
-class Images:
-    """The losses of the images of the start, by view; None for what is not finite."""
-
-    trained: list[Loss]
-    held_out: list[Loss]
-
-
-@dataclass(frozen=True)
-class Noted:
-    """After how many iterations `Certainty` took note of the squares (0: not yet), and of which parameters."""
-
-    seen: Count
-    keys: list[str]
 
 
 @dataclass(frozen=True)
@@ -231,8 +204,8 @@ class Met:
 
     images: Images
     certainty: Noted
-    best: BestLoss | None = None
-    last: dict[str, Any] | None = None
+    best: Least | None = None
+    last: Record | None = None
     best_values: Arrays = field(default_factory=dict, metadata=entry("best", "finite"))
     squares: Arrays = field(default_factory=dict, metadata=entry("squares"))
 
@@ -282,15 +255,10 @@ class Course:
 
     def save(self, folder: Path) -> int:
         """Keep it in `folder` as it was after its last whole iteration; return how many it had. Raises OSError."""
-        best, results, squares = self.best, self.results, self.certainty.squares
         met = Met(
-            Images(list(results.image_losses["initial"]), list(results.held_out["initial"])),
-            Noted(self.certainty.seen, list(squares)),
-            None if best.iteration is None else BestLoss(best.iteration, best.loss),
-            None if self.last is None else asdict(self.last),
-            self.best_values(),
-            squares,
-        )
+            self.results.images["initial"], self.certainty.noted, self.best.least, self.last,
+            self.best_values(), self.certainty.squares,
+        )  # fmt: skip
         found, values = entries(self._settled, self.state.on_file(self.problem), met)
         save_checkpoint(folder, self.done, {}, found, values)
         return self.done
@@ -309,10 +277,8 @@ class Course:
         for record in records:
             self._take(record)
         self.best.recent.extend(record.loss for record in records[-WINDOW:])
-        if met.best is not None:
-            for key, array in met.best_values.items():
-                check_bounds(problem, stored, f"best/{key}", key, array)
-            self.best.iteration, self.best.loss, self.best.values = met.best.iteration, met.best.loss, met.best_values
-        self.results.image_losses["initial"] = [math.nan if x is None else x for x in met.images.trained]
-        self.results.held_out["initial"] = [math.nan if x is None else x for x in met.images.held_out]
-        self.certainty.seen, self.certainty.squares = met.certainty.seen, met.squares
+        for key, array in met.best_values.items():
+            check_bounds(problem, stored, f"best/{key}", key, array)
+        self.best.least, self.best.values = met.best, met.best_values
+        self.results.images["initial"] = met.images
+        self.certainty.noted, self.certainty.squares = met.certainty, met.squares

@@ -233,9 +233,9 @@ def test_noise_is_not_taken_for_the_best():
     losses = [0.01] + [1.0] * 20 + [0.5] * 15 + [0.9] * 20
     best = seen(losses)
     means = [np.mean(losses[end - WINDOW : end]) for end in range(WINDOW, len(losses) + 1)]
-    assert best.iteration == int(np.argmin(means)) + WINDOW - 1
-    assert best.values == {"a": best.iteration}
-    assert best.loss == pytest.approx(0.5)
+    assert best.least.iteration == int(np.argmin(means)) + WINDOW - 1
+    assert best.values == {"a": best.least.iteration}
+    assert best.least.loss == pytest.approx(0.5)
 
 
 def test_there_is_none_before_the_window_is_full():
@@ -245,14 +245,14 @@ def test_there_is_none_before_the_window_is_full():
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_what_is_not_finite_is_never_the_best(bad):
-    assert seen([bad] * 30).iteration is None
-    assert seen([*[bad] * 5, *[2.0] * 30]).iteration == 5 + WINDOW - 1
+    assert seen([bad] * 30).least is None
+    assert seen([*[bad] * 5, *[2.0] * 30]).least.iteration == 5 + WINDOW - 1
 
 
 def test_views_that_are_held_out_decide():
     held_out = [3.0, None, 1.0, None, 2.0]
     best = seen([5.0, 4.0, 3.0, 2.0, 1.0], held_out)
-    assert (best.iteration, best.loss, best.values) == (2, 1.0, {"a": 2})
+    assert (best.least.iteration, best.least.loss, best.values) == (2, 1.0, {"a": 2})
 
 
 @pytest.mark.parametrize("at", [3, 12, 25])
@@ -262,7 +262,7 @@ def test_it_goes_on_from_what_it_was(at):
     again = Best(False)
     records = [replace(RECORD, iteration=number, loss=loss) for number, loss in enumerate(losses)]
     again.recent.extend(losses[:at])
-    again.iteration, again.loss, again.values = part.iteration, part.loss, part.values
+    again.least, again.values = part.least, part.values
     for record in records[at:]:
         again.see(record, {"a": record.iteration})
     assert again.to_json() == whole.to_json()
