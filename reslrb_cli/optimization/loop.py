@@ -9,6 +9,7 @@ import functools
 import math
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -109,12 +110,12 @@ def step(
     standstill = state.standstill + 1 if held or found.updates else 0
     state = standing(
         problem,
-        State(
+        replace(
+            state,
             iteration=iteration + 1,
             elapsed_s=clock.elapsed_s,
             peak_mib=max(state.peak_mib, peak_mib(dr.backend_v(loss))),
             standstill=standstill,
-            units={},
             scaling=scaling,
             clamp=clamp,
             clamp_sums=clamp_sums,

@@ -116,8 +116,8 @@ def load(problem: Problem, stored: Stored) -> State:
     learned = dict.fromkeys(f"{number}/{name}" for number in told.guiding or () for name in KNOWN)
     sums = {key: dict.fromkeys(SUMS, dr.detach(optimizer[key])) for key in told.clamp}
     values = _stored_values(problem, stored, "parameter")
-    state = stored.fill(replace(told, moments=optimizer.moments(), clamp_sums=sums, learned=learned))
-    state = replace(state, values=values)
+    asked = replace(told, moments=optimizer.moments(), clamp_sums=sums, learned=learned)
+    state = replace(stored.fill(asked), values=values)
     wrong = put(problem, state)
     if wrong is not None:
         raise stored.wrong(wrong, "is not what was learned of this scene")
