@@ -195,26 +195,23 @@ class Images:
 
 
 class Results:
-    """Collects the results of one run of `problem`: `begin` before its first iteration, `add` each, `end` after all.
+    """Collects the results of one run of `problem`, whose parameters stand at their initial values when this is made:
+    `add` each iteration, `end` after all.
 
     `to_json` can be asked for at any time; what is not known yet is null there.
     """
 
     def __init__(self, problem: Problem) -> None:
         self.problem, self.meter = problem, problem.meter
-        self._first: dict[str, float] = {}
+        self._first = self.meter.errors(problem.selection.array)
         self._last: dict[str, float] = {}
         self._values: dict[str, dict[str, Any]] = {key: {} for key in problem.selection.keys}
         self._losses: list[float] = []
         self.images = {"initial": Images(), "final": Images()}
         self._errors: dict[str, list[float]] = {}
-
-    def begin(self) -> None:
-        """Take the parameters as they are for those of the start."""
-        self._first = self.meter.errors(self.problem.selection.array)
         self._take("initial")
-        for key, true in self.problem.truth.items():
-            self._values[key]["true"] = summary(true, self.problem.masks.get(key))
+        for key, true in problem.truth.items():
+            self._values[key]["true"] = summary(true, problem.masks.get(key))
 
     def add(self, record: Record) -> None:
         """Take one iteration."""

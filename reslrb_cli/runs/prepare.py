@@ -223,7 +223,6 @@ class Course:
         self.best = Best(any(view.held_out for view in problem.views))
         self.nonfinite, self.clamped = NonFiniteTally(), ClampTally()
         self.last: Record | None = None
-        self.results.begin()
 
     @property
     def done(self) -> int:

@@ -88,10 +88,6 @@ class Ending:
         else:
             self._manifest.missing.pop(name, None)
 
-    def leave_out(self, name: str, reason: str) -> None:
-        """Note a part that a run which ends like this does not have."""
-        self._manifest.missing[name] = reason
-
     def finish(self, write_page: Callable[[], object]) -> Status:
         """Complete the manifest, write the page from it, and say how the run ended, or raise what it failed of."""
         self._write_manifest()
@@ -319,7 +315,7 @@ class Recording:
                 self._add("how certain the values are was", self._measure_certainty)
                 self._add("errors as people see them were", self._measure_seen_errors)
         else:
-            ending.leave_out("final images", "the run failed")
+            self.manifest.missing["final images"] = "the run failed"
         return ending.finish(self._write_page)
 
     def _write_parameters(self) -> None:

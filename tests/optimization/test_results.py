@@ -42,8 +42,6 @@ def test_textures_are_told_by_mean_and_range_of_what_is_reached():
 def test_results_of_a_run(tmp_path, steps):
     problem = steps.problem = make_problem(tmp_path)
     results = Results(problem)
-    assert results.to_json()["parameters"]["albedo"]["initial"] is None
-    results.begin()
     for record in loop.optimize(problem):
         results.add(record)
     halfway = results.to_json()
@@ -69,7 +67,6 @@ def test_a_short_run_is_called_worse_once_it_is_over(tmp_path, iterations, worse
     """Pages of a run that goes on ask from its first iterations on."""
     problem = make_problem(tmp_path, sets=[f"run.iterations={iterations}"])
     results = Results(problem)
-    results.begin()
     for iteration in range(3):
         results.add(make_record(iteration=iteration, parameter_errors={"albedo": 1e-3}))
     results.end()
@@ -81,7 +78,6 @@ def test_a_truth_that_is_not_finite_is_null(tmp_path):
     problem = make_problem(tmp_path)
     problem.truth["albedo"][0, 0, 0] = np.nan
     results = Results(problem)
-    results.begin()
     results.end()
     found = json.loads(json.dumps(results.to_json(), allow_nan=False))
     assert found["parameter_rmse"]["albedo"] == {"initial": None, "final": None}
