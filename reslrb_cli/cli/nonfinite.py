@@ -19,7 +19,6 @@ from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import with_integrator
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
-from reslrb_cli.guiding.tables import KNOWN
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.autotune.sampling import as_decided
 from reslrb_cli.optimization.problem import Problem
@@ -119,18 +118,13 @@ def _guided(config: Config, manifest: dict[str, Any], path: Path) -> GuidedRecor
 
 def _teach(problem: Problem, saved: NonFiniteStep, archive: Path) -> None:
     """Have the tables of a guided run's integrator know what they knew when the step began."""
-    guiding = guiding_of(problem)
-    if guiding is None:
+    if guiding_of(problem) is None:
         return
     if saved.calls is None:
         raise ConfigError(archive, "calls", "is missing: what the paths of a guided step were drawn from")
-    sensors = [str(number) for number in range(len(problem.scene.sensors()))]
-    names = {f"{number}/{what}" for number in saved.calls for what in KNOWN}
-    known = names == set(saved.learned) and set(saved.calls) <= set(sensors)
-    wrong = restore_tables(problem, guiding, saved.calls, lambda name: saved.learned[name]) if known else ""
+    wrong = restore_tables(problem, saved.calls, saved.learned)
     if wrong is not None:
-        where = f"guiding/{wrong}" if wrong else "guiding"
-        raise ConfigError(archive, where, "is not what was learned of this scene")
+        raise ConfigError(archive, wrong, "is not what was learned of this scene")
 
 
 def _samples_per_pass(memory: Any, path: Path) -> int:

@@ -26,10 +26,11 @@ from reslrb_cli.optimization.loading import (
 from reslrb_cli.optimization.memory import check_announced, check_described, check_films, outlook
 from reslrb_cli.optimization.moving import check_moving, moves_anything
 from reslrb_cli.optimization.problem import Problem, make_optimizer
-from reslrb_cli.optimization.state import Settled
+from reslrb_cli.optimization.state import begin_as, decide_as, reach_as
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.views import expose, make_views
 from reslrb_cli.records.cache import PilotCache
+from reslrb_cli.records.tree import Stored
 from reslrb_cli.scene.parameters import Selection, select_parameters
 
 Array = np.ndarray[Any, Any]
@@ -40,7 +41,7 @@ def assemble(
     say: Callable[[str], None] = lambda line: None,
     cache: PilotCache | None = None,
     to_run: bool = False,
-    settled: Settled | None = None,
+    settled: Stored | None = None,
 ) -> Problem:
     """Load and check what `config` names, make the targets, and settle the integrator; a variant must be set.
 
@@ -51,14 +52,14 @@ def assemble(
     """
     problem = assemble_scene(config)
     if settled is not None:
-        settled.begin(problem)
+        begin_as(problem, settled)
     options = find_options(problem)
     line = outlook(config, problem.scene, problem.sensors) if to_run else None
     if line is not None:
         say(line)
     problem = make_targets(problem, say)
     if settled is not None:
-        return settled.reach(settled.settle(problem, options))
+        return reach_as(decide_as(problem, settled, options), settled)
     problem = settle(problem, options, say, cache)
     if to_run:
         check_exposures(problem)

@@ -13,8 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.scene.values import resample
-
-Array = np.ndarray[Any, Any]
+from reslrb_cli.statistics import Array, rms
 
 #: What emitters emit; parameters of the same quantity have the same unit.
 _EMITTED = {
@@ -67,7 +66,7 @@ class ErrorMeter:
                 self._masks[key] = mask
                 self._truth[key] = on_grid(true, grid).astype(np.float64)[mask]
         #: The root mean square of each truth, over the same entries; a truth of zeros has none.
-        self.scales = {key: scale for key, true in self._truth.items() if (scale := _rms(true)) > 0}
+        self.scales = {key: scale for key, true in self._truth.items() if (scale := rms(true)) > 0}
         self.one_unit = len({(quantities or {}).get(key, "") for key in self._truth}) <= 1
 
     def errors(self, value: Callable[[str], Array]) -> dict[str, float]:
@@ -76,7 +75,7 @@ class ErrorMeter:
         for key, true in self._truth.items():
             mask, array = self._masks[key], value(key)
             grid = mask.shape if array.ndim == 3 and array.shape[:2] != mask.shape else None
-            found[key] = _rms(on_grid(array, grid).astype(np.float64)[mask] - true)
+            found[key] = rms(on_grid(array, grid).astype(np.float64)[mask] - true)
         return found
 
     def total(self, errors: Mapping[str, float]) -> float | None:
@@ -112,7 +111,3 @@ def nearest(mask: Array, grid: tuple[int, int]) -> Array:
         ((np.arange(size) + 0.5) * own / size).astype(int) for size, own in zip(grid, mask.shape, strict=True)
     )
     return mask[rows[:, None], columns]
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

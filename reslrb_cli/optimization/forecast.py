@@ -239,7 +239,9 @@ def _parts(problem: Problem) -> dict[str, int]:
         "geometry": geometry,
         "textures and other values of the scene": values,
         "targets": sum(_bytes(view.target) for view in problem.views),
-        "optimiser's state": sum(_bytes(v) for v in problem.optimizer.state().values() if isinstance(v, dr.ArrayBase)),
+        "optimiser's state": sum(
+            _bytes(value) for kept in problem.optimizer.moments().values() for value in kept.values()
+        ),
     }
 
 

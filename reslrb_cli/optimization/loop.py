@@ -9,41 +9,38 @@ import functools
 import math
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.errors import NonFinite
 from reslrb_cli.integrators.step import Refused, gradient_step
-from reslrb_cli.optimization.nonfinite import Findings, RefusedAt, count_nonfinite, finite_square_norm, zero_nonfinite
+from reslrb_cli.optimization.nonfinite import (
+    Findings,
+    RefusedAt,
+    count_nonfinite,
+    finite_square_norm,
+    held_back,
+    why_end,
+    zero_nonfinite,
+)
+from reslrb_cli.optimization.optimizers import clamp_gradients
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import rescale
-from reslrb_cli.optimization.state import State
+from reslrb_cli.optimization.state import State, put, standing
 from reslrb_cli.optimization.views import View
-from reslrb_cli.records.clock import peak_mib, reset_peak
+from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.seeds import seed
 
-
-def constant(progress: float, final_fraction: float) -> float:
-    """1 throughout."""
-    return 1.0
-
-
-def cosine(progress: float, final_fraction: float) -> float:
-    """Half a period of a cosine (Loshchilov and Hutter 2017, without restarts)."""
-    return final_fraction + (1.0 - final_fraction) * 0.5 * (1.0 + math.cos(math.pi * progress))
-
-
-def exponential(progress: float, final_fraction: float) -> float:
-    """The same factor from each iteration to the next."""
-    return float(final_fraction**progress)
-
-
+#: Of a run's progress (0 to 1) and the final fraction. The cosine is half a period of one (Loshchilov and Hutter 2017,
+#: without restarts); exponential is the same factor from each iteration to the next.
 SCHEDULES: dict[str, Callable[[float, float], float]] = {
-    "constant": constant,
-    "cosine": cosine,
-    "exponential": exponential,
+    "constant": lambda progress, final: 1.0,
+    "cosine": lambda progress, final: final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * progress)),
+    "exponential": lambda progress, final: float(final**progress),
 }
 
 
@@ -61,75 +58,113 @@ def learning_rate_factor(
 HELD_OUT_EVERY = 10
 
 
-def optimize(
+Told = Callable[[Findings], None]
+
+
+def step(
     problem: Problem,
-    on_nonfinite: Callable[[Findings], None] = lambda found: None,
-    state: State | None = None,
+    state: State,
+    on_nonfinite: Told = lambda found: None,
     progress: Callable[[], float] = lambda: 0.0,
-) -> Iterator[Record]:
-    """Run the iterations of `problem`, one record each; the parameters are updated when a record is yielded.
+) -> tuple[State, Record]:
+    """Make the iteration that follows `state`; return the state that it leaves, and its record.
 
-    They go on from `state`, if one is given, and leave there what the next one goes on from.
-
-    An iteration is a step (image, loss and gradient of every sensor; the loss is the mean over the sensors) and an
-    update. What is not finite reaches no parameter; what happens instead, and when NonFinite is raised, is in
-    `NonFinitePolicy`. `on_nonfinite` is told of it before the update, while the scene is as it was in the step.
-    `optimizer.scale: auto` measures before the first iteration, and `elapsed_s` counts that. Where a time may end the
-    run, `progress` says what share of it has gone (0 to 1): the schedule is as far as that, or as the iterations.
+    It is a step (image, loss and gradient of every sensor; the loss is the mean over the sensors) and an update. From
+    equal states equal ones follow: a problem that stands elsewhere is brought to `state` first, and stands at what is
+    returned afterwards. What is not finite reaches no parameter; what happens instead, and when a run is to end
+    (`State.end`), is in `nonfinite`. `on_nonfinite` is told of it before the update, while the scene is as it was in
+    the step. `optimizer.scale: auto` measures before the first iteration, and `elapsed_s` counts that. Where a time
+    may end the run, `progress` says what share of it has gone (0 to 1): the schedule is as far as that, or as the
+    iterations.
     """
-    config = problem.config
-    state = State(problem) if state is None else state
-    clock, policy, clamp, peak_before = state.clock, state.policy, state.clamp, state.peak_mib
-    reset_peak()
-    if config.optimizer.scale == "auto" and state.sensitivities is None:
+    config, optimizer, iteration = problem.config, problem.optimizer, state.iteration
+    if optimizer.stands_at is not state:
+        put(problem, state)
+    clock = StepClock(state.elapsed_s)
+    scaling, clamped, clamp, clamp_sums = state.scaling, None, state.clamp, state.clamp_sums
+    if config.optimizer.scale == "auto" and scaling is None:
         with clock.counted():
-            state.sensitivities = rescale(problem)
-    meter = problem.error_meter()
-    for iteration in range(state.iteration, config.run.iterations):
-        errors = meter.errors(problem.selection.array)
-        held_out = problem.held_out_loss() if iteration % HELD_OUT_EVERY == 0 else None
-        with clock.step() as times:
-            split = Split()
-            loss, squares, counts, refused = gradient(problem, iteration, split)
-            dr.eval(loss, squares, counts)
-        factor = learning_rate_factor(
-            config.optimizer.schedule, iteration, config.run.iterations, config.optimizer.final_fraction, progress()
-        )
-        with clock.counted():
-            value = float(loss[0])
-            found = _findings(problem, iteration, value, counts, refused)
-            if found:
-                on_nonfinite(found)
-            held = policy.held(found, problem.optimizer.keys())
-            for key in found.gradients if policy.kind == "zero" else ():
-                zero_nonfinite(problem.optimizer[key])
-            moved = [key for key in problem.optimizer.keys() if key not in held]  # noqa: SIM118 (not a mapping)
-            clamped = None if clamp is None else clamp.apply({key: problem.optimizer[key] for key in moved})
-            found.updates = problem.optimizer.step(factor, skip=held)
-            problem.apply()
-        policy.see(found, held)
-        state.iteration = iteration + 1
-        state.peak_mib = max(peak_before, peak_mib(dr.backend_v(loss)))
-        yield Record(
-            iteration=iteration,
-            loss=value,
-            step_ms=times.wall_ms,
-            primal_ms=split.primal_ms,
-            adjoint_ms=None if split.primal_ms is None else times.wall_ms - split.primal_ms,
-            codegen_ms=times.codegen_ms,
+            scaling = rescale(problem)
+    errors = problem.meter.errors(problem.selection.array)
+    held_out = problem.held_out_loss() if iteration % HELD_OUT_EVERY == 0 else None
+    with clock.step() as times:
+        split = Split()
+        loss, squares, counts, refused = gradient(problem, iteration, split)
+        dr.eval(loss, squares, counts)
+    factor = learning_rate_factor(
+        config.optimizer.schedule, iteration, config.run.iterations, config.optimizer.final_fraction, progress()
+    )
+    with clock.counted():
+        value = float(loss[0])
+        found = _findings(problem, iteration, value, counts, refused)
+        if found:
+            on_nonfinite(found)
+        held = held_back(config.run.on_nonfinite, found, optimizer.keys())
+        for key in found.gradients if config.run.on_nonfinite == "zero" else ():
+            zero_nonfinite(optimizer[key])
+        if (limit := config.optimizer.clamp_gradient) is not None:
+            moved = {key: optimizer[key] for key in optimizer.keys() if key not in held}  # noqa: SIM118
+            clamped, clamp, clamp_sums = clamp_gradients(limit, moved, clamp, clamp_sums)
+        found.updates = optimizer.step(factor, skip=held)
+        problem.apply()
+    standstill = state.standstill + 1 if held or found.updates else 0
+    state = standing(
+        problem,
+        replace(
+            state,
+            iteration=iteration + 1,
             elapsed_s=clock.elapsed_s,
-            peak_mib=state.peak_mib,
-            spp=config.run.spp,
-            lr=config.optimizer.learning_rate * factor,
-            grad_norm=float(sum(float(square[0]) for square in squares.values()) ** 0.5),
-            nonfinite=found.total,
-            parameter_rmse=meter.total(errors),
-            parameter_errors=errors,
-            nonfinite_by_parameter=found.by_parameter,
-            clamped=clamped,
-            held_out=held_out,
-        )
-        policy.check(found)
+            peak_mib=max(state.peak_mib, peak_mib(dr.backend_v(loss))),
+            standstill=standstill,
+            scaling=scaling,
+            clamp=clamp,
+            clamp_sums=clamp_sums,
+            end=why_end(config.run.on_nonfinite, found, standstill),
+        ),
+    )
+    return state, Record(
+        iteration=iteration,
+        loss=value,
+        step_ms=times.wall_ms,
+        primal_ms=split.primal_ms,
+        adjoint_ms=None if split.primal_ms is None else times.wall_ms - split.primal_ms,
+        codegen_ms=times.codegen_ms,
+        elapsed_s=clock.elapsed_s,
+        peak_mib=state.peak_mib,
+        spp=config.run.spp,
+        lr=config.optimizer.learning_rate * factor,
+        grad_norm=float(sum(float(square[0]) for square in squares.values()) ** 0.5),
+        nonfinite=found.total,
+        parameter_rmse=problem.meter.total(errors),
+        parameter_errors=errors,
+        nonfinite_by_parameter=found.by_parameter,
+        clamped=clamped,
+        held_out=held_out,
+    )
+
+
+def iterate(
+    problem: Problem,
+    state: State,
+    on_nonfinite: Told = lambda found: None,
+    progress: Callable[[], float] = lambda: 0.0,
+) -> Iterator[tuple[State, Record]]:
+    """Make the iterations from `state` to the last of the run, each as `step` does. Raises NonFinite where it ends."""
+    reset_peak()
+    while state.iteration < problem.config.run.iterations:
+        state, record = step(problem, state, on_nonfinite, progress)
+        yield state, record
+        if state.end:
+            raise NonFinite(state.end)
+
+
+def optimize(
+    problem: Problem, on_nonfinite: Told = lambda found: None, progress: Callable[[], float] = lambda: 0.0
+) -> Iterator[Record]:
+    """The records of all iterations of `problem` from where it stands; the parameters are updated when one is
+    yielded."""
+    for _, record in iterate(problem, standing(problem), on_nonfinite, progress):
+        yield record
 
 
 def _findings(

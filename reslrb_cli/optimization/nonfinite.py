@@ -15,8 +15,6 @@ from typing import Any, Literal
 
 import drjit as dr
 
-from reslrb_cli.errors import NonFinite
-
 OnNonFinite = Literal["stop", "skip", "zero"]
 
 #: Iterations in a row in which something sat out, after which a run ends.
@@ -71,34 +69,25 @@ def _entries(count: int) -> str:
     return "1 entry" if count == 1 else f"{count} entries"
 
 
-class NonFinitePolicy:
-    """Says which parameters sit an iteration out, and when to give up."""
+def held_back(kind: OnNonFinite, found: Findings, keys: list[str]) -> list[str]:
+    """Of all parameters, `keys`, those that are not to be updated."""
+    if found.loss or (found and kind == "stop") or (found.refused and kind == "skip"):
+        return keys
+    return found.lost if kind == "zero" else list(found.gradients)
 
-    def __init__(self, kind: OnNonFinite, patience: int = PATIENCE) -> None:
-        self.kind, self.patience = kind, patience
-        #: Iterations in a row, up to the last one, in which something sat out.
-        self.standstill = 0
 
-    def held(self, found: Findings, keys: list[str]) -> list[str]:
-        """Of all parameters, `keys`, those that are not to be updated."""
-        if found.loss or (found and self.kind == "stop") or (found.refused and self.kind == "skip"):
-            return keys
-        return found.lost if self.kind == "zero" else list(found.gradients)
-
-    def see(self, found: Findings, held: list[str]) -> None:
-        """Note one iteration, its update included."""
-        self.standstill = self.standstill + 1 if held or found.updates else 0
-
-    def check(self, found: Findings) -> None:
-        """Raise NonFinite where the run is to end after the iteration that was noted last."""
-        if found and self.kind == "stop":
-            raise NonFinite(f"{found}; run.on_nonfinite: stop")
-        if self.standstill >= self.patience:
-            where = "the loss" if found.loss else "dL/dI" if found.refused else ", ".join(found.by_parameter)
-            raise NonFinite(
-                f"{where} was not finite in {self.standstill} iterations in a row (up to iteration {found.iteration}); "
-                "no parameter was given such a value; check the scene for extreme values, or lower the learning rate"
-            )
+def why_end(kind: OnNonFinite, found: Findings, standstill: int) -> str:
+    """Why a run is to end after an iteration, the last of `standstill` in a row in which something sat out; "" where it
+    goes on."""
+    if found and kind == "stop":
+        return f"{found}; run.on_nonfinite: stop"
+    if standstill < PATIENCE:
+        return ""
+    where = "the loss" if found.loss else "dL/dI" if found.refused else ", ".join(found.by_parameter)
+    return (
+        f"{where} was not finite in {standstill} iterations in a row (up to iteration {found.iteration}); "
+        "no parameter was given such a value; check the scene for extreme values, or lower the learning rate"
+    )
 
 
 def zero_nonfinite(parameter: Any) -> None:

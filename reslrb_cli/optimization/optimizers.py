@@ -13,9 +13,14 @@ of it. T is increasing, entry by entry.
 Updates (`Optimizer`): one optimiser for each parameter rather than one for all, so that a parameter whose gradient is
 not finite can sit an iteration out with its moments and its count of steps as they were.
 
+    adam      m, v running means of g and g²; p -= lr · √(1-β₂ᵗ)/(1-β₁ᵗ) · m / (√v + ε)    Kingma and Ba 2015
+    adamw     as adam, and p -= lr · weight_decay · p besides                              Loshchilov and Hutter 2019
+    rmsprop   v the running mean of g²; p -= lr · g / (√v + ε)                             Hinton 2012
+    sgd       v = momentum · v + g; p -= lr · v
+
 What a parameter must satisfy: finite values, within its bounds (`clamp`, `count_nonfinite`).
 
-A clamp against outliers in gradients (`GradientClamp`): less variance, at the price of a bias, which is measured.
+A clamp against outliers in gradients (`clamp_gradients`): less variance, at the price of a bias, which is measured.
 
     m_e  running mean of |g_e| over the iterations before (of clamped gradients), decay DECAY
     r_e = max(m_e, mean of m over the parameter's entries)
@@ -140,35 +145,12 @@ def _opaque(like: Any, number: float) -> Any:
     return dr.opaque(dr.leaf_t(like), number)
 
 
-def adam(learning_rate: float, beta_1: float = 0.9, beta_2: float = 0.999, epsilon: float = 1e-8) -> Any:
-    """Adam (Kingma and Ba 2015): m, v running means of g and g²; p -= lr · √(1-β₂ᵗ)/(1-β₁ᵗ) · m / (√v + ε)."""
-    return dropt.Adam(lr=learning_rate, beta_1=beta_1, beta_2=beta_2, epsilon=epsilon)
-
-
-def adamw(
-    learning_rate: float,
-    beta_1: float = 0.9,
-    beta_2: float = 0.999,
-    epsilon: float = 1e-8,
-    weight_decay: float = 0.01,
-) -> Any:
-    """Adam with decoupled weight decay (Loshchilov and Hutter 2019): p -= lr · weight_decay · p besides."""
-    return dropt.AdamW(lr=learning_rate, beta_1=beta_1, beta_2=beta_2, epsilon=epsilon, weight_decay=weight_decay)
-
-
-def rmsprop(learning_rate: float, decay: float = 0.99, epsilon: float = 1e-8) -> Any:
-    """RMSProp (Hinton 2012): v the running mean of g²; p -= lr · g / (√v + ε)."""
-    return dropt.RMSProp(lr=learning_rate, alpha=decay, epsilon=epsilon)
-
-
-def sgd(learning_rate: float, momentum: float = 0.0) -> Any:
-    """Gradient descent: v = momentum · v + g; p -= lr · v."""
-    return dropt.SGD(lr=learning_rate, momentum=momentum)
-
-
-#: Yields a stored array, by its name, of the type and shape of another.
-Take = Callable[[str, Any], Any]
-OPTIMIZERS: dict[str, Callable[..., Any]] = {"adam": adam, "adamw": adamw, "rmsprop": rmsprop, "sgd": sgd}
+OPTIMIZERS: dict[str, Callable[..., Any]] = {
+    "adam": dropt.Adam,
+    "adamw": dropt.AdamW,
+    "rmsprop": dropt.RMSProp,
+    "sgd": dropt.SGD,
+}
 
 
 class Optimizer:
@@ -191,10 +173,13 @@ class Optimizer:
     ) -> None:
         self._rates = {key: float(rates[key] or learning_rate) for key in values}
         self._bounds = {key: bounds[key] for key in values}
-        self._own = {key: OPTIMIZERS[type](self._rates[key], **options) for key in values}
+        named = {"alpha" if name == "decay" else name: value for name, value in options.items()}
+        self._own = {key: OPTIMIZERS[type](lr=self._rates[key], **named) for key in values}
         self._variables: dict[str, Variable] = {}
         #: The scene's values of the parameters that have a variable.
         self._scene: dict[str, Any] = {}
+        #: The state at which it stands, of a run's iterations; None in the midst of a step, and where none was asked.
+        self.stands_at: object = None
         for key, value in values.items():
             self._own[key][key] = value
             transform = (transforms or {}).get(key)
@@ -215,6 +200,7 @@ class Optimizer:
 
     def set_value(self, key: str, value: Any) -> None:
         """Begin at another value of the scene's; to be called before the first step."""
+        self.stands_at = None
         variable = self._variables.get(key)
         if variable is None:
             self._own[key][key] = value
@@ -222,13 +208,9 @@ class Optimizer:
             self._scene[key] = _leaf(value)
             self._own[key][key] = variable.from_scene(value)
 
-    def is_moved_apart(self, key: str) -> bool:
-        """Whether what is moved is not the parameter itself, but a variable that it follows from."""
-        return key in self._variables
-
     def set_variable(self, key: str, variable: Variable) -> None:
         """Move a parameter by way of `variable` from now on; to be called before the first step."""
-        value = dr.detach(self[key])
+        self.stands_at, value = None, dr.detach(self[key])
         self._variables[key], self._scene[key] = variable, _leaf(value)
         self._own[key][key] = variable.from_scene(value)
 
@@ -246,6 +228,7 @@ class Optimizer:
         Returns the number of non-finite entries that the update made, by key, where there were any: even a finite
         gradient can, by overflow. Such a parameter keeps its old value and state.
         """
+        self.stands_at = None
         # Dr.Jit makes the rate opaque, so that one that changes compiles no new kernel.
         moved, before, counts = [key for key in self._own if key not in skip], {}, {}
         for key in moved:
@@ -329,38 +312,36 @@ class Optimizer:
         ways = [np.array(variable.to_scene(moved + side * self._rates[key]) - value) for side in (1, -1)]
         return float(np.sqrt(np.mean(np.square(np.maximum(*map(np.abs, ways)), dtype=np.float64))))
 
-    def state(self) -> dict[str, Any]:
-        """What the optimiser keeps for each parameter beside its value, as `<key>/<index>` (in Dr.Jit's order).
+    def units(self) -> dict[str, tuple[float, float]]:
+        """Length and gain of each parameter that is moved by way of a `Variable`."""
+        return {key: (variable.length, variable.gain) for key, variable in self._variables.items()}
 
-        `<key>/variable` is what it moves in place of the value, `<key>/length` and `<key>/gain` its unit (`Variable`),
-        where it does. Arrays are Dr.Jit's own, which no step changes: to ask for them costs nothing.
+    def moments(self) -> dict[str, dict[str, Any]]:
+        """What it keeps for each parameter beside its value, arrays by their place in Dr.Jit's order, and as `variable`
+        what it moves in place of the value, where it does. No step changes these arrays: to ask for them costs nothing.
         """
-        found: dict[str, Any] = {}
-        for key, variable in self._variables.items():
-            found[f"{key}/variable"] = dr.detach(self._own[key][key])
-            found |= {f"{key}/length": variable.length, f"{key}/gain": variable.gain}
+        found = {}
         for key, own in self._own.items():
-            found |= {f"{key}/{index}": entry for index, entry in enumerate(_entries(own, key)) if entry is not None}
+            kept = {str(place): entry for place, entry in enumerate(_entries(own, key)) if dr.is_array_v(entry)}
+            moved = {"variable": dr.detach(own[key])} if key in self._variables else {}
+            found[key] = moved | kept
         return found
 
-    def restore(self, values: Mapping[str, Any], units: Mapping[str, tuple[float, float]], take: Take) -> None:
-        """Go on from the scene's `values` and what `state` said; `units` are length and gain of each that had them.
-
-        `take(name, like)` is the array of that name, of the type and shape of `like`.
-        """
+    def restore(
+        self, values: Mapping[str, Any], units: Mapping[str, tuple[float, float]], moments: Mapping[str, Any]
+    ) -> None:
+        """Go on from the scene's `values`, and from what `units` and `moments` said."""
         for key, own in self._own.items():
+            kept = moments[key]
             if key in units:
                 before = self.variable(key)
                 self._variables[key] = Variable(before.transform, before.bounds, *units[key])
                 self._scene[key] = _leaf(values[key])
-                own[key] = take(f"{key}/variable", dr.detach(own[key]))
-            else:
-                own[key] = values[key]
+            elif key in self._variables:
+                del self._variables[key], self._scene[key]
+            own[key] = kept.get("variable", values[key])
             value, promoted, rate, extra = own.state[key]
-            entries = tuple(
-                None if entry is None else take(f"{key}/{index}", entry)
-                for index, entry in enumerate(_entries(own, key))
-            )
+            entries = tuple(kept.get(str(place), entry) for place, entry in enumerate(_entries(own, key)))
             own.state[key] = value, promoted, rate, entries if isinstance(extra, tuple) else entries[0]
 
 
@@ -386,56 +367,48 @@ def clamp(value: Any, bounds: tuple[float, float] | None) -> Any:
 DECAY = 0.95
 
 
-class GradientClamp:
-    """Clamps gradients at `factor` (k) times what is usual for them; the first iteration is only looked at."""
+#: What the clamp keeps of a parameter's gradients: m, which starts at 0 (corrected for as in Adam), and the sums of R
+#: and of g.
+SUMS = ("usual", "removed", "total")
 
-    def __init__(self, factor: float) -> None:
-        self.factor = factor
-        #: By parameter: iterations, m (which starts at 0, corrected for as in Adam), and the sums of R and g.
-        self._state: dict[str, tuple[int, Any, Any, Any]] = {}
 
-    def state(self) -> tuple[dict[str, int], dict[str, Any]]:
-        """What it knows: the iterations of each parameter, and arrays by `<key>/<what>`."""
-        names = ("usual", "removed", "total")
-        arrays = {
-            f"{key}/{name}": value
-            for key, state in self._state.items()
-            for name, value in zip(names, state[1:], strict=True)
-        }
-        return {key: state[0] for key, state in self._state.items()}, arrays
+def clamp_gradients(
+    factor: float, parameters: Mapping[str, Any], iterations: Mapping[str, int], known: Mapping[str, Mapping[str, Any]]
+) -> tuple[Clamped, dict[str, int], dict[str, dict[str, Any]]]:
+    """Clamp the gradients of these parameters, which are finite, in place at `factor` (k) times what is usual for them.
 
-    def restore(self, iterations: Mapping[str, int], parameters: Mapping[str, Any], take: Take) -> None:
-        """Go on from what `state` said of these parameters; `take(name, like)` is the array of a name."""
-        for key, count in iterations.items():
-            like = dr.detach(parameters[key])
-            usual, removed, total = (take(f"{key}/{name}", like) for name in ("usual", "removed", "total"))
-            self._state[key] = count, usual, removed, total
-
-    def apply(self, parameters: Mapping[str, Any]) -> Clamped:
-        """Clamp the gradients of these parameters, which are finite, in place; what was done, and its bias so far."""
-        counts, sums = {}, {}
-        for key, parameter in parameters.items():
-            g = clamped = dr.grad(parameter)
-            zero = dr.zeros(type(g), dr.shape(g))
-            iterations, m, removed, total = self._state.get(key, (0, zero, zero, zero))
-            if iterations:
-                # Opaque: as a literal it would compile a kernel each iteration.
-                usual = m * dr.opaque(mi.Float, 1 / (1 - DECAY**iterations))
-                limit = self.factor * dr.maximum(usual, dr.mean(flat(usual)))
-                clamped = dr.clip(g, -limit, limit)
-                dr.set_grad(parameter, clamped)
-            R = g - clamped
-            m = m + (dr.abs(clamped) - m) * (1 - DECAY)
-            self._state[key] = iterations + 1, m, removed + R, total + g
-            counts[key] = dr.count(flat(R) != 0)
-            sums[key] = [dr.sum(dr.abs(flat(value))) for value in (R, g, *self._state[key][2:])]
-        dr.eval(counts, sums, [state[1:] for state in self._state.values()])
-        values = {key: [float(value[0]) for value in row] for key, row in sums.items()}
-        return Clamped(
+    `iterations` and `known` (SUMS) are what there is of each parameter from iterations before; the first is only looked
+    at. Returns what was done, with its bias so far, and both anew.
+    """
+    after, sums = dict(iterations), {key: dict(each) for key, each in known.items()}
+    counts, sizes = {}, {}
+    for key, parameter in parameters.items():
+        g = clamped = dr.grad(parameter)
+        zero = dr.zeros(type(g), dr.shape(g))
+        before = iterations.get(key, 0)
+        m, removed, total = (known[key][name] for name in SUMS) if before else (zero, zero, zero)
+        if before:
+            # Opaque: as a literal it would compile a kernel each iteration.
+            usual = m * dr.opaque(mi.Float, 1 / (1 - DECAY**before))
+            limit = factor * dr.maximum(usual, dr.mean(flat(usual)))
+            clamped = dr.clip(g, -limit, limit)
+            dr.set_grad(parameter, clamped)
+        R = g - clamped
+        m = m + (dr.abs(clamped) - m) * (1 - DECAY)
+        after[key], sums[key] = before + 1, dict(zip(SUMS, (m, removed + R, total + g), strict=True))
+        counts[key] = dr.count(flat(R) != 0)
+        sizes[key] = [dr.sum(dr.abs(flat(value))) for value in (R, g, removed + R, total + g)]
+    dr.eval(counts, sizes, sums)
+    values = {key: [float(value[0]) for value in row] for key, row in sizes.items()}
+    return (
+        Clamped(
             entries=sum(int(count[0]) for count in counts.values()),
             share={key: _ratio(row[0], row[1]) for key, row in values.items()},
             bias={key: _ratio(row[2], row[3]) for key, row in values.items()},
-        )
+        ),
+        after,
+        sums,
+    )
 
 
 def _ratio(part: float, whole: float) -> float:

@@ -152,8 +152,9 @@ class Problem:
             self.integrator, self.scene, sensor, spp, config.run.seed, iteration, purpose, self.samples_per_pass
         )
 
-    def error_meter(self) -> ErrorMeter:
-        """What measures the parameters against `truth`, as that and `masks` are now."""
+    @functools.cached_property
+    def meter(self) -> ErrorMeter:
+        """What measures the parameters against `truth`."""
         return ErrorMeter(self.truth, self.masks, self.quantities)
 
 

@@ -26,7 +26,7 @@ import enum
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import mitsuba as mi
@@ -34,47 +34,45 @@ import numpy as np
 
 from reslrb_cli.optimization.errors import nearest
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.state import Count, Number
 from reslrb_cli.optimization.views import View
-from reslrb_cli.records.metrics import Record, finite
+from reslrb_cli.records.metrics import Figure, Record, finite
 
 #: Iterations over which losses are averaged.
 WINDOW = 10
 
 
+@dataclass(frozen=True)
+class Least:
+    """The least loss so far, and after how many updates it was."""
+
+    iteration: Count
+    loss: Number
+
+
 class Best:
-    """The best so far: after how many updates it was, its `loss`, and the values; None where there is none yet."""
+    """The best so far: its loss (None where there is none yet), the values, and the last WINDOW losses (`recent`)."""
 
     def __init__(self, held_out: bool) -> None:
         self.held_out = held_out
-        self.iteration: int | None = None
-        self.loss = math.inf
+        self.least: Least | None = None
         self.values: dict[str, Any] = {}
-        self._recent: deque[float] = deque(maxlen=WINDOW)
+        self.recent: deque[float] = deque(maxlen=WINDOW)
 
     def see(self, record: Record, values: Mapping[str, Any]) -> None:
         """Take one iteration, and the values that it began with, by key; they are kept, not copied."""
+        self.recent.append(record.loss)
         if self.held_out:
             loss = math.inf if record.held_out is None else record.held_out
         else:
-            self._recent.append(record.loss)
-            loss = sum(self._recent) / WINDOW if len(self._recent) == WINDOW else math.inf
-        if loss < self.loss:  # which what is not finite is not
-            self.iteration, self.loss, self.values = record.iteration, loss, dict(values)
-
-    def recall(self, records: list[Record]) -> None:
-        """Take note of the losses before, those of `records`, of a run that goes on."""
-        self._recent.extend(record.loss for record in records[-WINDOW:])
-
-    def restore(self, iteration: int, loss: float, values: Mapping[str, Any]) -> None:
-        """Go on from what was the best."""
-        self.iteration, self.loss, self.values = iteration, loss, dict(values)
+            loss = sum(self.recent) / WINDOW if len(self.recent) == WINDOW else math.inf
+        if loss < (math.inf if self.least is None else self.least.loss):  # which what is not finite is not
+            self.least, self.values = Least(record.iteration, loss), dict(values)
 
     def to_json(self) -> dict[str, Any] | None:
         """For the manifest; None where there is none."""
-        if self.iteration is None:
-            return None
         kind = "held_out" if self.held_out else f"mean of {WINDOW} iterations"
-        return {"iteration": self.iteration, "loss": self.loss, "loss_is": kind}
+        return None if self.least is None else {**asdict(self.least), "loss_is": kind}
 
 
 Array = np.ndarray[Any, Any]
@@ -188,36 +186,32 @@ def _quantile(freedom: int) -> float:
 MOST_NUMBERS = 4
 
 
+@dataclass
+class Images:
+    """The losses of the saved images of views, of those that are trained on, and of those held out."""
+
+    trained: list[Figure] = field(default_factory=list)
+    held_out: list[Figure] = field(default_factory=list)
+
+
 class Results:
-    """Collects the results of one run of `problem`: `begin` before its first iteration, `add` each, `end` after all.
+    """Collects the results of one run of `problem`, whose parameters stand at their initial values when this is made:
+    `add` each iteration, `end` after all.
 
     `to_json` can be asked for at any time; what is not known yet is null there.
     """
 
     def __init__(self, problem: Problem) -> None:
-        self.problem, self.meter = problem, problem.error_meter()
-        self._first: dict[str, float] = {}
+        self.problem, self.meter = problem, problem.meter
+        self._first = self.meter.errors(problem.selection.array)
         self._last: dict[str, float] = {}
         self._values: dict[str, dict[str, Any]] = {key: {} for key in problem.selection.keys}
         self._losses: list[float] = []
-        self._image_losses: dict[str, list[float]] = {"initial": [], "final": []}
-        self._held_out: dict[str, list[float]] = {"initial": [], "final": []}
+        self.images = {"initial": Images(), "final": Images()}
         self._errors: dict[str, list[float]] = {}
-
-    def begin(self) -> None:
-        """Take the parameters as they are for those of the start."""
-        self._first = self.meter.errors(self.problem.selection.array)
         self._take("initial")
-        for key, true in self.problem.truth.items():
-            self._values[key]["true"] = summary(true, self.problem.masks.get(key))
-
-    def recall(self, images: Mapping[str, list[float]]) -> None:
-        """Go on from what `images_seen` said of the start."""
-        self._image_losses["initial"], self._held_out["initial"] = images["trained"], images["held_out"]
-
-    def images_seen(self) -> dict[str, list[float]]:
-        """The losses of the images of the start: of views that are trained on, and of those held out."""
-        return {"trained": self._image_losses["initial"], "held_out": self._held_out["initial"]}
+        for key, true in problem.truth.items():
+            self._values[key]["true"] = summary(true, problem.masks.get(key))
 
     def add(self, record: Record) -> None:
         """Take one iteration."""
@@ -232,9 +226,9 @@ class Results:
 
     def see(self, moment: str, view: View, image: Array) -> None:
         """Take the saved image (H, W, C) of a view, at `initial` or `final`; every view in turn."""
-        if moment in self._image_losses:
+        if (images := self.images.get(moment)) is not None:
             loss = view.objective(mi.TensorXf(np.ascontiguousarray(image, dtype=np.float32)))
-            (self._held_out if view.held_out else self._image_losses)[moment].append(float(loss[0]))
+            (images.held_out if view.held_out else images.trained).append(float(loss[0]))
 
     def _take(self, moment: str) -> None:
         for key, value in self.problem.values().items():
@@ -264,10 +258,10 @@ class Results:
             "relative_error": {key: _pair(key, *relative) for key in relative[0] | relative[1]},
             "parameters": {key: self._about(key) | values for key, values in self._values.items()},
             "image_loss": {
-                moment: float(np.sum(losses)) if len(losses) == len(self.problem.trained) else None
-                for moment, losses in self._image_losses.items()
+                moment: float(np.sum(each.trained)) if len(each.trained) == len(self.problem.trained) else None
+                for moment, each in self.images.items()
             },
-            "held_out": {moment: float(np.mean(losses)) for moment, losses in self._held_out.items() if losses},
+            "held_out": {m: float(np.mean(each.held_out)) for m, each in self.images.items() if each.held_out},
             "loss_trend": None if trend is None else trend.to_json(),
             "worse": worse,
             "samples": {"step": run.spp, "target": None if render is None else render.spp},

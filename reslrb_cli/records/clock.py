@@ -32,8 +32,8 @@ class StepTimes:
 class StepClock:
     """Times steps, and adds up the time that an optimisation takes without what is written in between."""
 
-    def __init__(self) -> None:
-        self.elapsed_s = 0.0
+    def __init__(self, elapsed_s: float = 0.0) -> None:
+        self.elapsed_s = elapsed_s
         #: Kernel history of the last step.
         self.history: list[dict[str, Any]] = []
         self._known: set[Any] = set()

@@ -86,6 +86,7 @@ class Manifest:
     pilot: dict[str, Any] | None = None
     guided: dict[str, Any] | None = None
     sequence: dict[str, Any] | None = None
+    paths: dict[str, Any] | None = None
     memory: dict[str, Any] | None = None
     scaling: list[dict[str, Any]] | None = None
     correlated_bias: dict[str, Any] | None = None

@@ -12,7 +12,7 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -59,7 +59,7 @@ def _nan_for_null(value: object, handler: ValidatorFunctionWrapHandler) -> float
 
 
 #: A number that may be not finite, which JSON does not have.
-_Figure = Annotated[float, WrapValidator(_nan_for_null)]
+Figure = Annotated[float, WrapValidator(_nan_for_null)]
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ class Clamped:
     that it took of their sum."""
 
     entries: int
-    share: dict[str, _Figure]
-    bias: dict[str, _Figure]
+    share: dict[str, Figure]
+    bias: dict[str, Figure]
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Record(Line):
     __pydantic_config__ = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
     iteration: int
-    loss: _Figure
+    loss: Figure
     step_ms: float
     primal_ms: float | None
     adjoint_ms: float | None
@@ -102,10 +102,10 @@ class Record(Line):
     peak_mib: float
     spp: int
     lr: float
-    grad_norm: _Figure
+    grad_norm: Figure
     nonfinite: int
     parameter_rmse: float | None
-    parameter_errors: dict[str, _Figure] = field(default_factory=dict)
+    parameter_errors: dict[str, Figure] = field(default_factory=dict)
     nonfinite_by_parameter: dict[str, int] = field(default_factory=dict)
     clamped: Clamped | None = None
     held_out: float | None = None
@@ -163,7 +163,7 @@ def mend(folder: Path) -> None:
         pass
 
 
-def read_records(folder: Path, count: int, last: Mapping[str, Any] | None) -> tuple[list[Record], int]:
+def read_records(folder: Path, count: int, last: Record | None) -> tuple[list[Record], int]:
     """The first `count` records in `folder`, and the bytes that they take; the rest was not kept by a checkpoint.
 
     A full disk may have taken the line of the last one, which the checkpoint has too: `last`. Raises ConfigError,
@@ -173,8 +173,8 @@ def read_records(folder: Path, count: int, last: Mapping[str, Any] | None) -> tu
     content = read_file(path, MOST_BYTES) if count and os.path.lexists(path) else b""
     whole = [line for line in content.splitlines(keepends=True)[:count] if line.endswith(b"\n")]
     records = [_record(line, number, path) for number, line in enumerate(whole)]
-    if len(records) == count - 1 and last is not None:
-        records.append(_record(json.dumps(last).encode(), count - 1, path))
+    if len(records) == count - 1 and last is not None and last.iteration == count - 1:
+        records.append(last)
     if len(records) < count:
         held = f"holds {len(records)} of the {count} iterations of the checkpoint"
         raise ConfigError(path, "", f"{held}; put it back, or begin anew from `initial: {{run: ...}}`")

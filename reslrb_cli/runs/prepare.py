@@ -10,10 +10,9 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,21 +24,22 @@ from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, printable
-from reslrb_cli.integrators.plan_report import GUIDED, SEQUENCE, plan_rows, with_reason
+from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, SEQUENCE, plan_rows, with_reason
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.measure.prb_comparison import measure_rival
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.correlated_bias import measure_correlated_bias
 from reslrb_cli.optimization.moving import warn_of_border
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.results import Best, Results
-from reslrb_cli.optimization.state import COUNT, NUMBER, NUMBERS, TEXTS, State, Stored, stored_value
-from reslrb_cli.optimization.uncertainty.measuring import Certainty
+from reslrb_cli.optimization.results import WINDOW, Best, Images, Least, Results
+from reslrb_cli.optimization.state import Settled, State, check_bounds, load, on_file, standing
+from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
 from reslrb_cli.optimization.views import view_records
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.checkpoint import save_checkpoint
 from reslrb_cli.records.manifest import Manifest
-from reslrb_cli.records.metrics import ClampTally, NonFiniteTally, Record, finite
+from reslrb_cli.records.metrics import ClampTally, NonFiniteTally, Record
+from reslrb_cli.records.tree import Arrays, Stored, entries, entry, expected
 from reslrb_cli.report.tonemap import exposure_for
 from reslrb_cli.scene.needs import unsupported_part
 from reslrb_cli.scene.visibility import sees_lamps
@@ -59,6 +59,8 @@ def plan_record(problem: Problem) -> dict[str, Any]:
         found = with_reason(found, GUIDED, f"guiding: auto, {problem.guided.why()}")
     if problem.sequence is not None:
         found = with_reason(found, SEQUENCE, f"sequence: auto, {problem.sequence.why()}")
+    if problem.sides is not None:
+        found = with_reason(found, PATHS_FROM, f"paths: auto, {problem.sides.why()}")
     rows = [{"feature": row.feature, "needed": row.needed, "reason": row.reason} for row in found]
     estimator = type(integrator.estimator).__name__.removesuffix("Estimator").lower()
     assert isinstance(config, ReslrbConfig)
@@ -153,7 +155,7 @@ def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[Course, 
     manifest = manifest_of(problem, variant, config.source)
     manifest.rival = None if rival is None else rival.to_json()
     manifest.correlated_bias = None if bias is None else bias.to_json()
-    return Course(problem, fixed_of(problem, variant)), manifest
+    return Course(problem, variant), manifest
 
 
 def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
@@ -173,10 +175,14 @@ def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
     return manifest
 
 
-def fixed_of(problem: Problem, variant: str) -> dict[str, Any]:
-    """What every checkpoint says of the experiment: by it another process assembles the same problem."""
-    files = digests(problem.config)
-    return {"config": dump(problem.config), "variant": variant, "files": files, **problem.decisions()}
+def settled_of(problem: Problem, variant: str) -> Settled:
+    """What every checkpoint says of the experiment, whose parameters stand at their initial values: by it another
+    process assembles the same problem."""
+    initial, halo = on_file(problem, standing(problem).values)
+    return Settled(
+        dump(problem.config), variant, digests(problem.config), problem.pilot, problem.guided, problem.sequence,
+        problem.sides, problem.memory, initial, halo, problem.masks,
+    )  # fmt: skip
 
 
 def digests(config: Config) -> dict[str, str]:
@@ -194,52 +200,49 @@ def digests(config: Config) -> dict[str, str]:
 Array = np.ndarray[Any, Any]
 
 
+@dataclass(frozen=True)
+class Met:
+    """What a run has met on its way, beside the records of its iterations, of which `last` is the newest."""
+
+    images: Images
+    certainty: Noted
+    best: Least | None = None
+    last: Record | None = None
+    best_values: Arrays = field(default_factory=dict, metadata=entry("best", "finite"))
+    squares: Arrays = field(default_factory=dict, metadata=entry("squares"))
+
+
 class Course:
     """Of one run of `problem`, whose parameters stand at their initial values when this is made.
 
-    `fixed` are plain values that go into every checkpoint: by them another process assembles the same problem.
+    `state` is that after the last whole iteration; of the one that is at work nothing is in it.
     """
 
-    def __init__(self, problem: Problem, fixed: Mapping[str, Any]) -> None:
-        self.problem, self._fixed = problem, dict(fixed)
-        self.state, self.results = State(problem), Results(problem)
+    def __init__(self, problem: Problem, variant: str) -> None:
+        self.problem, self._settled = problem, settled_of(problem, variant)
+        self.state, self.results = standing(problem), Results(problem)
         self.certainty = Certainty(problem)
         self.best = Best(any(view.held_out for view in problem.views))
         self.nonfinite, self.clamped = NonFiniteTally(), ClampTally()
         self.last: Record | None = None
-        self._snapshot = self.state.capture()
-        #: The values of the start, in the host's memory.
-        self._initial: dict[str, Array] = {}
-        for key, value in self._snapshot.moved.items():
-            self._initial |= stored_value(problem, "initial", key, value)
-        self.results.begin()
 
     @property
     def done(self) -> int:
         """The number of finished iterations."""
-        return 0 if self.last is None else self.last.iteration + 1
+        return self.state.iteration
 
-    def add(self, record: Record) -> None:
-        """Take one iteration, of which `state` is what it leaves."""
-        self.best.see(record, self._snapshot.moved)
+    def add(self, state: State, record: Record) -> None:
+        """Take one iteration, which leaves `state`."""
+        self.best.see(record, self.state.values)
         self._take(record)
-        self.certainty.see(self.done)
-        self._snapshot = self.state.capture()
+        self.certainty.see(state.iteration)
+        self.state = state
 
     def _take(self, record: Record) -> None:
         self.last = record
         self.results.add(record)
         self.nonfinite.add(record)
         self.clamped.add(record)
-
-    def learned(self) -> tuple[dict[str, int] | None, dict[str, Array]]:
-        """What guided emission knew before the iteration that is at work, which may have taught it more by now.
-
-        That is the number of gradients by sensor, and arrays by `<sensor>/<what>`; None and nothing where it is off.
-        """
-        prefix = "guiding/"
-        arrays = {name.removeprefix(prefix): a for name, a in self._snapshot.arrays.items() if name.startswith(prefix)}
-        return self._snapshot.values.get("guiding"), arrays
 
     def best_values(self) -> dict[str, Array]:
         """The best parameters so far, as `problem.values()` has them; nothing where there are none yet."""
@@ -253,47 +256,30 @@ class Course:
 
     def save(self, folder: Path) -> int:
         """Keep it in `folder` as it was after its last whole iteration; return how many it had. Raises OSError."""
-        problem, snapshot = self.problem, self._snapshot
-        others = snapshot.others(problem) | self._initial
-        others |= {f"best/{key}": value for key, value in self.best_values().items()}
-        others |= {f"mask/{key}": mask for key, mask in problem.masks.items()}
-        seen, squares = self.certainty.state()
-        others |= {f"squares/{key}": np.array(value) for key, value in squares.items()}
-        best = self.best.to_json()
-        values = self._fixed | snapshot.values
-        values |= {
-            "best": best and {"iteration": best["iteration"], "loss": best["loss"]},
-            "images": self.results.images_seen(),
-            "certainty": {"seen": seen, "keys": list(squares)},
-            "last": None if self.last is None else asdict(self.last),
-        }
-        save_checkpoint(folder, snapshot.iteration, snapshot.parameters(problem), others, finite(values))
-        return snapshot.iteration
+        met = Met(
+            self.results.images["initial"], self.certainty.noted, self.best.least, self.last,
+            self.best_values(), self.certainty.squares,
+        )  # fmt: skip
+        found, values = entries(self._settled, self.state.on_file(self.problem), met)
+        save_checkpoint(folder, self.done, {}, found, values)
+        return self.done
 
     def restore(self, stored: Stored, records: Sequence[Record]) -> None:
         """Go on from what was stored, and from the records of all iterations until then.
 
         Raises ConfigError, located in the file, where something there is not what this run can have left.
         """
-        problem = self.problem
-        self.state.restore(stored)
+        problem, met = self.problem, stored.read(Met)
+        self.state = load(problem, stored)
+        squares = {key: problem.optimizer.squares(key) for key in met.certainty.keys if key in problem.selection.keys}
+        wanted = {key: expected(problem.selection.array(key).shape) for key in problem.selection.keys if met.best}
+        kept = {key: each[0] for key, each in squares.items() if each is not None}
+        met = stored.fill(replace(met, best_values=wanted, squares=kept))
         for record in records:
             self._take(record)
-        self.best.recall(list(records))
-        if stored.value("best") is not None:
-            values = {
-                key: stored.archive.array(f"best/{key}", problem.selection.array(key).shape, "f")
-                for key in problem.selection.keys
-            }
-            for key, array in values.items():
-                stored.check_bounds(problem, f"best/{key}", key, array)
-            self.best.restore(stored.read(COUNT, "best", "iteration"), stored.read(NUMBER, "best", "loss"), values)
-        seen = {name: stored.read(NUMBERS, "images", name) for name in ("trained", "held_out")}
-        self.results.recall({name: [math.nan if x is None else x for x in losses] for name, losses in seen.items()})
-        squares = {}
-        for key in stored.read(TEXTS, "certainty", "keys"):
-            kept = problem.optimizer.squares(key) if key in problem.selection.keys else None
-            if kept is not None:
-                squares[key] = stored.take(f"squares/{key}", kept[0])
-        self.certainty.restore(stored.read(COUNT, "certainty", "seen"), squares)
-        self._snapshot = self.state.capture()
+        self.best.recent.extend(record.loss for record in records[-WINDOW:])
+        for key, array in met.best_values.items():
+            check_bounds(problem, stored, f"best/{key}", key, array)
+        self.best.least, self.best.values = met.best, met.best_values
+        self.results.images["initial"] = met.images
+        self.certainty.noted, self.certainty.squares = met.certainty, met.squares

@@ -1,6 +1,5 @@
 """The recording of a run: its optimisation is run, and its folder written; one that is resumed goes on where it was.
 
-- `note_scaling`, `check_memory`: what a run says, and notes in its manifest, of scales and memory while it is at work.
 - `Recording`: one run being recorded.
 - `Ending`: the end of a run, part by part. Each stands alone, the manifest comes first, and it says what is missing.
 """
@@ -21,7 +20,7 @@ import numpy as np
 
 from reslrb_cli.errors import MachineError, NonFinite, describe, is_machine_fault, tell
 from reslrb_cli.optimization.decisions import Scaled
-from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.nonfinite import Findings
 from reslrb_cli.optimization.problem import Problem, saved_spp
 from reslrb_cli.optimization.sensitivity import step_line
@@ -89,10 +88,6 @@ class Ending:
         else:
             self._manifest.missing.pop(name, None)
 
-    def leave_out(self, name: str, reason: str) -> None:
-        """Note a part that a run which ends like this does not have."""
-        self._manifest.missing[name] = reason
-
     def finish(self, write_page: Callable[[], object]) -> Status:
         """Complete the manifest, write the page from it, and say how the run ended, or raise what it failed of."""
         self._write_manifest()
@@ -159,24 +154,6 @@ def what_is_kept(folder: RunFolder, saved: int | None, done: int, parameters: bo
     return "nothing of the run was kept"
 
 
-def note_scaling(manifest: Manifest, problem: Problem, measured: Sequence[Scaled]) -> None:
-    """Note what was measured for `scale: auto`, and say what it makes of a step."""
-    manifest.scaling = [row.to_json() for row in measured]
-    for row in measured:
-        spec = problem.selection.spec(row.key)
-        line = step_line(row, spec.transform, spec.learning_rate or problem.config.optimizer.learning_rate)
-        (logger.warning if row.own_length is None else logger.info)(f"scale auto: {line}")
-
-
-def check_memory(manifest: Manifest, problem: Problem, record: Record) -> None:
-    """Note the memory that was used, where there is a budget; warn the first time that it is above that."""
-    if problem.memory is not None:
-        warning = problem.memory.check(record.peak_mib)
-        if warning is not None:
-            logger.warning(warning)
-        manifest.memory = problem.memory.to_json()
-
-
 #: Images with more pixels take some seconds to be compared, and that is said.
 MANY_PIXELS = 5e5
 
@@ -210,11 +187,6 @@ class Recording:
         return self.course.problem
 
     @property
-    def last(self) -> Record | None:
-        """The newest record."""
-        return self.course.last
-
-    @property
     def done(self) -> int:
         """The number of finished iterations."""
         return self.course.done
@@ -231,10 +203,15 @@ class Recording:
         status: Status = Status.FAILED
         failure: BaseException | None = None
         try:
-            if self.done:
-                self._go_on(reserve)
+            self.page.refresh()
+            values = self.folder.parameters
+            if self.done:  # what `_begin` writes is there: a run has a state after an iteration only then
+                self._saved = self.done
             else:
-                self._begin(reserve)
+                self._begin()
+                values = values / "initial"
+            # the state at the end has the best values too, and what the clamp and the optimiser then know
+            reserve.hold(2 * size_of(self.folder.checkpoint) + size_of(values) + RESERVE_BYTES)
             self._iterate(show, stop)
             status = Status.INTERRUPTED if self.done < self.problem.config.run.iterations else Status.FINISHED
         except KeyboardInterrupt:
@@ -248,14 +225,13 @@ class Recording:
 
     def abandon(self) -> None:
         """Note in the manifest that the run was interrupted, in a process that is about to end in the midst of it."""
-        if not self.manifest.results and self.last is not None:
-            self.manifest.results = {"iterations": self.done, "elapsed_s": self.last.elapsed_s}
+        if not self.manifest.results and self.course.last is not None:
+            self.manifest.results = {"iterations": self.done, "elapsed_s": self.course.last.elapsed_s}
         if self.folder.is_there:
             self.manifest.end_for_good(self.folder.path, Status.INTERRUPTED)
 
-    def _begin(self, reserve: Reserve) -> None:
+    def _begin(self) -> None:
         problem, parameters = self.problem, self.folder.parameters
-        self.page.refresh()
         self._save_checkpoint()
         for view in problem.views:
             self._write_image("target", view.sensor, np.array(view.target))
@@ -267,14 +243,6 @@ class Recording:
             write_parameters(parameters / "true", problem.truth)
         for key, mask in problem.masks.items():
             write_mask(parameters, key, mask)
-        # the state at the end has the best values too, and what the clamp and the optimiser then know
-        reserve.hold(2 * size_of(self.folder.checkpoint) + size_of(parameters / "initial") + RESERVE_BYTES)
-
-    def _go_on(self, reserve: Reserve) -> None:
-        """What `_begin` writes is there: a run has a state after an iteration only then."""
-        self._saved = self.done
-        self.page.refresh()
-        reserve.hold(2 * size_of(self.folder.checkpoint) + size_of(self.folder.parameters) + RESERVE_BYTES)
 
     def _iterate(self, show: Callable[[Record], None], stop: Callable[[], bool]) -> None:
         run, saved, saved_at = self.problem.config.run, self.done, time.monotonic()
@@ -282,14 +250,14 @@ class Recording:
         if stop():
             return
         with MetricsWriter(self.folder.path) as metrics:
-            for record in optimize(self.problem, self._on_nonfinite, self.course.state):
-                if not told and self.course.state.sensitivities is not None:
-                    note_scaling(self.manifest, self.problem, self.course.state.sensitivities)
+            for state, record in iterate(self.problem, self.course.state, self._on_nonfinite):
+                if not told and state.scaling is not None:
+                    self._tell_scaling(state.scaling)
                 told = True
-                self.course.add(record)
+                self.course.add(state, record)
                 metrics.write(record)
                 show(record)
-                check_memory(self.manifest, self.problem, record)
+                self._note_memory(record.peak_mib)
                 if (fault := self.folder.fault) is not None:  # another run's may have taken its name
                     raise fault
                 if stop():
@@ -302,11 +270,28 @@ class Recording:
                     saved, saved_at = self.done, time.monotonic()
                 self.page.refresh()
 
+    def _tell_scaling(self, measured: Sequence[Scaled]) -> None:
+        """Note what was measured for `scale: auto`, and say what it makes of a step."""
+        self.manifest.scaling = [row.to_json() for row in measured]
+        for row in measured:
+            spec = self.problem.selection.spec(row.key)
+            rate = spec.learning_rate or self.problem.config.optimizer.learning_rate
+            level = logging.WARNING if row.own_length is None else logging.INFO
+            logger.log(level, f"scale auto: {step_line(row, spec.transform, rate)}")
+
+    def _note_memory(self, peak: float) -> None:
+        """Note the memory that was used, where there is a budget; warn the first time that it is above that."""
+        if (plan := self.problem.memory) is not None:
+            if (warning := plan.check(peak)) is not None:
+                logger.warning(warning)
+            self.manifest.memory = plan.to_json()
+
     def _on_nonfinite(self, found: Findings) -> None:
         """Keep what the first step that met a value that is not finite began with, and say how to look into it."""
         if self._saved_nonfinite:
             return
-        step = NonFiniteStep(found.iteration, self.problem.values(), *self.course.learned())
+        state = self.course.state  # what guided emission knew before this iteration, which may have taught it more
+        step = NonFiniteStep(found.iteration, self.problem.values(), state.guiding, state.learned)
         save_nonfinite(self.folder.checkpoint, step)
         self._saved_nonfinite = True
         if self.problem.config.run.on_nonfinite != "stop":  # which says so when it ends
@@ -327,10 +312,10 @@ class Recording:
         if failure is None:
             ending.part("final images", self._write_final_images)
             if status is Status.FINISHED:  # who interrupts does not want to wait; `reslrb report` finds them as well
-                self._note_certainty()
-                self._note_seen_errors()
+                self._add("how certain the values are was", self._measure_certainty)
+                self._add("errors as people see them were", self._measure_seen_errors)
         else:
-            ending.leave_out("final images", "the run failed")
+            self.manifest.missing["final images"] = "the run failed"
         return ending.finish(self._write_page)
 
     def _write_parameters(self) -> None:
@@ -350,37 +335,35 @@ class Recording:
             raise
 
     def _write_live_page(self) -> None:
-        if self.last is None:  # nothing is there to be drawn, so that this takes no time
+        if self.course.last is None:  # nothing is there to be drawn, so that this takes no time
             write_report(self.folder.path, self.manifest.content(), {})
         else:
             write_report(self.folder.path, self.manifest.content() | {"results": self._found()}, self.problem.values())
 
-    def _note_certainty(self) -> None:
-        """Add to the results how certain they are. The run is what it is without that."""
-        if self.last is None or self.done < LEAST_ITERATIONS or not self.problem.config.run.certainty:
-            return
-        logger.info("measuring how certain the values are")
+    def _add(self, failed: str, measure: Callable[[], None]) -> None:
+        """Add to the results what `measure` finds. The run is what it is without that; `failed` says so."""
         try:
-            self.certainty = self.course.certainty.measure(self.done, self.last.elapsed_s, self._stop)
-            for key, shown in self.course.certainty.shown.items():
-                if key not in self.problem.masks:  # of which it was found out before
-                    write_mask(self.folder.parameters, key, shown)
+            measure()
         except Exception as error:
-            logger.warning("how certain the values are was not measured: %s", describe(error))
+            logger.warning("%s not measured: %s", failed, describe(error))
         else:
             self._note_results()
 
-    def _note_seen_errors(self) -> None:
-        """Add errors as people see them to the results. The run is what it is without them."""
+    def _measure_certainty(self) -> None:
+        last = self.course.last
+        if last is None or self.done < LEAST_ITERATIONS or not self.problem.config.run.certainty:
+            return
+        logger.info("measuring how certain the values are")
+        self.certainty = self.course.certainty.measure(self.done, last.elapsed_s, self._stop)
+        for key, shown in self.course.certainty.shown.items():
+            if key not in self.problem.masks:  # of which it was found out before
+                write_mask(self.folder.parameters, key, shown)
+
+    def _measure_seen_errors(self) -> None:
         pixels = sum(view.target.shape[0] * view.target.shape[1] for view in self.problem.views)
         if pixels > MANY_PIXELS:
             logger.info(f"comparing images of {pixels / 1e6:.2g} million pixels as people see them")
-        try:
-            self.seen = finite(seen_errors(self.folder.path, self.manifest.results, self.manifest.views))
-        except Exception as error:
-            logger.warning("errors as people see them were not measured: %s", describe(error))
-        else:
-            self._note_results()
+        self.seen = finite(seen_errors(self.folder.path, self.manifest.results, self.manifest.views))
 
     def _write_final_images(self) -> None:
         self._write_images("final")
@@ -391,6 +374,7 @@ class Recording:
 
     def _found(self) -> dict[str, Any]:
         """What the run came to, or has come to by now."""
+        last = self.course.last
         self.course.results.end()
         found = self.course.results.to_json()
         if self.certainty is not None:
@@ -398,8 +382,8 @@ class Recording:
         found["warnings"] = warnings({"iterations": self.done, **found})
         return {
             "iterations": self.done,
-            "loss": self.last and _json_number(self.last.loss),
-            "elapsed_s": self.last and self.last.elapsed_s,
+            "loss": last and finite(last.loss),
+            "elapsed_s": last and last.elapsed_s,
             **found,
             "error_maps": self.error_maps,
             **({"seen": self.seen} if self.seen else {}),
@@ -443,7 +427,3 @@ class Recording:
 
     def _image_name(self, name: str, sensor: int) -> str:
         return name if len(self.problem.views) == 1 else f"{name}-{sensor}"
-
-
-def _json_number(value: float) -> Any:
-    return value if np.isfinite(value) else None

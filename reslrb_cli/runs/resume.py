@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
-from reslrb_cli.config.files import CONFIG_BYTES
 from reslrb_cli.config.loader import dump, load, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.state import COUNT, TEXT, Settled, Stored
+from reslrb_cli.optimization.state import Settled, State
 from reslrb_cli.records.checkpoint import PREVIOUS_FILE_NAME, STATE_FILE, open_state
 from reslrb_cli.records.manifest import Manifest, Status, now, versions
 from reslrb_cli.records.metrics import Record, cut_back, read_records
 from reslrb_cli.records.run_folder import RunFolder, check_writable, copy_into, opened, write_beginning
-from reslrb_cli.runs.prepare import Change, Course, changes, check_changes, digests, fixed_of, manifest_of
+from reslrb_cli.records.tree import Stored
+from reslrb_cli.runs.prepare import Change, Course, Met, changes, check_changes, digests, manifest_of
 
 Say = Callable[[str], None]
 
 #: The variants that `variant` may name, `auto` left out.
 VARIANTS = [name for name in get_args(Config.model_fields["variant"].annotation) if name != "auto"]
-
-#: Characters of the settings in a state, which has every default written out: those of a file are fewer.
-_MOST_CONFIG = 4 * CONFIG_BYTES
 
 
 @dataclass
@@ -40,6 +37,7 @@ class Earlier:
     folder: RunFolder
     manifest: dict[str, Any]
     stored: Stored
+    settled: Settled
     config: Config
     changed: dict[str, Change]
     elsewhere: bool
@@ -55,7 +53,7 @@ class Earlier:
     @property
     def variant(self) -> str:
         """The variant that the run began with, whatever `auto` would choose here. Raises ConfigError."""
-        variant = self.stored.read(TEXT, "variant")
+        variant = self.settled.variant
         if variant not in VARIANTS:
             raise self.stored.wrong("variant", "is none of those that a run can have")
         return variant
@@ -71,11 +69,11 @@ class Earlier:
 
         Raises ConfigError, UnsupportedScene.
         """
-        problem = assemble(self.config, say, to_run=True, settled=Settled(self.stored))
+        problem = assemble(self.config, say, to_run=True, settled=self.stored)
         manifest = self._manifest(manifest_of(problem, variant, self.config.source))
-        course = Course(problem, fixed_of(problem, variant))
+        course = Course(problem, variant)
         course.restore(self.stored, self.records)
-        measured = course.state.sensitivities
+        measured = course.state.scaling
         manifest.scaling = None if measured is None else [row.to_json() for row in measured]
         return course, manifest
 
@@ -143,21 +141,19 @@ def open_earlier(run: Path, config_file: Path | None, overrides: tuple[str, ...]
         said: list[str] = []
         stored = _read_state(folder, said)
         stack.callback(stored.archive.close)
-        if len(stored.read(TEXT, "config")) > _MOST_CONFIG:
-            raise stored.wrong("config", "is too long")
-        began = loads(stored.read(TEXT, "config"), stored.path)
-        config, source = _read_config(run, config_file, overrides, stored)
+        settled, iteration = stored.read(Settled), stored.read(State).iteration
+        began = loads(settled.config, stored.path)
+        config, source = _read_config(run, config_file, overrides, settled.config)
         elsewhere = config.run.output != source.run.output or config.run.name != source.run.name
         found = changes(began, config)
         asked = changes(source, config)
         changed = check_changes(found, lambda key: "--set" if key in asked else config.source, run)
-        iteration, last = stored.read(COUNT, "iteration"), stored.value("last")
         if config.run.iterations < iteration:
             reason = f"is {config.run.iterations}; the run has done {iteration} already"
             raise ConfigError(config.source, "run.iterations", reason)
-        _check_files(stored, config, run)
-        records, size = read_records(folder.path, iteration, last if isinstance(last, dict) else None)
-        earlier = Earlier(folder, manifest, stored, config, changed, elsewhere, records, size, said)
+        _check_files(settled.files, config, run)
+        records, size = read_records(folder.path, iteration, stored.read(Met).last)
+        earlier = Earlier(folder, manifest, stored, settled, config, changed, elsewhere, records, size, said)
         if not (elsewhere or earlier.is_done):
             check_writable(folder)
         yield earlier
@@ -177,28 +173,25 @@ def _read_state(folder: RunFolder, said: list[str]) -> Stored:
             continue
         if failures or name == PREVIOUS_FILE_NAME:
             why = str(failures[0]) if failures else f"{folder.checkpoint / STATE_FILE}: is missing"
-            said.append(f"{why}; going on from the state before, after {stored.read(COUNT, 'iteration')} iterations")
+            said.append(f"{why}; going on from the state before, after {stored.read(State).iteration} iterations")
         return stored
     if failures:
         raise failures[0]
     raise ConfigError(folder.path, "", f"has no checkpoint/{STATE_FILE}: the run ended before it kept anything")
 
 
-def _read_config(
-    run: Path, config_file: Path | None, overrides: tuple[str, ...], stored: Stored
-) -> tuple[Config, Config]:
-    """The configuration that the run is to go on with, and the same without overrides."""
+def _read_config(run: Path, config_file: Path | None, overrides: tuple[str, ...], text: str) -> tuple[Config, Config]:
+    """The configuration that the run is to go on with, and the same without overrides; `text` is what its state has."""
     own = run / "config.yaml"
     if config_file is not None or own.exists():
         path = own if config_file is None else config_file
         return load(path, list(overrides)), load(path)
-    text = stored.read(TEXT, "config")
     return loads(text, own, list(overrides)), loads(text, own)
 
 
-def _check_files(stored: Stored, config: Config, run: Path) -> None:
-    before, here = stored.value("files"), digests(config)
-    for key, digest in before.items() if isinstance(before, dict) else ():
+def _check_files(before: Mapping[str, str], config: Config, run: Path) -> None:
+    here = digests(config)
+    for key, digest in before.items():
         if here.get(key) != digest:
             what = "has changed" if key in here else "has gone"
             raise ConfigError(config.source, key, f"{what} since {run} began; put it back, or begin anew")

@@ -13,9 +13,11 @@ from optimization.toy import make_problem
 from reslrb_cli.errors import NonFinite
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.nonfinite import PATIENCE, count_nonfinite, finite_square_norm
-from reslrb_cli.optimization.optimizers import DECAY, GradientClamp
+from reslrb_cli.optimization.optimizers import DECAY, clamp_gradients
+from reslrb_cli.optimization.state import standing
 from reslrb_cli.records.clock import StepClock
 from reslrb_cli.records.metrics import ClampTally
+from reslrb_cli.records.tree import entries
 
 # The loop on a problem whose image is its parameter: what it records.
 
@@ -65,6 +67,24 @@ def test_each_view_and_iteration_has_its_own_seed(tmp_path, steps):
     assert [call.sensor for call in steps.calls[:3]] == [0, 1, 2]
     assert len({call.seed for call in steps.calls}) == 60
     assert {call.adjoint for call in steps.calls} == {"independent"}  # four batches do not divide 3 samples
+
+
+def test_from_equal_states_equal_ones_follow(tmp_path, steps):
+    """A step is a function of its state: one that was left behind is come back to, and what it was given stays."""
+    sets = ["optimizer.clamp_gradient=1.1", "optimizer.type=adam"]
+    problem = steps.problem = make_problem(tmp_path, sets=sets, keys=("albedo", "other"))
+    begun = standing(problem)
+    second, _ = loop.step(problem, loop.step(problem, begun)[0])
+    [first_time, again] = [loop.step(problem, second) for _ in range(2)]
+    for state in (begun, second):
+        loop.step(problem, state)
+    arrays, values = zip(*(entries(state) for state, _ in (first_time, again)), strict=True)
+    assert {name: array.tobytes() for name, array in arrays[0].items()} == {
+        name: array.tobytes() for name, array in arrays[1].items()
+    }
+    assert {name for name in values[0] if values[0][name] != values[1][name]} <= {"elapsed_s", "peak_mib"}
+    assert values[0]["clamp"] == {"albedo": 3, "other": 3}
+    np.testing.assert_array_equal(np.array(begun.values["albedo"]), 0.5)
 
 
 def test_the_loss_is_the_mean_over_the_views(tmp_path, steps):
@@ -279,14 +299,15 @@ def leaf(kind, shape):
     return value
 
 
-def clamp_all(clamp, gradients, kind=None):
+def clamp_all(factor, gradients, kind=None):
     """Clamp gradients (T, ...) in turn; the clamped ones, and what was said of each."""
     parameter = leaf(mi.TensorXf, gradients[0].shape) if kind is None else leaf(kind, 1)
-    clamped, said = [], []
+    clamped, said, known = [], [], ({}, {})
     for gradient in gradients:
         shaped = mi.TensorXf(gradient) if kind is None else kind(*gradient[:, 0].tolist())
         dr.set_grad(parameter, shaped)
-        said.append(clamp.apply({"x": parameter}))
+        found, *known = clamp_gradients(factor, {"x": parameter}, *known)
+        said.append(found)
         clamped.append(np.array(dr.grad(parameter)).reshape(gradient.shape))
     return np.array(clamped), said
 
@@ -313,7 +334,7 @@ def heavy_tailed():
 
 
 def test_it_is_what_its_docstring_says(heavy_tailed):
-    clamped, said = clamp_all(GradientClamp(4.0), heavy_tailed)
+    clamped, said = clamp_all(4.0, heavy_tailed)
     expected = reference(heavy_tailed.astype(np.float64), 4.0)
     np.testing.assert_allclose(clamped, expected, rtol=1e-4)
     assert clamped[20, 0, 0, 0] == 2, "an entry without a past is judged by the others"
@@ -330,7 +351,7 @@ def test_what_cancels_is_no_bias():
     """Outliers of both signs in turn: each takes a share of its gradient, and together they take nothing."""
     gradients = np.ones((41, 1, 1, 3), np.float32)
     gradients[1::2, 0, 0, 1] = np.where(np.arange(20) % 2, 1000, -1000)
-    _, said = clamp_all(GradientClamp(3.0), gradients)
+    _, said = clamp_all(3.0, gradients)
     assert min(entry.share["x"] for entry in said[1::2]) > 0.9
     assert said[-1].bias["x"] < 0.2, "not 0: what is usual grows with each of them"
 
@@ -338,7 +359,7 @@ def test_what_cancels_is_no_bias():
 def test_outliers_of_one_sign_are_a_bias():
     gradients = np.ones((40, 1, 1, 3), np.float32)
     gradients[5::10, 0, 0, 1] = 1000
-    _, said = clamp_all(GradientClamp(3.0), gradients)
+    _, said = clamp_all(3.0, gradients)
     removed = 4 * 1000
     assert said[-1].bias["x"] == pytest.approx(removed / (removed + 120), rel=0.02)
 
@@ -347,7 +368,7 @@ def test_colours_and_numbers_are_clamped_too():
     for kind, channels in ((mi.Color3f, 3), (mi.Float, 1)):
         gradients = np.ones((10, channels, 1), np.float32)
         gradients[9, 0] = 1e30  # whose square would overflow
-        clamped, said = clamp_all(GradientClamp(5.0), gradients, kind)
+        clamped, said = clamp_all(5.0, gradients, kind)
         assert clamped[9, 0, 0] == pytest.approx(5)
         assert said[9].entries == 1
         assert said[9].share["x"] == pytest.approx(1)
@@ -356,18 +377,18 @@ def test_colours_and_numbers_are_clamped_too():
 def test_large_gradients_do_not_switch_it_off():
     gradients = np.full((10, 1, 1, 3), 1e25, np.float32)
     gradients[9, 0, 0, 0] = 1e27
-    clamped, _ = clamp_all(GradientClamp(5.0), gradients)
+    clamped, _ = clamp_all(5.0, gradients)
     assert clamped[9].max() == pytest.approx(5e25)
 
 
 def test_later_iterations_compile_nothing():
-    parameter, clamp, clock, new = leaf(mi.TensorXf, (2, 2, 3)), GradientClamp(3.0), StepClock(), []
+    parameter, known, clock, new = leaf(mi.TensorXf, (2, 2, 3)), ({}, {}), StepClock(), []
     for iteration in range(5):
         gradient = dr.full(mi.TensorXf, 1.0, (2, 2, 3)) + dr.opaque(mi.Float, iteration)
         dr.eval(gradient)
         dr.set_grad(parameter, gradient)
         with clock.step() as times:
-            clamp.apply({"x": parameter})
+            _, *known = clamp_gradients(3.0, {"x": parameter}, *known)
         new.append(times.new_kernels)
     assert new[2:] == [0, 0, 0]
 

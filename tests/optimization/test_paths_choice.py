@@ -11,7 +11,7 @@ from runs.going_on import optimize
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.assemble import assemble, assemble_scene
 from reslrb_cli.optimization.autotune.sampling import FIRST_SHARE, SHARES
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.cache import PilotCache
@@ -21,6 +21,7 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 AUTO = ["integrator.paths=auto", "integrator.estimator=stack", *SMALL]
 RUN = Path("runs/tiny")
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(autouse=True)
@@ -80,21 +81,19 @@ def test_it_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
 
 def test_what_moves_light_has_light_paths():
-    motion = "parameters=[{motion: {of: [lamp], free: [translation]}}]"
-    problem = assemble(load("tiny.yaml", ["integrator.paths=both", motion, *SMALL]))
+    problem = assemble_scene(load(ROOT / "configs" / "lens_pose.yaml", ["integrator.paths=both"]))
     assert (problem.paths, problem.moves, problem.integrator.paths) == ("light", True, "light")
 
 
 def test_a_run_goes_on_with_the_paths_that_it_had():
-    settings = [word for setting in (*AUTO, "run.iterations=4") for word in ("--set", setting)]
-    whole = optimize("tiny.yaml", *settings, "--set", "run.name=whole")
-    assert whole.returncode == 0, whole.stderr
-    first = optimize("tiny.yaml", *settings, "--set", "run.name=parts", "--set", "run.iterations=2")
-    assert first.returncode == 0, first.stderr
-    again = optimize("--resume", "runs/parts", "--set", "run.iterations=4")
-    assert again.returncode == 0, again.stderr
-    found = [read_manifest(Path("runs") / name)["paths"] for name in ("whole", "parts")]
-    assert all(each["paths"] in ("both", "camera") for each in found)
+    settings = [word for setting in AUTO for word in ("--set", setting)]
+    assert optimize("tiny.yaml", *settings) == 0
+    found = read_manifest(RUN)
+    assert found["paths"]["paths"] in ("both", "camera")
+    assert optimize("--resume", str(RUN), "--set", "run.iterations=4") == 0
+    again = read_manifest(RUN)
+    assert again["paths"] == found["paths"]
+    assert again["plan"] == found["plan"]
 
 
 @pytest.mark.parametrize("paths", ["camera", "both"])
@@ -111,5 +110,5 @@ def test_targets_and_images_have_the_same_light(paths: str):
 
 
 def test_paths_that_cannot_be_are_located():
-    with pytest.raises(ConfigError, match=r"tiny.yaml: integrator.*gather"):
+    with pytest.raises(ConfigError, match=r"integrator.estimator: `gather` chooses"):
         load("tiny.yaml", ["integrator.paths=camera", "integrator.estimator=gather"])

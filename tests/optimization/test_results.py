@@ -42,8 +42,6 @@ def test_textures_are_told_by_mean_and_range_of_what_is_reached():
 def test_results_of_a_run(tmp_path, steps):
     problem = steps.problem = make_problem(tmp_path)
     results = Results(problem)
-    assert results.to_json()["parameters"]["albedo"]["initial"] is None
-    results.begin()
     for record in loop.optimize(problem):
         results.add(record)
     halfway = results.to_json()
@@ -69,7 +67,6 @@ def test_a_short_run_is_called_worse_once_it_is_over(tmp_path, iterations, worse
     """Pages of a run that goes on ask from its first iterations on."""
     problem = make_problem(tmp_path, sets=[f"run.iterations={iterations}"])
     results = Results(problem)
-    results.begin()
     for iteration in range(3):
         results.add(make_record(iteration=iteration, parameter_errors={"albedo": 1e-3}))
     results.end()
@@ -81,7 +78,6 @@ def test_a_truth_that_is_not_finite_is_null(tmp_path):
     problem = make_problem(tmp_path)
     problem.truth["albedo"][0, 0, 0] = np.nan
     results = Results(problem)
-    results.begin()
     results.end()
     found = json.loads(json.dumps(results.to_json(), allow_nan=False))
     assert found["parameter_rmse"]["albedo"] == {"initial": None, "final": None}
@@ -115,14 +111,14 @@ def meter_of(truth, quantities=None):
 def test_errors_are_taken_over_the_mask(tmp_path):
     problem = make_problem(tmp_path)
     problem.truth["albedo"] = np.array(problem.optimizer["albedo"]) + np.array([[[1.0], [50.0]], [[2.0], [3.0]]])
-    meter = problem.error_meter()
+    meter = problem.meter
     errors = meter.errors(problem.selection.array)
     assert errors["albedo"] == pytest.approx(np.sqrt((1 + 4 + 9) / 3), rel=1e-5)
     assert meter.total(errors) == pytest.approx(np.sqrt((1 + 4 + 9) / 3), rel=1e-5)
     truth = problem.truth["albedo"][problem.masks["albedo"]]
     assert meter.scales["albedo"] == pytest.approx(np.sqrt(np.mean(truth**2)), rel=1e-5)
     problem.masks["albedo"][:] = False
-    meter = problem.error_meter()
+    meter = replace(problem).meter
     assert meter.errors(problem.selection.array) == {}
     assert meter.total({}) is None
 
@@ -233,9 +229,9 @@ def test_noise_is_not_taken_for_the_best():
     losses = [0.01] + [1.0] * 20 + [0.5] * 15 + [0.9] * 20
     best = seen(losses)
     means = [np.mean(losses[end - WINDOW : end]) for end in range(WINDOW, len(losses) + 1)]
-    assert best.iteration == int(np.argmin(means)) + WINDOW - 1
-    assert best.values == {"a": best.iteration}
-    assert best.loss == pytest.approx(0.5)
+    assert best.least.iteration == int(np.argmin(means)) + WINDOW - 1
+    assert best.values == {"a": best.least.iteration}
+    assert best.least.loss == pytest.approx(0.5)
 
 
 def test_there_is_none_before_the_window_is_full():
@@ -245,14 +241,14 @@ def test_there_is_none_before_the_window_is_full():
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_what_is_not_finite_is_never_the_best(bad):
-    assert seen([bad] * 30).iteration is None
-    assert seen([*[bad] * 5, *[2.0] * 30]).iteration == 5 + WINDOW - 1
+    assert seen([bad] * 30).least is None
+    assert seen([*[bad] * 5, *[2.0] * 30]).least.iteration == 5 + WINDOW - 1
 
 
 def test_views_that_are_held_out_decide():
     held_out = [3.0, None, 1.0, None, 2.0]
     best = seen([5.0, 4.0, 3.0, 2.0, 1.0], held_out)
-    assert (best.iteration, best.loss, best.values) == (2, 1.0, {"a": 2})
+    assert (best.least.iteration, best.least.loss, best.values) == (2, 1.0, {"a": 2})
 
 
 @pytest.mark.parametrize("at", [3, 12, 25])
@@ -261,9 +257,8 @@ def test_it_goes_on_from_what_it_was(at):
     whole, part = seen(losses), seen(losses[:at])
     again = Best(False)
     records = [replace(RECORD, iteration=number, loss=loss) for number, loss in enumerate(losses)]
-    again.recall(records[:at])
-    if part.iteration is not None:
-        again.restore(part.iteration, part.loss, part.values)
+    again.recent.extend(losses[:at])
+    again.least, again.values = part.least, part.values
     for record in records[at:]:
         again.see(record, {"a": record.iteration})
     assert again.to_json() == whole.to_json()

@@ -12,13 +12,14 @@ import pytest
 from turns import a_few
 
 from reslrb_cli.config.loader import load
+from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.decisions import Scaled
 from reslrb_cli.optimization.identifiability import find_reached
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.optimizers import Optimizer, Variable, make_transform
 from reslrb_cli.optimization.sensitivity import measure_sensitivities, own_length, rescale, step_line
-from reslrb_cli.optimization.state import State
+from reslrb_cli.optimization.state import standing
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
 TINY = ["scene.options={resx: 12, resy: 12}", "integrator.max_depth=2", "run.spp=32", "run.reach_spp=16",
@@ -84,9 +85,9 @@ def test_measuring_leaves_everything_as_it_was():
 def test_what_has_no_effect_is_not_scaled():
     """At depth 1 nothing but emitters is seen, and a point has no size."""
     problem = assemble(load(CONFIG, [*TINY, "integrator={estimator: gather, max_depth: 1}", "run.iterations=1"]))
-    state = State(replace(problem, truth={}))
-    list(optimize(state.problem, state=state))
-    for row in state.sensitivities:
+    problem = replace(problem, truth={})
+    state, _ = loop.step(problem, standing(problem))
+    for row in state.scaling:
         assert (row.change, row.length, row.gradient) == (None, None, 0.0)
         assert problem.optimizer.variable(row.key).length == 1.0
 
@@ -158,11 +159,11 @@ def test_the_first_step_is_what_the_line_says(transform):
     """Adam's first step is one learning rate in what it moves."""
     sets = [f"parameters[1].transform={transform}", "parameters[1].bounds=[0, 1e8]", "run.iterations=1"]
     problem = assemble(load(CONFIG, [*TINY, *sets]))
-    state = State(replace(problem, truth={}))
+    problem = replace(problem, truth={})
     before = problem.selection.array(LAMP)
-    list(optimize(state.problem, state=state))
+    state, _ = loop.step(problem, standing(problem))
     moved = problem.selection.array(LAMP) / before
-    row = next(row for row in state.sensitivities if row.key == LAMP)
+    row = next(row for row in state.scaling if row.key == LAMP)
     rate = problem.config.optimizer.learning_rate
     line = step_line(row, transform, rate)
     assert line.startswith(f"{LAMP} moves in steps of {row.own_length:.3g} times the learning rate")

@@ -163,7 +163,7 @@ def test_records_are_what_they_were(tmp_path: Path) -> None:
 def test_the_last_line_is_put_back(tmp_path: Path, kept: int) -> None:
     records = written(tmp_path, kept)
     last = replace(RECORD, iteration=kept)
-    found, size = read_records(tmp_path, kept + 1, finite(asdict(last)))
+    found, size = read_records(tmp_path, kept + 1, last)
     cut_back(tmp_path, found, size)
     assert (tmp_path / "metrics.jsonl").read_text() == "".join(f"{text(each)}\n" for each in (*records, last))
 
@@ -197,7 +197,7 @@ def test_what_no_run_wrote_is_located(tmp_path: Path, case: str) -> None:
 def test_lines_that_are_missing_are_told(tmp_path: Path) -> None:
     written(tmp_path, 2)
     with pytest.raises(ConfigError, match="holds 2 of the 4 iterations of the checkpoint"):
-        read_records(tmp_path, 4, finite(asdict(replace(RECORD, iteration=3))))
+        read_records(tmp_path, 4, replace(RECORD, iteration=3))
 
 
 # The first line of a file of measurements: what it says, and what of it survives damage.

@@ -154,7 +154,7 @@ def test_a_run_that_went_on_can_go_on_again(experiment: Path, monkeypatch: pytes
     ]  # fmt: skip
 
 
-def _without_moments(self, values, units, take):
+def _without_moments(self, values, units, moments):
     for key, own in self._own.items():
         own[key] = values[key]
 
@@ -171,20 +171,23 @@ def _another_seed(run_seed, iteration, view, purpose):
 )
 def test_what_is_not_taken_up_is_missed(fault: str, experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Planted: each part of the state is left out in turn."""
-    from reslrb_cli.optimization import optimizers as clamping
-    from reslrb_cli.optimization import results
-    from reslrb_cli.optimization.uncertainty.measuring import Certainty
-    from reslrb_cli.runs import resume
+    from reslrb_cli.runs import prepare, resume
+
+    load, restore = prepare.load, prepare.Course.restore
+
+    def without_squares(self, stored, records):
+        restore(self, stored, records)
+        self.certainty.squares = {}
 
     # A state in the last fifth of the run has all parts; and losses that fall have the best of the run after it.
     sets = ["--set", "optimizer.clamp_gradient=1.5", "--set", "run.checkpoint_every={iterations: 15}"]
     whole, left = run_and_kill(monkeypatch, 17, *ITERATIONS, *sets, *FALLING)
     places = {
         "no moments": (optimizers.Optimizer, "restore", _without_moments),
-        "no clamp": (clamping.GradientClamp, "restore", lambda self, *given: None),
+        "no clamp": (prepare, "load", lambda *given: replace(load(*given), clamp={}, clamp_sums={})),
         "another seed": (loop, "seed", _another_seed),
-        "no best": (results.Best, "recall", lambda self, records: None),
-        "no squares": (Certainty, "restore", lambda self, *given: None),
+        "no best": (prepare, "WINDOW", 1),
+        "no squares": (prepare.Course, "restore", without_squares),
         "metrics not cut back": (resume, "cut_back", lambda folder, records, size: None),
     }
     monkeypatch.setattr(*places[fault])

@@ -51,7 +51,7 @@ class Judge:
     """Losses and errors of the parameters of `problem`, whose targets are made; `spp` are those of an image."""
 
     def __init__(self, problem: Problem, spp: int) -> None:
-        self.problem, self.spp, self.meter = problem, spp, problem.error_meter()
+        self.problem, self.spp, self.meter = problem, spp, problem.meter
 
     def loss(self, values: dict[str, Array]) -> float:
         """The loss of images with `values`, by key, of all views by their shares."""

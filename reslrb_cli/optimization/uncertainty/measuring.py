@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -14,6 +14,7 @@ from reslrb_cli.optimization.identifiability import shown_texels
 from reslrb_cli.optimization.loop import learning_rate_factor
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
+from reslrb_cli.optimization.state import Count
 from reslrb_cli.optimization.uncertainty.curvature import MOST_ENTRIES, Curvature, plan_changes, row_of
 from reslrb_cli.optimization.uncertainty.posterior import Measured
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord, Gradients, ParameterCertainty, weigh
@@ -42,41 +43,39 @@ RECENT = 0.2
 SHARE, MOST_STEPS = 0.25, 50
 
 
+@dataclass(frozen=True)
+class Noted:
+    """After how many iterations the squares of gradients were noted (0: not yet), and of which parameters."""
+
+    seen: Count
+    keys: list[str]
+
+
 class Certainty:
     """Of one run of `problem`: made before its first iteration, `measure` after the last."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self._initial = {key: row_of(problem, key) for key in problem.selection.keys}
-        self._squares: dict[str, tuple[Any, float] | None] = {}
-        self._seen = 0
+        #: What the optimiser kept of squares (`Optimizer.squares`) when that was noted, by key.
+        self.noted, self.squares = Noted(0, []), dict[str, Any]()
         #: The texels (H, W) of each texture that some view shows and light reaches, once that was asked.
         self.shown: dict[str, Array] = {}
 
     def see(self, iterations: int) -> None:
         """Take note of a run that has done so many iterations; it costs nothing."""
         if iterations == int((1 - RECENT) * self.problem.config.run.iterations):
-            self._seen = iterations
-            self._squares = {key: self.problem.optimizer.squares(key) for key in self._initial}
-
-    def state(self) -> tuple[int, dict[str, Any]]:
-        """What it took note of: after how many iterations (0: not yet), and by key what the optimiser kept then."""
-        return self._seen, {key: found[0] for key, found in self._squares.items() if found is not None}
-
-    def restore(self, seen: int, squares: Mapping[str, Any]) -> None:
-        """Go on from what `state` said."""
-        self._seen = seen
-        for key, array in squares.items():
-            now = self.problem.optimizer.squares(key)
-            self._squares[key] = None if now is None else (array, now[1])
+            kept = {key: self.problem.optimizer.squares(key) for key in self._initial}
+            self.squares = {key: each[0] for key, each in kept.items() if each is not None}
+            self.noted = Noted(iterations, list(self.squares))
 
     def _recent(self, key: str, iterations: int) -> Array | None:
         """The mean square of the gradients since `see` took note, (N,); None where the optimiser keeps none."""
-        before, now = self._squares.get(key), self.problem.optimizer.squares(key)
-        if before is None or now is None or iterations <= self._seen:
+        before, now = self.squares.get(key), self.problem.optimizer.squares(key)
+        if before is None or now is None or iterations <= self.noted.seen:
             return None
-        first, last = (np.array(mean, dtype=np.float64).ravel() for mean, _ in (before, now))
-        kept = now[1] ** (iterations - self._seen)
+        first, last = (np.array(mean, dtype=np.float64).ravel() for mean in (before, now[0]))
+        kept = now[1] ** (iterations - self.noted.seen)
         squares = np.maximum(last - kept * first, 0) / max(1 - kept, 1e-300)
         return np.asarray(squares / np.maximum(self.problem.optimizer.slope(key) ** 2, 1e-300))
 
