@@ -71,7 +71,8 @@ class Case:
         values |= {name: value for name, value in self.options.items() if name not in ADJOINT}
         if self.type == "reslrb" and values.setdefault("estimator", PLUGIN_ESTIMATOR) == "auto" and not auto:
             raise ConfigError(blame, "estimator", "`auto` measures which to take; name those to compare")
-        for option, compared in (("guiding", "`on` with `off`"), ("sequence", "`independent` with `low_discrepancy`")):
+        ways = {"guiding": "`on` with `off`", "sequence": "`independent` with `low_discrepancy`"}
+        for option, compared in (ways | {"paths": "`light`, `camera` and `both`"}).items():
             if values.get(option) == "auto" and not auto:
                 raise ConfigError(blame, option, f"`auto` measures whether it pays; compare {compared}")
         return with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
@@ -83,7 +84,7 @@ class Case:
             return None
         name = str(self.options.get("estimator", PLUGIN_ESTIMATOR))
         usual = {option: ReslrbConfig.model_fields[option].default for option in _ESTIMATOR_OPTIONS}
-        usual |= dict.fromkeys(UNDECIDED, "auto") if name == "auto" else UNDECIDED
+        usual |= {} if name == "auto" else UNDECIDED
         other = [
             f"{option}={value}"
             for option, value in self.options.items()

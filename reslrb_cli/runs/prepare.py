@@ -29,6 +29,7 @@ from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.measure.prb_comparison import measure_rival
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.correlated_bias import measure_correlated_bias
+from reslrb_cli.optimization.loading import paths_of
 from reslrb_cli.optimization.moving import warn_of_border
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import WINDOW, Best, Images, Least, Results
@@ -37,6 +38,7 @@ from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
 from reslrb_cli.optimization.views import view_records
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.checkpoint import save_checkpoint
+from reslrb_cli.records.decisions import RivalRecord
 from reslrb_cli.records.manifest import Manifest
 from reslrb_cli.records.metrics import ClampTally, NonFiniteTally, Record
 from reslrb_cli.records.tree import Arrays, Stored, entries, entry, expected
@@ -151,7 +153,7 @@ def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[Course, 
     warn_of_border(problem, warn)
     rival = measure_rival(problem, cache, say)
     if rival is not None and rival.is_better:
-        warn(f"{rival.line()}; --set integrator.type={rival.integrator}")
+        warn(f"{rival.line()}; --set {_other_way(problem, rival)}")
     manifest = manifest_of(problem, variant, config.source)
     manifest.rival = None if rival is None else rival.to_json()
     manifest.correlated_bias = None if bias is None else bias.to_json()
@@ -173,6 +175,16 @@ def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
     for name, decided in problem.decisions().items():
         setattr(manifest, name, decided)
     return manifest
+
+
+def _other_way(problem: Problem, rival: RivalRecord) -> str:
+    """The setting that has what `rival` is better by: camera paths beside light paths, where that is something new."""
+    integrator = problem.config.integrator
+    if problem.paths == "light" and isinstance(integrator, ReslrbConfig):
+        auto = integrator.model_copy(update={"paths": "auto"})
+        if paths_of(auto, problem.scene, problem.sensors, problem.moves) == "both":
+            return "integrator.paths=auto"
+    return f"integrator.type={rival.integrator}"
 
 
 def settled_of(problem: Problem, variant: str) -> Settled:

@@ -87,7 +87,7 @@ def test_it_is_not_tried_where_nobody_chose_an_estimator(experiment, capsys, mon
     better = RivalRecord(integrator="prb", rounds=8, spp=4, advantage=5.0, low=3.0, high=8.0, measure_s=1.5)
     monkeypatch.setattr(prepare, "measure_rival", lambda problem, cache, say: better)
     err, manifest = optimize(capsys, "integrator.estimator=stack")
-    assert f"{better.line()}; --set integrator.type=prb" in err
+    assert f"{better.line()}; --set integrator.paths=auto" in err
     assert better.line(cost=True).startswith("prb: 5 times the efficiency here (3 to 8) (measured in 1.5 s")
     assert manifest["rival"] == better.to_json()
     no_better = RivalRecord(integrator="prb", rounds=8, advantage=1.5, low=0.9, high=2.5)
