@@ -364,7 +364,8 @@ def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, c
     """The plan of a step for the first sensor that is used, or why there is none."""
     from reslrb_cli.integrators.plan_report import GUIDED, SEQUENCE, report_plan, with_reason
     from reslrb_cli.integrators.reslrb import Reslrb
-    from reslrb_cli.optimization.loading import choose_sensors, pass_spp
+    from reslrb_cli.optimization.loading import choose_sensors, pass_spp, paths_of
+    from reslrb_cli.optimization.moving import moves_anything
 
     config = subject.config
     if isinstance(selection, str):
@@ -379,7 +380,9 @@ def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, c
         options[option], reasons[feature] = sampling_of(subject, option)
     known = config.adjoint == "batched" or options.get("weight") == "adjoint"
     try:
-        [sensor, *_] = choose_sensors(config, scene)
+        [sensor, *_] = sensors = choose_sensors(config, scene)
+        options["paths"] = paths_of(config.integrator, scene, sensors, moves_anything(config, selection))
+        options |= sides_of(subject, options, reasons)
         integrator = Reslrb.of(**options)
         integrator.expect(pass_spp(config))
         params, keys = selection.params, selection.scene_keys
@@ -389,6 +392,24 @@ def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, c
     for feature, why in reasons.items():
         report = dataclasses.replace(report, rows=with_reason(report.rows, feature, why)) if why else report
     return report
+
+
+def sides_of(subject: Subject, options: dict[str, Any], reasons: dict[str, str]) -> dict[str, Any]:
+    """`integrator.paths` and `light_share` as they are in a run, or before one; adds to the `reasons` of features."""
+    from reslrb_cli.config.integrators import UNDECIDED
+    from reslrb_cli.integrators.plan_report import PATHS_FROM
+    from reslrb_cli.records.decisions import PathsRecord
+
+    asked = subject.config.integrator.options()
+    if options["paths"] != "both" or "auto" not in (asked["paths"], asked["light_share"]):
+        return {"light_share": UNDECIDED["light_share"] if asked["light_share"] == "auto" else asked["light_share"]}
+    try:
+        record = PathsRecord.from_json(dict((subject.run or {}).get("paths") or {}))
+    except (TypeError, ValueError):
+        reasons[PATHS_FROM] = "light_share: auto, which a run decides by measurement"
+        return {"light_share": UNDECIDED["light_share"]}
+    reasons[PATHS_FROM] = f"paths: auto, {record.why()}"
+    return {"paths": record.paths, "light_share": record.light_share}
 
 
 def sampling_of(subject: Subject, option: str) -> tuple[str, str]:

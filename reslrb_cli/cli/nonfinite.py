@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.cli.terminal import echo
+from reslrb_cli.config.integrators import UNDECIDED
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import with_integrator
 from reslrb_cli.config.schema import Config
@@ -25,7 +26,7 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.state import guiding_of, restore_tables
 from reslrb_cli.optimization.views import color_channels, to_tensor
 from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, NonFiniteStep, load_nonfinite
-from reslrb_cli.records.decisions import GuidedRecord, SequenceRecord
+from reslrb_cli.records.decisions import GuidedRecord, PathsRecord, SequenceRecord
 from reslrb_cli.records.manifest import MANIFEST_FILE as MANIFEST
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.metrics import finite
@@ -97,6 +98,11 @@ def _as_written(path: Path, place: str, what: str) -> Iterator[None]:
 def _settled(config: Config, manifest: dict[str, Any], path: Path) -> Config:
     """The configuration with the sequence that was measured to pay, and the estimator that the run's pilot chose."""
     options = config.integrator.options()
+    if manifest.get("paths"):
+        with _as_written(path, "paths", "which paths paid"):
+            sides = PathsRecord.from_json(manifest["paths"])
+        options |= {"paths": sides.paths, "light_share": sides.light_share or UNDECIDED["light_share"]}
+        config = with_integrator(config, {"type": config.integrator.type} | options, str(path), {})
     if options.get("sequence") == "auto":
         with _as_written(path, "sequence", "whether a sequence paid"):
             options["sequence"] = SequenceRecord.from_json(manifest["sequence"]).setting

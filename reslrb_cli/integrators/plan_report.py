@@ -158,7 +158,9 @@ def _guided(plan: Plan) -> Plan:
 def _paths(plan: Plan) -> Plan | str:
     if plan.attached:
         return "what moves light has light paths alone"
-    return replace(plan, paths="light" if plan.paths != "light" else "camera")
+    if plan.paths == "camera":
+        return "they take the place of light paths"
+    return replace(plan, paths="light" if plan.paths == "both" else "both")
 
 
 def _sequence(plan: Plan) -> Plan:

@@ -141,10 +141,8 @@ class LightTracer:
             purpose = purpose or (Purpose.IMAGE if job.params is None else Purpose.GRADIENT)
             if guiding.serves(purpose):
                 table = guiding.table(sensor_number(job.scene, job.sensor), purpose, delta)
-        emitters = self.preparation.emitters(job.scene) if plan.weighs else None
-        return passes(
-            plan, job.scene, job.sensor, job.seed, spp, self.samples_per_pass, table, self.light_share, emitters
-        )
+        sides = (self.light_share, self.preparation.emitters(job.scene)) if plan.weighs else ()
+        return passes(plan, job.scene, job.sensor, job.seed, spp, self.samples_per_pass, table, *sides)
 
     def learn(self, job: Job, gradient: mi.TensorXf) -> None:
         """Have the tables learn, where they are due to, from other samples than those of the job; dL/dI is known.

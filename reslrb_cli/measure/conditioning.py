@@ -91,6 +91,7 @@ def measure_chains(problem: Problem) -> list[ChainConditions]:
     damping = options.get("jacobian_damping", JACOBIAN_DAMPING)
     shared = {name: value for name, value in options.items() if name in Reslrb.OPTIONS}
     own = {"estimator": "reservoir", "guiding": "off", "sequence": "independent", "freeze": False}
+    own |= {"paths": "light", "light_share": 0.5}  # chains are those of light paths
     tracer = Reslrb.of(**(shared | own))
     scene, sensor = problem.scene, problem.scene.sensors()[problem.sensors[0]]
     problem.apply()

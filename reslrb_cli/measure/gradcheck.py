@@ -215,7 +215,8 @@ class Gradcheck:
 def _draws_plainly(config: Config) -> bool:
     """Whether paths are those of naive AD at equal seeds: it draws them by nothing that it learned, nor evenly."""
     options = config.integrator.options()
-    return options.get("guiding", "off") != "on" and options.get("sequence", "independent") == "independent"
+    usual = {"guiding": "off", "sequence": "independent", "paths": "light"}
+    return all(options.get(name, value) == value for name, value in usual.items())
 
 
 def _maps(ours: np.ndarray, reference: np.ndarray, shape: tuple[int, ...]) -> Maps | None:

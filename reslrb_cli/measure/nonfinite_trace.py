@@ -344,8 +344,8 @@ def _of_view(problem: Problem, iteration: int, view: View) -> Offender | None:
     if witness is not None:
         problem.integrator.preparation.draw_from(witness, problem.scene)
     step = _take_step(problem, view, step_seed)
-    if problem.config.integrator.type not in LIGHT_TRACERS:
-        return _of_step(step, view, None)
+    if problem.config.integrator.type not in LIGHT_TRACERS or problem.paths != "light":
+        return _of_step(step, view, None)  # camera paths are not looked at one by one
     if not is_attached(problem):
         _set_tangents(problem)
     pixel = None if step.refused is None else step.refused[:2]

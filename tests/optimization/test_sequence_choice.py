@@ -280,6 +280,7 @@ class Spent:
     def __init__(self, pilot: float | None, guided: float | None) -> None:
         self.pilot = None if pilot is None else SimpleNamespace(share=pilot)
         self.guided = None if guided is None else GuidedRecord(guided=True, share=guided)
+        self.sides = None
 
 
 @pytest.mark.parametrize("pilot", [None, 0.02, PILOT_SHARE - GUIDING_SHARE])

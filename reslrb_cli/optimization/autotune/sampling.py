@@ -97,7 +97,7 @@ def settle_sampling(tuner: race.Tuner) -> None:
     """
     config, plain, memory = tuner.problem.config, tuner.problem.integrator, tuner.problem.memory
     trials: list[StepTrial] = []  # what was measured on so far
-    if plain.paths == "camera":  # nothing begins at the emitters
+    if isinstance(plain, Tracer) and plain.paths == "camera":  # nothing begins at the emitters
         return
     if race.is_auto(config, "guiding"):
         guided = _guided(tuner, trials)
