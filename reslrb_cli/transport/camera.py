@@ -38,22 +38,27 @@ class FilmRay:
 
 
 def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
-    """A ray for each lane: as many in each pixel of the crop window, or one more."""
+    """A ray for each lane: as many in each pixel of the crop window, or one more; of fewer rays than pixels, each in a
+    random pixel of its own share of them."""
     plan, sensor, size = samples.plan, samples.sensor, samples.film.size
     n_pixels = int(dr.prod(size))
     lane = dr.arange(mi.UInt32, samples.width)
-    pixel = lane % n_pixels
     count = dr.opaque(mi.UInt32, samples.width)  # as a literal it would give every sample count a kernel of its own
-    per_pixel = mi.Float(count // n_pixels + dr.select(pixel < count % n_pixels, mi.UInt32(1), 0))
     time = sample_time(plan, sensor, sampler)
+    if samples.width < n_pixels:
+        per_pixel = mi.Float(count) / n_pixels
+        pixel = dr.minimum(mi.UInt32((mi.Float(lane) + sampler.next_1d()) / per_pixel), n_pixels - 1)
+    else:
+        pixel = lane % n_pixels
+        per_pixel = mi.Float(count // n_pixels + dr.select(pixel < count % n_pixels, mi.UInt32(1), 0))
     u = mi.Point2f(pixel % int(size[0]), pixel // int(size[0])) + _within_pixel(samples, lane, pixel, per_pixel)
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     ray, weight = sensor.sample_ray(time, 0.5, u / mi.Vector2f(size), aperture, True)
     near = mi.Float(0)
     if plan.weighs:
         near = mi.Float(mi.traverse(sensor)["near_clip"]) / dr.dot(ray.d, axis_of(sensor))
-    weight = weight * (samples.fraction * dr.rcp(dr.maximum(per_pixel, 1)))
-    return FilmRay(dr.detach(ray), u, dr.detach(weight), near, per_pixel > 0)
+    weight = weight * (samples.fraction * dr.rcp(per_pixel))
+    return FilmRay(dr.detach(ray), u, dr.detach(weight), near, mi.Bool(True))
 
 
 def _within_pixel(samples: Samples, lane: mi.UInt32, pixel: mi.UInt32, per_pixel: mi.Float) -> mi.Point2f:
