@@ -12,7 +12,7 @@ from runs.going_on import optimize
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble, assemble_scene
-from reslrb_cli.optimization.autotune.sampling import FIRST_SHARE, SHARES
+from reslrb_cli.optimization.autotune.sampling import FEWER, FIRST_SHARE, MORE
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.manifest import read_manifest
@@ -33,8 +33,7 @@ def decided(
     monkeypatch: pytest.MonkeyPatch, other_ms: float, *settings: str, cache: PilotCache | None = None
 ) -> Problem:
     """The problem, where steps of another share take so many times as long as those of the best so far."""
-    shares = [share for side in SHARES for share in side]
-    fix_times(monkeypatch, {f"paths {share:g}": other_ms for share in shares})
+    fix_times(monkeypatch, {f"paths {share:g}": other_ms for share in (*FEWER, *MORE)})
     return assemble(load("tiny.yaml", [*AUTO, *settings]), cache=cache)
 
 

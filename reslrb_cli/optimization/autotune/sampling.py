@@ -48,9 +48,9 @@ from reslrb_cli.statistics import Array
 ROUNDS, ROUNDS_OF_FEW, FEW_ENTRIES = 8, 16, 64
 #: A guided step, or one with low-discrepancy numbers, may take so many times as long as another.
 GUIDING_LONGER, SEQUENCE_LONGER = 3.0, 1.25
-#: The share of light paths that is begun with, and those that are tried then: fewer, as long as they are better; or
-#: more. Steps of another share may take so many times as long. A share is tried where so much of the time is left.
-FIRST_SHARE, SHARES, PATHS_LONGER, LEAST_TURNS = 0.5, ((0.2, 0.05, 0.0), (0.8, 0.95)), 2.0, 0.2
+#: The share of light paths that is begun with, and those that are tried then: fewer, as long as they are better; else
+#: more. Steps of another share may take so many times as long. One is tried where so much of the time is left for it.
+FIRST_SHARE, FEWER, MORE, PATHS_LONGER, LEAST_TURNS = 0.5, (0.2, 0.05, 0.0), (0.8, 0.95), 2.0, 0.1
 #: What of the share the rounds of the sequence are planned for; the first step takes a part too, and is no round.
 ROUNDS_SHARE = 0.8
 #: Views that are looked at, spread over those that are trained on, and values of each one's image.
@@ -212,33 +212,28 @@ def _paths(tuner: race.Tuner) -> PathsRecord:
     problem = tuner.problem
 
     def measure(allowance: Allowance) -> PathsRecord:
-        best, trials, records = FIRST_SHARE, list[StepTrial](), list[PathsRecord]()
+        best, records, trials = FIRST_SHARE, list[PathsRecord](), list[StepTrial]()
         left = min(race.PATHS_SHARE, allowance.iterations_left(race.PATHS_NEEDS[0]) / race.ITERATIONS)
 
-        def gains(share: float) -> bool:
-            """Whether this share is better than the best so far, which it is from then on if so."""
+        def climb(shares: Sequence[float]) -> None:
+            """Take these shares in turn, as long as each is better than what there is."""
             nonlocal best
-            spent = sum(record.share for record in records)
-            if left - spent < LEAST_TURNS * race.PATHS_SHARE:
-                return False
-            own, other = (_of_share(problem, value) for value in (best, share))
-            trials.append(StepTrial(problem, f"paths {share:g}", own, other, *trials[-1:]))
-            each = (left - spent) if share in (SHARES[0][-1], SHARES[1][-1]) else (left - spent) / 2
-            record = trials[-1].turns(PathsPilot, sizes(problem, PATHS_LONGER, planned(each)), each)
-            records.append(record)
-            if record.paths == "other":
-                best = share
-            return record.paths == "other"
-
-        for shares in SHARES:
-            alone = 0.0 in shares and not camera_finds_all(problem.scene)
             for share in shares:
-                if (alone and share == 0) or not gains(share):
-                    break
-            if best != FIRST_SHARE:
-                break
-        last = [record for record in records if record.paths == "other"] or records
-        kept = last[-1] if last else PathsRecord(paths="both", note="too little time to compare shares")
+                part = (left - sum(record.share for record in records)) / 2
+                if part < LEAST_TURNS * race.PATHS_SHARE:
+                    return
+                own, other = (_of_share(problem, value) for value in (best, share))
+                trials.append(StepTrial(problem, f"paths {share:g}", own, other, *trials[-1:]))
+                records.append(trials[-1].turns(PathsPilot, sizes(problem, PATHS_LONGER, planned(part)), part))
+                if records[-1].paths != "other":
+                    return
+                best = share
+
+        climb([share for share in FEWER if share or camera_finds_all(problem.scene)])
+        if best == FIRST_SHARE:
+            climb(MORE)
+        gained = [record for record in records if record.paths == "other"]
+        kept = (gained or records or [PathsRecord(paths="both", note="too little time to compare shares")])[-1]
         costs = {name: sum(getattr(each, name) for each in records) for name in ("measure_s", "compile_s", "share")}
         return replace(kept, paths="both" if best else "camera", light_share=best, **costs)
 
