@@ -36,15 +36,18 @@ def command(run: Path, overrides: tuple[str, ...], output: Path) -> None:
     check_folder(output)
     start_variant(config)
 
-    from reslrb_cli.optimization.loading import check_integrator, choose_sensors, load_configured
+    from reslrb_cli.optimization.loading import check_integrator, choose_sensors, load_configured, paths_of
+    from reslrb_cli.optimization.moving import moves_anything
     from reslrb_cli.scene.export import export_scene
     from reslrb_cli.scene.parameters import select_parameters
 
     described: list[Description] = []
     scene = load_configured(config, described.append)
-    check_integrator(config, config.integrator, scene, choose_sensors(config, scene))
-    selection = select_parameters(scene, config.parameters, config.source)
-    integrator, why = choose_integrator(config, scene, selection.params)
+    selection, sensors = select_parameters(scene, config.parameters, config.source), choose_sensors(config, scene)
+    moves = moves_anything(config, selection)
+    check_integrator(config, config.integrator, scene, sensors, moves)
+    paths = paths_of(config.integrator, scene, sensors, moves)
+    integrator, why = choose_integrator(config, scene, selection.params, paths)
     with writing("--output", output):
         export_scene(described[0], selection.params, selection.scene_keys, integrator, output, run)
     echo(f"{output / 'scene.xml'}: {', '.join(selection.keys)}; rendered by {integrator['type']}{why}")
@@ -56,17 +59,20 @@ def check_folder(path: Path) -> None:
         raise ConfigError("--output", "", f"{path} exists; name a folder that does not exist yet, or is empty")
 
 
-def choose_integrator(config: Config, scene: mi.Scene, params: mi.SceneParameters) -> tuple[dict[str, object], str]:
-    """Mitsuba's integrator whose image is that of the run's, as far as there is one; and why it is not the usual one.
+def choose_integrator(
+    config: Config, scene: mi.Scene, params: mi.SceneParameters, paths: str
+) -> tuple[dict[str, object], str]:
+    """Mitsuba's integrator whose image is that of the run's `paths` (`loading.paths_of`), as far as there is one; and
+    why it is not the usual one.
 
     Light paths are traced by `ptracer`, and where that is wrong by `path`, which also sees glass and mirrors.
     """
     from reslrb_cli.measure.references import DEEPEST, Situation, ptracer_image
-    from reslrb_cli.optimization.loading import LIGHT_TRACERS, choose_sensors
+    from reslrb_cli.optimization.loading import choose_sensors
 
     own = config.integrator.options()
     options: dict[str, object] = {name: own[name] for name in ("max_depth", "rr_depth", "hide_emitters") if name in own}
-    if config.integrator.type not in LIGHT_TRACERS:
+    if paths != "light":
         return {"type": "path", **options}, ""
     sensor = scene.sensors()[choose_sensors(config, scene)[0]]
     # Roulette, which that asks about, changes no image.

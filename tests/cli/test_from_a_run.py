@@ -187,11 +187,11 @@ def test_an_exported_scene_is_rendered_by_path_where_ptracer_is_wrong(tmp_path: 
     (tmp_path / "scene.xml").write_text(tiny.SCENE.replace("</scene>", sky))
     config = load(tmp_path / "tiny.yaml")
     scene = load_scene(config.scene.file)
-    integrator, why = choose_integrator(config, scene, mi.traverse(scene))
+    integrator, why = choose_integrator(config, scene, mi.traverse(scene), "light")
     assert integrator == {"type": "path", "max_depth": 3, "rr_depth": 5, "hide_emitters": False}
     assert why == ", since ptracer emits wrongly from a turned environment map"
     by_prb = load(tmp_path / "tiny.yaml", ["integrator={type: prb, max_depth: 4}"])
-    integrator, why = choose_integrator(by_prb, scene, mi.traverse(scene))
+    integrator, why = choose_integrator(by_prb, scene, mi.traverse(scene), "camera")
     assert (integrator["type"], integrator["max_depth"], why) == ("path", 4, "")
 
 
