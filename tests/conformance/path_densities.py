@@ -1,28 +1,26 @@
 """Weights of paths from both sides are ratios of densities, which are written down here a second time.
 
 Two walks note what they meet, and what weight the kernel gave each contribution. Of these vertices, and of the scene's
-own shapes and numbers, `Paths.densities` makes how many paths of each kind would find that very path: a camera path that
-meets the light (H), one whose last vertex samples it (N), a light path that connects to the sensor (L).
+own shapes and numbers, `Densities` makes how many paths of each kind would find that very path: a camera path that meets
+the light (H), one whose last vertex samples it (N), a light path that connects to the sensor (L).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
-import pytest
 
-from reslrb_cli.transport.camera import CameraHooks, camera_walk
+from reslrb_cli.transport.camera import CameraHooks
 from reslrb_cli.transport.connection import connect
 from reslrb_cli.transport.emission import sample_emission
-from reslrb_cli.transport.walk import Hooks, walk
-
-pytestmark = pytest.mark.usefixtures("llvm")
+from reslrb_cli.transport.walk import Hooks
 
 DEPTH = 6
-NEAR, GRAZING = 0.15, 0.02  # segments that are shorter, cosines that are smaller: left to rounding
+NEAR, GRAZING = 0.3, 0.02  # segments that are shorter, cosines that are smaller: left to rounding
 WAYS = ("H", "N", "L")
 
 
@@ -40,9 +38,6 @@ class Notes:
     """Buffers by field, and whether a vertex is there at all."""
 
     def __init__(self, samples: Any) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         self.samples, self.lanes = samples, samples.width
         self.buffers = {
             (name, k): dr.zeros(mi.Float, self.lanes * DEPTH) for name, n in FIELDS.items() for k in range(n)
@@ -50,9 +45,6 @@ class Notes:
         dr.make_opaque(self.buffers)
 
     def note(self, lane: Any, depth: Any, active: Any, **values: Any) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         for name, value in values.items():
             for k, one in enumerate([value] if FIELDS[name] == 1 else value):
                 if dr.is_mask_v(one):
@@ -62,9 +54,6 @@ class Notes:
     def event(self, vertex: Any, wo: Any, camera: bool) -> tuple[Any, Any, Any]:
         """Densities of a direction (local) of this walk, as camera and light paths have them, and whether light paths
         go there: as seen from both sides of the surface, its shading normals agree with its own."""
-        import drjit as dr
-        import mitsuba as mi
-
         si, bsdf = vertex.si, vertex.bsdf
         turned = mi.SurfaceInteraction3f(si)
         turned.wi = wo
@@ -81,8 +70,6 @@ class Notes:
         return f, b, ok
 
     def scattered(self, lane: Any, vertex: Any, scattering: Any, camera: bool) -> None:
-        import drjit as dr
-
         si, wo = vertex.si, scattering.wo
         f, b, ok = self.event(vertex, wo, camera)
         mirror = dr.norm(wo - type(wo)(-si.wi.x, -si.wi.y, si.wi.z))
@@ -91,8 +78,6 @@ class Notes:
 
     def taken(self) -> dict[str, np.ndarray]:
         """The fields, (lanes, DEPTH) or (lanes, DEPTH, n)."""
-        import drjit as dr
-
         dr.eval(self.buffers)
         found = {}
         for name, n in FIELDS.items():
@@ -103,9 +88,6 @@ class Notes:
 
 def number(emitter: Any) -> Any:
     """An emitter's number in Dr.Jit's registry."""
-    import drjit as dr
-    import mitsuba as mi
-
     return dr.reinterpret_array(mi.UInt32, emitter)
 
 
@@ -113,15 +95,12 @@ class CameraNotes(CameraHooks, Notes):
     """What camera paths meet."""
 
     def start(self, first: Any) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         return dr.arange(mi.UInt32, self.lanes)
 
     def vertex(self, lane: Any, vertex: Any, met: Any, event: Any, scattering: Any) -> Any:
         self.scattered(lane, vertex, scattering, True)
         if met is not None:
-            at = lane, vertex.depth, met.active
+            at = lane, vertex.depth, met.active & dr.any(met.Le > 0)
             self.note(*at, H=met.weight, H_id=number(met.emitter), H_n=met.si.n, H_uv=met.si.uv)
         if event is not None:
             ds, at = event.ds, (lane, vertex.depth, event.active)
@@ -135,9 +114,6 @@ class LightNotes(Hooks, Notes):
     """What light paths meet."""
 
     def start(self, product: Any) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         return dr.arange(mi.UInt32, self.lanes)
 
     def connection(self, lane: Any, vertex: Any, connection: Any, numbers: list[Any]) -> Any:
@@ -153,6 +129,40 @@ class LightNotes(Hooks, Notes):
         return lane
 
 
+@dataclass
+class Emission:
+    """Rays that left emitters, (lanes,) or (lanes, n): which, from where, normal and texture coordinates there, where to,
+    their weight, and what light of one wavelength there is along each, beside the cosine at a lamp."""
+
+    id: np.ndarray
+    z: np.ndarray
+    nz: np.ndarray
+    uv: np.ndarray
+    d: np.ndarray
+    weight: np.ndarray
+    light: np.ndarray
+
+    @staticmethod
+    def of(samples: Any) -> Emission:
+        """The rays of these light paths."""
+        e, scene = sample_emission(samples, samples.sampler()), samples.scene
+        ray, emitter = e.ray, e.emitter
+        # They begin a little off the lamp, above the point that was drawn.
+        above = scene.ray_intersect(mi.Ray3f(ray.o + 0.01 * ray.d, -ray.d))
+        si = scene.ray_intersect(mi.Ray3f(ray.o + 0.01 * above.n, -above.n), above.is_valid())
+        on_lamp = si.is_valid() & (si.t < 0.02) & (si.emitter(scene) == emitter)
+        z, nz, uv = (dr.select(on_lamp, a, b) for a, b in ((si.p, ray.o), (si.n, 0), (si.uv, 0)))
+        si.wi = dr.select(emitter.is_environment(), ray.d, si.to_local(ray.d))
+        light = emitter.eval(si, on_lamp | emitter.is_environment())
+        before = dr.zeros(mi.SurfaceInteraction3f, samples.width)
+        before.p = ray.o + ray.d
+        delta = mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
+        light += emitter.sample_direction(before, mi.Point2f(0.5), delta)[1]
+        values = number(emitter) + dr.zeros(mi.UInt32, samples.width), z, nz, uv, ray.d, e.weight[0], light[0]
+        dr.eval(values)
+        return Emission(*(np.array(value, np.float64).T for value in values))
+
+
 # Paths, from the sensor to the light, and their densities.
 
 
@@ -160,8 +170,8 @@ class LightNotes(Hooks, Notes):
 class Paths:
     """Paths that one way has found, (P,) or (P, DEPTH) from the sensor on, null events left out: `count` vertices.
 
-    `x`, `n`, `f`, `b`, `ok` are those of the fields, `delta` whether a vertex is; `d0` the direction of the first
-    segment. The last segment ends at `z` on an emitter (number `id`, normal `nz`, coordinates `uv`), and `d` is its
+    `x`, `n`, `f`, `b`, `ok` are those of the fields, `delta` whether a vertex is, `come` the direction of the segment
+    before it. The last segment ends at `z` on an emitter (number `id`, normal `nz`, coordinates `uv`), and `d` is its
     direction from the last vertex.
     """
 
@@ -174,19 +184,19 @@ class Paths:
     b: np.ndarray
     ok: np.ndarray
     delta: np.ndarray
-    d0: np.ndarray
+    come: np.ndarray
     id: np.ndarray
     z: np.ndarray
     nz: np.ndarray
     uv: np.ndarray
     d: np.ndarray
 
-    def pattern(self) -> list[tuple[bool, ...]]:
+    def patterns(self) -> list[tuple[bool, ...]]:
         """Which vertices are delta, of each path."""
         return [tuple(bool(x) for x in row[:m]) for row, m in zip(self.delta, self.count, strict=True)]
 
 
-def paths_of(way: str, notes: dict[str, np.ndarray], emission: dict[str, np.ndarray]) -> Paths:
+def paths_of(way: str, notes: dict[str, np.ndarray], emission: Emission | None = None) -> Paths:
     """The paths that ended in one way, of what their walk noted."""
     lane, last = np.nonzero(notes[way] > 0)
     index = np.arange(DEPTH)
@@ -204,20 +214,21 @@ def paths_of(way: str, notes: dict[str, np.ndarray], emission: dict[str, np.ndar
     count = (there & ~null).sum(1)
     x, n = (np.take_along_axis(own[name], keep[..., None], 1) for name in ("p", "n"))
     f, b, ok, delta = (np.take_along_axis(v, keep, 1) for v in (own["f"], own["b"], own["ok"], delta))
+    come = np.take_along_axis(own["come"], keep[..., None], 1)
     if way == "L":
-        d0, d = -notes["to"][lane, last], -emission["d"][lane]
-        ident, z, nz, uv = (emission[name][lane] for name in ("id", "p", "n", "uv"))
+        assert emission is not None
+        come = np.concatenate([-notes["to"][lane, last][:, None], -come[:, :-1]], 1)
+        d = -emission.d[lane]
+        ident, z, nz, uv = (values[lane] for values in (emission.id, emission.z, emission.nz, emission.uv))
     else:
-        d0, d = notes["come"][lane, 0], notes["to" if way == "N" else "come"][lane, last]
+        d = notes["to" if way == "N" else "come"][lane, last]
         ident, nz, uv = (notes[f"{way}_{name}"][lane, last] for name in ("id", "n", "uv"))
         z = notes["N_p" if way == "N" else "p"][lane, last]
-    return Paths(way, notes[way][lane, last], count, x, n, f, b, ok > 0, delta, d0, ident, z, nz, uv, d)
+    return Paths(way, notes[way][lane, last], count, x, n, f, b, ok > 0, delta, come, ident, z, nz, uv, d)
 
 
 def singular(own: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Which events are delta, and which pass straight through: by what the BSDF can do, and what came of it."""
-    import mitsuba as mi
-
     flags = own["flags"].astype(np.int64)
     straight = np.linalg.norm(own["go"] - own["come"], axis=-1) < 1e-4
     null = (flags & int(mi.BSDFFlags.Null) > 0) & straight
@@ -235,11 +246,11 @@ def cosine(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 class Densities:
-    """How many paths of each kind find a path: of one scene, seen by one sensor, with so many of them."""
+    """How many paths of each kind find a path: of one scene, seen by one sensor, with so many of them; `cutoff` and
+    `fov` are those of its spots and projectors, in degrees."""
 
-    def __init__(self, samples: Any) -> None:
-        import mitsuba as mi
-
+    def __init__(self, samples: Any, cutoff: float, fov: float) -> None:
+        self.cutoff, self.fov = np.radians(cutoff), np.radians(fov)
         self.samples, self.scene = samples, samples.scene
         sensor = samples.sensor
         crop = int(np.prod(sensor.film().crop_size()))
@@ -264,17 +275,15 @@ class Densities:
         rows, last = np.arange(len(paths.count)), paths.count - 1
         x_m, n_m = paths.x[rows, last], paths.n[rows, last]
         # From the aperture: the plane through the sensor's origin.
-        x_1, cos_axis = paths.x[:, 0], paths.d0 @ self.axis
+        x_1, cos, cos_axis = paths.x[:, 0], cosine(paths.n[:, 0], paths.come[:, 0]), paths.come[:, 0] @ self.axis
         d = (x_1 - self.origin) @ self.axis / cos_axis
-        begun = cosine(paths.n[:, 0], paths.d0) / d**2 / (self.pixel * cos_axis**3)
-        fit = (d > NEAR) & (cosine(paths.n[:, 0], paths.d0) > GRAZING)
+        begun = cos / d**2 / (self.pixel * cos_axis**3)
+        fit = (d > NEAR) & (cos > GRAZING)
         from_camera, from_light, sides = self.camera * begun, np.full(len(rows), float(self.light)), paths.ok[:, 0]
         for i in range(1, DEPTH):
             here = i < paths.count
-            step = paths.x[:, i] - paths.x[:, i - 1]
-            d = np.where(here, length(step), 1)
-            step = step / d[:, None]
-            cos, cos_before = cosine(paths.n[:, i], step), cosine(paths.n[:, i - 1], step)
+            d = np.where(here, length(paths.x[:, i] - paths.x[:, i - 1]), 1)
+            cos, cos_before = (cosine(paths.n[:, k], paths.come[:, i]) for k in (i, i - 1))
             f = np.where(paths.delta[:, i - 1], 1, paths.f[:, i - 1])
             b = np.where(paths.delta[:, i], 1, paths.b[:, i])
             from_camera = np.where(here, from_camera * f * cos / d**2, from_camera)
@@ -296,8 +305,6 @@ class Densities:
         """Of the light's end: `met` brings a density of directions to the measure that the others are of (area on
         lamps, solid angle of what surrounds, points), `sampled` is next event's density, `sent` that of the rays, with
         what brings it to the last vertex (but for the cosine there)."""
-        import mitsuba as mi
-
         z = np.zeros(len(x_m))
         result = {"met": z, "sampled": z, "sent": z, "near": z + 1, "cos": z + 1}
         for k, emitter in enumerate(self.scene.emitters()):
@@ -314,9 +321,6 @@ class Densities:
         self, emitter: Any, z: np.ndarray, nz: np.ndarray, uv: np.ndarray, d: np.ndarray, x: np.ndarray
     ) -> dict[str, Any]:
         """The same for one emitter, and its choice left out."""
-        import drjit as dr
-        import mitsuba as mi
-
         kind, far = emitter.class_name(), length(z - x)
         if kind == "ConstantBackgroundEmitter":
             return {"met": 1, "sampled": 1 / (4 * np.pi), "sent": self.disk / (4 * np.pi)}
@@ -324,7 +328,7 @@ class Densities:
             ds = dr.zeros(mi.DirectionSample3f)
             ds.d = mi.Vector3f(d.T.astype(np.float32))
             p = np.array(emitter.pdf_direction(dr.zeros(mi.Interaction3f), ds, True), np.float64)
-            evened = 0.8 * p + 0.2 / (4 * np.pi) if self.samples.plan.differentiate_emission else p
+            evened = 0.9 * p + 0.1 / (4 * np.pi) if self.samples.plan.differentiate_emission else p
             return {"met": 1, "sampled": p, "sent": evened * self.disk}
         if kind == "DirectionalEmitter":
             return {"met": 0, "sampled": 1, "sent": self.disk}
@@ -355,16 +359,14 @@ class Densities:
 
     def beam(self, emitter: Any, kind: str, d: np.ndarray) -> Any:
         """The density of directions of the rays of a light at a point."""
-        import mitsuba as mi
-
         params = mi.traverse(emitter)
         if kind == "PointLight":
             return 1 / (4 * np.pi)
         if kind == "SpotLight":
-            return 1 / (2 * np.pi * (1 - np.cos(np.radians(CUTOFF))))
+            return 1 / (2 * np.pi * (1 - np.cos(self.cutoff)))
         frame = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)[:3, :3]
         cos = d @ frame[:, 2]
-        half, texels = np.tan(np.radians(FOV) / 2), np.array(params["irradiance.data"], np.float64)
+        half, texels = np.tan(self.fov / 2), np.array(params["irradiance.data"], np.float64)
         picture = texels @ np.array([0.212671, 0.715160, 0.072169])
         rows, columns = picture.shape
         column = ((d @ frame[:, 0]) / cos / half * -0.5 + 0.5) * columns
@@ -372,5 +374,3 @@ class Densities:
         there = picture[row.astype(int).clip(0, rows - 1), column.astype(int).clip(0, columns - 1)]
         return there / picture.mean() / (4 * half**2 * rows / columns * cos**3)
 
-
-CUTOFF, FOV = 50.0, 70.0  # of spots and projectors, in degrees
