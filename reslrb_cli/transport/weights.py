@@ -133,7 +133,8 @@ def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission
         unseen = mi.Bool(False)
         sphere: list[mi.UInt32 | mi.Float] = []
         M = choice * own / (e * dr.maximum(cos, 1e-12))
-        spheres = [lamp for lamp in plan.needs.lamps if lamp.is_sphere and lamp.texture is None and not lamp.parallel]
+        spheres = [lamp for lamp in plan.needs.lamps if lamp.is_sphere and lamp.texture is None]
+        spheres = [lamp for lamp in spheres if not (lamp.parallel or lamp.surrounds)]
         if spheres:
             number = mi.UInt32(0)
             for lamp in spheres:

@@ -20,7 +20,9 @@ from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.walk import Hooks
 
 DEPTH = 6
-NEAR, GRAZING = 0.3, 0.02  # segments that are shorter, cosines that are smaller: left to rounding
+#: How far rays start off a surface, over its largest coordinate and 1; and how many times that, at a right angle, the
+#: segments are long whose weights are compared. Shorter ones are left to rounding, and so are smaller cosines.
+OFF, STEADY, GRAZING = 1500 * 2**-24, 400, 0.01
 WAYS = ("H", "N", "L")
 
 
@@ -278,7 +280,8 @@ class Densities:
         x_1, cos, cos_axis = paths.x[:, 0], cosine(paths.n[:, 0], paths.come[:, 0]), paths.come[:, 0] @ self.axis
         d = (x_1 - self.origin) @ self.axis / cos_axis
         begun = cos / d**2 / (self.pixel * cos_axis**3)
-        fit = (d > NEAR) & (cos > GRAZING)
+        least = STEADY * OFF * (1 + np.abs(paths.x).max())
+        fit = d * cos > least
         from_camera, from_light, sides = self.camera * begun, np.full(len(rows), float(self.light)), paths.ok[:, 0]
         for i in range(1, DEPTH):
             here = i < paths.count
@@ -289,11 +292,11 @@ class Densities:
             from_camera = np.where(here, from_camera * f * cos / d**2, from_camera)
             from_light = np.where(here, from_light * b * cos_before / d**2, from_light)
             sides = np.where(here, sides & paths.ok[:, i], sides)
-            fit &= ~here | (d > NEAR) & (cos > GRAZING) & (cos_before > GRAZING)
-        end = self.ends(paths, x_m)
+            fit &= ~here | (d * np.minimum(cos, cos_before) > least)
+        end = self.ends(paths, x_m, paths.d)
         cos = cosine(n_m, paths.d)
         f = np.where(paths.delta[rows, last], 1, paths.f[rows, last])
-        fit &= (end["near"] > NEAR) & (end["cos"] > GRAZING) & (cos > GRAZING)
+        fit &= (end["near"] * np.minimum(cos, end["cos"]) > least) & (cos > GRAZING)
         return {
             "H": from_camera * f * end["met"],
             "N": from_camera * end["sampled"] * ~paths.delta[rows, last],
@@ -301,16 +304,17 @@ class Densities:
             "fit": fit,
         }
 
-    def ends(self, paths: Paths, x_m: np.ndarray) -> dict[str, np.ndarray]:
-        """Of the light's end: `met` brings a density of directions to the measure that the others are of (area on
-        lamps, solid angle of what surrounds, points), `sampled` is next event's density, `sent` that of the rays, with
-        what brings it to the last vertex (but for the cosine there)."""
-        z = np.zeros(len(x_m))
-        result = {"met": z, "sampled": z, "sent": z, "near": z + 1, "cos": z + 1}
+    def ends(self, light: Paths | Emission, x: np.ndarray, d: np.ndarray) -> dict[str, np.ndarray]:
+        """Of the light's end, for vertices `x` from which it lies in the direction `d`: `met` brings a density of
+        directions to the measure that the others are of (area on lamps, solid angle of what surrounds, points),
+        `sampled` is next event's density, `sent` that of the rays, with what brings it to `x` (but for the cosine
+        there)."""
+        z = np.zeros(len(x))
+        result = {"met": z, "sampled": z, "sent": z, "near": z + np.inf, "cos": z + 1}
         for k, emitter in enumerate(self.scene.emitters()):
-            here = paths.id == int(number(mi.EmitterPtr(emitter))[0])
+            here = light.id == int(number(mi.EmitterPtr(emitter))[0])
             if here.any():
-                own = self.end(emitter, paths.z[here], paths.nz[here], paths.uv[here], paths.d[here], x_m[here])
+                own = self.end(emitter, light.z[here], light.nz[here], light.uv[here], d[here], x[here])
                 for name, value in own.items():
                     scale = self.choice[k] if name in ("sampled", "sent") else 1
                     result[name] = result[name].copy()
@@ -324,11 +328,11 @@ class Densities:
         kind, far = emitter.class_name(), length(z - x)
         if kind == "ConstantBackgroundEmitter":
             return {"met": 1, "sampled": 1 / (4 * np.pi), "sent": self.disk / (4 * np.pi)}
-        if kind == "EnvironmentMapEmitter":
+        if kind in ("EnvironmentMapEmitter", "SunskyEmitter"):
             ds = dr.zeros(mi.DirectionSample3f)
             ds.d = mi.Vector3f(d.T.astype(np.float32))
             p = np.array(emitter.pdf_direction(dr.zeros(mi.Interaction3f), ds, True), np.float64)
-            evened = 0.9 * p + 0.1 / (4 * np.pi) if self.samples.plan.differentiate_emission else p
+            evened = 0.9 * p + 0.1 / (4 * np.pi) if self.samples.plan.differentiate_emission and kind[0] == "E" else p
             return {"met": 1, "sampled": p, "sent": evened * self.disk}
         if kind == "DirectionalEmitter":
             return {"met": 0, "sampled": 1, "sent": self.disk}
@@ -338,7 +342,8 @@ class Densities:
         if kind != "AreaLight":
             return {"met": 0, "sampled": 1, "near": far, "sent": self.beam(emitter, kind, -d) / far**2}
         shape, cos = emitter.get_shape(), cosine(nz, d)
-        area, own, sampled = float(np.ravel(shape.surface_area())[0]), 1, 1
+        area = float(np.ravel(shape.surface_area())[0])  # of the unit square of texture coordinates, where these count
+        own = sampled = np.ones(len(x))
         if "radiance.data" in params:  # over texels of equal area
             texture = next(t for t in self.samples.plan.needs.lamps if t.emitter == emitter).texture
             si = dr.zeros(mi.SurfaceInteraction3f)
@@ -348,14 +353,14 @@ class Densities:
             sampled = own = luminance @ np.array(texture.eval(si), np.float64) / texels.mean()
             if self.samples.plan.evened_lamps:
                 own = 0.9 * own + 0.1
-        p_D = sampled / area
-        if shape.class_name() == "Sphere":  # the cone that holds it
+            area = area * {"Sphere": np.pi / 2 * np.sin(np.pi * uv[:, 1]), "Disk": 2 * uv[:, 0]}.get(shape.class_name(), 1)
+        elif shape.class_name() == "Sphere":  # the cone that holds it
             ball = shape.bbox()
             center, r = np.array(ball.center(), np.float64).ravel(), float(ball.extents().x) / 2
             outside = length(x - center)
             cone = 2 * np.pi * (1 - np.sqrt(1 - (r / np.maximum(outside, r)) ** 2))
-            p_D = np.where(outside > r * 1.001, cos / far**2 / np.maximum(cone, 1e-9), 1 / area)
-        return {"met": cos / far**2, "sampled": p_D, "sent": own / area * cos / np.pi / far**2, "near": far, "cos": cos}
+            sampled = np.where(outside > r * 1.001, cos / far**2 / np.maximum(cone, 1e-9) * area, 1)
+        return {"met": cos / far**2, "sampled": sampled / area, "sent": own / area * cos / np.pi / far**2, "near": far, "cos": cos}
 
     def beam(self, emitter: Any, kind: str, d: np.ndarray) -> Any:
         """The density of directions of the rays of a light at a point."""
