@@ -1,8 +1,8 @@
 """Weights of paths from both sides are ratios of densities, which are written down here a second time.
 
 Two walks note what they meet, and what weight the kernel gave each contribution. Of these vertices, and of the scene's
-own shapes and numbers, `Densities` makes how many paths of each kind would find that very path: a camera path that meets
-the light (H), one whose last vertex samples it (N), a light path that connects to the sensor (L).
+own shapes and numbers, `Densities` makes how many paths of each kind would find that very path: a camera path that
+meets the light (H), one whose last vertex samples it (N), a light path that connects to the sensor (L).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from reslrb_cli.transport.walk import Hooks
 DEPTH = 6
 #: How far rays start off a surface, over its largest coordinate and 1; and how many times that, at a right angle, the
 #: segments are long whose weights are compared. Shorter ones are left to rounding, and so are smaller cosines.
-OFF, STEADY, GRAZING = 1500 * 2**-24, 400, 0.01
+OFF, STEADY, GRAZING = 1500 * 2**-24, 500, 0.01
 WAYS = ("H", "N", "L")
 
 
@@ -133,8 +133,8 @@ class LightNotes(Hooks, Notes):
 
 @dataclass
 class Emission:
-    """Rays that left emitters, (lanes,) or (lanes, n): which, from where, normal and texture coordinates there, where to,
-    their weight, and what light of one wavelength there is along each, beside the cosine at a lamp."""
+    """Rays that left emitters, (lanes,) or (lanes, n): which, from where, normal and texture coordinates there, where
+    to, their weight, and what light of one channel there is along each, but for the cosine at a lamp."""
 
     id: np.ndarray
     z: np.ndarray
@@ -280,7 +280,7 @@ class Densities:
         x_1, cos, cos_axis = paths.x[:, 0], cosine(paths.n[:, 0], paths.come[:, 0]), paths.come[:, 0] @ self.axis
         d = (x_1 - self.origin) @ self.axis / cos_axis
         begun = cos / d**2 / (self.pixel * cos_axis**3)
-        least = STEADY * OFF * (1 + np.abs(paths.x).max())
+        least = STEADY * OFF * (1 + np.abs(paths.x).max(initial=0))
         fit = d * cos > least
         from_camera, from_light, sides = self.camera * begun, np.full(len(rows), float(self.light)), paths.ok[:, 0]
         for i in range(1, DEPTH):
@@ -310,7 +310,7 @@ class Densities:
         `sampled` is next event's density, `sent` that of the rays, with what brings it to `x` (but for the cosine
         there)."""
         z = np.zeros(len(x))
-        result = {"met": z, "sampled": z, "sent": z, "near": z + np.inf, "cos": z + 1}
+        result = {"met": z, "sampled": z, "sent": z, "near": z + 1e9, "cos": z + 1}
         for k, emitter in enumerate(self.scene.emitters()):
             here = light.id == int(number(mi.EmitterPtr(emitter))[0])
             if here.any():
@@ -342,7 +342,7 @@ class Densities:
         if kind != "AreaLight":
             return {"met": 0, "sampled": 1, "near": far, "sent": self.beam(emitter, kind, -d) / far**2}
         shape, cos = emitter.get_shape(), cosine(nz, d)
-        area = float(np.ravel(shape.surface_area())[0])  # of the unit square of texture coordinates, where these count
+        area = float(np.ravel(shape.surface_area())[0])  # for each unit of texture coordinates, where these count
         own = sampled = np.ones(len(x))
         if "radiance.data" in params:  # over texels of equal area
             texture = next(t for t in self.samples.plan.needs.lamps if t.emitter == emitter).texture
@@ -353,14 +353,16 @@ class Densities:
             sampled = own = luminance @ np.array(texture.eval(si), np.float64) / texels.mean()
             if self.samples.plan.evened_lamps:
                 own = 0.9 * own + 0.1
-            area = area * {"Sphere": np.pi / 2 * np.sin(np.pi * uv[:, 1]), "Disk": 2 * uv[:, 0]}.get(shape.class_name(), 1)
+            stretch = {"Sphere": np.pi / 2 * np.sin(np.pi * uv[:, 1]), "Disk": 2 * uv[:, 0]}
+            area = np.maximum(area * stretch.get(shape.class_name(), np.ones(len(x))), 1e-9)
         elif shape.class_name() == "Sphere":  # the cone that holds it
             ball = shape.bbox()
             center, r = np.array(ball.center(), np.float64).ravel(), float(ball.extents().x) / 2
             outside = length(x - center)
             cone = 2 * np.pi * (1 - np.sqrt(1 - (r / np.maximum(outside, r)) ** 2))
             sampled = np.where(outside > r * 1.001, cos / far**2 / np.maximum(cone, 1e-9) * area, 1)
-        return {"met": cos / far**2, "sampled": sampled / area, "sent": own / area * cos / np.pi / far**2, "near": far, "cos": cos}
+        sent = own / area * cos / np.pi / far**2
+        return {"met": cos / far**2, "sampled": sampled / area, "sent": sent, "near": far, "cos": cos}
 
     def beam(self, emitter: Any, kind: str, d: np.ndarray) -> Any:
         """The density of directions of the rays of a light at a point."""
@@ -378,4 +380,3 @@ class Densities:
         row = ((d @ frame[:, 1]) / cos / (half * rows / columns) * -0.5 + 0.5) * rows
         there = picture[row.astype(int).clip(0, rows - 1), column.astype(int).clip(0, columns - 1)]
         return there / picture.mean() / (4 * half**2 * rows / columns * cos**3)
-
