@@ -48,25 +48,22 @@ class Rivals:
     loop state.
 
     `sphere` holds, where any lamp is a sphere (whose p_D depends on the vertex), the number of the shape that the path
-    comes from, 0 for others, and the cosine at which it left.
+    comes from, 0 for others.
     """
 
     M: mi.Float
     V: mi.Float
     distance: mi.Float
-    sphere: list[mi.UInt32 | mi.Float] = field(default_factory=list)
+    sphere: list[mi.UInt32] = field(default_factory=list)
 
-    def arrive(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, near: mi.Float | float = 0) -> Rivals:
-        """Those at the vertex `si`, which `ray` reaches; `near` is how far before its origin the segment began."""
-        d = self.distance + si.t + near
+    def arrive(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> Rivals:
+        """Those at the vertex `si`, which `ray` reaches."""
+        d = self.distance + si.t
         cos = dr.maximum(dr.abs(dr.dot(si.n, ray.d)), 1e-12)
         M = self.M * dr.select(d < 0, 1, dr.square(d)) / cos
-        if self.sphere:
-            number, left = self.sphere
+        for number in self.sphere:  # one, or none
             ds = dr.zeros(mi.DirectionSample3f)
-            ds.d, ds.dist = -ray.d, d
-            ds.p = dr.fma(ds.d, d, si.p)
-            ds.n = mi.Normal3f(ds.d * left)  # as far as its density goes by the angle there
+            ds.d, ds.dist, ds.n = -ray.d, d, mi.Normal3f(ray.d)  # the cone of directions is the same for all of them
             shape = dr.reinterpret_array(mi.ShapePtr, number)
             p_D = shape.pdf_direction(si, ds, number != 0)
             M = dr.select(number != 0, self.M * p_D / cos, M)
@@ -80,7 +77,7 @@ class Rivals:
         """Those behind an event at which they arrived: M is `renewed` by a smooth one, and V made of `joined`."""
         p, is_delta = scattering.ways.p, scattering.is_delta
         V = dr.select(is_delta, self.V * cos, dr.select(joined > 0, cos / p * joined, 0))
-        sphere = [mi.UInt32(0), mi.Float(0)] if self.sphere else []
+        sphere = [mi.UInt32(0) for _ in self.sphere]
         return Rivals(dr.select(is_delta, 0, renewed), V, mi.Float(0), sphere)
 
 
@@ -131,7 +128,7 @@ def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission
         )
         e = density_of_rays(plan, table, Place(emitter, own, uv, ray.d), mi.Bool(True))
         unseen = mi.Bool(False)
-        sphere: list[mi.UInt32 | mi.Float] = []
+        sphere = []
         M = choice * own / (e * dr.maximum(cos, 1e-12))
         spheres = [lamp for lamp in plan.needs.lamps if lamp.is_sphere and lamp.texture is None]
         spheres = [lamp for lamp in spheres if not (lamp.parallel or lamp.surrounds)]
@@ -140,7 +137,7 @@ def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission
             for lamp in spheres:
                 shape = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(lamp.shape))
                 number = dr.select(emitter == mi.EmitterPtr(lamp.emitter), shape, number)
-            sphere, M = [number, cos], dr.select(number != 0, choice / e, M)
+            sphere, M = [number], dr.select(number != 0, choice / e, M)
         for lamp in plan.needs.lamps:
             if lamp.parallel:
                 unseen |= emitter == mi.EmitterPtr(lamp.emitter)

@@ -42,7 +42,9 @@ class Notes:
     def __init__(self, samples: Any) -> None:
         self.samples, self.lanes = samples, samples.width
         self.buffers = {
-            (name, k): dr.zeros(mi.Float, self.lanes * DEPTH) for name, n in FIELDS.items() for k in range(n)
+            (name, k): dr.full(mi.Float, -1 if name in WAYS else 0, self.lanes * DEPTH)
+            for name, n in FIELDS.items()
+            for k in range(n)
         }
         dr.make_opaque(self.buffers)
 
@@ -88,8 +90,13 @@ class Notes:
         return found
 
 
+def emitter_number(emitter: Any) -> int:
+    """One emitter's."""
+    return int(number(mi.EmitterPtr(emitter))[0])
+
+
 def number(emitter: Any) -> Any:
-    """An emitter's number in Dr.Jit's registry."""
+    """Emitters' numbers in Dr.Jit's registry."""
     return dr.reinterpret_array(mi.UInt32, emitter)
 
 
@@ -200,7 +207,7 @@ class Paths:
 
 def paths_of(way: str, notes: dict[str, np.ndarray], emission: Emission | None = None) -> Paths:
     """The paths that ended in one way, of what their walk noted."""
-    lane, last = np.nonzero(notes[way] > 0)
+    lane, last = np.nonzero(notes[way] >= 0)
     index = np.arange(DEPTH)
     length = last if way == "H" else last + 1
     order = last[:, None] - index if way == "L" else np.broadcast_to(index, (len(lane), DEPTH))  # of the walk
@@ -251,12 +258,13 @@ class Densities:
     """How many paths of each kind find a path: of one scene, seen by one sensor, with so many of them; `cutoff` and
     `fov` are those of its spots and projectors, in degrees."""
 
-    def __init__(self, samples: Any, cutoff: float, fov: float) -> None:
+    def __init__(self, samples: Any, camera: Any, cutoff: float, fov: float) -> None:
         self.cutoff, self.fov = np.radians(cutoff), np.radians(fov)
         self.samples, self.scene = samples, samples.scene
         sensor = samples.sensor
         crop = int(np.prod(sensor.film().crop_size()))
-        self.light, self.camera = samples.width, samples.camera.width / crop  # the latter in each pixel
+        # The latter in each pixel.
+        self.light, self.camera = samples.width if samples is not camera else 0, camera.width / crop
         params = mi.traverse(sensor)
         to_world = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)
         self.axis = to_world[:3, 2] / length(to_world[:3, 2])
@@ -312,7 +320,7 @@ class Densities:
         z = np.zeros(len(x))
         result = {"met": z, "sampled": z, "sent": z, "near": z + 1e9, "cos": z + 1}
         for k, emitter in enumerate(self.scene.emitters()):
-            here = light.id == int(number(mi.EmitterPtr(emitter))[0])
+            here = light.id == emitter_number(emitter)
             if here.any():
                 own = self.end(emitter, light.z[here], light.nz[here], light.uv[here], d[here], x[here])
                 for name, value in own.items():
