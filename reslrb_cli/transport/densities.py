@@ -81,7 +81,7 @@ def _cosine_of_cutoff(spot: mi.Emitter) -> float:
     rim = mi.Point2f(1 - 1e-7, 0.5)  # the end of the unit disk; it is the numbers of the place that it takes
     axis = np.ravel(mi.traverse(spot)["to_world"] @ mi.Vector3f(0, 0, 1))
     d = np.ravel(spot.sample_ray(0, 0.5, rim, rim, True)[0].d)
-    return min(float(axis @ d / np.linalg.norm(axis)), 1 - 1e-7)
+    return min(float(axis @ d / (np.linalg.norm(axis) * np.linalg.norm(d))), 1 - 1e-7)
 
 
 def _projected_area(projector: mi.Emitter) -> float:

@@ -114,19 +114,21 @@ def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission
             ds = dr.zeros(mi.DirectionSample3f)
             ds.d = -d
             return self.pdf_direction(dr.zeros(mi.Interaction3f), ds, active), one, mi.Point2f(0), one, far
+        # Directions are as long as a `to_world` makes them; up to the first vertex, distances are in units of that.
+        distant = self.class_name() == "DirectionalEmitter"
+        scaled = dr.norm(d) if distant else dr.norm(d) ** 3
         if self.class_name() == "Projector":
             si = dr.zeros(mi.SurfaceInteraction3f)
             si.p = o + d
-            return one, one, self.sample_direction(si, mi.Point2f(0.5), active)[0].uv, zero, zero
-        distant = self.class_name() == "DirectionalEmitter"
-        return one, one, mi.Point2f(0), zero, far if distant else zero
+            return scaled, one, self.sample_direction(si, mi.Point2f(0.5), active)[0].uv, zero, zero
+        return scaled, one, mi.Point2f(0), zero, far if distant else zero
 
     far = mi.Float(FROM_INFINITY)
     with dr.suspend_grad():
         own, cos, uv, surface, distance = dr.dispatch(
             emitter, leave, ray.time, emission.position, ray.o, ray.d, mi.Bool(True)
         )
-        e = density_of_rays(plan, table, Place(emitter, own, uv, ray.d), mi.Bool(True))
+        e = density_of_rays(plan, table, Place(emitter, own, uv, dr.normalize(ray.d)), mi.Bool(True))
         unseen = mi.Bool(False)
         sphere = []
         M = choice * own / (e * dr.maximum(cos, 1e-12))

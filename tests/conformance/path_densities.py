@@ -167,7 +167,7 @@ class Emission:
         before.p = ray.o + ray.d
         delta = mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
         light += emitter.sample_direction(before, mi.Point2f(0.5), delta)[1]
-        values = number(emitter) + dr.zeros(mi.UInt32, samples.width), z, nz, uv, ray.d, e.weight[0], light[0]
+        values = number(emitter) + dr.zeros(mi.UInt32, samples.width), z, nz, uv, dr.normalize(ray.d), e.weight[0], light[0]
         dr.eval(values)
         return Emission(*(np.array(value, np.float64).T for value in values))
 
@@ -380,6 +380,7 @@ class Densities:
         if kind == "SpotLight":
             return 1 / (2 * np.pi * (1 - np.cos(self.cutoff)))
         frame = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)[:3, :3]
+        frame = frame / length(frame.T)
         cos = d @ frame[:, 2]
         half, texels = np.tan(self.fov / 2), np.array(params["irradiance.data"], np.float64)
         picture = texels @ np.array([0.212671, 0.715160, 0.072169])
