@@ -167,7 +167,8 @@ class Emission:
         before.p = ray.o + ray.d
         delta = mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
         light += emitter.sample_direction(before, mi.Point2f(0.5), delta)[1]
-        values = number(emitter) + dr.zeros(mi.UInt32, samples.width), z, nz, uv, dr.normalize(ray.d), e.weight[0], light[0]
+        which, d = number(emitter) + dr.zeros(mi.UInt32, samples.width), dr.normalize(ray.d)
+        values = which, z, nz, uv, d, e.weight[0], light[0]
         dr.eval(values)
         return Emission(*(np.array(value, np.float64).T for value in values))
 

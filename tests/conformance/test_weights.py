@@ -126,12 +126,14 @@ EMITTERS: dict[str, Callable[[], Any]] = {
     "disk": lambda: {"type": "disk", "to_world": place(-1.2, 3.2, -0.5, rotate=([1, 0, 0], 70), scale=0.4),
                      "emitter": glow()},
     "sphere": lambda: ball(WHITE, (1.3, 3, -1), 0.35) | {"emitter": glow()},
+    "cylinder": lambda: {"type": "cylinder", "p0": [-1, 3, 0], "p1": [1, 3, 0.3], "radius": 0.2, "emitter": glow()},
     "mesh": lambda: sheet(MESH, emitter=glow()),
     "textured": lambda: lamp(glow(texels(3, 4))),
     "textured_mesh": lambda: sheet(MESH, emitter=glow(texels(4, 2))),
     "point": lambda: {"type": "point", "position": [1, 3, 1], "intensity": rgb(9, 9, 9)},
     "spot": lambda: {"type": "spot", "to_world": looking([-1, 3, 1.5], [0, 1, -1]), "cutoff_angle": CUTOFF,
                      "intensity": rgb(20, 20, 20)},
+    "scaled_spot": lambda: EMITTERS["spot"]() | {"to_world": looking([-1, 3, 1.5], [0, 1, -1]).scale(2)},
     "projector": lambda: {"type": "projector", "to_world": looking([1, 2.5, 2], [0, 1, -1]), "fov": FOV,
                           "irradiance": texels(3, 4)},
     "directional": lambda: {"type": "directional", "direction": [0.3, -0.5, -1], "irradiance": rgb(2, 2, 2)},
@@ -328,7 +330,10 @@ def test_every_pattern_of_delta_vertices_is_there():
 
 @pytest.mark.parametrize(
     "name",
-    a_few([n for n in CASES if n not in ("guided", "camera")], ["lamps", "evened", "masks", "envmap", "only_constant"]),
+    a_few(
+        [n for n in CASES if n not in ("guided", "camera", "only_scaled_spot")],
+        ["lamps", "evened", "masks", "envmap", "only_constant"],
+    ),
 )
 def test_the_density_of_rays_is_that_of_those_that_are_sampled(name: str):
     """Which a ray's weight tells: it is the light along it, times the cosine at a lamp, over that density."""
