@@ -128,6 +128,12 @@ class Lamp:
         return self.shape.class_name() == "Sphere"
 
     @cached_property
+    def surrounds(self) -> bool:
+        """Whether it is a sphere that shines inwards, evenly. Mitsuba draws its points evenly over it, and takes their
+        density for that of a cone where rounding has the vertex outside: all those that lie on it."""
+        return self.is_sphere and self.texture is None and not self.parallel and self.shape.has_flipped_normals()
+
+    @cached_property
     def faces_by_area(self) -> bool:
         """Whether one of its faces is drawn in proportion to its area, as Mitsuba has it now."""
         return self.has_faces and self.texture is None

@@ -302,6 +302,11 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
         ds = mi.DirectionSample3f(scene, si, reference)
         indirect = active & ~direct
         p_D = scene.pdf_emitter_direction(reference, ds, indirect)
+        for lamp in plan.needs.lamps:
+            if lamp.surrounds:
+                even = dr.square(ds.dist) / (dr.abs(dr.dot(ds.n, ds.d)) * lamp.shape.surface_area())
+                here = indirect & (emitter == mi.EmitterPtr(lamp.emitter))
+                p_D = dr.select(here, scene.pdf_emitter(mi.UInt32(lamp.index)) * even, p_D)
         if not path.rivals:
             rivals = p_D * path.M[0]
         else:

@@ -78,10 +78,10 @@ def _ray_density(plan: Plan, emitter: mi.Emitter, lamp: Lamp | None, surrounds: 
 
 def _cosine_of_cutoff(spot: mi.Emitter) -> float:
     """The cosine of the angle at which the cone ends that a spot's rays are drawn from; its plugin does not tell it."""
-    place, rim = mi.Point2f(0.5), mi.Point2f(1 - 1e-7, 0.5)  # the end of the unit disk
+    rim = mi.Point2f(1 - 1e-7, 0.5)  # the end of the unit disk; it is the numbers of the place that it takes
     axis = np.ravel(mi.traverse(spot)["to_world"] @ mi.Vector3f(0, 0, 1))
-    d = np.ravel(spot.sample_ray(0, 0.5, place, rim, True)[0].d)
-    return min(float(axis @ d / np.linalg.norm(axis)), 1 - 1e-7)
+    d = np.ravel(spot.sample_ray(0, 0.5, rim, rim, True)[0].d)
+    return min(float(axis @ d / (np.linalg.norm(axis) * np.linalg.norm(d))), 1 - 1e-7)
 
 
 def _projected_area(projector: mi.Emitter) -> float:

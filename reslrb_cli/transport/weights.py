@@ -48,25 +48,22 @@ class Rivals:
     loop state.
 
     `sphere` holds, where any lamp is a sphere (whose p_D depends on the vertex), the number of the shape that the path
-    comes from, 0 for others, and the cosine at which it left.
+    comes from, 0 for others.
     """
 
     M: mi.Float
     V: mi.Float
     distance: mi.Float
-    sphere: list[mi.UInt32 | mi.Float] = field(default_factory=list)
+    sphere: list[mi.UInt32] = field(default_factory=list)
 
-    def arrive(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, near: mi.Float | float = 0) -> Rivals:
-        """Those at the vertex `si`, which `ray` reaches; `near` is how far before its origin the segment began."""
-        d = self.distance + si.t + near
+    def arrive(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> Rivals:
+        """Those at the vertex `si`, which `ray` reaches."""
+        d = self.distance + si.t
         cos = dr.maximum(dr.abs(dr.dot(si.n, ray.d)), 1e-12)
         M = self.M * dr.select(d < 0, 1, dr.square(d)) / cos
-        if self.sphere:
-            number, left = self.sphere
+        for number in self.sphere:  # one, or none
             ds = dr.zeros(mi.DirectionSample3f)
-            ds.d, ds.dist = -ray.d, d
-            ds.p = dr.fma(ds.d, d, si.p)
-            ds.n = mi.Normal3f(ds.d * left)  # as far as its density goes by the angle there
+            ds.d, ds.dist, ds.n = -ray.d, d, mi.Normal3f(ray.d)  # the cone of directions is the same for all of them
             shape = dr.reinterpret_array(mi.ShapePtr, number)
             p_D = shape.pdf_direction(si, ds, number != 0)
             M = dr.select(number != 0, self.M * p_D / cos, M)
@@ -80,7 +77,7 @@ class Rivals:
         """Those behind an event at which they arrived: M is `renewed` by a smooth one, and V made of `joined`."""
         p, is_delta = scattering.ways.p, scattering.is_delta
         V = dr.select(is_delta, self.V * cos, dr.select(joined > 0, cos / p * joined, 0))
-        sphere = [mi.UInt32(0), mi.Float(0)] if self.sphere else []
+        sphere = [mi.UInt32(0) for _ in self.sphere]
         return Rivals(dr.select(is_delta, 0, renewed), V, mi.Float(0), sphere)
 
 
@@ -117,29 +114,32 @@ def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission
             ds = dr.zeros(mi.DirectionSample3f)
             ds.d = -d
             return self.pdf_direction(dr.zeros(mi.Interaction3f), ds, active), one, mi.Point2f(0), one, far
+        # Directions are as long as a `to_world` makes them; up to the first vertex, distances are in units of that.
+        distant = self.class_name() == "DirectionalEmitter"
+        scaled = dr.norm(d) if distant else dr.norm(d) ** 3
         if self.class_name() == "Projector":
             si = dr.zeros(mi.SurfaceInteraction3f)
             si.p = o + d
-            return one, one, self.sample_direction(si, mi.Point2f(0.5), active)[0].uv, zero, zero
-        distant = self.class_name() == "DirectionalEmitter"
-        return one, one, mi.Point2f(0), zero, far if distant else zero
+            return scaled, one, self.sample_direction(si, mi.Point2f(0.5), active)[0].uv, zero, zero
+        return scaled, one, mi.Point2f(0), zero, far if distant else zero
 
     far = mi.Float(FROM_INFINITY)
     with dr.suspend_grad():
         own, cos, uv, surface, distance = dr.dispatch(
             emitter, leave, ray.time, emission.position, ray.o, ray.d, mi.Bool(True)
         )
-        e = density_of_rays(plan, table, Place(emitter, own, uv, ray.d), mi.Bool(True))
+        e = density_of_rays(plan, table, Place(emitter, own, uv, dr.normalize(ray.d)), mi.Bool(True))
         unseen = mi.Bool(False)
-        sphere: list[mi.UInt32 | mi.Float] = []
+        sphere = []
         M = choice * own / (e * dr.maximum(cos, 1e-12))
-        spheres = [lamp for lamp in plan.needs.lamps if lamp.is_sphere and lamp.texture is None and not lamp.parallel]
+        spheres = [lamp for lamp in plan.needs.lamps if lamp.is_sphere and lamp.texture is None]
+        spheres = [lamp for lamp in spheres if not (lamp.parallel or lamp.surrounds)]
         if spheres:
             number = mi.UInt32(0)
             for lamp in spheres:
                 shape = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(lamp.shape))
                 number = dr.select(emitter == mi.EmitterPtr(lamp.emitter), shape, number)
-            sphere, M = [number, cos], dr.select(number != 0, choice / e, M)
+            sphere, M = [number], dr.select(number != 0, choice / e, M)
         for lamp in plan.needs.lamps:
             if lamp.parallel:
                 unseen |= emitter == mi.EmitterPtr(lamp.emitter)

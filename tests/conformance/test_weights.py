@@ -1,0 +1,448 @@
+"""Weights of paths from both sides: those that the kernels used are ratios of explicit densities."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+from measure.faults import Fault
+from measure.test_mutations import plant
+from turns import a_few
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+
+# Scenes: a room of 4 by 4 by 4 that is open in front and above, seen from there.
+
+
+def place(*translate: float, scale: Any = 1, rotate: Any = None) -> Any:
+    import mitsuba as mi
+
+    result = mi.ScalarTransform4f().translate(list(translate))
+    return (result if rotate is None else result.rotate(*rotate)).scale(scale)
+
+
+def turned(axis: list[float], angle: float) -> Any:
+    return place(0, 0, 0, rotate=(axis, angle))
+
+
+def looking(origin: Any, target: Any) -> Any:
+    import mitsuba as mi
+
+    return mi.ScalarTransform4f().look_at(list(origin), list(target), [0, 1, 0])
+
+
+def rgb(*value: float) -> dict[str, Any]:
+    return {"type": "rgb", "value": list(value)}
+
+
+def texels(height: int, width: int) -> dict[str, Any]:
+    import mitsuba as mi
+
+    data = np.random.default_rng(3).uniform(0.4, 20, (height, width, 3)).astype(np.float32)
+    return {"type": "bitmap", "data": mi.TensorXf(data), "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
+
+
+def bitmap(height: int, width: int, channels: int = 3) -> Any:
+    import mitsuba as mi
+
+    return mi.Bitmap(np.random.default_rng(4).random((height, width, channels)).astype(np.float32) ** 3 + 0.01)
+
+
+WHITE = {"type": "diffuse", "reflectance": rgb(0.8, 0.7, 0.6)}
+MIRROR, GLASS, ROUGH_GLASS = {"type": "conductor"}, {"type": "dielectric"}, {"type": "roughdielectric", "alpha": 0.3}
+#: Half of its events are delta.
+HALF = {"type": "blendbsdf", "weight": 0.5, "a": WHITE, "b": MIRROR}
+VEIL = {"type": "mask", "opacity": 0.4, "bsdf": WHITE}
+PLASTIC = {"type": "plastic", "int_ior": 3.0, "diffuse_reflectance": rgb(0.8, 0.8, 0.8)}
+ROUGH = {"type": "roughconductor", "alpha": 0.3}
+
+
+def bumpy() -> dict[str, Any]:
+    """A rough conductor whose normals are perturbed."""
+    return {"type": "bumpmap", "texture": {"type": "bitmap", "bitmap": bitmap(8, 8, 1), "raw": True}, "scale": 0.3,
+            "bsdf": ROUGH}  # fmt: skip
+
+
+def ball(bsdf: Any, center: Any = (0.8, 0.7, 0.3), radius: float = 0.6) -> dict[str, Any]:
+    return {"type": "sphere", "center": list(center), "radius": radius, "bsdf": bsdf}
+
+
+def plate(bsdf: Any, *at: float, scale: Any = 2, rotate: Any = None) -> dict[str, Any]:
+    return {"type": "rectangle", "bsdf": bsdf, "to_world": place(*at, scale=scale, rotate=rotate)}
+
+
+def sheet(at: Any, bsdf: Any = WHITE, emitter: Any = None, leaning: float = 0, size: float = 0.6) -> Any:
+    """A mesh of two faces that faces down; its vertices' normals are `leaning` outwards, if any."""
+    import mitsuba as mi
+
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(bsdf)
+    if emitter is not None:
+        properties["emitter"] = mi.load_dict(emitter)
+    mesh = mi.Mesh("sheet", 4, 2, has_vertex_normals=leaning > 0, has_vertex_texcoords=True, props=properties)
+    params, corner = mi.traverse(mesh), np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    own = np.insert(corner * size, 1, 0, axis=1)
+    params["vertex_positions"] = (own + np.array(at)).astype(np.float32).ravel()
+    if leaning > 0:
+        normals = np.insert((corner - 0.5) * leaning, 1, -1, axis=1)
+        params["vertex_normals"] = (normals / np.linalg.norm(normals, axis=1)[:, None]).astype(np.float32).ravel()
+    params["vertex_texcoords"], params["faces"] = corner.ravel(), np.array([0, 1, 2, 0, 2, 3], np.uint32)
+    params.update()
+    return mesh
+
+
+def room(lights: dict[str, Any], sensor: Any = None, film: Any = None, walls: Any = WHITE, **things: Any) -> Any:
+    """The scene; of these BSDF are the floor and the wall behind, that to the left is white."""
+    import mitsuba as mi
+
+    size = {"type": "hdrfilm", "width": 16, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    view = {"type": "perspective", "fov": 50.0, "near_clip": 0.1, "to_world": looking([0.5, 2.2, 7], [0, 1.8, 0])}
+    return mi.load_dict({
+        "type": "scene", "sensor": view | (sensor or {}) | {"film": size | (film or {})},
+        "floor": plate(walls, 0, 0, 0, rotate=([1, 0, 0], -90)), "back": plate(walls, 0, 2, -2),
+        "left": plate(WHITE, -2, 2, 0, rotate=([0, 1, 0], 90)), **things, **lights,
+    }, optimize=False)  # fmt: skip
+
+
+def glow(radiance: Any = None, kind: str = "area") -> dict[str, Any]:
+    return {"type": kind, "radiance": radiance or rgb(8, 7, 6)}
+
+
+def lamp(emitter: Any = None) -> dict[str, Any]:
+    """A rectangle that shines down."""
+    return plate(WHITE, 0.4, 3.9, 0.2, rotate=([1, 0, 0], 90), scale=[0.5, 0.4, 1]) | {"emitter": emitter or glow()}
+
+
+CUTOFF, FOV = 50.0, 70.0  # of the spot and the projector, in degrees
+MESH = (-0.8, 3.4, 0.6)
+EMITTERS: dict[str, Callable[[], Any]] = {
+    "rectangle": lamp,
+    "disk": lambda: {"type": "disk", "to_world": place(-1.2, 3.2, -0.5, rotate=([1, 0, 0], 70), scale=0.4),
+                     "emitter": glow()},
+    "sphere": lambda: ball(WHITE, (1.3, 3, -1), 0.35) | {"emitter": glow()},
+    "cylinder": lambda: {"type": "cylinder", "p0": [-1, 3, 0], "p1": [1, 3, 0.3], "radius": 0.2, "emitter": glow()},
+    "mesh": lambda: sheet(MESH, emitter=glow()),
+    "textured": lambda: lamp(glow(texels(3, 4))),
+    "textured_mesh": lambda: sheet(MESH, emitter=glow(texels(4, 2))),
+    "point": lambda: {"type": "point", "position": [1, 3, 1], "intensity": rgb(9, 9, 9)},
+    "spot": lambda: {"type": "spot", "to_world": looking([-1, 3, 1.5], [0, 1, -1]), "cutoff_angle": CUTOFF,
+                     "intensity": rgb(20, 20, 20)},
+    "scaled_spot": lambda: EMITTERS["spot"]() | {"to_world": looking([-1, 3, 1.5], [0, 1, -1]).scale(2)},
+    "projector": lambda: {"type": "projector", "to_world": looking([1, 2.5, 2], [0, 1, -1]), "fov": FOV,
+                          "irradiance": texels(3, 4)},
+    "directional": lambda: {"type": "directional", "direction": [0.3, -0.5, -1], "irradiance": rgb(2, 2, 2)},
+    "constant": lambda: {"type": "constant", "radiance": rgb(0.5, 0.6, 0.7)},
+    "envmap": lambda: {"type": "envmap", "bitmap": bitmap(8, 16), "to_world": turned([0.6, 0, 0.8], 70)},
+    "inside": lambda: ball(WHITE, (0, 2, 2), 12) | {"flip_normals": True, "emitter": glow()},
+    "sunsky": lambda: {"type": "sunsky", "to_world": turned([1, 0, 0], -90)},
+    "textured_sphere": lambda: ball(WHITE, (1.3, 3, -1), 0.35) | {"emitter": glow(texels(3, 4))},
+    "textured_disk": lambda: {"type": "disk", "to_world": place(-1.2, 3.2, -0.5, rotate=([1, 0, 0], 70), scale=0.4),
+                     "emitter": glow(texels(3, 4))},
+    "directionalarea": lambda: lamp(glow(kind="directionalarea")),
+}  # fmt: skip
+
+
+def lights(*names: str, **weights: float) -> dict[str, Any]:
+    """These emitters, sampled in proportion to their weights (1)."""
+    made = {f"light_{name}": EMITTERS[name]() for name in names}
+    for name, weight in weights.items():
+        one = made[f"light_{name}"]
+        one.get("emitter", one)["sampling_weight"] = weight
+    return made
+
+
+THIN = {"type": "thinlens", "aperture_radius": 0.3, "focus_distance": 6.0}
+SHIFTED = {"principal_point_offset_x": 0.15, "principal_point_offset_y": -0.2}
+CROPPED = {"crop_width": 9, "crop_height": 7, "crop_offset_x": 3, "crop_offset_y": 4}
+EVENED = ("light_textured.emitter.radiance.data", "light_textured_mesh.emitter.radiance.data", "light_envmap.data")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene, what of it is differentiated, and options of the integrator; `guided` by what a random dL/dI says."""
+
+    scene: Callable[[], Any]
+    keys: tuple[str, ...] = ()
+    paths: str = "both"
+    max_depth: int = 6
+    light_share: float = 0.5
+    rr_depth: int = 100
+    hide_emitters: bool = False
+    guided: bool = False
+    spp: int = 48
+
+
+CASES = {
+    # Lights that have a place, sampled unequally.
+    "lamps": Case(lambda: room(
+        lights("rectangle", "disk", "sphere", "mesh", "point", "spot", "projector", "directional", disk=3, point=0.5),
+        ball=ball(GLASS), other=ball(MIRROR, (-0.9, 0.7, 0.5)))),
+    # Every pattern of delta vertices.
+    "patterns": Case(lambda: room(
+        lights("rectangle", "constant", constant=2), walls=HALF, right=plate(HALF, 2, 2, 0, rotate=([0, 1, 0], -90)),
+        above=plate(HALF, 0, 4.2, 0, rotate=([1, 0, 0], 90)), ball=ball(PLASTIC), other=ball(GLASS, (-0.8, 0.8, 0))),
+        spp=192),
+    # Textures and maps that are differentiated, and so drawn more evenly.
+    "evened": Case(lambda: room(
+        lights("textured", "textured_mesh", "envmap", textured=2), sensor=SHIFTED, walls=HALF), EVENED),
+    "textured": Case(lambda: room(
+        lights("textured", "textured_mesh", "constant"), film=CROPPED, sensor={"near_clip": 2.0},
+        close=plate(WHITE, 0.4, 2.1, 6, scale=0.1)), light_share=0.2),
+    # Also a hidden lamp before the camera.
+    "masks": Case(lambda: room(
+        lights("sphere", "directionalarea", sphere=3), sensor=SHIFTED, film=CROPPED,
+        shade=ball(VEIL, (1.3, 3, -1), 0.7),
+        front=plate(WHITE, 0.3, 2, 4.5, rotate=([0, 1, 0], 180), scale=0.7) | {"emitter": glow()},
+        shell=ball({"type": "thindielectric"}), core=ball(HALF, radius=0.4)), hide_emitters=True, spp=96),
+    "envmap": Case(lambda: room(lights("envmap"), sensor=THIN, ball=ball(GLASS)), rr_depth=2),
+    "perturbed": Case(lambda: room(lights("rectangle", "point"), walls=bumpy(), ball=ball(ROUGH_GLASS)),
+                      light_share=0.8),
+    "smooth": Case(lambda: room(lights("sphere", "constant"), sensor=THIN,
+                                roof=sheet([-2, 3.6, -2], HALF, leaning=3, size=4)), spp=192),
+    "rough": Case(lambda: room(lights("rectangle", "constant"), walls=HALF, ball=ball(ROUGH_GLASS, radius=1.2))),
+    "camera": Case(lambda: room(lights("sphere", "constant", "point", point=2), walls=HALF,
+                                shade=ball(VEIL, radius=0.9), core=ball(ROUGH_GLASS)), paths="camera"),
+    "guided": Case(lambda: room(lights("rectangle", "spot"), walls=ROUGH, ball=ball(PLASTIC)), guided=True),
+}  # fmt: skip
+
+
+CASES |= {f"only_{name}": Case(partial(lambda name: room(lights(name), walls=HALF, ball=ball(GLASS)), name))
+          for name in EMITTERS}  # fmt: skip
+
+
+def prepared(case: Case) -> Any:
+    """Samples of light paths, which know of the camera paths beside them; or of camera paths alone."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from reslrb_cli.integrators.protocol import Job
+    from reslrb_cli.integrators.reslrb import Reslrb
+
+    names = ("paths", "max_depth", "light_share", "rr_depth", "hide_emitters")
+    options = {name: getattr(case, name) for name in names} | {"estimator": "stack"}
+    scene, params = case.scene(), None
+    tracer = Reslrb.of(**options, guiding="on" if case.guided else "off")
+    if case.keys:
+        params = mi.traverse(scene)
+        for key in case.keys:
+            dr.enable_grad(params[key])
+        params.update()
+    job = Job(scene, scene.sensors()[0], mi.UInt32(1), case.spp, params)
+    if case.guided:
+        size = job.sensor.film().crop_size()
+        tracer.plan(scene, job.sensor)
+        tracer.learn_now(job, mi.TensorXf(np.random.default_rng(1).normal(size=(size[1], size[0], 3))))
+    with dr.suspend_grad():
+        [samples] = tracer.passes(job)
+    assert (samples.guide is not None and samples.plan.aimed) == case.guided
+    return samples
+
+
+def found(samples: Any) -> dict[str, Any]:
+    """The paths that each way has found."""
+    import drjit as dr
+    from conformance.path_densities import CameraNotes, Emission, LightNotes, paths_of
+
+    from reslrb_cli.transport.camera import camera_walk
+    from reslrb_cli.transport.walk import walk
+
+    with dr.suspend_grad():
+        camera = CameraNotes(samples.camera or samples)
+        camera_walk(camera.samples, camera)
+        seen = camera.taken()
+        result = {way: paths_of(way, seen) for way in ("H", "N")}
+        if samples.camera is not None:
+            light = LightNotes(samples)
+            walk(samples, light)
+            result["L"] = paths_of("L", light.taken(), Emission.of(samples))
+        return result
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Of one way, over paths that rounding leaves alone: how far weights are off ratios of densities, relative to
+    these, patterns of delta vertices, and emitters that no path has found."""
+
+    error: np.ndarray
+    patterns: list[tuple[bool, ...]]
+    missed: set[str]
+
+    @property
+    def holds(self) -> bool:
+        return bool(np.all(self.error < TOLERANCE))
+
+
+TOLERANCE = 1e-3
+
+
+def compared(case: Case) -> dict[str, Comparison]:
+    """The weights of a case and its densities, by way."""
+    from conformance.path_densities import Densities, emitter_number
+
+    samples = prepared(case)
+    densities, result = Densities(samples, samples.camera or samples, CUTOFF, FOV), {}
+    for way, paths in found(samples).items():
+        d = densities.of(paths)
+        direct, fit = paths.count == 0, d["fit"] & (paths.count > 0)
+        with np.errstate(all="ignore"):
+            ratio = d[way] / (d["H"] + d["N"] + d["L"])
+            error = (np.abs(paths.weight - ratio) / np.maximum(ratio, 1e-5))[fit]
+        error = np.append(np.nan_to_num(error, nan=np.inf), np.abs(paths.weight[direct] - 1))
+        patterns = [pattern for pattern, here in zip(paths.patterns(), fit, strict=True) if here]
+        missed = {e.class_name() for e in samples.scene.emitters() if emitter_number(e) not in paths.id[fit]}
+        result[way] = Comparison(error, patterns, missed)
+    return result
+
+
+@cache
+def as_it_stands(name: str) -> dict[str, Comparison]:
+    """Of a case, once for all tests."""
+    return compared(CASES[name])
+
+
+POINTS = ("PointLight", "SpotLight", "Projector", "DirectionalEmitter")
+#: A few emitters alone, of which the plan is another, are for the default suite.
+ALONE = ("only_point", "only_directional", "only_constant", "only_inside")
+
+
+@pytest.mark.parametrize("name", a_few(CASES, [name for name in CASES if not name.startswith("only")] + [*ALONE]))
+def test_a_weight_is_a_ratio_of_densities(name: str):
+    ways = as_it_stands(name)
+    assert {way: one.error.max(initial=0) for way, one in ways.items() if not one.holds} == {}
+    assert ways["H"].missed <= {*POINTS, "DirectionalArea"}
+    assert ways["N"].missed <= {"DirectionalArea"}
+    assert "L" not in ways or (ways["L"].missed == set() and len(ways["L"].error) > 500)
+
+
+def test_every_pattern_of_delta_vertices_is_there():
+    met = {way: set(one.patterns) for way, one in as_it_stands("patterns").items()}
+    every = {pattern for m in range(1, 6) for pattern in product((False, True), repeat=m)}
+    assert met["H"] == every
+    assert met["N"] == {pattern for pattern in every if not pattern[-1]}
+    assert met["L"] == {pattern for pattern in every if not pattern[0]}
+
+
+@pytest.mark.parametrize(
+    "name",
+    a_few(
+        [n for n in CASES if n not in ("guided", "camera", "only_scaled_spot")],
+        ["lamps", "evened", "masks", "envmap", "only_constant"],
+    ),
+)
+def test_the_density_of_rays_is_that_of_those_that_are_sampled(name: str):
+    """Which a ray's weight tells: it is the light along it, times the cosine at a lamp, over that density."""
+    import drjit as dr
+    from conformance.path_densities import Densities, Emission, cosine
+
+    from reslrb_cli.transport.emission import sample_emission
+    from reslrb_cli.transport.weights import leave_emitter
+
+    samples = prepared(CASES[name])
+    densities = Densities(samples, samples.camera, CUTOFF, FOV)
+    with dr.suspend_grad():
+        rays, again = Emission.of(samples), sample_emission(samples, samples.sampler())
+        rivals = leave_emitter(samples.plan, samples.emitters, samples.scene, again)
+        M, V = (np.array(value, np.float64) for value in (rivals.M, rivals.V))
+    cos = np.where(np.linalg.norm(rays.nz, axis=1) > 0, cosine(rays.nz, rays.d), 1)
+    fit = (cos > 0.02) & (rays.light > 0) & ((M > 0) | (V > 0))
+    e = (rays.light * cos / rays.weight)[fit]
+    by_hand = densities.ends(rays, rays.z + rays.d, -rays.d)
+    with np.errstate(all="ignore"):
+        own = np.where(V > 0, 1 / V, by_hand["sampled"] / M)
+    assert fit.mean() > 0.99 or name in ("masks", "only_directionalarea")  # parallel light has no densities
+    np.testing.assert_allclose(by_hand["sent"][fit], e, rtol=2 * TOLERANCE)
+    np.testing.assert_allclose((own * cos)[fit], e, rtol=TOLERANCE)
+
+
+# Faults: each is found, by the ways that have it.
+
+#: Where, the line as it is and as it is broken, the ways whose weights are wrong then.
+FAULTS = {
+    "light_without_reverse": ("transport.weights:weight_of_connection", "arrived.V * back", "arrived.V", "L"),
+    "met_without_reverse": ("transport.camera:_behind", "here.V * ways.back", "here.V", "HN"),
+    "sampled_without_reverse": ("transport.camera:_weigh", "own.V * ways.ahead_back", "own.V", "N"),
+    "more_light_paths": ("transport.walk:walk", "samples.ratio, ways", "2 * samples.ratio, ways", "L"),
+    "fewer_camera_paths": ("transport.camera:camera_walk", "samples.ratio / p_cam", "2 * samples.ratio / p_cam", "HN"),
+    "emitted_without_choice": ("transport.densities:EmitterDensities.of", "= choice[number] * own",
+                               "= own * (choice[number] if index else 1)", "HNL"),
+    "sampled_without_choice": ("transport.weights:leave_emitter", "M = choice * own", "M = own", "L"),
+    "delta_by_flags": ("transport.bsdf:scatter", "mi.has_flag(lobe, mi.BSDFFlags.Delta) & ~is_null",
+                       "mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) & ~is_null", "HNL"),
+    "null_is_a_vertex": ("transport.camera:_behind", "if plan.needs.has_null", "if False", "HN"),
+    "null_is_a_vertex_of_light": ("transport.walk:walk", "before_here.after_null(arrived), behind", "behind, behind",
+                                  "L"),
+    "null_restarts_distance": ("transport.weights:Rivals.after_null", "distance=arrived.distance",
+                               "distance=mi.Float(0)", "HNL"),
+    "sides_forgotten": ("transport.camera:_behind", "dr.select(ways.valid, m, 0)", "m", "HN"),
+    "aperture_forgotten": ("transport.camera:camera_walk", "mi.Float(first.near)", "mi.Float(0)", "HN"),
+    "twice_as_many_on_both_sides": ("transport.samples:_of_both", "width / (n_camera / crop)",
+                                    "2 * width / (n_camera / crop)", "HNL"),
+    "crop_forgotten": ("transport.samples:_of_both", "width / (n_camera / crop)", "width / (n_camera / pixels)", "HNL"),
+}  # fmt: skip
+#: Cases that show them.
+SHOWN = {"sides_forgotten": "smooth", "crop_forgotten": "cropped"}
+CASES |= {
+    "small": Case(lambda: room(lights("rectangle", "disk", disk=3), walls=HALF,
+                               veil=plate(VEIL, 0, 1.5, 1.5, scale=1.5))),
+    "cropped": Case(lambda: room(lights("constant"), film=CROPPED)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_is_found(name: str, monkeypatch: pytest.MonkeyPatch):
+    where, right, wrong, ways = FAULTS[name]
+    case = SHOWN.get(name, "small")
+    assert all(one.holds for one in as_it_stands(case).values())
+    plant(Fault(name, "", where, right, wrong, frozenset()), monkeypatch)
+    result = compared(CASES[case])
+    assert {way for way, one in result.items() if not one.holds} == set(ways)
+
+
+# A fault of the walk back, which weights know nothing of: at equal seeds naive AD finds it.
+
+WALKS_BACK = {
+    "walk_back_forgets_what_is_met": ("Pushing.vertex", "for C, active in found]",
+                                      "for C, active in found[int(met is not None):]]", 16),
+    "second_walk_forgets_what_is_met": ("Taking.vertex", "self.found(vertex, met, event)",
+                                        "self.found(vertex, None, event)", 1),
+}  # fmt: skip
+
+
+def gradient(**options: Any) -> np.ndarray:
+    """Derivatives by all colours of a room, of camera paths, which are the same whatever takes them."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from reslrb_cli.integrators.step import gradient_step, make_integrator
+
+    scene = room(lights("rectangle", "constant"), walls=HALF)
+    params = mi.traverse(scene)
+    params.keep([key for key in params.keys() if key.endswith(("reflectance.value", "radiance.value"))])  # noqa: SIM118
+    for key in list(params.keys()):
+        dr.enable_grad(params[key])
+    params.update()
+    weights = np.random.default_rng(5).random(12 * 16 * 3).astype(np.float32)
+    integrator = make_integrator(max_depth=5, rr_depth=100, paths="camera", **options)
+    gradient_step(integrator, scene, 0, lambda image: dr.sum(image.array * mi.Float(weights)), seed=3, spp=16,
+                  params=params, adjoint="independent")  # fmt: skip
+    return np.concatenate([np.ravel(np.array(dr.grad(value))) for _, value in params.items()])
+
+
+@cache
+def by_naive_ad() -> np.ndarray:
+    return gradient(type="walk_ad")
+
+
+@pytest.mark.parametrize("name", WALKS_BACK)
+def test_a_walk_back_that_forgets_is_found(name: str, monkeypatch: pytest.MonkeyPatch):
+    where, right, wrong, stack_size = WALKS_BACK[name]
+    options = {"type": "reslrb", "estimator": "stack", "stack_size": stack_size}
+    np.testing.assert_allclose(gradient(**options), by_naive_ad(), rtol=1e-4)
+    plant(Fault(name, "", f"estimators.camera:{where}", right, wrong, frozenset()), monkeypatch)
+    assert np.abs(gradient(**options) / by_naive_ad() - 1).max() > 0.01
