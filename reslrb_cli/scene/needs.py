@@ -83,7 +83,6 @@ class SceneNeeds:
     principal_point: bool
     near_clip: bool
     lens_clip: bool
-    samples_otherwise: bool = False  # a BSDF whose samples have another density than it tells of their directions
     unfollowed: tuple[mi.BSDF, ...] = ()  # surfaces' BSDFs whose sampling is not to be differentiated
     lamps: tuple[Lamp, ...] = ()  # shapes that emit
     small_lamps: tuple[Lamp, ...] = ()  # those of them that the sensor sees as less than a pixel
@@ -141,7 +140,6 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         ),
         near_clip=near,
         lens_clip=thin_lens and (near or far or (is_projective and _focuses_outside(params))),
-        samples_otherwise=any(bsdf.class_name() == "RoughDielectric" for bsdf in graph.of_type(mi.BSDF)),
         unfollowed=tuple(bsdf for bsdf in graph.surface_bsdfs() if bsdf in unfollowed),
         lamps=lamps,
         small_lamps=small_lamps(scene, sensor, lamps) if is_projective else (),

@@ -196,9 +196,7 @@ def _ways(
 ) -> tuple[mi.Float, ...]:  # fmt: skip
     """The densities of `Ways`, 0 for those that nobody asks for."""
     zero = mi.Float(0)
-    p, back, ahead, ahead_back = pdf, zero, zero, zero
-    if plan.needs.samples_otherwise:
-        p = density(plan, si, bsdf, wo, active, plan.camera)
+    back, ahead, ahead_back = zero, zero, zero
     if plan.weighs:
         back = _back(plan, si, bsdf, wo, active)
     if connected is not None:
@@ -206,7 +204,7 @@ def _ways(
             ahead = density(plan, si, bsdf, connection_wo, connected, True)
         if plan.weighs:
             ahead_back = _back(plan, si, bsdf, connection_wo, connected)
-    return p, back, ahead, ahead_back
+    return pdf, back, ahead, ahead_back
 
 
 def shading_correction(
