@@ -397,9 +397,7 @@ def trace_image(estimator: Estimator, samples: list[Samples]) -> tuple[mi.Tensor
     return image, state
 
 
-def replay(
-    samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointImage, done: bool = False
-) -> None:
+def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointImage, done: bool = False) -> None:
     """Add the derivatives of the objective, whose derivative with respect to the film is `adjoint`; `done`: those of
     camera paths are there, from their only traversal."""
     differentiate_visible_emission(samples, adjoint)

@@ -180,9 +180,7 @@ def make_forecast(
     say("measuring a few steps")
     steps, scratch, integrator = measure_steps(problem), 0, problem.integrator
     if isinstance(integrator, Reslrb):  # of all paths that are traced at a time
-        scratch = (
-            max(integrator.scratch_bytes(plan) for plan in plans(problem, integrator)) * resident_paths()
-        )
+        scratch = max(integrator.scratch_bytes(plan) for plan in plans(problem, integrator)) * resident_paths()
     run, measured = config.run, (problem.pilot, problem.guided, problem.sequence)
     parts = _parts(problem)
     rest = max(steps.peak - sum(parts.values()), 0)

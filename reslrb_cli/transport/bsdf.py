@@ -391,9 +391,7 @@ def _mixed(
     return Sample(wo, pdf, sample.weight, dr.select(defensive, 1, sample.eta), _glossy(defensive, sample.lobe))
 
 
-def _to_point(
-    plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, aimed: Aimed, sample: Sample
-) -> Sample:
+def _to_point(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, aimed: Aimed, sample: Sample) -> Sample:
     """A BSDF's sample, replaced by one towards their point in lanes that are aimed; of density 0 where there is no
     point, or none of the BSDF's own samples goes there."""
     there = si.to_local(dr.normalize(aimed.point - si.p))

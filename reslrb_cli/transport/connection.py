@@ -210,9 +210,7 @@ def passage(
         active = active & (si.emitter(scene) == dr.zeros(mi.EmitterPtr))
     if plan.needs.has_null or past_lamps:
         limit = plan.max_depth - depth - 1
-        through = transmittance(
-            scene, si, connection.target, limit, active, loop_mode=loop_mode, past_lamps=past_lamps
-        )
+        through = transmittance(scene, si, connection.target, limit, active, loop_mode=loop_mode, past_lamps=past_lamps)
         return through.reached, through.value
     if seen is None:
         return active & ~scene.ray_test(si.spawn_ray_to(connection.target), active), one
