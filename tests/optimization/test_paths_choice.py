@@ -15,6 +15,7 @@ from reslrb_cli.optimization.assemble import assemble, assemble_scene
 from reslrb_cli.optimization.autotune.sampling import FEWER, FIRST_SHARE, MORE
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.cache import PilotCache
+from reslrb_cli.records.decisions import PathsRecord
 from reslrb_cli.records.manifest import read_manifest
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -89,6 +90,7 @@ def test_a_run_goes_on_with_the_paths_that_it_had():
     assert optimize("tiny.yaml", *settings) == 0
     found = read_manifest(RUN)
     assert found["paths"]["paths"] in ("both", "camera")
+    assert PathsRecord.from_json(found["paths"]).line() in (RUN / "report.html").read_text()
     assert optimize("--resume", str(RUN), "--set", "run.iterations=4") == 0
     again = read_manifest(RUN)
     assert again["paths"] == found["paths"]

@@ -24,6 +24,7 @@ from report.measured import (
     write_maps,
 )
 
+from reslrb_cli.records.decisions import GuidedRecord, PathsRecord, SequenceRecord
 from reslrb_cli.records.images import read_layers
 from reslrb_cli.records.manifest import Status, read_manifest
 from reslrb_cli.report import page as page_module
@@ -221,6 +222,34 @@ def test_pilot_scaling_memory_and_run_are_tables(tmp_path):
     everything = "".join(page.sections.values())
     assert "{'" not in everything
     assert "None" not in everything
+
+
+def test_paths_and_how_they_are_drawn_stand_below_the_estimator(tmp_path):
+    """In the order in which they are decided, each where it was left to measurement."""
+    paths = PathsRecord(paths="both", light_share=0.125, gain=1.5, low=1.2, high=1.9, measure_s=2.0, compile_s=3.0)
+    guided, sequence = GuidedRecord(guided=False, note="<b>"), SequenceRecord(low_discrepancy=False, note="alike")
+    decided = {"pilot": PILOT, "paths": paths, "guided": guided, "sequence": sequence}
+    records = {name: each if name == "pilot" else each.to_json() for name, each in decided.items()}
+    told = page_of(make_run(tmp_path / "all", iterations=0, **records)).sections["Choice of the estimator"]
+    lines = [
+        "estimator event, capacity 4: 1.25 times",
+        "paths both, 12.5 % light paths: 1.5 times the efficiency here (1.2 to 1.9)"
+        " (measured in 2.0 s and 3.0 s of first steps)",
+        "guiding off: <b>",
+        "sequence independent: alike",
+    ]
+    assert [told.count(line) for line in lines] == [1] * len(lines)
+    assert sorted(lines, key=told.index) == lines
+
+
+def test_paths_alone_are_told(tmp_path):
+    """Where the estimator is given."""
+    camera = PathsRecord(paths="camera", light_share=0.0, note="all is diffuse").to_json()
+    title = "Choice of the estimator"
+    page = page_of(make_run(tmp_path / "camera", iterations=0, paths=camera))
+    assert page.sections[title].strip() == f"{title}paths camera: all is diffuse"
+    for number, unread in enumerate((None, {}, {"paths": "both", "of another": "version"})):
+        assert title not in page_of(make_run(tmp_path / f"{number}", iterations=0, paths=unread)).sections
 
 
 def test_the_bias_of_correlated_samples_is_a_table(tmp_path):

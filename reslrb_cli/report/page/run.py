@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.correlated_bias import CorrelatedBias, share_words
-from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, RivalRecord, SequenceRecord
+from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, PathsRecord, RivalRecord, SequenceRecord
 from reslrb_cli.report.format import count, duration, number
 from reslrb_cli.report.page.images import image_rows, seen_tables, view_table
 from reslrb_cli.report.page.layout import lay_out, soft
@@ -166,6 +166,7 @@ def record_parts(run: Run) -> dict[str, Markup]:
         "Plan": lambda: lay_out("run.plan", plan["rows"]) if (plan := manifest.get("plan")) else Markup(),
         "Choice of the estimator": lambda: (
             pilot_table(manifest.get("pilot"))
+            + soft(measured_line(PathsRecord, manifest.get("paths")))
             + soft(measured_line(GuidedRecord, manifest.get("guided")))
             + soft(measured_line(SequenceRecord, manifest.get("sequence")))
             + soft(measured_line(RivalRecord, manifest.get("rival")))
