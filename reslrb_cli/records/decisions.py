@@ -150,7 +150,7 @@ class PaidRecord(Finding):
 class PathsRecord(PaidRecord):
     """Of where paths begin: `paths` (light, camera, both), of which `light_share` are light paths where both are.
 
-    The gain is that over the best share that was tried before, or of the next that was found no better.
+    The gain is that over the best share that was tried before, or of the next that was found no better, as `note` says.
     """
 
     paths: str

@@ -1,1 +1,1 @@
-"""What is measured of a run before its first iteration: estimator, guiding, sequence."""
+"""What is measured of a run before its first iteration: estimator, paths, guiding, sequence."""

@@ -224,8 +224,10 @@ def _paths(tuner: race.Tuner) -> PathsRecord:
                     return
                 own, other = (_of_share(problem, value) for value in (best, share))
                 trials.append(StepTrial(problem, f"paths {share:g}", own, other, *trials[-1:]))
-                records.append(trials[-1].turns(PathsPilot, sizes(problem, PATHS_LONGER, planned(part)), part))
-                if records[-1].paths != "other":
+                record = trials[-1].turns(PathsPilot, sizes(problem, PATHS_LONGER, planned(part)), part)
+                words = f"over that of {100 * best:g} %" if record.paths == "other" else f"that of {100 * share:g} %"
+                records.append(replace(record, note=record.note or words))
+                if record.paths != "other":
                     return
                 best = share
 
