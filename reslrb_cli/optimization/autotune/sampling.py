@@ -239,14 +239,15 @@ def _paths(tuner: race.Tuner) -> PathsRecord:
         costs = {name: sum(getattr(each, name) for each in records) for name in ("measure_s", "compile_s", "share")}
         return replace(kept, paths="both" if best else "camera", light_share=best, **costs)
 
+    later = [race.LATER[option] for option in ("guiding", "sequence") if race.is_auto(problem.config, option)]
     return tuner.decide(
         PathsRecord,
-        of={"paths": 1, "of": problem.pilot and problem.pilot.chosen},
-        needs=[race.PATHS_NEEDS],
+        of={"paths": 2, "of": problem.pilot and problem.pilot.chosen},
+        needs=[race.PATHS_NEEDS, *later],
         integrator=problem.integrator,
         measure=measure,
         unmeasured=lambda note: PathsRecord(paths="both", note=f"{note}; half of them cost little anywhere"),
-        later=[race.LATER[option] for option in ("guiding", "sequence") if race.is_auto(problem.config, option)],
+        later=later,
     )
 
 

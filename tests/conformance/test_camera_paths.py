@@ -1,0 +1,271 @@
+"""`paths: camera` and `both`: images against `path` in every pixel, gradients against naive AD and in expectation.
+
+Mirrors and glass are in view, lamps are hidden, and the film's border counts: what light paths alone lack is there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from agreement import compare
+from conformance.gradient_cases import CASES, GradientCase
+from conformance.scenes import (
+    RED,
+    agreement,
+    ball,
+    bitmap,
+    camera,
+    images,
+    lamp,
+    plugin,
+    rectangle,
+    rgb,
+    stage,
+    transform,
+)
+from conformance.test_gradients import forward
+from turns import a_few, taking_turns
+
+from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.integrators.protocol import Job
+from reslrb_cli.integrators.step import interface_of, make_integrator
+from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
+from reslrb_cli.records.clock import peak_mib, reset_peak
+
+pytestmark = pytest.mark.usefixtures("samples")
+
+
+# --- images -----------------------------------------------------------------------------------------------------------
+
+SMALL = {"width": 20, "height": 16}
+
+
+def seen(**bsdf: Any) -> dict[str, Any]:
+    """A ball of this material in view."""
+    return {"ball": ball(bsdf)}
+
+
+def lamps(**lights: Any) -> dict[str, Any]:
+    return dict(lights)
+
+
+def looks(**changes: Any) -> Any:
+    return camera(**{**SMALL, **changes})
+
+
+def sheet() -> Any:
+    """A perforated sheet between camera and stage."""
+    to_world = transform().look_at(origin=[0.2, 1.3, 2.0], target=[0.4, 1.5, 4], up=[0, 1, 0]) @ transform().scale(0.5)
+    bsdf = {"type": "mask", "opacity": bitmap(6, 6, channels=1, low=0), "bsdf": {"type": "twosided", "bsdf": RED}}
+    return rectangle(bsdf, to_world)
+
+
+#: Lights, what stands there, the sensor, and options of both integrators.
+SCENES: dict[str, Callable[[], tuple[dict[str, Any] | None, Any, dict[str, Any], dict[str, Any]]]] = {
+    "mirror": lambda: (None, looks(), seen(type="conductor"), {}),
+    "glass": lambda: (None, looks(), seen(type="dielectric"), {}),
+    "plastic": lambda: (None, looks(), seen(type="plastic"), {}),
+    "rough glass": lambda: (None, looks(), seen(type="roughdielectric", alpha=0.3), {}),
+    "mask": lambda: (None, looks(), {"sheet": sheet()}, {}),
+    "gaussian": lambda: (None, looks(rfilter="gaussian"), {}, {}),
+    "mitchell": lambda: (None, looks(rfilter="mitchell"), {}, {}),
+    "hidden lamp": lambda: (
+        lamps(lamp=lamp(position=(0, 1.6, -0.8), target=(0, 0.3, 2))), looks(), {}, {"hide_emitters": True}),
+    "lamp in view": lambda: (lamps(lamp=lamp(position=(0, 1.6, -0.8), target=(0, 0.3, 2))), looks(), {}, {}),
+    "crop": lambda: (None, looks(film={"crop_width": 9, "crop_height": 7, "crop_offset_x": 5, "crop_offset_y": 4}),
+                     {}, {}),
+    "point": lambda: (lamps(lamp={"type": "point", "position": [0.5, 1.9, 0.6], "intensity": rgb(3, 4, 5)}), looks(),
+                      {}, {}),
+    "constant": lambda: (lamps(sky={"type": "constant", "radiance": rgb(0.5, 0.6, 0.7)}), looks(), {}, {}),
+    "sphere": lambda: (lamps(lamp={"type": "sphere", "center": [0.5, 1.9, 0.6], "radius": 0.2, "emitter": {
+        "type": "area", "radiance": rgb(5, 4, 3)}}), looks(), {}, {}),
+    "roulette": lambda: (None, looks(), seen(type="roughconductor", alpha=0.2), {"rr_depth": 2, "max_depth": 8}),
+}  # fmt: skip
+WAYS = [{"paths": "camera"}, *({"paths": "both", "light_share": share} for share in (0.5, 0.1, 0.9))]
+FEW = ("mirror", "mask", "gaussian", "hidden lamp", "crop", "sphere")
+
+
+@taking_turns("name", [*FEW, *(name for name in SCENES if name not in FEW)], "way", [0, 1, 2, 3], FEW)
+def test_images_are_those_of_path_in_every_pixel(name: str, way: int):
+    lights, sensor, things, options = SCENES[name]()
+    scene = stage(lights, sensor, **things)
+    result = agreement(scene, spp=128, seeds=12, reslrb={"estimator": "stack", **WAYS[way]}, **options)
+    print(name, WAYS[way], result)
+    assert result
+
+
+def test_what_camera_paths_cannot_find_is_left_to_light_paths():
+    """Parallel light through a ball of glass: next event estimation is blocked, and no path meets the lamp."""
+    scene = stage({"sun": {"type": "directional", "direction": [0, -1, -0.2], "irradiance": rgb(3, 3, 3)}}, looks(),
+                  ball=ball({"type": "dielectric"}))  # fmt: skip
+    sizes = {"max_depth": 5, "rr_depth": 100, "estimator": "stack"}
+    ours, light, alone = (
+        images(scene, "reslrb", range(at, at + 12), 128, paths=paths, **sizes)
+        for at, paths in ((0, "both"), (100, "light"), (200, "camera"))
+    )
+    # In the caustic's pixels, which see the floor alone, all is light paths' own, or next event estimation's.
+    caustic = light.mean((0, 3)) > 2 * alone.mean((0, 3)) + 1e-3
+    assert caustic.sum() >= 4
+    assert compare(ours[:, caustic][:, None], light[:, caustic][:, None])
+
+
+@pytest.mark.parametrize("paths", ["camera", "both"])
+def test_fewer_paths_than_pixels_and_the_rest_of_their_share(paths: str):
+    """At one sample per pixel, and where but a few paths are light paths, means are what they are."""
+    scene = stage(None, looks())
+    options = {"max_depth": 3, "rr_depth": 100, "estimator": "stack", "paths": paths}
+    usual = images(scene, "reslrb", range(16), 256, **options)
+    few = images(scene, "reslrb", range(1000, 1200), 1, **options, light_share=0.01 if paths == "both" else 0.5)
+    assert compare(few.mean((1, 2), keepdims=True), usual.mean((1, 2), keepdims=True), block=None)
+
+
+@pytest.mark.parametrize("depth", [0, 1, 2])
+def test_short_paths(depth: int):
+    scene = stage({"lamp": lamp(position=(0, 1.6, -0.8), target=(0, 0.3, 2))}, looks())
+    for way in WAYS[:2]:
+        ours = images(scene, "reslrb", range(4), 64, max_depth=depth, estimator="stack", **way)
+        theirs = images(scene, "path", range(50, 54), 64, max_depth=depth)
+        assert ours.mean() == pytest.approx(theirs.mean(), rel=0.1)
+
+
+# --- gradients --------------------------------------------------------------------------------------------------------
+
+#: Those that both sides can find; camera paths do not know parallel lamps.
+BOTH = [case for case in CASES if case.name not in ("retained", "texture_prb", "directionalarea")]
+SOME = ("texture", "roulette", "crop", "mask_texture_in_view", "two_emitters", "visible_lamp", "glass", "envmap")
+
+
+def options_of(case: GradientCase, paths: str, **more: Any) -> dict[str, Any]:
+    return {**case.both, "estimator": "stack", "paths": paths, **more}
+
+
+@pytest.mark.parametrize("paths", ["camera", "both"])
+@pytest.mark.parametrize("case", a_few(BOTH, [case.name for case in BOTH if case.name in SOME]))
+def test_gradients_equal_naive_ad(case: GradientCase, paths: str):
+    """Known before the image, of one traversal; after it; beyond a stack that has room for one vertex."""
+    scene = Case(case.scene(), case.keys)
+    reference = scene.gradient(integrator("walk_ad", **case.both, paths=paths), 5, case.spp)
+    ways: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+        "correlated": ({}, {}),
+        "known": ({}, {"step": scene.known_step}),
+        "beyond": ({"stack_size": 1}, {}),
+        "recorded": ({"freeze": True}, {"step": scene.known_step}),
+    }
+    for name, (more, step) in ways.items():
+        ours = scene.gradient(integrator("reslrb", **options_of(case, paths, **more)), 5, case.spp, **step)
+        error = relative(ours, reference)
+        print(case.name, paths, name, f"{error:.1e}")
+        assert error < 1e-4, f"{name}: {error:.1e}"
+
+
+@pytest.mark.parametrize("paths", ["camera", "both"])
+@pytest.mark.parametrize(
+    "name", a_few([case.name for case in BOTH], ["texture", "mask_texture_in_view", "visible_lamp"])
+)
+def test_forward_mode_is_naive_ad(name: str, paths: str):
+    case = next(case for case in CASES if case.name == name)
+    scene = Case(case.scene(), case.keys)
+    tangent = forward(scene, plugin("reslrb", **options_of(case, paths)), 3, 16)
+    naive = forward(scene, plugin("walk_ad", **case.both, paths=paths), 3, 16)
+    assert np.abs(naive).max() > 0
+    assert relative(tangent, naive) < 1e-5
+
+
+@pytest.mark.parametrize("case", a_few([case for case in BOTH if case.reference == "prb"], ()))
+def test_gradients_are_those_of_prb(case: GradientCase):
+    scene = Case(case.scene(), case.keys)
+    reference = scene.gradients(integrator("prb", **case.both), seeds(16, 1), case.spp)
+    for paths in ("camera", "both"):
+        ours = scene.gradients(integrator("reslrb", **options_of(case, paths)), seeds(16), case.spp)
+        assert compare(ours, reference, block=None), paths
+
+
+@pytest.mark.parametrize("case", a_few(BOTH, ["texture", "area"]))
+def test_both_is_in_expectation_what_camera_paths_are(case: GradientCase):
+    if case.name in ("glass", "mirror"):  # caustics, which light paths alone find in reasonable time
+        pytest.skip("camera paths hardly find its light")
+    scene = Case(case.scene(), case.keys)
+    ours, reference = (
+        scene.gradients(integrator("reslrb", **options_of(case, paths)), seeds(16, at), case.spp)
+        for at, paths in enumerate(("both", "camera"))
+    )
+    assert compare(ours, reference, block=None)
+
+
+@pytest.mark.parametrize("estimator", ["gather", "event", "reservoir"])
+def test_every_estimator_takes_weighed_connections(estimator: str):
+    case = next(case for case in CASES if case.name == "texture")
+    scene = Case(case.scene(), case.keys)
+    exact = scene.gradients(integrator("reslrb", **options_of(case, "both")), seeds(16), case.spp)
+    own = {**options_of(case, "both"), "estimator": estimator}
+    assert compare(scene.gradients(integrator("reslrb", **own), seeds(16, 1), case.spp), exact, block=None)
+
+
+# --- what a run asks for ----------------------------------------------------------------------------------------------
+
+
+def peak(depth: int, spp: int, paths: str) -> float:
+    """MiB that a step holds at most, its kernels known."""
+    case = next(case for case in CASES if case.name == "texture")
+    options = options_of(case, paths) | {"max_depth": depth, "rr_depth": 1000}
+    scene, work = Case(case.scene(), case.keys), integrator("reslrb", **options)
+    for _ in range(2):
+        reset_peak()
+        scene.gradient(work, 3, spp, step=scene.known_step)
+        dr.sync_thread()
+    return peak_mib(dr.backend_v(mi.Float))
+
+
+@pytest.mark.parametrize("paths", ["camera", "both"])
+def test_memory_is_that_of_light_paths_however_deep_they_go(paths: str):
+    light = peak(4, 16, "light")
+    film = 32 * 32 * 4 * 4 / 2**20
+    for depth, spp in ((4, 16), (64, 16), (4, 64)):
+        assert peak(depth, spp, paths) <= max(1.03 * light, light + film), (depth, spp)
+
+
+def test_a_share_that_leaves_one_side_has_nothing_of_the_other():
+    for share, paths in ((0.0, "camera"), (1.0, "light")):
+        made = make_integrator("reslrb", estimator="stack", paths="both", light_share=share)
+        assert made.paths == paths
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"paths": "camera", "estimator": "gather"}, "chooses among the connections of light paths"),
+        ({"paths": "both", "light_share": 1.5}, "must lie in"),
+        ({"paths": "sideways"}, "must be one of light, camera, both"),
+    ],
+)
+def test_options_that_cannot_be(options: dict[str, Any], words: str):
+    with pytest.raises(ValueError, match=words):
+        make_integrator("reslrb", **options)
+
+
+def test_sensors_that_light_paths_cannot_connect_to():
+    """`camera` renders them; `both` is refused with what to take."""
+    sensor = {"type": "orthographic", "to_world": transform().look_at([0, 1, 4], [0, 0.7, 0], [0, 1, 0]),
+              "film": {"type": "hdrfilm", "width": 16, "height": 12, "rfilter": {"type": "box"}}}  # fmt: skip
+    scene = stage(None, mi.load_dict(sensor) if not isinstance(sensor, dict) else sensor)
+    ours = images(scene, "reslrb", range(8), 64, max_depth=4, estimator="stack", paths="camera")
+    theirs = images(scene, "path", range(50, 58), 64, max_depth=4)
+    assert compare(ours[..., :3], theirs[..., :3])
+    with pytest.raises(UnsupportedScene, match=r"take integrator.paths: camera"):
+        images(scene, "reslrb", range(1), 4, max_depth=4, estimator="stack", paths="both")
+
+
+def test_what_moves_light_has_light_paths_in_images_too():
+    case = next(case for case in CASES if case.name == "gaussian")
+    scene = Case(case.scene(), case.keys)
+    work = interface_of(integrator("reslrb", estimator="stack", paths="both", attached=True, **case.both))
+    job = Job(scene.scene, scene.scene.sensors()[0], mi.UInt32(3), 4, scene.params)
+    leaves = scene.leaves()
+    assert work.plan(scene.scene, job.sensor, scene.params).paths == "light"
+    assert work.plan(scene.scene, job.sensor).paths == "light"
+    scene.release(leaves)
