@@ -96,6 +96,11 @@ UNDECIDED: dict[str, str | float] = {
     "sequence": "independent",
 }
 
+#: What a run's own configuration, which holds every setting, always had; nobody writes all of these by hand.
+_WRITTEN_BEFORE_PATHS = frozenset(
+    "estimator max_depth rr_depth hide_emitters attached attached_sampling guiding sequence freeze".split()
+)
+
 #: Every option that says which estimator, and how.
 _ANY_ESTIMATORS = {"estimator", *(option for options in ESTIMATOR_OPTIONS.values() for option in options)}
 
@@ -128,13 +133,14 @@ class Reslrb(AttachingTracer):
     stack_size: Count = 64
     """Vertices of a path that fit into thread-local memory; longer paths are traced a second time. Only with estimator
     `stack`."""
-    paths: Literal["auto", "light", "camera", "both"] = "light"
+    paths: Literal["auto", "light", "camera", "both"] = "auto"
     """Where paths begin. `light`: at the emitters, which finds caustics and light through glass, but shows mirrors and
     clear glass black; `camera`: at the sensor, which finds what mirrors and glass show, and most light of rooms, but no
     caustics of small lamps (with estimators `auto` and `stack`); `both`: each path is weighed by how likely either
     side was to find it, so that the image has all light. `auto`: `both`, or `camera` where that finds all light and a
     few steps of each, before the first iteration, show that it is the more efficient; `light` where nothing else can
-    render the scene. What moves light has light paths alone."""
+    render the scene, or finds any of its light. What moves light has light paths alone. Left out it is `auto` with
+    estimator `auto`, and `light` with one that is named."""
     light_share: Annotated[
         Annotated[float, Field(ge=0, le=1, allow_inf_nan=False), mark("number")]
         | Annotated[Literal["auto"], mark("text")],
@@ -159,6 +165,14 @@ class Reslrb(AttachingTracer):
     freeze: bool = True
     """Record what a step launches and launch that again, so that its Python runs once, not in every iteration. Not with
     passes, nor with more than 4 million paths, beside which Python does not show."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_written(cls, values: Any) -> Any:
+        """What a run folder of before there were `paths` says goes on as it was."""
+        if isinstance(values, dict) and "paths" not in values and values.keys() >= _WRITTEN_BEFORE_PATHS:
+            return {**values, "paths": UNDECIDED["paths"]}
+        return values
 
     @model_validator(mode="after")
     def _leave_off(self) -> Self:

@@ -22,7 +22,14 @@ from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import make_integrator, render_image
 from reslrb_cli.scene.load import load_scene, warn_once
-from reslrb_cli.scene.needs import check_camera_paths, check_paths, paths_obstacle, scene_needs, stock_clip
+from reslrb_cli.scene.needs import (
+    camera_finds_nothing,
+    check_camera_paths,
+    check_paths,
+    paths_obstacle,
+    scene_needs,
+    stock_clip,
+)
 from reslrb_cli.scene.xml.read import Description
 from reslrb_cli.seeds import seed
 
@@ -139,6 +146,8 @@ def paths_of(integrator: Integrator, scene: mi.Scene, sensors: list[int], moves:
         return "light" if integrator.light_share else "camera"
     if integrator.paths != "auto":
         return integrator.paths
+    if camera_finds_nothing(scene):
+        return "light"
     looked = [scene.sensors()[sensor] for sensor in sensors]
     for kind in ("both", "camera"):
         if all(paths_obstacle(scene, sensor, kind) is None for sensor in looked):

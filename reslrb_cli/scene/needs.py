@@ -173,6 +173,11 @@ def camera_finds_all(scene: Any) -> bool:
     return not any(int(bsdf.flags()) & bundled for bsdf in SceneGraph.of(scene).surface_bsdfs())
 
 
+def camera_finds_nothing(scene: Any) -> bool:
+    """Whether all light of `scene` is from emitters that shine along their normal alone, which no camera path finds."""
+    return all(emitter.class_name() == "DirectionalArea" for emitter in scene.emitters())
+
+
 def check_supported(scene: Any, sensor: Any, hide_emitters: bool = False) -> None:
     """Raise UnsupportedScene, with the reason and the way out, where light tracing cannot render `scene`."""
     if (obstacle := light_obstacle(scene, sensor, hide_emitters)) is not None:

@@ -68,7 +68,7 @@ def test_defaults(tmp_path: Path) -> None:
     assert config.integrator.options() == {
         "max_depth": 8, "rr_depth": 5, "hide_emitters": False, "estimator": "auto", "freeze": True,
         "attached": "auto", "attached_sampling": "auto", "filter_normalization": "attached", "guiding": "auto",
-        "paths": "light", "light_share": "auto",
+        "paths": "auto", "light_share": "auto",
         "sequence": "auto",
     }  # fmt: skip
     assert config.loss.type == "l2"
@@ -374,11 +374,16 @@ def test_options_and_defaults_are_the_estimators_own(name: str) -> None:
 
 
 def test_paths_that_an_estimator_named_leaves_to_nobody() -> None:
-    assert (Reslrb().paths, Reslrb().light_share) == ("light", "auto")
+    assert (Reslrb().paths, Reslrb().light_share) == ("auto", "auto")
+    assert Reslrb(estimator="stack").paths == "light"
     named = Reslrb(estimator="stack", paths="both")
     assert (named.paths, named.light_share) == ("both", 0.5)
     again = Reslrb(**Reslrb(paths="camera").model_dump())  # as a run's folder has it
     assert again.paths == "camera"
+    written = Reslrb().model_dump(exclude_none=True)
+    assert Reslrb(**written).paths == "auto"
+    del written["paths"], written["light_share"]  # a run's folder of before there were any
+    assert Reslrb(**written).paths == "light"
 
 
 @pytest.mark.parametrize(
