@@ -161,6 +161,23 @@ def paths_obstacle(scene: Any, sensor: Any, paths: str) -> str | None:
         return f"{obstacle}; take integrator.paths: light"
     if paths == "both" and (obstacle := unsupported_part(scene, sensor) or _unsampled(scene)) is not None:
         return f"{obstacle}; take integrator.paths: camera"
+    return _scaled_emitter(scene) if paths == "both" else None
+
+
+def _scaled_emitter(scene: Any) -> str | None:
+    """The reason why both kinds of paths do not render the same light, in words; None where they do.
+
+    Of a `directional` or `projector` emitter Mitsuba's `sample_ray` takes the scale of `to_world`, along which
+    directions are no longer of length 1, otherwise than its `sample_direction`.
+    """
+    plugins = {"DirectionalEmitter": "directional", "Projector": "projector"}
+    for emitter in scene.emitters():
+        if (plugin := plugins.get(emitter.class_name())) is None:
+            continue
+        columns = np.array(emitter.world_transform().matrix, dtype=float).reshape(4, 4, -1)[:3, :3]
+        if np.any(np.abs(np.linalg.norm(columns, axis=0) - 1) > 1e-4):
+            why = "with which light and camera paths of Mitsuba's disagree on its light"
+            return f"emitter {emitter.id()} is a `{plugin}` with a scale in `to_world`, {why}; remove the scale"
     return None
 
 

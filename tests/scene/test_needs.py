@@ -14,7 +14,7 @@ import pytest
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene.catalog import summarise
 from reslrb_cli.scene.load import load_scene, warn_once
-from reslrb_cli.scene.needs import check_camera_paths, check_supported, light_obstacle, look, scene_needs
+from reslrb_cli.scene.needs import check_camera_paths, check_paths, check_supported, light_obstacle, look, scene_needs
 from reslrb_cli.scene.visibility import (
     DEPTHS,
     LOST,
@@ -139,6 +139,21 @@ def test_refused(make_scene, changes, hide_emitters, reason):
     scene = make_scene(**changes)
     with pytest.raises(UnsupportedScene, match=reason):
         check_supported(scene, scene.sensors()[0], hide_emitters)
+
+
+@pytest.mark.usefixtures("_without_scenes_of_before")
+@pytest.mark.parametrize("plugin", ["directional", "projector"])
+def test_scaled_emitters_are_refused_from_both_sides(make_scene, plugin):
+    def scene(scale):
+        turned = mi.ScalarTransform4f().look_at([0, 0, 3], [1, 0, 0], [0, 1, 0])
+        return make_scene(beam={"type": plugin, "to_world": turned @ mi.ScalarTransform4f().scale(scale)})
+
+    scaled, plain = scene(2.0), scene(1.0)
+    with pytest.raises(UnsupportedScene, match=f"emitter beam is a `{plugin}` with a scale .*; remove the scale$"):
+        check_paths(scaled, scaled.sensors()[0], "both")
+    check_paths(scaled, scaled.sensors()[0], "camera")
+    check_paths(scaled, scaled.sensors()[0], "light")
+    check_paths(plain, plain.sensors()[0], "both")
 
 
 @pytest.mark.usefixtures("_without_scenes_of_before")
