@@ -27,6 +27,7 @@ from reslrb_cli.scene.needs import (
     check_camera_paths,
     check_paths,
     paths_obstacle,
+    scaled_emitter,
     scene_needs,
     stock_clip,
 )
@@ -146,7 +147,7 @@ def paths_of(integrator: Integrator, scene: mi.Scene, sensors: list[int], moves:
         return "light" if integrator.light_share else "camera"
     if integrator.paths != "auto":
         return integrator.paths
-    if camera_finds_nothing(scene):
+    if camera_finds_nothing(scene) or scaled_emitter(scene) is not None:
         return "light"
     looked = [scene.sensors()[sensor] for sensor in sensors]
     for kind in ("both", "camera"):

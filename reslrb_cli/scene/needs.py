@@ -161,10 +161,10 @@ def paths_obstacle(scene: Any, sensor: Any, paths: str) -> str | None:
         return f"{obstacle}; take integrator.paths: light"
     if paths == "both" and (obstacle := unsupported_part(scene, sensor) or _unsampled(scene)) is not None:
         return f"{obstacle}; take integrator.paths: camera"
-    return _scaled_emitter(scene) if paths == "both" else None
+    return scaled_emitter(scene) if paths == "both" else None
 
 
-def _scaled_emitter(scene: Any) -> str | None:
+def scaled_emitter(scene: Any) -> str | None:
     """The reason why both kinds of paths do not render the same light, in words; None where they do.
 
     Of a `directional` or `projector` emitter Mitsuba's `sample_ray` takes the scale of `to_world`, along which

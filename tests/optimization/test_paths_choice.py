@@ -11,10 +11,12 @@ import pytest
 from optimization.deciding import SMALL, begin, fix_times
 from runs.going_on import optimize
 
+from reslrb_cli.config.integrators import Reslrb
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble, assemble_scene
 from reslrb_cli.optimization.autotune.sampling import FEWER, FIRST_SHARE, MORE, with_sides
+from reslrb_cli.optimization.loading import paths_of
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.decisions import PathsRecord
@@ -108,6 +110,22 @@ def test_light_paths_find_all_but_mirrors_and_what_hidden_lamps_cover():
     room["wall"]["bsdf"] = {"type": "conductor"}
     scene = mi.load_dict(room)
     assert not light_finds_all(scene, scene.sensors(), False)
+
+
+def test_beams_alone_and_scaled_ones_are_left_to_light_paths():
+    def paths(**lights: Any) -> str:
+        wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 3])}
+        scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}, "wall": wall, **lights})
+        return paths_of(Reslrb(), scene, [0])
+
+    def sun(scale: float) -> dict[str, Any]:
+        return {"type": "directional", "to_world": mi.ScalarTransform4f().scale(scale)}
+
+    beam = {"type": "rectangle", "emitter": {"type": "directionalarea"}}
+    assert paths(beam=beam) == "light"
+    assert paths(beam=beam, sun=sun(1)) == "both"
+    assert paths(sun=sun(1)) == "both"
+    assert paths(sun=sun(2)) == "light"
 
 
 def test_what_moves_light_has_light_paths():
