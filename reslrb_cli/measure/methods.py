@@ -28,6 +28,22 @@ SHARED = (
     *UNDECIDED,
 )
 
+#: Options that say which paths there are.
+PATHS_OPTIONS = ("paths", "light_share")
+
+
+def records_of(paths: str, light_share: Any) -> dict[str, Any]:
+    """`paths` and `light_share` as records have them: a share where there are both kinds of paths and it is known."""
+    known = paths == "both" and isinstance(light_share, (int, float))
+    return {"paths": paths, "light_share": float(light_share) if known else None}
+
+
+def paths_in_records(config: Config) -> dict[str, Any]:
+    """Those of an integrator; `auto` where that is left to measurement."""
+    options, usual = config.integrator.options(), "camera" if config.integrator.type == "prb" else "light"
+    return records_of(str(options.get("paths", usual)), options.get("light_share", UNDECIDED["light_share"]))
+
+
 #: The estimator of a case that names none, as that of the plugin.
 PLUGIN_ESTIMATOR = "reservoir"
 
@@ -110,8 +126,9 @@ def parse_estimators(text: str) -> list[Case]:
 def all_estimators(config: Config) -> list[Case]:
     """Every estimator of `reslrb`; that of the configuration has the options that stand there."""
     cases, own = [], config.integrator
+    camera = isinstance(own, ReslrbConfig) and own.paths == "camera"  # of which there is one estimator alone
     for name in ESTIMATOR_OPTIONS:
-        if name != "auto":
+        if name != "auto" and (name == "stack" or not camera):
             mine = isinstance(own, ReslrbConfig) and own.estimator == name
             names = [option for option in ESTIMATOR_OPTIONS[name] if mine and option in own.model_fields_set]
             options = {option: getattr(own, option) for option in names}
@@ -357,7 +374,8 @@ class Plan(Measurement):
         own = {name: value for name, value in case.options.items() if name not in ADJOINT}
         estimator = replace(case, options=own).estimator
         label = f"{case.label}, {spp} spp" if self.spps and not reference else case.label
-        return Method(label, case.type, estimator, options.get("capacity"), adjoint, spp)
+        capacity = options.get("capacity")
+        return Method(label, case.type, estimator, capacity, adjoint, spp, **paths_in_records(config))
 
 
 #: What is compared where the user names nothing.
