@@ -5,8 +5,8 @@ Baselines, has the reasons.
 
 Two things come before: `leave_out_border` leaves out the film's border where paths from the camera and paths from the
 lights are compared, since light tracing loses there what samples just outside of the film would have added
-(`scene.visibility.interior`; `divides_by_film` says whose pixels lose nothing); `known_gradient` recognises scenes whose
-gradient is known in closed form.
+(`scene.visibility.interior`; `divides_by_film` says whose pixels lose nothing); `known_gradient` recognises scenes
+whose gradient is known in closed form.
 """
 
 from __future__ import annotations
