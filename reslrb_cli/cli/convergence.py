@@ -144,7 +144,7 @@ MOST_RUNS = 100
                    "loss, by run.adjoint; image: the image.")  # fmt: skip
 @click.option("--runs", type=click.IntRange(min=1, max=MOST_RUNS), metavar="N",
               help="Whole optimisations in place of gradients: N seeds by each method, at equal wall time, all costs "
-                   "counted. Default list: ptracer, prb, reslrb:stack, and reslrb:auto, also on light paths.")  # fmt: skip
+                   "counted. Default list: ptracer, prb, reslrb:stack, reslrb:auto, also on light paths.")  # fmt: skip
 @click.option("--rates", type=Factors(), metavar="LIST",
               help="With --runs: each method tries its learning rates times each of these, e.g. 0.3,1,3, and is "
                    "compared at its best.")  # fmt: skip
