@@ -166,7 +166,8 @@ MOST_RUNS = 100
 def command(
     config_file: Path, overrides: tuple[str, ...], integrators: str | None, objective: str, runs: int | None,
     rates: tuple[float, ...] | None, budget: float, rounds: int | None, spps: tuple[int, ...] | None,
-    reference: str | None, resumed: Path | None, memory_limit: int | None, json_file: Path | None, plot_file: Path | None,
+    reference: str | None, resumed: Path | None, memory_limit: int | None, json_file: Path | None,
+    plot_file: Path | None,
 ) -> int:  # fmt: skip
     """Measure how fast the error of each method falls on CONFIG, at its initial values, seen through its first sensor.
 

@@ -343,8 +343,8 @@ class Plan(Measurement):
 
     @property
     def camera(self) -> dict[str, bool]:
-        """Whether paths from the `camera` take part, whether that is so in any case, `named`, and whether those from the
-        `light` alone do, as `survey` asks."""
+        """Whether paths from the `camera` take part, whether that is so in any case, `named`, and whether those from
+        the `light` alone do, as `survey` asks."""
         spp = self.config.run.spp
         sides = [self._has_camera_paths(self.config_of(case, spp)) for case in self.cases]
         named = self._has_camera_paths(self.reference_config)  # what errors are taken from is a side too

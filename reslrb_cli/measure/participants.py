@@ -194,7 +194,7 @@ class Participants:
             self.images[way] = choose(by_camera | by_light if divides_by_film(way.paths) else by_light | by_camera)
         seen = {reference for reference, _ in self.images.values()}
         #: Whether images, and what they are compared with, leave out the film's border.
-        self._masked = self._are_unlike(seen)
+        self.masked = self._are_unlike(seen)
         self._weigh(self._are_unlike({*self.stock.values(), *seen}))
         along = all_directions(self.case, problem.selection, MOVING_DIRECTIONS, DIRECTIONS)
         self.directions = {way.named(key): along[key] for way in self.each_way for key in self.case.keys}
@@ -276,7 +276,7 @@ class Participants:
             return self.case.gradient(self.integrators[of], seed, self.spp, **options)
         if kind == "image":
             image = self.case.image(self.integrators[of], seed, self.spp)
-            if self._masked:
+            if self.masked:
                 image *= interior(image.shape, self.sensor)[:, :, None]
             return image.ravel()
         _, way = self._of[of]

@@ -27,7 +27,7 @@ SMALL = [
 KEY = "white.reflectance.data"
 KEYS = ["case", "parameter", "integrator", "estimator", "reference", "kind", "seeds", "verdict", "relative_l2",
         "relative_l2_limit", "z_rms", "z_rms_limit", "z_max", "z_max_limit", "cosine", "variance_ratio", "detectable",
-        "message", "holds"]  # fmt: skip
+        "message", "paths", "light_share", "holds"]  # fmt: skip
 
 
 def call(*args: str) -> int:

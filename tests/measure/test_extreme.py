@@ -11,8 +11,8 @@ from reslrb_cli.measure.extreme import CASES, LISTED, run_suite
 from reslrb_cli.measure.extreme.suite import WAYS
 from reslrb_cli.records.measurements import GradcheckRecord, Verdict
 
-#: By default: no path that connects, values that are not finite, a lamp of which no point can be drawn; roulette and its
-#: fault, and a furnace, stand below.
+#: By default: no path that connects, values that are not finite, a lamp of which no point can be drawn; roulette and
+#: its fault, and a furnace, stand below.
 FEW = ("no_connection", "nan_loss", "black_lamp")
 
 

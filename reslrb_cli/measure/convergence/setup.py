@@ -200,11 +200,11 @@ def survey(
 
     The facts: `keys`, `shapes` of what is estimated (of the parameters, or `image`), `independent` (key to the name of
     a stock integrator, or None), `why` (key to what keeps others from it), `without` (stock integrators that are right
-    for nothing here, with the reason), `paths` (those of what errors are taken from, by which all of this goes), `masked` (whether pixels along the border are left out), `pixels`, and in words
-    what was rendered, `pictures`. The arrays: `mask` (H, W, 1), and unless the image is the objective the first
-    view's `target_arrays` and `adjoints` (B, H, W, C). `camera`: paths from the camera take part, where they are right
-    or `named`, which lose nothing by the film's border, `light`: such take part that do; `budget_s` is the time of the whole measurement, if it
-    counts.
+    for nothing here, with the reason), `paths` (those of what errors are taken from, by which all of this goes),
+    `masked` (whether pixels along the border are left out), `pixels`, and in words what was rendered, `pictures`. The
+    arrays: `mask` (H, W, 1), and unless the image is the objective the first view's `target_arrays` and `adjoints` (B,
+    H, W, C). `camera`: paths from the camera take part, where they are right or `named`, which lose nothing by the
+    film's border, `light`: such take part that do; `budget_s` is the time of the whole measurement, if it counts.
     """
     film = problem.scene.sensors()[problem.sensors[0]].film()
     width, height = (int(n) for n in film.crop_size())

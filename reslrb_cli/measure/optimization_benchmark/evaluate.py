@@ -108,9 +108,10 @@ def prepare(
     """Make the targets, and write them to `out`; `budget_s` is the time of the whole, `image_s` that of one judgement.
 
     Where the `camera`'s paths take part, which may be left out unless they are `named`, and such from the `light`
-    alone, all leave out the film's border. The facts: `masked` (whether that is so), `without` (stock integrators that are right for nothing here, and
-    the reason), `loss` and `error` of the initial values, the seconds that a judgement takes (`judge_s`), the samples
-    of its images (`spp`), and in words `pictures` and `error_of`.
+    alone, all leave out the film's border. The facts: `masked` (whether that is so), `without` (stock integrators that
+    are right for nothing here, and the reason), `paths` (those of the images), `loss` and `error` of the initial
+    values, the seconds that a judgement takes (`judge_s`), the samples of its images (`spp`), and in words `pictures`
+    and `error_of`.
     """
     references = find_references(problem, "loss")
     without = references["without"]
