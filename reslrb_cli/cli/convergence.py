@@ -136,14 +136,15 @@ MOST_RUNS = 100
 @experiment_arguments
 @click.option("--integrators", metavar="LIST",
               help="What to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)], separated by commas; OPTION is one of the "
-                   "integrator's, or, with --objective loss, adjoint. Default: ptracer, prb and the estimators, as far "
-                   "as they can do CONFIG; with loss the ways to take adjoint.")  # fmt: skip
+                   "integrator's, or, with --objective loss, adjoint. Default: ptracer, prb, the estimators, "
+                   "stack guided, and its camera paths, alone and beside light paths, as far as they can do CONFIG; "
+                   "with loss the ways to take adjoint.")  # fmt: skip
 @click.option("--objective", type=click.Choice(["fixed", "loss", "image"]), default="fixed", show_default=True,
               help="fixed: the gradient with dL/dI held at that of a reference image; loss: the gradient of CONFIG's "
                    "loss, by run.adjoint; image: the image.")  # fmt: skip
 @click.option("--runs", type=click.IntRange(min=1, max=MOST_RUNS), metavar="N",
               help="Whole optimisations in place of gradients: N seeds by each method, at equal wall time, all costs "
-                   "counted. Default list: ptracer, prb, reslrb:stack and reslrb:auto.")  # fmt: skip
+                   "counted. Default list: ptracer, prb, reslrb:stack, reslrb:auto, also on light paths.")  # fmt: skip
 @click.option("--rates", type=Factors(), metavar="LIST",
               help="With --runs: each method tries its learning rates times each of these, e.g. 0.3,1,3, and is "
                    "compared at its best.")  # fmt: skip
@@ -153,8 +154,9 @@ MOST_RUNS = 100
                    "every machine.")  # fmt: skip
 @click.option("--spp", "spps", type=Counts(), metavar="LIST",
               help="Samples per pixel of a step, several to compare, e.g. 4,16,64; default: run.spp.")  # fmt: skip
-@click.option("--reference", metavar="METHOD", default="reslrb:stack", show_default=True,
-              help="What errors are taken from: the mean of many steps of this one.")  # fmt: skip
+@click.option("--reference", metavar="METHOD",
+              help="What errors are taken from: the mean of many steps of this one. Default: reslrb:stack with paths "
+                   "from both sides, half of each, where CONFIG allows that.")  # fmt: skip
 @resume_option
 @memory_limit_option
 @click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False),
@@ -163,8 +165,9 @@ MOST_RUNS = 100
               help="PNG of error against run time; default: beside the JSON file.")  # fmt: skip
 def command(
     config_file: Path, overrides: tuple[str, ...], integrators: str | None, objective: str, runs: int | None,
-    rates: tuple[float, ...] | None, budget: float, rounds: int | None, spps: tuple[int, ...] | None, reference: str,
-    resumed: Path | None, memory_limit: int | None, json_file: Path | None, plot_file: Path | None,
+    rates: tuple[float, ...] | None, budget: float, rounds: int | None, spps: tuple[int, ...] | None,
+    reference: str | None, resumed: Path | None, memory_limit: int | None, json_file: Path | None,
+    plot_file: Path | None,
 ) -> int:  # fmt: skip
     """Measure how fast the error of each method falls on CONFIG, at its initial values, seen through its first sensor.
 
@@ -178,15 +181,17 @@ def command(
     from reslrb_cli.config.loader import load
 
     load_packages()  # before what follows asks for them
-    from reslrb_cli.measure.methods import DEFAULT, DEFAULTS, Plan, RunsPlan, parse_cases
+    from reslrb_cli.measure.methods import DEFAULT, DEFAULTS, REFERENCE, Plan, RunsPlan, parse_cases
 
     config = load(config_file, overrides)
     if runs is not None:
         _refuse_with_runs()
     elif rates is not None:
         raise ConfigError("--rates", "", "are those of whole optimisations; add --runs N")
-    cases = parse_cases(integrators or (DEFAULTS[objective] if runs is None else DEFAULT), deep=False)
-    stands = parse_cases(reference, "--reference", deep=False)
+    before = _settings_of(resumed)  # what nobody names is as it was: defaults may have been others
+    usual = ",".join(before.get("integrators", ())) or (DEFAULTS[objective] if runs is None else DEFAULT)
+    cases = parse_cases(integrators or usual, deep=False)
+    stands = parse_cases(reference or before.get("reference") or REFERENCE, "--reference", deep=False)
     if len(stands) != 1:
         raise ConfigError("--reference", "", "errors are taken from one method; name one")
     json_file, plot_file = files_of(resumed, json_file, plot_file)
@@ -216,6 +221,16 @@ def command(
         look_at(plot_file)
     done = any(record.relative_rmse is not None for record in results.methods)
     return exit_code(interrupted, done, {record.status for record in results.methods})
+
+
+def _settings_of(resumed: Path | None) -> dict[str, Any]:
+    """The settings of what is gone on from; nothing where there is none. Raises ConfigError."""
+    if resumed is None:
+        return {}
+    from reslrb_cli.records.measurement_files import read_samples, samples_file
+
+    found = read_samples(samples_file(resumed))[0].get("settings")
+    return found if isinstance(found, dict) else {}
 
 
 def _refuse_with_runs() -> None:

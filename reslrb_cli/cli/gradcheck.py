@@ -31,7 +31,7 @@ from reslrb_cli.cli.options import (
 from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
 from reslrb_cli.errors import ConfigError, ExitCode
-from reslrb_cli.measure.methods import all_estimators, parse_estimators
+from reslrb_cli.measure.methods import PATHS_OPTIONS, all_estimators, parse_estimators
 from reslrb_cli.measure.resume_store import Earlier, settings
 from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verdict
 
@@ -128,19 +128,20 @@ def run_suite_command(
 
 
 def _estimators(text: str | None) -> list[str] | None:
-    """Names of estimators, without options: the cases have their own."""
+    """Estimators as they are written, without options other than `paths`: the cases have their own."""
     if text is None:
         return None
-    names = []
+    written = []
     for case in parse_estimators(text):
-        name = case.options["estimator"]
-        if len(case.options) > 1:
-            raise ConfigError("--estimators", case.label.partition(":")[2], "a suite takes names without options")
+        name, label = case.options["estimator"], case.label.partition(":")[2]
+        if not case.options.keys() <= {"estimator", *PATHS_OPTIONS}:
+            raise ConfigError("--estimators", label, "a suite takes names without options, other than paths")
         if name not in ESTIMATOR_OPTIONS or name == "auto":
             known = ", ".join(other for other in ESTIMATOR_OPTIONS if other != "auto")
             raise ConfigError("--estimators", "", f"`{name}` is no estimator; there are {known}")
-        names.append(name)
-    return names
+        case.at(read_or_box(None, ()), 4, known=True)
+        written.append(label)
+    return written
 
 
 def _case_line(case: str, rows: list[GradcheckRecord]) -> str:

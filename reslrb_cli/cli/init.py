@@ -306,17 +306,20 @@ def _propose(scene_file: Path, scene: mi.Scene, index: int, wanted: tuple[str, .
 
 
 def _integrator(scene: mi.Scene, sensor: mi.Sensor, hides_emitters: bool, file: Path) -> tuple[str, str | None]:
-    """The integrator that can render the scene, and why it is not light paths where these cannot.
+    """The integrator that can render the scene, and why it is not ours where that cannot.
 
     Raises ConfigError, located in the scene's `file`, where none can.
     """
-    from reslrb_cli.scene.needs import camera_obstacle, check_supported, light_obstacle
+    from reslrb_cli.scene.needs import camera_obstacle, check_supported, paths_obstacle
 
     try:
         check_supported(scene, sensor, hides_emitters)
     except UnsupportedScene as error:
+        obstacle = paths_obstacle(scene, sensor, "camera")
+        if obstacle is None:  # which `paths: auto` takes
+            return "reslrb", None
         if camera_obstacle(scene, sensor) is None:
-            return "prb", light_obstacle(scene, sensor, hides_emitters)
+            return "prb", obstacle.partition("; take ")[0]
         raise ConfigError(file, "", str(error)) from None  # which has words for both
     return "reslrb", None
 

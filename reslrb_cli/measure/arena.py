@@ -14,7 +14,7 @@ from typing import Any, Generic, TypeVar
 from reslrb_cli.backend.installation import python_command
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ExitCode
-from reslrb_cli.measure.methods import Measurement, Plan
+from reslrb_cli.measure.methods import Case, Measurement, Plan
 from reslrb_cli.measure.processes import Contestant, Pace, Process, Refused, Stepping, Stopped
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.workers import Begin
@@ -165,12 +165,22 @@ class Arena(Generic[Measured, Worker]):
     def _say_left_out(self) -> None:
         """Name what nobody named and cannot do the scene: of the default list alone."""
         for case in self.plan.cases:
-            if self.plan.default and case.type in self.facts["without"]:
-                self._say(f"left out: {case.label}: {self.facts['without'][case.type]}")
+            reason = self._without(case)
+            if reason is not None:
+                self._say(f"left out: {case.label}: {reason}")
 
-    def _takes_part(self, type: str) -> bool:
-        """Whether methods of this type are measured."""
-        return not self.plan.default or type not in self.facts["without"]
+    def _takes_part(self, case: Case) -> bool:
+        """Whether a method is measured."""
+        return self._without(case) is None
+
+    def _without(self, case: Case) -> str | None:
+        """Why a method of the default list is left out; None where it takes part."""
+        if not self.plan.default:
+            return None
+        if self.facts.get("paths") == "light" and case.options.get("paths", "light") != "light":
+            return "this scene has light paths alone"
+        reason: str | None = self.facts["without"].get(case.type)
+        return reason
 
 
 def load(does: str) -> Begin:

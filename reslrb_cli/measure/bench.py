@@ -20,7 +20,7 @@ from typing import Any
 from reslrb_cli.config.schema import Config
 from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.arena import Arena
-from reslrb_cli.measure.methods import WIDTHS, Case, Sweep
+from reslrb_cli.measure.methods import WIDTHS, Case, Sweep, paths_in_records
 from reslrb_cli.measure.processes import GROWTH, MAX_ROUNDS, NO_TIME, Ended, Stepping, Stopped
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import Kept
@@ -110,6 +110,7 @@ def _result(run: Run, value: int, sweep: Sweep, runs: Sequence[Run]) -> Result:
         height=height,
         status=BenchStatus.OK if run.end is None else run.end.status,
         texels=next((other.texels for other in runs if other.texels is not None), None),
+        **paths_in_records(run.config),
         **figures,
     )
     kernel, step = (_ratio(run, baseline, key) for key in ("kernel_ms", "step_ms"))

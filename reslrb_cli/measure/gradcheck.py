@@ -25,7 +25,8 @@ from reslrb_cli.measure.comparison import (
     entry_count,
     paired_z_scores,
 )
-from reslrb_cli.measure.participants import Settings
+from reslrb_cli.measure.methods import records_of
+from reslrb_cli.measure.participants import Settings, Way
 from reslrb_cli.measure.processes import NO_TIME
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.sampling import NAIVE, Name, Sampling
@@ -59,12 +60,19 @@ class Result:
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison to be made: of the parameter `key` (None: the image) by the integrator `label`."""
+    """One comparison to be made: of the parameter `key` (None: the image) by the integrator `label`, whose paths are
+    `way`."""
 
     key: str | None
     label: str
     reference: Reference
     kind: Kind
+    way: Way
+
+    @property
+    def place(self) -> str:
+        """The parameter, by way, as `Participants` has what belongs to it."""
+        return self.way.named(str(self.key))
 
 
 class Gradcheck:
@@ -80,18 +88,23 @@ class Gradcheck:
     def rows(self) -> list[Row]:
         """What is compared, in the order of the table: last, what needs naive AD, which compiles for longest."""
         parts = self.participants
-        found = [] if parts.image is None else [Row(None, "reslrb", parts.image, Kind.IMAGE)]
+        found = [
+            Row(None, "reslrb", reference, Kind.IMAGE, way)
+            for way, (reference, _) in parts.images.items()
+            if reference is not None
+        ]
         plain = [label for label, config in self.settings.configs().items() if _draws_plainly(config)]
         for key in parts.case.keys:
             for listed in parts.listed:
-                exact = ESTIMATORS[listed.options["estimator"]].exact and listed.label in plain
+                label, way = listed.label, parts.ways[listed.label]
+                exact = ESTIMATORS[listed.options["estimator"]].exact and label in plain
                 kind = Kind.EQUAL_SEEDS if exact else Kind.EXPECTATION
-                found.append(Row(key, listed.label, Reference.WALK_AD, kind))
-                stock = parts.stock[key]
+                found.append(Row(key, label, Reference.WALK_AD, kind, way))
+                stock = parts.stock[way.named(key)]
                 references = [] if stock is None else [stock]
                 references += [Reference.ANALYTIC] if key in parts.exact else []
                 references += [Reference.FINITE_DIFFERENCE] + ([Reference.FORWARD_MODE] if parts.forward_mode else [])
-                found += [Row(key, listed.label, reference, Kind.EXPECTATION) for reference in references]
+                found += [Row(key, label, reference, Kind.EXPECTATION, way) for reference in references]
         return sorted(found, key=lambda row: row.key is not None and row.reference.value in NAIVE)
 
     def conditions(self) -> str:
@@ -102,7 +115,7 @@ class Gradcheck:
         roulette = f"roulette from depth {integrator.rr_depth}" if plays else "no roulette"
         return (
             f"{self.settings.config.source}, film {width}x{height}, {parts.spp} spp "
-            f"({width * height * parts.spp} light paths a seed), max_depth {integrator.max_depth}, {roulette}"
+            f"({width * height * parts.spp} paths a seed), max_depth {integrator.max_depth}, {roulette}"
         )
 
     def expected(self) -> list[GradcheckRecord]:
@@ -142,13 +155,15 @@ class Gradcheck:
 
     def _needs(self, row: Row) -> list[Name]:
         """The samples that a comparison is made of: of ours, and of the reference where that is not exact."""
+        naive = row.way.named("walk_ad")
         if row.key is None:
-            return [("image", "walk_ad"), ("image", row.reference.value)]
+            return [("image", naive), ("image", row.reference.value)]
         ours = "gradient", self.participants.sampled(row.label, row.reference)
         its = {
             Reference.ANALYTIC: [],
-            Reference.FINITE_DIFFERENCE: [("differences", row.key)],
-            Reference.FORWARD_MODE: [("tangents", row.key)],
+            Reference.WALK_AD: [("gradient", naive)],
+            Reference.FINITE_DIFFERENCE: [("differences", row.place)],
+            Reference.FORWARD_MODE: [("tangents", row.place)],
         }
         return [ours, *its.get(row.reference, [("gradient", row.reference.value)])]
 
@@ -163,7 +178,7 @@ class Gradcheck:
         if row.key is None:
             return entry_count(tuple(parts.case.weights.shape))
         if row.reference in ALONG_DIRECTIONS:
-            return len(parts.directions[row.key])
+            return len(parts.directions[row.place])
         if row.reference is Reference.ANALYTIC:
             return len(parts.exact[row.key])
         return entry_count(parts.shape(row.key))
@@ -175,7 +190,7 @@ class Gradcheck:
         if row.key is None:
             shape = tuple(parts.case.weights.shape)
         else:
-            place, chosen = parts.case.places[row.key], parts.directions[row.key]
+            place, chosen = parts.case.places[row.key], parts.directions[row.place]
             ours = ours[:, place]
             if row.reference in ALONG_DIRECTIONS:
                 ours = ours @ np.array([direction.vector[place] for direction in chosen]).T
@@ -198,16 +213,21 @@ class Gradcheck:
         kind, _, estimator = row.label.partition(":")
         return GradcheckRecord(
             str(self.settings.config.source), row.key, kind, estimator or None, row.reference, row.kind, seeds,
-            **vars(figures),
+            **vars(figures), **records_of(row.way.paths, row.way.light_share),
         )  # fmt: skip
 
     def _without_reference(self) -> Iterator[Result]:
         """Say so where no stock integrator counts."""
         parts = self.participants
-        missing = {key: parts.why[key] for key in parts.case.keys if parts.stock[key] is None}
-        rows = [(Row(key, "reslrb", Reference.PTRACER, Kind.EXPECTATION), why) for key, why in missing.items()]
-        if parts.image is None:
-            rows.append((Row(None, "reslrb", Reference.PATH, Kind.IMAGE), parts.why_no_image))
+        rows = []
+        for way in parts.each_way:
+            missing = {key: parts.why[way.named(key)] for key in parts.case.keys if parts.stock[way.named(key)] is None}
+            rows += [
+                (Row(key, "reslrb", Reference.PTRACER, Kind.EXPECTATION, way), why) for key, why in missing.items()
+            ]
+        for way, (reference, why) in parts.images.items():
+            if reference is None:
+                rows.append((Row(None, "reslrb", Reference.PATH, Kind.IMAGE, way), why))
         for row, why in rows:
             yield Result(self._record(row, Comparison(Verdict.NO_REFERENCE, message=why), 0))
 
@@ -215,7 +235,7 @@ class Gradcheck:
 def _draws_plainly(config: Config) -> bool:
     """Whether paths are those of naive AD at equal seeds: it draws them by nothing that it learned, nor evenly."""
     options = config.integrator.options()
-    usual = {"guiding": "off", "sequence": "independent", "paths": "light"}
+    usual = {"guiding": "off", "sequence": "independent"}
     return all(options.get(name, value) == value for name, value in usual.items())
 
 

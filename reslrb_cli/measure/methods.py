@@ -28,6 +28,25 @@ SHARED = (
     *UNDECIDED,
 )
 
+#: Options that say which paths there are.
+PATHS_OPTIONS = ("paths", "light_share")
+
+
+def records_of(paths: str, light_share: Any) -> dict[str, Any]:
+    """`paths` and `light_share` as records have them: a share where there are both kinds of paths and it is known."""
+    known = paths == "both" and isinstance(light_share, (int, float))
+    return {"paths": paths, "light_share": float(light_share) if known else None}
+
+
+def paths_in_records(config: Config) -> dict[str, Any]:
+    """Those of an integrator; `auto` where that is left to measurement."""
+    options, usual = config.integrator.options(), "camera" if config.integrator.type == "prb" else "light"
+    return records_of(str(options.get("paths", usual)), options.get("light_share", UNDECIDED["light_share"]))
+
+
+#: The share of light paths where there are both kinds, and nothing else is asked for.
+BOTH_SHARE = float(UNDECIDED["light_share"])
+
 #: The estimator of a case that names none, as that of the plugin.
 PLUGIN_ESTIMATOR = "reservoir"
 
@@ -68,6 +87,8 @@ class Case:
         values = {"type": self.type} | {name: shared[name] for name in SHARED if name in shared and name in own}
         # Of the experiment, whose pilot decides it; what is named here has none.
         values = {name: value for name, value in values.items() if name not in UNDECIDED or value != "auto"}
+        if "paths" in self.options:  # a share is of the experiment's own paths
+            values.pop("light_share", None)
         values |= {name: value for name, value in self.options.items() if name not in ADJOINT}
         if self.type == "reslrb" and values.setdefault("estimator", PLUGIN_ESTIMATOR) == "auto" and not auto:
             raise ConfigError(blame, "estimator", "`auto` measures which to take; name those to compare")
@@ -110,8 +131,9 @@ def parse_estimators(text: str) -> list[Case]:
 def all_estimators(config: Config) -> list[Case]:
     """Every estimator of `reslrb`; that of the configuration has the options that stand there."""
     cases, own = [], config.integrator
+    camera = isinstance(own, ReslrbConfig) and own.paths == "camera"  # of which there is one estimator alone
     for name in ESTIMATOR_OPTIONS:
-        if name != "auto":
+        if name != "auto" and (name == "stack" or not camera):
             mine = isinstance(own, ReslrbConfig) and own.estimator == name
             names = [option for option in ESTIMATOR_OPTIONS[name] if mine and option in own.model_fields_set]
             options = {option: getattr(own, option) for option in names}
@@ -278,13 +300,15 @@ OBJECTIVES = ("fixed", "loss", "image")
 
 #: What is compared where the user names nothing, by objective.
 DEFAULTS = {
-    "fixed": "ptracer,prb,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack",
+    "fixed": "ptracer,prb,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,reslrb:stack(guiding=on),"
+    "reslrb:stack(paths=camera),reslrb:stack(paths=both)",
     "loss": "reslrb:stack(adjoint=correlated),reslrb:stack(adjoint=independent),reslrb:stack(adjoint=batched)",
-    "image": "ptracer,prb,reslrb:stack",
+    "image": "ptracer,prb,reslrb:stack,reslrb:stack(paths=camera),reslrb:stack(paths=both)",
 }
 
-#: What errors are taken from where the user names nothing.
-REFERENCE = "reslrb:stack"
+#: What errors are taken from where the user names nothing: all light, `both` at a share that nothing is measured for,
+#: where the scene allows it, and else what paths can render it.
+REFERENCE = "reslrb:stack(paths=auto)"
 
 #: A depth at which roulette never begins.
 NEVER = 1_000_000
@@ -319,9 +343,17 @@ class Plan(Measurement):
 
     @property
     def camera(self) -> dict[str, bool]:
-        """Whether paths from the `camera` take part, and whether that is so in any case, `named`, as `survey` asks."""
-        named = self.reference.type == "prb"  # what errors are taken from is a side too
-        return {"camera": named or any(case.type == "prb" for case in self.cases), "named": named or not self.default}
+        """Whether paths from the `camera` take part, whether that is so in any case, `named`, and whether those from
+        the `light` alone do, as `survey` asks."""
+        spp = self.config.run.spp
+        sides = [self._has_camera_paths(self.config_of(case, spp)) for case in self.cases]
+        named = self._has_camera_paths(self.reference_config)  # what errors are taken from is a side too
+        return {"camera": named or any(sides), "named": named or not self.default,
+                "light": not (named and all(sides))}  # fmt: skip
+
+    def _has_camera_paths(self, config: Config) -> bool:
+        """Whether an integrator's images lose nothing by the film's border, as far as that is known of it."""
+        return str(paths_in_records(config)["paths"]) != "light"
 
     @property
     def entries(self) -> list[tuple[Case, int]]:
@@ -335,7 +367,18 @@ class Plan(Measurement):
     @property
     def reference_config(self) -> Config:
         """The experiment with the integrator that errors are taken from, dL/dI known. Raises ConfigError."""
-        return self.reference.at(self.config, self.config.integrator.max_depth, True)
+        return self.reference.at(self.config, self.config.integrator.max_depth, True, auto=True)
+
+    def settled_reference(self, paths: str) -> Case:
+        """What errors are taken from, with these `paths` where that was left to what the scene allows."""
+        if self.reference.options.get("paths") != "auto":
+            return self.reference
+        own: dict[str, Any] = {} if paths == "light" else {"paths": paths}
+        own |= {"light_share": BOTH_SHARE} if paths == "both" else {}
+        options = {name: value for name, value in self.reference.options.items() if name not in PATHS_OPTIONS} | own
+        text = ",".join(f"{name}={value}" for name, value in options.items() if name != "estimator")
+        kind = f"{self.reference.type}:{options['estimator']}"
+        return replace(self.reference, label=f"{kind}({text})" if text else kind, options=options)
 
     def independent_config(self, name: str) -> Config:
         """The experiment with a stock integrator: without roulette, which naive AD does not differentiate rightly."""
@@ -346,6 +389,8 @@ class Plan(Measurement):
 
     def check(self) -> None:
         """Raise ConfigError where an integrator of the list, or the reference, cannot be."""
+        if self.reference.options.get("estimator") == "auto":
+            raise ConfigError("--reference", "", "`auto` measures which estimator to take; name one")
         for case, spp in self.entries:
             self.config_of(case, spp)
         _ = self.reference_config
@@ -357,11 +402,12 @@ class Plan(Measurement):
         own = {name: value for name, value in case.options.items() if name not in ADJOINT}
         estimator = replace(case, options=own).estimator
         label = f"{case.label}, {spp} spp" if self.spps and not reference else case.label
-        return Method(label, case.type, estimator, options.get("capacity"), adjoint, spp)
+        capacity = options.get("capacity")
+        return Method(label, case.type, estimator, capacity, adjoint, spp, **paths_in_records(config))
 
 
 #: What is compared where the user names nothing.
-DEFAULT = "ptracer,prb,reslrb:stack,reslrb:auto"
+DEFAULT = "ptracer,prb,reslrb:stack,reslrb:auto(paths=light),reslrb:auto"
 
 
 @dataclass(frozen=True)

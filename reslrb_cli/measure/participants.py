@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -16,8 +17,10 @@ from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import Case, all_directions, choose_step, seeds, smooth_weights
 from reslrb_cli.measure.methods import Case as Listed
 from reslrb_cli.measure.references import (
+    CAMERA_PATHS,
     Situation,
     choose,
+    divides_by_film,
     ends,
     known_gradient,
     of_gradient,
@@ -28,6 +31,7 @@ from reslrb_cli.measure.references import (
 from reslrb_cli.measure.scenes import small
 from reslrb_cli.measure.stepper import multiple_of, shrink
 from reslrb_cli.optimization.assemble import assemble_scene
+from reslrb_cli.optimization.loading import check_integrator
 from reslrb_cli.records.measurements import Reference
 from reslrb_cli.scene.catalog import value_shape
 from reslrb_cli.scene.visibility import interior
@@ -51,9 +55,6 @@ ALIKE: dict[Reference, dict[str, str]] = {
     Reference.PTRACER: {"attached_sampling": "follow", "filter_normalization": "detached"},
     Reference.FINITE_DIFFERENCE: {"filter_normalization": "attached"},
 }
-
-#: References that trace paths from the sensor, of which the film's border takes nothing.
-CAMERA_PATHS = {Reference.PRB, Reference.PATH}
 
 #: The integrator whose images are differenced: ours, without roulette where paths end without.
 DIFFERENCED = "differenced"
@@ -89,12 +90,43 @@ class Settings:
         return {case.label: case.at(self.config, depth, self.known) for case in self.integrators}
 
 
+@dataclass(frozen=True)
+class Way:
+    """Which paths there are, and the share of light paths in them: what is seen, and what naive AD has to trace."""
+
+    paths: str = "light"
+    light_share: float = 0.5
+
+    @classmethod
+    def of(cls, config: Config) -> Way:
+        """That of an integrator; whoever leaves nobody a choice has light paths."""
+        options = config.integrator.options()
+        paths, share = options.get("paths", "light"), options.get("light_share", "auto")
+        share = 0.5 if share == "auto" else share
+        if paths == "both" and share in (0, 1):
+            paths = "light" if share else "camera"
+        return cls(paths, share) if paths == "both" else cls(paths)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What integrators are told; of light paths nothing."""
+        share = {"light_share": self.light_share} if self.paths == "both" else {}
+        return {} if self.paths == "light" else {"paths": self.paths} | share
+
+    def named(self, name: str) -> str:
+        """What is called `name` of light paths, of these."""
+        words = {"light": "", "camera": ", paths: camera", "both": f", paths: both, light_share: {self.light_share:g}"}
+        return name + words[self.paths]
+
+
 class Participants:
     """The scene, loaded, and every integrator by its label; a variant must be set.
 
-    `stock` holds the stock reference of each parameter's gradient, or None, and `why` the reasons for what is not one;
-    `image` is the reference of the image, and `exact` holds gradients that are known in closed form. `listed` are the
-    estimators that take part: where `attached` derivatives are asked for, those that have them. Raises ConfigError and
+    `ways` say which paths each estimator has, by its label, and in all dictionaries whose keys are said to be by way
+    stand, behind the names of what light paths have, those of the others (`Way.named`). `stock` holds the stock
+    reference of each parameter's gradient, or None, and `why` the reasons for what is not one; `images` those of the
+    image, by way, and `exact` gradients that are known in closed form. `listed` are the estimators that take part:
+    where `attached` derivatives are asked for, those that have them, on light paths. Raises ConfigError and
     UnsupportedScene.
     """
 
@@ -115,6 +147,9 @@ class Participants:
         depth = config.integrator.max_depth
         self._situation = Situation.of_problem(problem, sensor)
         self.attached, moved = self._situation.attached, self._situation.moved
+        if not moved:
+            for config in {Way.of(config): config for config in configs.values()}.values():
+                check_integrator(config, config.integrator, scene, problem.sensors)
         #: Whether there is a forward mode: of emitters that move there is none.
         nodes = [self.case.params.properties[key][2] for key in moved]
         self.forward_mode = not any(
@@ -125,23 +160,44 @@ class Participants:
         naive = {"samples_per_pass": options.get("samples_per_pass")}
         if self.attached:
             naive |= {"attached": True, "filter_normalization": options.get("filter_normalization", "attached")}
+        light = Way()
+        self.ways = {
+            case.label: light if self._situation.moved else Way.of(configs[case.label]) for case in self.listed
+        }
+        self.each_way = list(dict.fromkeys(self.ways.values()))
         self.integrators = self._configured({case.label: configs[case.label] for case in self.listed})
+        for way in self.each_way:
+            self.integrators |= {
+                way.named("walk_ad"): make_integrator("walk_ad", **shared, **naive, **way.options),
+                # With roulette differences are heavy-tailed: now and then a path ends for one of the values alone.
+                way.named(DIFFERENCED): make_integrator(
+                    "walk_ad", **shared | ({"rr_depth": NEVER} if ends(depth) else {}), **way.options
+                ),
+            }
         self.integrators |= {
-            "walk_ad": make_integrator("walk_ad", **shared, **naive),
-            # With roulette differences are heavy-tailed: now and then a path ends for one of the values alone.
-            DIFFERENCED: make_integrator("walk_ad", **shared | ({"rr_depth": NEVER} if ends(depth) else {})),
             "ptracer": make_integrator("ptracer", **shared | {"rr_depth": NEVER}),
             "prb": make_integrator("prb", **shared),
             "path": make_integrator("path", **shared),
         }
-        at = self._situation
-        chosen = {key: choose(of_gradient(at, key)) for key in self.case.keys}
-        self.stock = {key: reference for key, (reference, _) in chosen.items()}
-        self.why = {key: reason for key, (_, reason) in chosen.items()}
-        by_camera = {Reference.PATH: path_image(at), Reference.PRB: prb_image(at)}
-        self.image, self.why_no_image = choose({Reference.PTRACER: ptracer_image(at)} | by_camera)
-        self._weigh()
-        self.directions = all_directions(self.case, problem.selection, MOVING_DIRECTIONS, DIRECTIONS)
+        self.stock: dict[str, Reference | None] = {}
+        self.why: dict[str, str] = {}
+        self.images: dict[Way, tuple[Reference | None, str]] = {}
+        self._of: dict[str, tuple[str, Way]] = {}
+        for way in self.each_way:
+            at = replace(self._situation, paths=way.paths)
+            for key in self.case.keys:
+                name = way.named(key)
+                self._of[name] = key, way
+                self.stock[name], self.why[name] = choose(of_gradient(at, key))
+            by_camera = {Reference.PATH: path_image(at), Reference.PRB: prb_image(at)}
+            by_light = {Reference.PTRACER: ptracer_image(at)}
+            self.images[way] = choose(by_camera | by_light if divides_by_film(way.paths) else by_light | by_camera)
+        seen = {reference for reference, _ in self.images.values()}
+        #: Whether images, and what they are compared with, leave out the film's border.
+        self.masked = self._are_unlike(seen)
+        self._weigh(self._are_unlike({*self.stock.values(), *seen}))
+        along = all_directions(self.case, problem.selection, MOVING_DIRECTIONS, DIRECTIONS)
+        self.directions = {way.named(key): along[key] for way in self.each_way for key in self.case.keys}
         weights = np.array(self.case.weights, np.float64)
         known = {key: known_gradient(self._situation, self.sensor, key, weights) for key in self.case.keys}
         self.exact = {key: value for key, value in known.items() if value is not None}
@@ -150,6 +206,9 @@ class Participants:
         """The estimators that can take part. Raises ConfigError where one was named that cannot."""
         able = [case for case in settings.integrators if ESTIMATORS[case.options["estimator"]].attaches]
         others = [case for case in settings.integrators if case not in able]
+        told = [case.label for case in settings.integrators if case.options.get("paths", "light") != "light"]
+        if self._situation.moved and told:
+            raise ConfigError("--estimators", told[0], "what moves light has derivatives on light paths alone")
         if not self.attached or not others:
             return list(settings.integrators)
         if settings.named or not able:
@@ -163,6 +222,8 @@ class Participants:
         made = {}
         for label, config in configs.items():
             kind, options = config.integrator.type, config.integrator.options()
+            if self._situation.moved:  # as the run
+                options |= {"paths": "light", "light_share": 0.5}
             made[label] = make_integrator(kind, **options)
             for reference, alike in ALIKE.items() if self.attached else ():
                 if options | alike != options:
@@ -174,8 +235,13 @@ class Participants:
         alike = _alike(label, reference)
         return alike if alike in self.integrators else label
 
-    def _weigh(self) -> None:
-        """Random weights of mean 1, so that entries do not cancel, a sixth negative; 0 where the border lacks light.
+    def _are_unlike(self, references: set[Reference | None]) -> bool:
+        """Whether something here loses light along the film's border, and something else does not."""
+        sides = {reference in CAMERA_PATHS for reference in references if reference is not None}
+        return len(sides | {divides_by_film(way.paths) for way in self.each_way}) > 1
+
+    def _weigh(self, inside: bool) -> None:
+        """Random weights of mean 1, so that entries do not cancel, a sixth negative; with `inside` 0 at the border.
 
         Where light moves, smooth ones.
         """
@@ -184,7 +250,7 @@ class Participants:
             self.case.weigh(smooth_weights(*shape))
             return
         weights = np.random.default_rng(7).uniform(-0.5, 2.5, shape)
-        if {*self.stock.values(), self.image} & CAMERA_PATHS:
+        if inside:
             weights *= interior(shape, self.sensor)[:, :, None]
         self.case.weigh(weights)
 
@@ -192,30 +258,32 @@ class Participants:
         """Shape of a parameter."""
         return value_shape(self.case.values.value(key))
 
-    def choose_steps(self, key: str) -> None:
-        """Choose the steps of the finite differences of a parameter."""
-        image, pilot = self.integrators[DIFFERENCED], seeds(PILOT_SEEDS, 9)
-        self.directions[key] = [choose_step(self.case, image, d, pilot, self.spp) for d in self.directions[key]]
+    def choose_steps(self, of: str) -> None:
+        """Choose the steps of the finite differences of a parameter, by way."""
+        _, way = self._of[of]
+        image, pilot = self.integrators[way.named(DIFFERENCED)], seeds(PILOT_SEEDS, 9)
+        self.directions[of] = [choose_step(self.case, image, d, pilot, self.spp) for d in self.directions[of]]
 
     def sample(self, kind: str, of: str, seed: int) -> np.ndarray:
         """One sample in a row: by an integrator, `gradient` or `image`, or along the directions of a parameter, `of`.
 
         Gradients are of all parameters, by a step such as the experiment takes; images are black along the border where
-        they are compared with one that loses no light there. Along directions there are finite `differences`, and
-        `tangents`, forward derivatives, which are the same for all estimators.
+        they are compared with one that loses no light there. Along directions, which are by way, there are finite
+        `differences`, and `tangents`, forward derivatives, which are the same for all estimators of the same paths.
         """
         if kind == "gradient":
             options = {"step": self.case.known_step} if self.known else {}
             return self.case.gradient(self.integrators[of], seed, self.spp, **options)
         if kind == "image":
             image = self.case.image(self.integrators[of], seed, self.spp)
-            if self.image in CAMERA_PATHS:
+            if self.masked:
                 image *= interior(image.shape, self.sensor)[:, :, None]
             return image.ravel()
+        _, way = self._of[of]
         if kind == "differences":
-            tracer, along = self.integrators[DIFFERENCED], self.directions[of]
+            tracer, along = self.integrators[way.named(DIFFERENCED)], self.directions[of]
             return np.array([direction.difference(self.case, tracer, seed, self.spp) for direction in along])
-        tracer = self.integrators[self.listed[0].label]
+        tracer = self.integrators[next(label for label, its in self.ways.items() if its == way)]
         return np.array([self.case.tangent(tracer, d.vector, seed, self.spp) for d in self.directions[of]])
 
 

@@ -5,7 +5,8 @@ Baselines, has the reasons.
 
 Two things come before: `leave_out_border` leaves out the film's border where paths from the camera and paths from the
 lights are compared, since light tracing loses there what samples just outside of the film would have added
-(`scene.visibility.interior`); `known_gradient` recognises scenes whose gradient is known in closed form.
+(`scene.visibility.interior`; `divides_by_film` says whose pixels lose nothing); `known_gradient` recognises scenes
+whose gradient is known in closed form.
 """
 
 from __future__ import annotations
@@ -25,6 +26,14 @@ from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import PrimaryHits, SceneNeeds, look, scene_needs, stock_clip
 from reslrb_cli.scene.visibility import interior
+
+#: References that trace paths from the sensor.
+CAMERA_PATHS = (Reference.PRB, Reference.PATH)
+
+
+def divides_by_film(paths: str) -> bool:
+    """Whether images by these paths (`loading.paths_of`) lose nothing along the film's border, as those of `path`."""
+    return paths != "light"
 
 
 def leave_out_border(problem: Problem) -> bool:
@@ -88,7 +97,8 @@ _ROUGHNESS = ("alpha", "alpha_u", "alpha_v")
 class Situation:
     """What decides: a scene as one sensor sees it, the paths' greatest depth, and whether emitters are hidden.
 
-    `attached`: derivatives are; `moved` are the scene's parameters that move light and are recovered.
+    `attached`: derivatives are; `moved` are the scene's parameters that move light and are recovered. `paths` (`light`,
+    `camera`, `both`) make what is judged: a reference sees no more and no less than they do.
     """
 
     scene: Any
@@ -100,15 +110,16 @@ class Situation:
     hide_emitters: bool
     attached: bool = False
     moved: tuple[str, ...] = ()
+    paths: str = "light"
 
     @classmethod
     def of(
         cls, scene: Any, sensor: Any, params: Any, max_depth: int, hide_emitters: bool, attached: bool = False,
-        moved: tuple[str, ...] = (),
+        moved: tuple[str, ...] = (), paths: str = "light",
     ) -> Situation:  # fmt: skip
         """The situation of a loaded scene, whose `mi.traverse` is `params`."""
         graph, needs, view = SceneGraph.of(scene), scene_needs(scene, sensor), look(scene, sensor)
-        return cls(scene, params, graph, needs, view, max_depth, hide_emitters, attached, moved)
+        return cls(scene, params, graph, needs, view, max_depth, hide_emitters, attached, moved, paths)
 
     @classmethod
     def of_problem(cls, problem: Problem, sensor: int) -> Situation:
@@ -116,7 +127,15 @@ class Situation:
         params, options = problem.selection.params, problem.config.integrator.options()
         moved = tuple(key for key in problem.selection.scene_keys if moves_light(params, key))
         attached, seen = options.get("attached") is True or bool(moved), problem.scene.sensors()[sensor]
-        return cls.of(problem.scene, seen, params, options["max_depth"], options["hide_emitters"], attached, moved)
+        depth, hidden = options["max_depth"], options["hide_emitters"]
+        # Stock integrators, which may stand in a problem too, are judged as the light paths that they stand beside.
+        paths = problem.paths if problem.config.integrator.type == "reslrb" else "light"
+        return cls.of(problem.scene, seen, params, depth, hidden, attached, moved, paths)
+
+    @property
+    def has_pointlike(self) -> bool:
+        """Whether any light comes from a point, or along one direction."""
+        return any(int(emitter.flags()) & int(mi.EmitterFlags.Delta) for emitter in self.scene.emitters())
 
 
 def choose(reasons: Mapping[Reference, str | None]) -> tuple[Reference | None, str]:
@@ -126,13 +145,18 @@ def choose(reasons: Mapping[Reference, str | None]) -> tuple[Reference | None, s
 
 
 def of_image(at: Situation) -> dict[Reference, str | None]:
-    """Why stock integrators are no reference of the image."""
-    return {Reference.PTRACER: ptracer_image(at), Reference.PRB: prb_image(at)}
+    """Why stock integrators are no reference of the image; first the one that treats the film's border alike."""
+    return _alike_first(at, {Reference.PTRACER: ptracer_image(at), Reference.PRB: prb_image(at)})
 
 
 def of_gradient(at: Situation, key: str) -> dict[Reference, str | None]:
-    """Why stock integrators are no reference of the gradient with respect to the parameter `key`."""
-    return {Reference.PTRACER: ptracer_gradient(at, key), Reference.PRB: prb_gradient(at, key)}
+    """Why stock integrators are no reference of the gradient with respect to the parameter `key`, in the same order."""
+    return _alike_first(at, {Reference.PTRACER: ptracer_gradient(at, key), Reference.PRB: prb_gradient(at, key)})
+
+
+def _alike_first(at: Situation, reasons: dict[Reference, str | None]) -> dict[Reference, str | None]:
+    ordered = sorted(reasons, key=lambda name: (name in CAMERA_PATHS) != divides_by_film(at.paths))
+    return {name: reasons[name] for name in ordered}
 
 
 def ptracer_image(at: Situation) -> str | None:
@@ -150,6 +174,14 @@ def ptracer_image(at: Situation) -> str | None:
         return f"it {clipping}"
     if not ends(at.max_depth):
         return f"without roulette its paths are to end at depth {DEEPEST} or before"
+    if at.paths == "light":
+        return None
+    if at.view.specular > 0:
+        return "it does not connect to glass or mirrors, which the sensor sees"
+    if at.hide_emitters and at.view.emission > 0:
+        return "hidden emitters stop its paths, and not those from the sensor"
+    if at.paths == "camera" and at.has_pointlike and at.needs.has_delta_lobes:
+        return "it finds what paths from the sensor cannot: point or parallel lights through glass or by mirrors"
     return None
 
 
@@ -169,9 +201,13 @@ def prb_image(at: Situation) -> str | None:
     """Of the image, by paths from the sensor."""
     if any(emitter.class_name() == "DirectionalArea" for emitter in at.scene.emitters()):
         return "camera paths cannot find a `directionalarea` emitter"
-    pointlike = any(int(emitter.flags()) & int(mi.EmitterFlags.Delta) for emitter in at.scene.emitters())
-    if pointlike and (at.needs.has_delta_lobes or at.needs.has_null):
-        return "camera paths cannot find point or parallel lights through glass, mirrors or masks"
+    if at.has_pointlike and at.needs.has_null:
+        return "it cannot find point or parallel lights through masks"
+    # What it does not find by glass and mirrors, other paths from the sensor do not, either.
+    if at.has_pointlike and at.needs.has_delta_lobes and at.paths != "camera":
+        return "camera paths cannot find point or parallel lights through glass or by mirrors"
+    if at.paths != "light":
+        return None
     if at.view.specular > 0:
         return "the sensor sees glass or mirrors, where light paths cannot connect"
     if at.hide_emitters and at.view.emission > 0:

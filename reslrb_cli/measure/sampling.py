@@ -178,7 +178,7 @@ class Sampling:
 
     def _is_cheap(self, name: Name) -> bool:
         """Whether more than LEAST_SEEDS are taken: of estimators and stock references, which have the most noise."""
-        return name[0] == "image" or (name[0] == "gradient" and name[1] != "walk_ad")
+        return name[0] == "image" or (name[0] == "gradient" and not name[1].startswith("walk_ad"))
 
     def _most(self, name: Name) -> int:
         """Seeds of `name`, at most; within a budget, as many more as there would be without an earlier session."""
@@ -203,4 +203,4 @@ class Sampling:
 def _kind(name: Name) -> tuple[str, bool]:
     """What takes as long to compile as others of its kind: the kind, and whether it is naive AD."""
     kind, of = name
-    return kind, kind == "gradient" and of in NAIVE
+    return kind, kind == "gradient" and of.startswith(NAIVE)

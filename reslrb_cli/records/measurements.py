@@ -49,7 +49,8 @@ class BenchRecord(Line):
     calls; all of warm steps. `cold_ms` is the wall time of the first step in a new process with an empty kernel cache,
     `cold_codegen_ms` its part in which kernels were generated and compiled. `peak_mib` is the most that the allocator
     held in that step, the scene included. `scratch_bytes` is thread-local memory of a path. `texels` are those of all
-    textures that are parameters. What was not measured is None: everything, where `status` is not ok.
+    textures that are parameters. `paths` are those of the integrator (`light`, `camera`, `both`), `light_share` is the
+    share of light paths where there are both. What was not measured is None: everything, where `status` is not ok.
     """
 
     integrator: str
@@ -71,6 +72,8 @@ class BenchRecord(Line):
     scratch_bytes: int | None = None
     repeats: int = 0
     texels: int | None = None
+    paths: str = "light"
+    light_share: float | None = None
 
 
 #: Relative errors whose time is told.
@@ -92,7 +95,8 @@ class Method:
 
     `estimator` is None where the integrator has none, `capacity` where the estimator has none; `adjoint` is
     `run.adjoint`, None where dL/dI is held or nothing is differentiated. `label` is how the user wrote it, `spp` are
-    samples per pixel of a step.
+    samples per pixel of a step. `paths` and `light_share` are as in a `BenchRecord`, `auto` and None where a pilot
+    decides.
     """
 
     label: str
@@ -101,6 +105,8 @@ class Method:
     capacity: int | None
     adjoint: str | None
     spp: int
+    paths: str = "light"
+    light_share: float | None = None
 
 
 @dataclass(frozen=True)
@@ -279,7 +285,10 @@ class Comparison:
 
 @dataclass(frozen=True)
 class GradcheckRecord(Comparison, Compared, Line):
-    """One comparison: what was compared, and what was found."""
+    """One comparison: what was compared, by which paths (as in a `BenchRecord`), and what was found."""
+
+    paths: str = "light"
+    light_share: float | None = None
 
     def to_json(self) -> str:
         """The record as one line of JSON; figures that are not finite become null."""

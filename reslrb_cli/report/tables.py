@@ -94,7 +94,9 @@ def parameter_name(record: GradcheckRecord) -> str:
 
 
 def integrator_name(record: GradcheckRecord) -> str:
-    """`reslrb:stack`, or the type alone."""
+    """`reslrb:stack`, or the type alone, with its paths, where these are not those from the light."""
+    if record.estimator is None and record.paths != "light":
+        return f"{record.integrator}(paths={record.paths})"
     return record.integrator if record.estimator is None else f"{record.integrator}:{record.estimator}"
 
 

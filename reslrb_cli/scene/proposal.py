@@ -116,6 +116,8 @@ _BOUNDS = (
     (r"\.value$|\.data$|\.specular$", "[0, 1]"),
 )
 
+#: Surfaces, mirrors and clear glass but for the last, by way of which things are looked for.
+_CROSSINGS = 6
 #: Rays along each axis of the film, by which shares are taken.
 _RAYS = 64
 #: What takes less of the picture is left for later, and so are more parameters than these. A lamp is known by a few
@@ -214,25 +216,36 @@ def _above(params: mi.SceneParameters, key: str) -> list[Any]:
 
 
 def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
-    """The share of the picture that each BSDF, shape and emitter has, as the rays from the sensor meet it first."""
+    """The share of the picture that each BSDF, shape and emitter has, as the rays from the sensor meet it first, or by
+    way of mirrors and clear glass."""
     sensor = scene.sensors()[index]
     # One for each ray: an irradiance meter makes a single direction of a single one, which Dr.Jit fails to compile.
     aperture = dr.opaque(mi.Point2f, 0.5, shape=_RAYS**2)
     ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, grid(_RAYS), aperture, True)
-    si = scene.ray_intersect(ray)
-    emitter = si.emitter(scene)  # an area light has a back
-    shining = dr.select(dr.any(emitter.eval(si) > 0), emitter, dr.zeros(mi.EmitterPtr))
-    graph = SceneGraph.of(scene)
+    graph, active, lane = SceneGraph.of(scene), dr.full(mi.Bool, True, _RAYS**2), dr.arange(mi.UInt32, _RAYS**2)
     shares: dict[Any, float] = {}
-    for pointers, kind, items in (
-        (si.bsdf(), mi.BSDFPtr, graph.surface_bsdfs()),
-        (si.shape, mi.ShapePtr, graph.shapes()),
-        (shining, mi.EmitterPtr, scene.emitters()),
-    ):
-        numbers = np.bincount(np.array(dr.reinterpret_array(mi.UInt32, pointers)))
-        for item in items:
-            own = int(np.array(dr.reinterpret_array(mi.UInt32, kind(item)))[0])
-            shares[item] = float(numbers[own]) / _RAYS**2 if own < len(numbers) else 0.0
+    for crossing in range(_CROSSINGS):
+        si = scene.ray_intersect(ray, active)
+        emitter = si.emitter(scene, active)  # an area light has a back
+        shining = dr.select(dr.any(emitter.eval(si, active) > 0), emitter, dr.zeros(mi.EmitterPtr))
+        bsdf = dr.select(active, si.bsdf(), dr.zeros(mi.BSDFPtr))
+        for pointers, kind, items in (
+            (bsdf, mi.BSDFPtr, graph.surface_bsdfs()),
+            (si.shape, mi.ShapePtr, graph.shapes()),
+            (shining, mi.EmitterPtr, scene.emitters()),
+        ):
+            numbers = np.bincount(np.array(dr.reinterpret_array(mi.UInt32, pointers)))
+            for item in items:
+                own = int(np.array(dr.reinterpret_array(mi.UInt32, kind(item)))[0])
+                more = float(numbers[own]) / _RAYS**2 if own < len(numbers) else 0.0
+                shares[item] = min(shares.get(item, 0.0) + more, 1.0)
+        active &= si.is_valid() & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        if dr.none(active):
+            break
+        x, y = (mi.sample_tea_float32(lane, 2 * crossing + k) for k in range(2))
+        sample, weight = bsdf.sample(mi.BSDFContext(), si, x, mi.Point2f(x, y), active)
+        active &= dr.any(weight > 0)
+        ray = mi.RayDifferential3f(si.spawn_ray(si.to_world(sample.wo)))
     for bsdf in graph.of_type(mi.BSDF):  # what is nested is seen with what it is nested in
         shares[bsdf] = max((shares.get(owner, 0.0) for owner in graph.owning_bsdfs(bsdf)), default=0.0)
     return shares

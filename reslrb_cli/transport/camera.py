@@ -307,8 +307,10 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
                 even = dr.square(ds.dist) / (dr.abs(dr.dot(ds.n, ds.d)) * lamp.shape.surface_area())
                 here = indirect & (emitter == mi.EmitterPtr(lamp.emitter))
                 p_D = dr.select(here, scene.pdf_emitter(mi.UInt32(lamp.index)) * even, p_D)
+        # Points of a lamp whose texture is black everywhere have no density: they are met alone.
+        sampled = dr.select(dr.isfinite(p_D), p_D, 0)
         if not path.rivals:
-            rivals = p_D * path.M[0]
+            rivals = sampled * path.M[0]
         else:
             [own] = path.rivals
             table = samples.emitters
@@ -319,7 +321,7 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
                 cos = dr.abs(dr.dot(ds.n, ds.d))
                 place = dr.select(emitter.is_environment(), place, place * cos / dr.square(ds.dist))
             e = density_of_rays(plan, table, Place(emitter, place, si.uv, -path.ray.d), indirect)
-            rivals = p_D * own.M + e * own.V
+            rivals = sampled * own.M + dr.select(dr.isfinite(e), e, 0) * own.V
         weight = dr.select(active, dr.select(direct, 1, dr.rcp(1 + rivals)), 0)
     return Met(dr.select(active, Le, 0), weight, active, emitter, si)
 
@@ -336,8 +338,8 @@ def _next_event(
             ds, weight = _sample_some(samples, unseen, si, numbers, active)
         else:
             ds, weight = scene.sample_emitter_direction(si, numbers, False, active)
-    active = active & (ds.pdf > 0)
-    zero = mi.Point2f(0)
+    active = active & (ds.pdf > 0) & dr.isfinite(ds.pdf)
+    weight, zero = dr.select(active, weight, 0), mi.Point2f(0)
     return NextEvent(
         weight, zero, ds.p, si.to_local(ds.d), active, zero,
         Le=dr.select(active, weight * ds.pdf, 0), scale=dr.select(active, dr.rcp(ds.pdf), 0), ds=ds,

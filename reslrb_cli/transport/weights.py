@@ -108,7 +108,6 @@ def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission
             if lamp.texture is not None and lamp in plan.evened_lamps:
                 there = lamp.shape.eval_parameterization(si.uv, mi.RayFlags.All, active)
                 own = lamp.texture.pdf_position(si.uv, active) / dr.norm(dr.cross(there.dp_du, there.dp_dv))
-                own = dr.select(dr.isfinite(own), own, 0)
             return own, dr.abs(dr.dot(si.n, d)), si.uv, one, zero
         if self == environment:
             ds = dr.zeros(mi.DirectionSample3f)

@@ -70,7 +70,9 @@ def test_a_scene_from_end_to_end(folder: Path, capsys: pytest.CaptureFixture[str
     for line in points:
         assert line["elapsed_s"] == pytest.approx(line["steps"] * points[0]["elapsed_s"])
     reference = next(line for line in lines if line["kind"] == "reference")
-    assert (reference["label"], reference["bias_reference"], reference["biased"]) == ("reslrb:stack", "ptracer", False)
+    assert (reference["label"], reference["bias_reference"], reference["biased"]) == (
+        "reslrb:stack(paths=both,light_share=0.5)", "prb", False
+    )  # fmt: skip
     assert (folder / "out/c.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out.splitlines()
     assert printed[-2].startswith("Best for this scene: ")

@@ -27,7 +27,7 @@ SMALL = [
 KEY = "white.reflectance.data"
 KEYS = ["case", "parameter", "integrator", "estimator", "reference", "kind", "seeds", "verdict", "relative_l2",
         "relative_l2_limit", "z_rms", "z_rms_limit", "z_max", "z_max_limit", "cosine", "variance_ratio", "detectable",
-        "message", "holds"]  # fmt: skip
+        "message", "paths", "light_share", "holds"]  # fmt: skip
 
 
 def call(*args: str) -> int:
@@ -58,7 +58,7 @@ def test_a_table_and_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str
     ]
     assert all(row["holds"] is True and row["seeds"] == 8 for row in rows)
     lines = capsys.readouterr().out.splitlines()
-    assert lines[1] == "the built-in Cornell box, film 24x24, 4 spp (2304 light paths a seed), max_depth 3, no roulette"
+    assert lines[1] == "the built-in Cornell box, film 24x24, 4 spp (2304 paths a seed), max_depth 3, no roulette"
     assert lines[2].split()[:3] == ["parameter", "integrator", "reference"]
     assert lines[-1] == "9 of 9 comparisons hold, 0 fail"
     assert len(markdown.read_text().splitlines()) == 11

@@ -30,7 +30,7 @@ from reslrb_cli.records.measurements import BenchStatus
 
 KEYS = ["integrator", "estimator", "capacity", "max_depth", "rr_depth", "spp", "width", "height", "status", "step_ms",
         "kernel_ms", "codegen_ms", "tracing_ms", "cold_ms", "cold_codegen_ms", "peak_mib", "scratch_bytes",
-        "repeats", "texels"]  # fmt: skip
+        "repeats", "texels", "paths", "light_share"]  # fmt: skip
 SMALL = ["--set", "scene.options.size=16", "--set", "run.spp=1", "--rounds", "3"]
 
 

@@ -151,13 +151,14 @@ def test_a_sweep_of_samples(tmp_path: Path) -> None:
 
 def test_lines_of_json(tmp_path: Path) -> None:
     _, results, _ = play(tmp_path, Stage(case_reslrb_event=Pretence(bias=0.4)), plan())
-    common = ["kind", "label", "integrator", "estimator", "capacity", "adjoint", "spp", "parameter"]
+    common = ["kind", "label", "integrator", "estimator", "capacity", "adjoint", "spp"]
+    common += ["paths", "light_share", "parameter"]
     point = json.loads(results.points[0].to_json())
     assert list(point) == [*common, "steps", "elapsed_s", "relative_rmse", "reference_rmse", "repeats"]
     assert (point["kind"], point["spp"], point["parameter"], point["adjoint"]) == ("point", 4, "a", None)
     method = json.loads(of(results, "reslrb:event").to_json())
     assert method["kind"] == "method"
-    assert list(method)[:8] == common
+    assert list(method)[: len(common)] == common
     assert set(method["slope"]) == set(method["efficiency"]) == {"value", "low", "high"}
     assert list(method["seconds_to"]) == ["0.1", "0.03", "0.01"]
     assert method["seconds_to"] == {"0.1": None, "0.03": None, "0.01": None}  # none can be reached

@@ -8,10 +8,12 @@ from typing import Any
 import pytest
 
 from reslrb_cli.measure.extreme import CASES, LISTED, run_suite
-from reslrb_cli.records.measurements import GradcheckRecord
+from reslrb_cli.measure.extreme.suite import WAYS
+from reslrb_cli.records.measurements import GradcheckRecord, Verdict
 
-#: By default: no path that connects, values that are not finite; roulette and its fault, and a furnace, stand below.
-FEW = ("no_connection", "nan_loss")
+#: By default: no path that connects, values that are not finite, a lamp of which no point can be drawn; roulette and
+#: its fault, and a furnace, stand below.
+FEW = ("no_connection", "nan_loss", "black_lamp")
 
 
 @pytest.fixture(autouse=True)
@@ -38,9 +40,31 @@ def test_case(name: str):
     records = list(run_suite([name]))
     moving = CASES[name].moves is not None
     assert {record.estimator for record in records} == {"stack", "reservoir"} | (
-        set() if moving else {"gather", "event"}
+        set() if moving else {"gather", "event", *WAYS}
     )
     assert not failures(records)
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [("refraction", "point or parallel lights"), ("slab", "directionalarea"), ("nested_dielectrics", "hardly find")],
+)
+def test_camera_paths_alone_are_left_out_of_what_they_cannot_find(name: str, reason: str):
+    [record] = run_suite([name], ["stack(paths=camera)"])
+    assert (record.verdict, record.paths, record.light_share) == (Verdict.NO_REFERENCE, "camera", None)
+    assert reason in record.message
+
+
+def test_along_the_border_camera_paths_are_compared_with_those_that_lose_nothing_there():
+    """`ptracer` does, and is no reference of theirs: the light that it lacks there would be found missing."""
+    records = list(run_suite(["film_crop"], WAYS))
+    assert {record.reference.value for record in records} == {"walk_ad", "prb", "path"}
+    assert {record.paths for record in records} == {"both", "camera"}
+    assert all(record.holds for record in records)
+
+
+def test_of_what_moves_there_are_light_paths_alone():
+    assert not list(run_suite(["slope_0"], WAYS))
 
 
 @pytest.mark.long

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES
@@ -34,6 +36,7 @@ from reslrb_cli.measure.methods import all_estimators, parse_estimators
 from reslrb_cli.measure.participants import Participants, Settings
 from reslrb_cli.measure.references import (
     Situation,
+    of_image,
     path_image,
     prb_gradient,
     prb_image,
@@ -46,7 +49,7 @@ from reslrb_cli.measure.scenes import small
 from reslrb_cli.measure.scenes.small import camera, diffuse, lamp, rgb, room, transform
 from reslrb_cli.measure.scenes.small import room as corner
 from reslrb_cli.records.measurement_files import read_samples, write_samples
-from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict
+from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict, record_of
 from reslrb_cli.report.tables import summary_lines
 from reslrb_cli.scene.visibility import interior
 
@@ -280,13 +283,11 @@ def test_a_wide_filter_has_no_weights_along_the_border():
 
 
 @pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize(
-    ("reference", "dark"), [(Reference.PATH, True), (Reference.PRB, True), (Reference.PTRACER, False)]
-)
-def test_images_are_compared_without_the_border_that_paths_from_the_lights_leave_dark(reference, dark):
+@pytest.mark.parametrize("dark", [True, False])
+def test_images_are_compared_without_the_border_that_paths_from_the_lights_leave_dark(dark):
     case = Case(room(camera=camera("gaussian")), [])
     sensor, integrators = case.scene.sensors()[0], {"walk_ad": integrator("walk_ad", 4)}
-    parts = SimpleNamespace(case=case, sensor=sensor, integrators=integrators, image=reference, spp=16)
+    parts = SimpleNamespace(case=case, sensor=sensor, integrators=integrators, masked=dark, spp=16)
     image = Participants.sample(parts, "image", "walk_ad", 1).reshape(16, 16, 3)
     inside = interior(image.shape, sensor)
     assert (image[~inside] == 0).all() == dark
@@ -334,6 +335,79 @@ def test_directions_stay_within_the_bounds():
     assert natural_bounds("bsdf", np.array([1.5])) == (0, np.inf)
     assert natural_bounds("emitter", np.array([0.2])) == (0, np.inf)
     assert natural_bounds("bsdf", np.array([-1.5])) == (-np.inf, np.inf)
+
+
+# Camera paths: compared with what sees the same, and with naive AD of the same paths at equal seeds.
+
+WAYS = "stack,stack(paths=both,light_share=0.25),stack(paths=camera)"
+
+
+@pytest.mark.usefixtures("llvm")
+def test_paths_are_compared_with_naive_ad_of_the_same_at_equal_seeds():
+    results = check("scene.options.size=8", estimators=WAYS, seeds=4)
+    records = [result.record for result in results]
+    assert not [record for record in records if record.holds is False]
+    alike = [record for record in records if record.kind is Kind.EQUAL_SEEDS]
+    assert [(r.paths, r.light_share, r.holds) for r in alike] == [
+        ("light", None, True), ("both", 0.25, True), ("camera", None, True)
+    ]  # fmt: skip
+    assert [(r.paths, r.reference) for r in records if r.kind is Kind.IMAGE] == [
+        ("light", Reference.PTRACER), ("both", Reference.PATH), ("camera", Reference.PATH)
+    ]  # fmt: skip
+    assert {r.paths for r in records if r.reference is Reference.PRB} == {"both", "camera"}
+    entry = json.loads(alike[1].to_json())
+    assert (entry["estimator"], entry["paths"]) == ("stack(paths=both,light_share=0.25)", "both")
+    assert record_of(GradcheckRecord, entry) == alike[1]
+    old = {name: value for name, value in entry.items() if name not in ("paths", "light_share")}
+    found = record_of(GradcheckRecord, old)
+    assert found is not None
+    assert (found.paths, found.light_share) == ("light", None)
+
+
+@pytest.mark.usefixtures("llvm")
+def test_a_weight_of_camera_paths_that_is_wrong_is_found(monkeypatch: pytest.MonkeyPatch):
+    """Light paths count in full beside camera paths: naive AD has the same fault, `path` has not."""
+    monkeypatch.setattr("reslrb_cli.transport.walk.weight_of_connection", lambda *_: mi.Float(1))
+    results = check("scene.options.size=8", "run.spp=64", estimators="stack(paths=both)", seeds=4)
+    failed = {(result.record.parameter, result.record.reference) for result in results if result.record.holds is False}
+    assert (None, Reference.PATH) in failed
+
+
+@pytest.mark.usefixtures("llvm")
+def test_of_camera_paths_alone_there_is_one_estimator():
+    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, "integrator.paths=camera"])
+    assert [case.label for case in all_estimators(config)] == ["reslrb:stack"]
+
+
+@pytest.mark.usefixtures("llvm")
+def test_of_what_moves_light_there_are_light_paths():
+    config = room_moving("lamp_over_floor.xml", "lamp.position")
+    with pytest.raises(ConfigError, match="what moves light has derivatives on light paths alone"):
+        Gradcheck(Settings(config, parse_estimators("stack(paths=both)"), 0, 3))
+
+
+def _lit(view: str, **more: Any) -> Situation:
+    """A small room as a sensor sees it; its references are those of these paths."""
+    made = Case(room(**more), [])
+    return Situation.of(made.scene, made.scene.sensors()[0], made.params, 4, False, paths=view)
+
+
+@pytest.mark.usefixtures("llvm")
+def test_what_counts_as_a_reference_goes_by_the_paths():
+    mirror = {"wall": {"type": "twosided", "bsdf": {"type": "conductor"}}}
+    assert prb_image(_lit("light", **mirror)) is not None
+    assert ptracer_image(_lit("light", **mirror)) is None
+    for paths in ("camera", "both"):
+        assert prb_image(_lit(paths, **mirror)) is None
+        assert ptracer_image(_lit(paths, **mirror)) is not None
+    ball = {"ball": {"type": "sphere", "radius": 0.1, "center": [0, 9, 0], "bsdf": {"type": "dielectric"}}}
+    bulb = {"bulb": {"type": "point", "position": [0, 8, 0], "intensity": rgb(1, 1, 1)}}
+    assert prb_image(_lit("both", **ball, **bulb)) is not None
+    assert ptracer_image(_lit("both", **ball, **bulb)) is None
+    assert prb_image(_lit("camera", **ball, **bulb)) is None
+    assert ptracer_image(_lit("camera", **ball, **bulb)) is not None
+    assert list(of_image(_lit("light"))) == [Reference.PTRACER, Reference.PRB]
+    assert list(of_image(_lit("both"))) == [Reference.PRB, Reference.PTRACER]
 
 
 # Gradcheck of parameters that move light: which references count, and which estimators take part.

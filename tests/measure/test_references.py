@@ -17,7 +17,8 @@ from measure.test_convergence import GAUSSIAN, problem
 from reslrb_cli.cli import main
 from reslrb_cli.config.loader import dump, load
 from reslrb_cli.measure import prb_comparison
-from reslrb_cli.measure.methods import parse_cases
+from reslrb_cli.measure.convergence.setup import Role
+from reslrb_cli.measure.methods import REFERENCE, parse_cases
 from reslrb_cli.measure.optimization_benchmark import evaluate
 from reslrb_cli.measure.references import leave_out_border
 from reslrb_cli.optimization.assemble import assemble
@@ -222,24 +223,48 @@ def test_all_processes_of_whole_runs_leave_it_out(llvm: None, tmp_path: Path, ca
 
 
 CAMERA_CASES = [
-    ("ptracer,reslrb:stack", "reslrb:stack", (False, True)),
-    ("prb,reslrb:stack", "reslrb:stack", (True, True)),
-    ("reslrb:stack", "prb", (True, True)),  # what errors are taken from is a side too
+    ("ptracer,reslrb:stack", "reslrb:stack", (False, True, True)),
+    ("prb,reslrb:stack", "reslrb:stack", (True, True, True)),
+    ("reslrb:stack", "prb", (True, True, True)),  # what errors are taken from is a side too
+    ("reslrb:stack(paths=both),reslrb:event", "reslrb:stack", (True, True, True)),
+    ("reslrb:stack", "reslrb:stack(paths=auto)", (True, True, True)),
+    ("prb,reslrb:stack(paths=camera)", "reslrb:stack(paths=both)", (True, True, False)),  # all alike
 ]
 
 
 @pytest.mark.parametrize(("cases", "reference", "expected"), CAMERA_CASES)
 def test_camera_paths_are_seen_wherever_they_take_part(
-    tmp_path: Path, cases: str, reference: str, expected: tuple[bool, bool]
+    tmp_path: Path, cases: str, reference: str, expected: tuple[bool, bool, bool]
 ) -> None:
     changes: dict[str, Any] = {"reference": parse_cases(reference)[0]}
     stage = pretended_steps.Stage()
     pretended_steps.play(tmp_path, stage, pretended_steps.plan(cases, rounds=3, **changes))
     [ask] = [question["ask"] for question in stage.asked if "ask" in question]
-    assert (ask["camera"], ask["named"]) == expected
+    assert (ask["camera"], ask["named"], ask["light"]) == expected
     runs = pretended_runs.Stage()
     pretended_runs.play(tmp_path, runs, pretended_runs.plan(cases, runs=1, **changes))
-    assert (runs.prepared["camera"], runs.prepared["named"]) == expected
+    assert (runs.prepared["camera"], runs.prepared["named"], runs.prepared["light"]) == expected
+
+
+@pytest.mark.parametrize(
+    ("paths", "label", "share"),
+    [("light", "reslrb:stack", None), ("camera", "reslrb:stack(paths=camera)", None),
+     ("both", "reslrb:stack(paths=both,light_share=0.5)", 0.5)],
+)  # fmt: skip
+def test_errors_are_taken_from_all_light_that_the_scene_allows_for(
+    tmp_path: Path, paths: str, label: str, share: float | None
+) -> None:
+    """Of the default list, what there are no paths for is left out, and said."""
+    stage = pretended_steps.Stage(facts={"paths": paths})
+    usual = pretended_steps.plan(
+        "reslrb:stack,reslrb:stack(paths=both)", rounds=3, reference=parse_cases(REFERENCE)[0], default=True
+    )
+    session, results, said = pretended_steps.play(tmp_path, stage, usual)
+    method = results.references[0].method
+    assert (method.label, method.paths, method.light_share) == (label, paths, share)
+    assert session.of(Role.REFERENCE)[0].config.integrator.options()["paths"] == paths
+    left_out = "left out: reslrb:stack(paths=both): this scene has light paths alone"
+    assert (left_out in said) == (paths == "light")
 
 
 def test_of_the_default_list_camera_paths_may_be_left_out(tmp_path: Path) -> None:

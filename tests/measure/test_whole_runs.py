@@ -247,8 +247,8 @@ def test_equal_methods_are_seldom_told_apart() -> None:
 def test_records_and_lines(tmp_path: Path) -> None:
     session, points, _ = play(tmp_path, Stage(), plan(runs=1))
     line = json.loads(points[-1].to_json())
-    assert list(line) == ["kind", "label", "integrator", "estimator", "capacity", "adjoint", "spp", "seed", "elapsed_s",
-                          "iteration", "loss", "parameter_error"]  # fmt: skip
+    assert list(line) == ["kind", "label", "integrator", "estimator", "capacity", "adjoint", "spp", "paths",
+                          "light_share", "seed", "elapsed_s", "iteration", "loss", "parameter_error"]  # fmt: skip
     assert line["kind"] == "run_point"
     record = method_records(session.members, session.limit_s)[1]
     line = json.loads(record.to_json())

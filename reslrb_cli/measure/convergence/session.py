@@ -124,9 +124,12 @@ class Session(Arena[Plan, Member]):
         plan, facts = self.plan, self.facts
         self._say_left_out()
         for case, spp in plan.entries:
-            if self._takes_part(case.type):
+            if self._takes_part(case):
                 self._add(Role.CASE, case, plan.config_of(case, spp), plan.objective)
-        self._add(Role.REFERENCE, plan.reference, plan.reference_config, self._noise_free)
+        # Files of before it was known which paths there are had a reference that said so.
+        reference = plan.settled_reference(facts.get("paths", "light"))
+        known = reference.at(plan.config, plan.config.integrator.max_depth, True)
+        self._add(Role.REFERENCE, reference, known, self._noise_free)
         for name in dict.fromkeys(name for name in facts["independent"].values() if name is not None):
             config = plan.independent_config(name)
             same = [] if plan.objective == "loss" else [m for m in self.of(Role.CASE) if m.config == config]
@@ -137,7 +140,7 @@ class Session(Arena[Plan, Member]):
             self._restore(self._earlier)
         for key, reason in facts["why"].items():
             if facts["independent"][key] is None:
-                self._say(f"{key}: no independent reference ({reason}); biases are judged by {plan.reference.label}")
+                self._say(f"{key}: no independent reference ({reason}); biases are judged by {reference.label}")
 
     @property
     def _noise_free(self) -> str:

@@ -22,7 +22,7 @@ from reslrb_cli.integrators.step import render_image
 from reslrb_cli.measure.methods import IMAGES
 from reslrb_cli.measure.participants import ALIKE
 from reslrb_cli.measure.processes import Ended, Stepping
-from reslrb_cli.measure.references import Situation, choose, of_gradient, of_image
+from reslrb_cli.measure.references import CAMERA_PATHS, Situation, choose, of_gradient, of_image
 from reslrb_cli.measure.stepper import Steps, multiple_of
 from reslrb_cli.measure.workers import Begun
 from reslrb_cli.optimization.assemble import assemble_scene
@@ -194,24 +194,26 @@ def begin_survey(first: dict[str, Any]) -> Begun:
 
 
 def survey(
-    problem: Problem, objective: str, camera: bool, named: bool, budget_s: float | None
+    problem: Problem, objective: str, camera: bool, named: bool, budget_s: float | None, light: bool = True
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """What is known of a problem, targets not made yet, and arrays that its samples are taken with.
 
     The facts: `keys`, `shapes` of what is estimated (of the parameters, or `image`), `independent` (key to the name of
     a stock integrator, or None), `why` (key to what keeps others from it), `without` (stock integrators that are right
-    for nothing here, with the reason), `masked` (whether pixels along the border are left out), `pixels`, and in words
-    what was rendered, `pictures`. The arrays: `mask` (H, W, 1), and unless the image is the objective the first
-    view's `target_arrays` and `adjoints` (B, H, W, C). `camera`: paths from the camera take part, where they are right
-    or `named`, which lose nothing by the film's border; `budget_s` is the time of the whole measurement, if it
-    counts.
+    for nothing here, with the reason), `paths` (those of what errors are taken from, by which all of this goes),
+    `masked` (whether pixels along the border are left out), `pixels`, and in words what was rendered, `pictures`. The
+    arrays: `mask` (H, W, 1), and unless the image is the objective the first view's `target_arrays` and `adjoints` (B,
+    H, W, C). `camera`: paths from the camera take part, where they are right or `named`, which lose nothing by the
+    film's border, `light`: such take part that do; `budget_s` is the time of the whole measurement, if it counts.
     """
     film = problem.scene.sensors()[problem.sensors[0]].film()
     width, height = (int(n) for n in film.crop_size())
     facts = find_references(problem, objective)
     inside = np.ones((height, width), bool)
     pixels = width * height
-    if (camera and (named or "prb" not in facts["without"])) or Reference.PRB.value in facts["independent"].values():
+    sides = {name in CAMERA_PATHS for name in facts["independent"].values() if name is not None}
+    sides |= {True} if camera and (named or "prb" not in facts["without"]) else set()
+    if len(sides | ({False} if light else set())) > 1:
         inside = interior((height, width), problem.scene.sensors()[problem.sensors[0]])
     mask = inside[:, :, None].astype(np.float32)
     facts |= {"masked": not inside.all(), "pictures": "", "pixels": pixels}
@@ -264,7 +266,8 @@ def find_references(problem: Problem, objective: str) -> dict[str, Any]:
         if all(reasons[name] is not None for reasons in found.values())
     }
     shapes = {key: list(value_shape(problem.selection.value(key))) for key in keys if key != "image"}
-    return {"keys": keys, "shapes": shapes, "independent": independent, "why": why, "without": without}
+    return {"keys": keys, "shapes": shapes, "independent": independent, "why": why, "without": without,
+            "paths": problem.paths}  # fmt: skip
 
 
 def _unlike(config: Config) -> str | None:

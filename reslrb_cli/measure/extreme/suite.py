@@ -1,4 +1,8 @@
-"""The extreme suite: what a case is (`ExtremeCase`), and how its estimators are run against references (`run_case`)."""
+"""The extreme suite: what a case is (`ExtremeCase`), and how its estimators are run against references (`run_case`).
+
+Beside the estimators on light paths each case has camera paths (`WAYS`), against the same references but for the film's
+border (`_seen_by`), and against naive AD of the same paths.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +23,8 @@ from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.comparison import Family, compare_equal_seeds, compare_expectations
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.gradients import seeds as seeds_of
+from reslrb_cli.measure.methods import parse_estimators, records_of
+from reslrb_cli.measure.references import Situation, prb_image
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.scenes.analytic import KnownScene
 from reslrb_cli.measure.scenes.moving import Move, moving_case
@@ -92,7 +98,7 @@ class Differences:
     def samples(self, case: ExtremeCase, setup: Case) -> Samples:
         directions = setup.directions(2)
         along = directions if self.sides == "both" else np.abs(directions)
-        tracer = integrator("reslrb", **without_roulette(case))
+        tracer = integrator("reslrb", **without_roulette(case), **case.way)
         paired = "rr_depth" not in case.options
         chosen = seeds_of(case.seeds, 0 if paired else 1)
         values = setup.differences(tracer, along, chosen, case.spp, self.step, self.sides)
@@ -201,6 +207,11 @@ class ExtremeCase:
     elsewhere: Mapping[str, str] = field(default_factory=dict)
     moves: Callable[[Any], Sequence[Move]] | None = None
 
+    @property
+    def way(self) -> dict[str, Any]:
+        """Those of its options that say which paths there are."""
+        return {name: self.ours[name] for name in ("paths", "light_share") if name in self.ours}
+
     def setup(self) -> Case:
         """The scene, loaded, with its parameters."""
         if self.moves is None:
@@ -272,6 +283,65 @@ def run_case(
     """Run a case with these estimators (all of them by default); `seeds` replaces its own number."""
     case = case if seeds is None else replace(case, seeds=seeds)
     setup = case.setup()
+    plain, groups = np.array(setup.weights), dict[str, list[tuple[str, dict[str, Any]]]]()
+    for label in (*ESTIMATORS, *WAYS) if estimators is None else estimators:
+        estimator, way = split(label)
+        groups.setdefault(str(way), []).append((label, {"estimator": estimator} | way))
+    for members in groups.values():
+        way = {name: value for name, value in members[0][1].items() if name != "estimator"}
+        setup.weights = type(setup.weights)(plain)
+        if way and case.moves is not None:
+            continue  # what moves light has derivatives on light paths alone
+        reason = _hidden_from(case, setup) if way.get("paths") == "camera" else None
+        if reason is not None:
+            for label, _ in members:
+                none = Comparison(Verdict.NO_REFERENCE, message=reason)
+                yield _record(case, label, None, Reference.PRB, Kind.EXPECTATION, none)
+            continue
+        yield from _run_way(_seen_by(case, setup, way) if way else case, setup, members)
+
+
+#: Camera paths, beside the estimators on light paths, as `--estimators` has them.
+WAYS = ("stack(paths=both)", "stack(paths=camera)")
+
+#: Radius of a filter, in pixels, that does not reach over the film's border.
+BOX = 0.5
+
+
+def split(label: str) -> tuple[str, dict[str, Any]]:
+    """The estimator of a label, such as `stack(paths=both)`, and its options. Raises ConfigError."""
+    [listed] = parse_estimators(label)
+    options = dict(listed.options)
+    return str(options.pop("estimator")), options
+
+
+def _loses_border(case: ExtremeCase, setup: Case) -> bool:
+    """Whether light paths lose what camera paths have along the film's border."""
+    return bool(setup.scene.sensors()[0].film().rfilter().radius() > BOX)
+
+
+def _hidden_from(case: ExtremeCase, setup: Case) -> str | None:
+    """Why camera paths alone are left out: they find the light not at all, or too rarely for a z-test; else None."""
+    depth, hidden = case.options["max_depth"], bool(case.options.get("hide_emitters", False))
+    at = Situation.of(setup.scene, setup.scene.sensors()[0], setup.params, depth, hidden, paths="both")
+    reason = prb_image(at)
+    if reason is None and case.image == "ptracer" and not _loses_border(case, setup):
+        reason = "paths from the sensor hardly find this light"
+    return reason
+
+
+def _seen_by(case: ExtremeCase, setup: Case, way: Mapping[str, Any]) -> ExtremeCase:
+    """The case with these paths: `prb` and `path` are its references where `ptracer` loses the film's border."""
+    changed: dict[str, Any] = {"ours": {**case.ours, **way}}
+    if _loses_border(case, setup) and case.source == Stock("ptracer"):
+        changed |= {"source": Stock("prb"), "image": "path" if case.image else ""}
+    return replace(case, **changed)
+
+
+def _run_way(
+    case: ExtremeCase, setup: Case, members: Sequence[tuple[str, Mapping[str, Any]]]
+) -> Iterator[GradcheckRecord]:
+    """Run estimators that trace the same kinds of paths, by their labels and options."""
     weights = np.array(setup.weights) if case.weights is None else case.weights(np.array(setup.weights))
     # What is refused of dL/dI counts as zero; references are never shown it.
     setup.weights = type(setup.weights)(np.where(np.isfinite(weights), weights, 0))
@@ -284,7 +354,8 @@ def run_case(
         tracer = integrator(case.image, **without_roulette(case))
         stock = np.stack([setup.image(tracer, seed, case.spp) for seed in seeds_of(case.seeds, 2)])
     setup.weights = type(setup.weights)(weights)
-    for name in ESTIMATORS if estimators is None else estimators:
+    for label, options in members:
+        name = options["estimator"]
         if case.moves is not None and not ESTIMATORS[name].attaches:
             continue
         gradients, images, refused = _steps(case, setup, name)
@@ -293,10 +364,18 @@ def run_case(
             rows.append((None, Reference(case.image), Kind.IMAGE, _images(images, stock)))
         if not np.isfinite(weights).all():
             rows.append((None, Reference.ANALYTIC, Kind.EQUAL_SEEDS, _refusals(weights, refused)))
-        if case.residual and name == "gather":
+        if case.residual and name == "gather" and not case.way:
             rows.append((None, Reference.ANALYTIC, Kind.EQUAL_SEEDS, residual(case, setup)))
-        for parameter, other, kind, comparison in rows:
-            yield GradcheckRecord(case.name, parameter, "reslrb", name, other, kind, case.seeds, **vars(comparison))
+        for row in rows:
+            yield _record(case, label, *row)
+
+
+def _record(
+    case: ExtremeCase, label: str, parameter: str | None, other: Reference, kind: Kind, found: Comparison
+) -> GradcheckRecord:
+    options = split(label)[1]
+    way = records_of(options.get("paths", "light"), options.get("light_share", 0.5))
+    return GradcheckRecord(case.name, parameter, "reslrb", label, other, kind, case.seeds, **vars(found), **way)
 
 
 def _steps(case: ExtremeCase, setup: Case, name: str) -> tuple[np.ndarray, np.ndarray, list[int]]:

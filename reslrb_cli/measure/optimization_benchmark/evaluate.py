@@ -103,16 +103,18 @@ def begin_judging(first: dict[str, Any]) -> Begun:
 
 
 def prepare(
-    problem: Problem, out: str, budget_s: float, image_s: float, camera: bool, named: bool
+    problem: Problem, out: str, budget_s: float, image_s: float, camera: bool, named: bool, light: bool = True
 ) -> tuple[Judge, dict[str, Any]]:
     """Make the targets, and write them to `out`; `budget_s` is the time of the whole, `image_s` that of one judgement.
 
-    Where the `camera`'s paths take part, which may be left out unless they are `named`, all leave out the film's
-    border. The facts: `masked` (whether that is so), `without` (stock integrators that are right for nothing here, and
-    the reason), `loss` and `error` of the initial values, the seconds that a judgement takes (`judge_s`), the samples
-    of its images (`spp`), and in words `pictures` and `error_of`.
+    Where the `camera`'s paths take part, which may be left out unless they are `named`, and such from the `light`
+    alone, all leave out the film's border. The facts: `masked` (whether that is so), `without` (stock integrators that
+    are right for nothing here, and the reason), `paths` (those of the images), `loss` and `error` of the initial
+    values, the seconds that a judgement takes (`judge_s`), the samples of its images (`spp`), and in words `pictures`
+    and `error_of`.
     """
-    without = find_references(problem, "loss")["without"]
+    references = find_references(problem, "loss")
+    without = references["without"]
     initial = copies(problem)
     films = [problem.scene.sensors()[sensor].film() for sensor in problem.sensors]
     pixels = sum(int(np.prod(film.crop_size())) for film in films)
@@ -121,13 +123,18 @@ def prepare(
     problem = find_reached(make_targets(problem, lambda line: None))
     with open(out, "wb") as file:
         np.savez(file, **target_arrays(problem.views))  # type: ignore[arg-type]
-    masked = camera and (named or "prb" not in without) and leave_out_border(problem)
+    masked = light and camera and (named or "prb" not in without) and leave_out_border(problem)
     affordable = affordable_paths(problem, pixels, image_s) // pixels
     spp = multiple_of(max(affordable, LEAST_SPP), problem.samples_per_pass)
     judge, facts = _judge(problem, spp, initial)
     kind = "RMSE of the parameters" if judge.meter.one_unit else "relative RMSE of the parameters"
     pictures = f"losses of images of {spp} spp{shortened}"
-    found = {"without": without, "error_of": kind if facts["error"] is not None else "", "pictures": pictures}
+    found = {
+        "without": without,
+        "paths": references["paths"],
+        "error_of": kind if facts["error"] is not None else "",
+        "pictures": pictures,
+    }
     return judge, facts | found | {"spp": spp, "masked": masked}
 
 

@@ -88,7 +88,7 @@ class RunsSession(Arena[RunsPlan, Run]):
     def _course(self) -> Iterator[RunPointRecord]:
         if self._prepare():
             self._say_left_out()
-            sides = [side for side in self.plan.sides if self._takes_part(side.case.type)]
+            sides = [side for side in self.plan.sides if self._takes_part(side.case)]
             if self._divide(len(sides)):
                 yield from self._waves(sides)
 
