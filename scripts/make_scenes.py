@@ -263,7 +263,7 @@ def lens(x: np.ndarray, z: np.ndarray) -> np.ndarray:
 def pane(x: np.ndarray, z: np.ndarray) -> np.ndarray:
     """The lower face of a pane of cast glass: ripples in four directions, that gather light at arm's length."""
     # Wave vector, phase, amplitude.
-    waves = [((34, 13), 0.4, 2.0e-3), ((-16, 38), 1.9, 1.7e-3), ((44, -28), 4.1, 0.8e-3), ((20, 48), 2.7, 0.6e-3)]
+    waves = [((26, 9), 0.4, 5.0e-3), ((-13, 24), 1.9, 4.2e-3), ((37, -20), 4.1, 1.6e-3), ((15, 33), 2.7, 1.4e-3)]
     return sum(amplitude * np.sin(kx * x + kz * z + phase) for (kx, kz), phase, amplitude in waves)
 
 
