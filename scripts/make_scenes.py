@@ -43,7 +43,7 @@ def images() -> dict[str, Image]:
         "caustic_slab/paper.exr": paper(64),
         "caustic_heightmap/heights.exr": heights(32),
         "lens_pose/beam.exr": beam(64),
-        "mixed_room/wallpaper.exr": wallpaper(48),
+        "mixed_room/wallpaper.exr": wallpaper(32),
     }
 
 

@@ -16,7 +16,7 @@ from reslrb_cli.scene.parameters import select_parameters, set_values
 from reslrb_cli.scene.visibility import visible_texels
 
 ROOT = Path(__file__).resolve().parents[2]
-NAMES = ("cornell_floor", "grey_room", "caustic_slab", "furnace", "lens_pose", "caustic_heightmap")
+NAMES = ("cornell_floor", "grey_room", "caustic_slab", "furnace", "lens_pose", "caustic_heightmap", "mixed_room")
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
