@@ -98,7 +98,8 @@ UNDECIDED: dict[str, str | float] = {
 
 #: What a run's own configuration, which holds every setting, always had; nobody writes all of these by hand.
 _WRITTEN_BEFORE_PATHS = frozenset(
-    "estimator max_depth rr_depth hide_emitters attached attached_sampling guiding sequence freeze".split()
+    {"max_depth", "rr_depth", "hide_emitters", "attached", "attached_sampling", "estimator"}
+    | {"guiding", "sequence", "freeze"}
 )
 
 #: Every option that says which estimator, and how.

@@ -152,6 +152,9 @@ class TargetConfig(Section):
     color_space: ColorSpace = Field(default="auto", description=f"{COLOR_SPACE} Only with `file`.")
     gamma: Positive | None = None
     """Decode values of 8 and 16 bit files by this power, in place of `color_space`. Only with `file`."""
+    truth: bool = False
+    """Whether files show the scene with its own values, as pictures of another renderer do: the error of each parameter
+    is then known and told. Only with files."""
     render: Rendering | None = Field(default=None, description="Render the target from the scene.")
     mask: AnyMask = Mask()
     """Pixels that are left out of the loss, and what the others weigh: `auto` (all kinds are left out), `none`, the
@@ -172,6 +175,8 @@ class TargetConfig(Section):
             raise located("color_space", "has no effect on a rendered target; it goes with `file`")
         if self.render is not None and self.gamma is not None:
             raise located("gamma", "has no effect on a rendered target; it goes with `file`")
+        if self.render is not None and self.truth:
+            raise located("truth", "is known of a rendered target; it goes with files")
         if self.gamma is not None and self.color_space != "auto":
             raise located("gamma", "decodes the file in place of color_space; give one of the two")
         return self
@@ -181,6 +186,7 @@ class TargetConfig(Section):
         values: dict[str, Any] = handler(self)
         if self.render is not None:
             values.pop("color_space", None)
+            values.pop("truth", None)
         return values
 
 

@@ -109,7 +109,7 @@ class Preparation:
         # By the parameters, and the objects that have them.
         self._differentiated: dict[tuple[tuple[str, mi.Object], ...], Differentiated] = {}
         self._track_zeros = False
-        self.paths = "light"
+        self.paths, self.whole = "light", False
         self._emitters: EmitterDensities | None = None
         self._renewal: Renewal | None = None
         self.recordings = Recordings()
@@ -122,7 +122,7 @@ class Preparation:
         made = Preparation(*self._depths, self._hide_emitters, self._motion, guided, low_discrepancy)
         if made.guiding is not None:
             made.guiding.images = (own is None or own.images) if images is None else images
-        made.expected, made.paths = self.expected, self.paths
+        made.expected, made.paths, made.whole = self.expected, self.paths, self.whole
         return made
 
     def draw_from(self, guiding: Guiding, scene: mi.Scene) -> None:
@@ -154,7 +154,7 @@ class Preparation:
         plan = replace(plan, evened_lamps=drawn)
         if which.shapes or which.emitters or self._motion.attached is True:
             if self.paths != "light":  # from here on for images, too: those of one run are of one kind
-                self.paths = "light"
+                self.paths, self.whole = "light", False
                 self._plans.clear()
                 return self.plan(scene, sensor, params, spp)
             plan = attach(plan, which, self._motion, scene, sensor)
@@ -174,7 +174,8 @@ class Preparation:
         needs = scene_needs(scene, sensor)
         self._renewal = self._renewal or Renewal(scene)
         settle(scene)
-        plan = replace(make_plan(needs, *self._depths, self._hide_emitters), paths=self.paths)
+        plan = make_plan(needs, *self._depths, self._hide_emitters)
+        plan = replace(plan, paths=self.paths, whole=self.whole)
         if plan.weighs:
             plan = self._renewal.renew(plan, scene)  # the horizon
         if plan.paths == "camera" or (self.guiding is None and not self._low_discrepancy):

@@ -142,7 +142,7 @@ def _on_samples(samples: Samples, function: Callable[..., Any]) -> Callable[...,
     sides = [(side.plan, side.spp, side.width) for side in samples.sides()]
 
     def on_samples(scene: mi.Scene, sensor: mi.Sensor, *given: Any) -> Any:
-        film, made = Film(sensor, sides[0][0].paths != "light"), []
+        film, made = Film(sensor, sides[0][0].whole), []
         for (plan, spp, width), arrays in zip(sides, given, strict=False):
             seed, *others = arrays
             made.append(Samples(scene, sensor, plan, film, seed, spp, width, *others))

@@ -160,7 +160,7 @@ def _paths(plan: Plan) -> Plan | str:
         return "what moves light has light paths alone"
     if plan.paths == "camera":
         return "they take the place of light paths"
-    return replace(plan, paths="light" if plan.paths == "both" else "both")
+    return replace(plan, paths="light" if plan.weighs else "both", whole=not plan.weighs)
 
 
 def _sequence(plan: Plan) -> Plan:

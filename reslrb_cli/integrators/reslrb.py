@@ -83,16 +83,17 @@ class LightTracer:
 
     def afresh(
         self, *, guided: bool | None = None, images: bool | None = None, low_discrepancy: bool | None = None,
-        paths: str | None = None, light_share: float | None = None,
+        light_share: float | None = None,
     ) -> Self:  # fmt: skip
         """The same, which knows nothing of any scene yet, with other ways of drawing samples; None: as it has it.
 
-        Guided emission or none, `images`: of images too; low-discrepancy numbers or independent ones; other `paths`, of
-        which `light_share` are light paths.
+        Guided emission or none, `images`: of images too; low-discrepancy numbers or independent ones; paths from both
+        sides, of which `light_share` are light paths: images have the film's border of both, whatever that share is.
         """
         other = copy.copy(self)
         other.preparation = self.preparation.afresh(guided, images, low_discrepancy)
-        other.have_paths(paths or self.paths, self.light_share if light_share is None else light_share)
+        if light_share is not None:
+            other.have_paths("both", light_share, whole=True)
         return other
 
     def to_measure(self) -> Self:
@@ -107,16 +108,16 @@ class LightTracer:
         """
         self.preparation.expected = spp
 
-    def have_paths(self, paths: str, light_share: float) -> None:
+    def have_paths(self, paths: str, light_share: float, whole: bool = False) -> None:
         """Have light paths, camera paths, or both, `light_share` of the samples being light paths; a share of 0 or 1
-        leaves one kind of them."""
+        leaves one kind of them. `whole`: light paths alone, too, have the film's border that the others have."""
         one_of("paths", paths, PATHS)
         if not 0 <= light_share <= 1:
             raise ValueError(f'"light_share" must lie in [0, 1], not {light_share}')
         if paths == "both" and light_share in (0, 1):
             paths = "light" if light_share else "camera"
         self.paths, self.light_share = paths, light_share
-        self.preparation.paths = paths
+        self.preparation.paths, self.preparation.whole = paths, whole or paths != "light"
 
     def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
         """What a walk of this scene needs, with derivatives of `params`, if any. Raises UnsupportedScene."""

@@ -115,6 +115,13 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
     if problem.config.target.render is not None:
         problem = replace(problem, truth=_render_targets(problem, say))
         gc.collect()  # a second scene takes part in all that is traced, until it is gone
+    elif problem.config.target.truth:
+        true_scene = load_configured(config, warn=False)
+        problem = replace(
+            problem, truth=_truth(problem, set_values(true_scene, config.parameters, {}, config.source, ""), say)
+        )
+        del true_scene
+        gc.collect()
     _check_light(problem, say)
     return problem
 
@@ -161,16 +168,7 @@ def _render_targets(problem: Problem, say: Callable[[str], None]) -> dict[str, A
     config, render = problem.config, problem.config.target.render
     assert render is not None, "called for rendered targets only"
     true_scene = load_configured(config, warn=False)
-    true_values = set_true_values(config, true_scene)
-    truth: dict[str, Array] = {}
-    for key in problem.selection.keys:
-        if key in problem.selection.factors:  # the scene's own images are the target
-            truth[key] = np.ones_like(problem.selection.array(key))
-            continue
-        truth[key] = true_values.array(key)
-        grid = comparison_grid(problem.selection.array(key).shape, truth[key].shape)
-        if grid is not None:
-            say(f"{key} has another resolution than its true value: compared, resampled, at {grid[1]}x{grid[0]}")
+    truth = _truth(problem, set_true_values(config, true_scene), say)
     chosen = render.integrator or config.integrator
     check_integrator(config, chosen, true_scene, problem.sensors, problem.moves)
     paths = paths_of(chosen, true_scene, problem.sensors, problem.moves)
@@ -182,6 +180,20 @@ def _render_targets(problem: Problem, say: Callable[[str], None]) -> dict[str, A
         say(f"rendering the target of sensor {view.sensor}: {render.spp} spp")
         image = render_in_passes(integrator, true_scene, view.sensor, render.spp, render.seed, 0, "target", multiple)
         _see(problem, view, image, None, say)
+    return truth
+
+
+def _truth(problem: Problem, true_values: Selection, say: Callable[[str], None]) -> dict[str, Array]:
+    """The parameters' true values."""
+    truth: dict[str, Array] = {}
+    for key in problem.selection.keys:
+        if key in problem.selection.factors:  # the scene's own images are the target
+            truth[key] = np.ones_like(problem.selection.array(key))
+            continue
+        truth[key] = true_values.array(key)
+        grid = comparison_grid(problem.selection.array(key).shape, truth[key].shape)
+        if grid is not None:
+            say(f"{key} has another resolution than its true value: compared, resampled, at {grid[1]}x{grid[0]}")
     return truth
 
 

@@ -173,6 +173,16 @@ def camera_finds_all(scene: Any) -> bool:
     return not any(int(bsdf.flags()) & bundled for bsdf in SceneGraph.of(scene).surface_bsdfs())
 
 
+def light_finds_all(scene: Any, sensors: Sequence[Any], hide_emitters: bool) -> bool:
+    """Whether light paths find all that these sensors see: where none of them looks at a mirror or at clear glass, and
+    no lamp that is hidden stands in the way of connections."""
+    if hide_emitters and any(shape.is_emitter() for shape in scene.shapes()):
+        return False
+    return all(
+        light_obstacle(scene, sensor, hide_emitters) is None and not look(scene, sensor).specular for sensor in sensors
+    )
+
+
 def camera_finds_nothing(scene: Any) -> bool:
     """Whether all light of `scene` is from emitters that shine along their normal alone, which no camera path finds."""
     return all(emitter.class_name() == "DirectionalArea" for emitter in scene.emitters())

@@ -140,6 +140,8 @@ class Plan:
     # Which paths there are: `light`, `camera`, or `both`; and whether this walk's begin at the sensor.
     paths: str = "light"
     camera: bool = False
+    # Whether each pixel is divided by the part of its filter that lies on the film, as wherever camera paths may run.
+    whole: bool = False
     # Whether guided paths may be aimed at what the sensor sees (`aim.py`), where nothing moves.
     aims: bool = False
     # The numbers of low discrepancy, where there are any.

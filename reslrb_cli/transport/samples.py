@@ -268,7 +268,7 @@ def passes(
     others = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(PASS_STREAM + p))[0] for p in range(1, len(sizes))]
     seeds = [mi.UInt32(seed), *others]
     dr.make_opaque(seeds)
-    film, pixels = Film(sensor, plan.paths != "light"), int(dr.prod(sensor.film().size()))  # as for `ptracer`
+    film, pixels = Film(sensor, plan.whole), int(dr.prod(sensor.film().size()))  # as for `ptracer`
     # Opaque: as literals these would give every sample count kernels of its own.
     scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / (float(pixels) * spp))
 

@@ -148,6 +148,7 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
         target("{render: {}, color_space: srgb}"),
         "target.color_space: has no effect",
     ),
+    "truth of a rendered target": (target("{render: {}, truth: true}"), "target.truth: is known of a rendered target"),
     "colour space unknown": (
         target("{file: a.png, color_space: sRGB}"),
         "target.color_space: must be one of auto, linear, srgb (did you mean srgb?)",

@@ -33,7 +33,7 @@ from turns import a_few, taking_turns
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.protocol import Job
-from reslrb_cli.integrators.step import interface_of, make_integrator
+from reslrb_cli.integrators.step import interface_of, make_integrator, render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.records.clock import peak_mib, reset_peak
 
@@ -97,6 +97,17 @@ def test_images_are_those_of_path_in_every_pixel(name: str, way: int):
     result = agreement(scene, spp=128, seeds=12, reslrb={"estimator": "stack", **WAYS[way]}, **options)
     print(name, WAYS[way], result)
     assert result
+
+
+def test_light_paths_alone_may_have_the_border_that_both_have():
+    """Where they are what `paths: auto` makes of both."""
+    film = {"film": {"rfilter": {"type": "gaussian", "stddev": 1.5}}}
+    scene = stage(None, looks(**film))
+    ours = make_integrator("reslrb", estimator="stack", max_depth=3, rr_depth=100)
+    theirs = images(scene, "path", range(50, 62), 128, max_depth=3, rr_depth=100)
+    for made, holds in ((ours, False), (ours.afresh(light_share=1.0), True)):
+        renders = np.stack([np.array(render_image(made, scene, 0, seed, 128)) for seed in range(12)])
+        assert bool(compare(renders, theirs, block=1)) == holds
 
 
 def test_what_camera_paths_cannot_find_is_left_to_light_paths():

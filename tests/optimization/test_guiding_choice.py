@@ -300,7 +300,7 @@ def test_estimators_leave_guiding_its_time(experiment: Path, monkeypatch: pytest
     monkeypatch.setattr(race.Tuner, "allowance", allowed)
     monkeypatch.setattr(estimators, "run_pilot", slow)
     fix_times(monkeypatch, {"guiding": 1.0, "sequence": 1.0, "sequence alone": 1000.0})
-    problem = assemble(load("tiny.yaml", [*AUTO, "integrator={max_depth: 3}"]))
+    problem = assemble(load("tiny.yaml", [*AUTO, "integrator={max_depth: 3, paths: light}"]))
     assert problem.pilot is not None
     assert problem.pilot.note.startswith("not measured")
     assert problem.guided is not None

@@ -240,6 +240,17 @@ def test_kinds_of_a_file(masked_folder):
     assert (left_out(problem), lines) == ([], [])
 
 
+def test_a_file_may_show_the_values_of_the_scene(masked_folder):
+    """As pictures of other renderers do; the parameters' errors are then those from the scene's own values."""
+    assert not make_masked(masked_folder, "target.file=photo.png")[0].truth
+    problem, _ = make_masked(masked_folder, "target.file=photo.png", "target.truth=true")
+    rendered = assemble(load(masked_folder / "tiny.yaml", []))
+    assert rendered.truth.keys() == problem.truth.keys() == set(problem.selection.keys)
+    for key, value in rendered.truth.items():
+        np.testing.assert_array_equal(problem.truth[key], value)
+        assert not np.array_equal(value, problem.selection.array(key))  # where the run begins
+
+
 def test_photograph_and_weights_are_turned_each_by_its_own_exif(masked_folder):
     """The same picture upright, and upside down with an EXIF that says so, make the same target and mask."""
     from PIL import Image  # comes with matplotlib

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from optimization.deciding import SMALL, begin, fix_times
@@ -12,11 +14,12 @@ from runs.going_on import optimize
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble, assemble_scene
-from reslrb_cli.optimization.autotune.sampling import FEWER, FIRST_SHARE, MORE
+from reslrb_cli.optimization.autotune.sampling import FEWER, FIRST_SHARE, MORE, with_sides
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.decisions import PathsRecord
 from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.scene.needs import light_finds_all
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -78,6 +81,33 @@ def test_it_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     assert not first.sides.cached
     assert second.sides.cached
     assert share_of(first) == share_of(second)
+
+
+def test_light_paths_alone_are_what_is_guided_where_they_find_all(monkeypatch: pytest.MonkeyPatch):
+    """With the border of both, which the target has; and that is what goes on from a checkpoint."""
+    fix_times(monkeypatch, {f"paths {share:g}": 100.0 for share in (*FEWER, *MORE)} | {"guiding": 1e-6})
+    problem = assemble(load("tiny.yaml", [*AUTO, "integrator.guiding=auto"]))
+    assert problem.guided.guided
+    assert (problem.sides.paths, problem.sides.light_share) == ("both", 1.0)
+    assert problem.sides.line().startswith("paths both, 100 % light paths: guided, they have ")
+    assert problem.integrator.paths == "light"
+    assert problem.integrator.preparation.whole
+    assert problem.integrator.plan(problem.scene, problem.scene.sensors()[0]).whole
+    assert with_sides(problem.integrator, problem.sides).preparation.whole
+
+
+def test_light_paths_find_all_but_mirrors_and_what_hidden_lamps_cover():
+    room: dict[str, Any] = {
+        "type": "scene", "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 16, "height": 16}},
+        "wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 3]).scale(4)},
+        "lamp": {"type": "sphere", "radius": 0.2, "center": [0, 0, 1], "emitter": {"type": "area"}},
+    }  # fmt: skip
+    scene = mi.load_dict(room)
+    assert light_finds_all(scene, scene.sensors(), False)
+    assert not light_finds_all(scene, scene.sensors(), True)
+    room["wall"]["bsdf"] = {"type": "conductor"}
+    scene = mi.load_dict(room)
+    assert not light_finds_all(scene, scene.sensors(), False)
 
 
 def test_what_moves_light_has_light_paths():

@@ -3,12 +3,14 @@
 Each is settled where it is left to measurement: which paths there are, guiding, and then the sequence. Steps drawn one
 way take turns with steps drawn the other (`race.Turns`), with dL/dI held at one image's (`StepTrial`):
 
-- `PathsPilot`: another share of light paths, or camera paths alone, unguided. One share after the other takes its turns
-  with the best so far, from one half on to the side that was found to be the better, as long as one is.
+- `PathsPilot`: another share of light paths, or paths of one side alone where that finds all light, unguided. One share
+  after the other takes its turns with the best so far, from one half on to the side that was found to be the better, as
+  long as one is.
 - `GuidingPilot`: guided emission, from a table that is learned first, and held. To a guided step's time is added its
   part of what a run of that length learns: each time one more walk of one pass, with what Python does for a new table,
   often at first and then rarely. Short steps make the table less worth than a run's, which has learned from more, and
-  draws more paths from each of its cells: what pays here pays there.
+  draws more paths from each of its cells: what pays here pays there. Where light paths alone find all light they are
+  what is guided: weights know nothing of guiding, and take from guided paths what camera paths might have found.
 - `SequencePilot`: low-discrepancy numbers, guided if the run is; then both draw from one table. What a run goes on
   learning takes both the same time; it is left out, which makes more of the time that such numbers take. Noise of
   evenly spread numbers falls faster than with one over the samples, or as fast, so that short steps find less of the
@@ -40,7 +42,7 @@ from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.clock import StepClock, StepTimes
 from reslrb_cli.records.decisions import GuidedRecord, PathsRecord, SequenceRecord
-from reslrb_cli.scene.needs import camera_finds_all
+from reslrb_cli.scene.needs import camera_finds_all, light_finds_all
 from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array
 
@@ -50,7 +52,7 @@ ROUNDS, ROUNDS_OF_FEW, FEW_ENTRIES = 8, 16, 64
 GUIDING_LONGER, SEQUENCE_LONGER = 3.0, 1.25
 #: The share of light paths that is begun with, and those that are tried then: fewer, as long as they are better; else
 #: more. Steps of another share may take so many times as long. One is tried where so much of the time is left for it.
-FIRST_SHARE, FEWER, MORE, PATHS_LONGER, LEAST_TURNS = 0.5, (0.2, 0.05, 0.0), (0.8, 0.95), 2.0, 0.1
+FIRST_SHARE, FEWER, MORE, PATHS_LONGER, LEAST_TURNS = 0.5, (0.2, 0.05, 0.0), (0.8, 0.95, 1.0), 2.0, 0.1
 #: What of the share the rounds of the sequence are planned for; the first step takes a part too, and is no round.
 ROUNDS_SHARE = 0.8
 #: Views that are looked at, spread over those that are trained on, and values of each one's image.
@@ -86,9 +88,7 @@ def settle_paths(tuner: race.Tuner) -> None:
 
 def with_sides(integrator: Any, sides: PathsRecord | None) -> Any:
     """An integrator that traces the paths that were decided on, where they were."""
-    if sides is None:
-        return integrator
-    return integrator.afresh(paths=sides.paths, light_share=sides.light_share)
+    return integrator if sides is None else integrator.afresh(light_share=sides.light_share)
 
 
 def settle_sampling(tuner: race.Tuner) -> None:
@@ -97,14 +97,16 @@ def settle_sampling(tuner: race.Tuner) -> None:
     """
     config, plain, memory = tuner.problem.config, tuner.problem.integrator, tuner.problem.memory
     trials: list[StepTrial] = []  # what was measured on so far
-    if isinstance(plain, Tracer) and plain.paths == "camera":  # nothing begins at the emitters
-        return
-    if race.is_auto(config, "guiding"):
-        guided = _guided(tuner, trials)
+    if race.is_auto(config, "guiding") and (guided := _guided(tuner, trials)) is not None:
+        if guided.guided and guides_light_alone(tuner.problem):
+            sides, plain = _light_alone(tuner.problem.sides, guided), plain.afresh(light_share=1.0)
+            tuner.take(sides=sides)
         tuner.take(guided=guided, integrator=as_decided(plain, guided, None))
         if guided.guided and memory is not None:
             expected = replace(memory.expected_bytes, fixed=memory.expected_bytes.fixed + table_bytes(tuner.problem))
             tuner.take(memory=replace(memory, expected_bytes=expected))
+    if isinstance(plain, Tracer) and plain.paths == "camera":  # nothing begins at the emitters
+        return
     if race.is_auto(config, "sequence"):
         sequence, found = _sequence(tuner, trials), tuner.problem.guided
         if found is not None and sequence.alone and sequence.low_discrepancy:
@@ -126,11 +128,29 @@ def as_decided(integrator: Any, guided: GuidedRecord | None, sequence: SequenceR
 
 def table_bytes(problem: Problem) -> int:
     """Bytes of the tables of all sensors, if `problem.integrator` is guided, or were."""
-    made = problem.integrator.afresh(guided=True)
+    made = problem.integrator.afresh(guided=True, light_share=1.0 if guides_light_alone(problem) else None)
     if made.paths == "camera":
         return 0
     made.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]])  # cuts the grid
     return int(made.preparation.guiding.bytes(len(problem.sensors)))
+
+
+def guides_light_alone(problem: Problem) -> bool:
+    """Whether it is light paths alone that guiding is tried with, where there are camera paths beside or in place of
+    them, of a share that was left to measurement."""
+    return problem.sides is not None and problem.sides.light_share < 1 and _light_finds_all(problem)
+
+
+def _light_finds_all(problem: Problem) -> bool:
+    sensors = [problem.scene.sensors()[sensor] for sensor in problem.sensors]
+    return light_finds_all(problem.scene, sensors, problem.integrator.hide_emitters)
+
+
+def _light_alone(sides: PathsRecord | None, guided: GuidedRecord) -> PathsRecord:
+    """What `sides` becomes where guided light paths alone do better."""
+    assert sides is not None
+    note = f"guided, they have {guided.gain:.2g} times the efficiency of {100 * sides.light_share:g} %"
+    return replace(sides, paths="both", light_share=1.0, gain=None, low=None, high=None, note=note)
 
 
 def suits_even_numbers(problem: Problem) -> str | None:
@@ -233,7 +253,7 @@ def _paths(tuner: race.Tuner) -> PathsRecord:
 
         climb([share for share in FEWER if share or camera_finds_all(problem.scene)])
         if best == FIRST_SHARE:
-            climb(MORE)
+            climb([share for share in MORE if share < 1 or _light_finds_all(problem)])
         gained = [record for record in records if record.paths == "other"]
         kept = (gained or records or [PathsRecord(paths="both", note="too little time to compare shares")])[-1]
         costs = {name: sum(getattr(each, name) for each in records) for name in ("measure_s", "compile_s", "share")}
@@ -242,7 +262,7 @@ def _paths(tuner: race.Tuner) -> PathsRecord:
     later = [race.LATER[option] for option in ("guiding", "sequence") if race.is_auto(problem.config, option)]
     return tuner.decide(
         PathsRecord,
-        of={"paths": 2, "of": problem.pilot and problem.pilot.chosen},
+        of={"paths": 3, "of": problem.pilot and problem.pilot.chosen},
         needs=[race.PATHS_NEEDS, *later],
         integrator=problem.integrator,
         measure=measure,
@@ -253,13 +273,17 @@ def _paths(tuner: race.Tuner) -> PathsRecord:
 
 def _of_share(problem: Problem, share: float) -> Tracer:
     """The problem's integrator with this share of light paths; none of them leaves camera paths alone."""
-    tracer: Tracer = problem.integrator.afresh(paths="both", light_share=share)
+    tracer: Tracer = problem.integrator.afresh(light_share=share)
     return tracer
 
 
-def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord:
-    """Whether the problem's integrator, whose estimator is settled, is to be guided; `trials` gets the steps of it."""
+def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord | None:
+    """Whether the problem's integrator, whose estimator is settled, is to be guided, or light paths in place of it;
+    `trials` gets the steps of it. None where nothing begins at the emitters."""
     problem = tuner.problem
+    alone = guides_light_alone(problem)
+    if isinstance(problem.integrator, Tracer) and problem.integrator.paths == "camera" and not alone:
+        return None
     if problem.memory is not None:
         free, needed = problem.memory.budget_bytes - problem.memory.expected_bytes.total, table_bytes(problem)
         if needed > free:
@@ -270,14 +294,18 @@ def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord:
 
     def measure(allowance: Allowance) -> GuidedRecord:
         share = share_left(problem, allowance, race.SEQUENCE_SHARE if sequence else 0.0, race.GUIDING_NEEDS[0])
-        plain, guided = (problem.integrator.afresh(guided=on) for on in (False, True))
+        plain = problem.integrator.afresh(guided=False)
+        guided = problem.integrator.afresh(guided=True, light_share=1.0 if alone else None)
         trials.append(StepTrial(problem, "guiding", plain, guided))
-        return trials[-1].turns(GuidingPilot, plan, share)
+        record = trials[-1].turns(GuidingPilot, plan, share)
+        if alone and record.guided and not record.images and plan.alone:
+            return replace(record, guided=False, note="images would have less")
+        return record
 
     return tuner.decide(
         GuidedRecord,
         # Learning is a larger part of a short run, where tables learn most often at first.
-        of={"guiding": 4, "of": problem.pilot and problem.pilot.chosen, "lessons": plan.lessons} | _sides(problem),
+        of={"guiding": 5, "of": problem.pilot and problem.pilot.chosen, "lessons": plan.lessons} | _sides(problem),
         # Where even numbers are likely to do better, to measure guiding alone would mislead.
         needs=(race.GUIDING_NEEDS, *([] if why is None else 2 * [race.SEQUENCE_NEEDS])),
         integrator=problem.integrator,
