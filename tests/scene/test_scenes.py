@@ -139,6 +139,35 @@ def test_caustic_is_not_seen_through_the_glass():
     assert needs.has_shading_normals
 
 
+def test_mixed_room_has_light_that_either_side_lacks():
+    """Light paths do not see the mirror; of what both see, connections to the lamp find less than half on the wall."""
+    import mitsuba as mi
+
+    scene = small("mixed_room")
+    image = {name: np.array(mi.render(scene, spp=256, integrator=mi.load_dict(options))).mean(2) for name, options in {
+        "light": {"type": "ptracer", "max_depth": 8},
+        "direct": {"type": "direct", "bsdf_samples": 0, "emitter_samples": 1},
+    }.items()}  # fmt: skip
+    mirror, caustic = np.s_[6:16, 19:22], np.s_[6:14, 10:12]
+    assert image["light"][mirror].max() == 0
+    assert image["light"][caustic].min() > 0.05
+    assert image["direct"][caustic].mean() < 0.1 * image["light"][caustic].mean()
+
+
+def test_the_target_of_the_mixed_room_is_its_image():
+    """By blocks of 16 pixels, against light from both sides, which shares no code with what made it."""
+    import mitsuba as mi
+
+    scene = load_scene(ROOT / "scenes" / "mixed_room" / "scene.xml", {"resx": 128, "resy": 128})
+    both = mi.load_dict({"type": "reslrb", "paths": "both", "estimator": "stack", "max_depth": 8})
+    images = np.array([np.array(mi.render(scene, integrator=both, spp=16, seed=seed)) for seed in range(8)])
+    target = np.array(mi.Bitmap(str(ROOT / "scenes" / "mixed_room" / "target.exr")), dtype=np.float64)
+    blocks = images.reshape(8, 8, 16, 8, 16, 3).mean((2, 4, 5))
+    error = blocks.mean(0) - target.reshape(8, 16, 8, 16, 3).mean((1, 3, 4))
+    allowed = 6 * blocks.std(0, ddof=1) / np.sqrt(8) + 0.02 * blocks.mean(0)  # seeds are few, and the target has noise
+    assert (abs(error) < allowed).all()
+
+
 def test_furnace_is_exact():
     import mitsuba as mi
 
