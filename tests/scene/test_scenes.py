@@ -10,7 +10,7 @@ import pytest
 from turns import a_few
 
 from reslrb_cli.config.loader import load
-from reslrb_cli.integrators.step import make_integrator
+from reslrb_cli.integrators.step import make_integrator, render_image
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.needs import check_supported, look, scene_needs
 from reslrb_cli.scene.parameters import select_parameters, set_values
@@ -161,7 +161,7 @@ def test_the_target_of_the_mixed_room_is_its_image():
 
     scene = load_scene(ROOT / "scenes" / "mixed_room" / "scene.xml", {"resx": 128, "resy": 128})
     both = make_integrator("reslrb", paths="both", estimator="stack", max_depth=8)
-    images = np.array([np.array(mi.render(scene, integrator=both, spp=16, seed=seed)) for seed in range(8)])
+    images = np.array([np.array(render_image(both, scene, 0, seed, 16)) for seed in range(8)])
     target = np.array(mi.Bitmap(str(ROOT / "scenes" / "mixed_room" / "target.exr")), dtype=np.float64)
     blocks = images.reshape(8, 8, 16, 8, 16, 3).mean((2, 4, 5))
     error = blocks.mean(0) - target.reshape(8, 16, 8, 16, 3).mean((1, 3, 4))
