@@ -22,6 +22,7 @@ ABOUT = {
     "furnace": "the walls of a closed sphere",
     "lens_pose": "a lens's place, and its tilt in degrees",
     "caustic_heightmap": "the relief of a glass face",
+    "mixed_room": "the printed wall of a room with a caustic and a mirror, and a sofa",
     "paper/figure1": "the relief of a glass face, finely",
     "stiff/lamp": "albedo, and intensity",
     "stiff/plate": "roughness, and radiance",

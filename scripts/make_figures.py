@@ -35,8 +35,8 @@ SCENES = {
     "furnace": (64, 8, 0.2),
 }
 
-#: Of the experiments that move light, samples per pixel and exposure of the target's picture.
-EXPERIMENTS = {"lens_pose": (4096, 1.0), "caustic_heightmap": (4096, 0.6)}
+#: Of the experiments that move light, or show it in a mirror, samples per pixel and exposure of the target's picture.
+EXPERIMENTS = {"lens_pose": (4096, 1.0), "caustic_heightmap": (4096, 0.6), "mixed_room": (4096, 1.5)}
 Image = np.ndarray[Any, Any]
 
 
@@ -69,7 +69,7 @@ def run_panels(folder: Path) -> list[tuple[str, Image]]:
 
 
 def scene_panels() -> list[tuple[str, Image]]:
-    """The scenes in `scenes/`, light-traced by `reslrb`; of those in which light is moved the target."""
+    """The scenes in `scenes/`, light-traced by `reslrb`; of `EXPERIMENTS` the target."""
     from reslrb_cli.backend.variant import set_variant
     from reslrb_cli.config.loader import load
     from reslrb_cli.integrators.step import make_integrator

@@ -43,6 +43,7 @@ def images() -> dict[str, Image]:
         "caustic_slab/paper.exr": paper(64),
         "caustic_heightmap/heights.exr": heights(32),
         "lens_pose/beam.exr": beam(64),
+        "mixed_room/wallpaper.exr": wallpaper(32),
     }
 
 
@@ -51,6 +52,7 @@ def meshes() -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]
     return {
         "caustic_heightmap/face.ply": height_field(128, 0.805, lambda x, z: 0 * x),
         "lens_pose/lens.ply": height_field(64, 0.6, lens),
+        "mixed_room/pane.ply": height_field(64, 0.2, pane),
     }
 
 
@@ -130,6 +132,25 @@ def paper(size: int) -> Image:
     square = np.maximum(abs(x), abs(y))
     color[(square > size * 0.44) & (square < size * 0.47)] = (0.62, 0.22, 0.14)
     return quantise(color)
+
+
+def wallpaper(size: int) -> Image:
+    """A printed wall: rows of flowers in two colours on a light ground, each texel of a shade of its own."""
+    x, y = grid(size)
+    color = np.empty((size, size, 3))
+    color[:] = (0.62, 0.58, 0.44)
+    step = size / 4
+    row = np.floor(y / step).astype(int)
+    u = (x + row % 2 * step / 2) % step - step / 2
+    v = y % step - step / 2
+    radius, angle = np.hypot(u, v), np.arctan2(v, u)
+    color[radius < step * (0.36 + 0.10 * np.cos(5 * angle))] = (0.58, 0.16, 0.14)
+    other = (row % 2 == 0) & (radius < step * (0.36 + 0.10 * np.cos(5 * angle)))
+    color[other] = (0.14, 0.30, 0.52)
+    color[radius < step * 0.13] = (0.82, 0.66, 0.20)
+    color[abs(y) > size * 0.46] = (0.22, 0.40, 0.24)
+    shade = 0.85 + 0.3 * noise(size, size, 13)[..., None]
+    return quantise(np.clip(color * shade, 0.05, 0.95))
 
 
 def heights(size: int) -> Image:
@@ -237,6 +258,13 @@ def height_field(cells: int, half: float, height: Callable[[np.ndarray, np.ndarr
 def lens(x: np.ndarray, z: np.ndarray) -> np.ndarray:
     """The lower face of a lens that is stronger along x than along z, and has coma, so that every turn of it shows."""
     return x**2 / 1.6 + z**2 / 3.2 + 0.2 * x**3 + 0.2 * x * z**2 + 0.15 * z**3
+
+
+def pane(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """The lower face of a pane of cast glass: ripples in four directions, that gather light at arm's length."""
+    # Wave vector, phase, amplitude.
+    waves = [((26, 9), 0.4, 5.0e-3), ((-13, 24), 1.9, 4.2e-3), ((37, -20), 4.1, 1.6e-3), ((15, 33), 2.7, 1.4e-3)]
+    return sum(amplitude * np.sin(kx * x + kz * z + phase) for (kx, kz), phase, amplitude in waves)
 
 
 # ---- Tools ----------------------------------------------------------------------------------------------------------

@@ -38,6 +38,18 @@ def test_sensitivities_differ_by_a_million(name, quantity):
     assert measured.spread("length") is not None
 
 
+@pytest.mark.long
+def test_the_mixed_room_is_recovered_where_only_the_mirror_shows_it():
+    """Light paths alone keep the initial values there."""
+    problem = assemble(load(CONFIGS.parent / "mixed_room.yaml"))
+    for _ in optimize(problem):
+        pass
+    key = "print.reflectance.data"
+    error = (problem.values()[key] - problem.truth[key])[4:22]
+    assert np.sqrt((error[:, 14:] ** 2).mean()) < 0.05
+    assert np.sqrt((error[:, :10] ** 2).mean()) < 0.12  # only the mirror shows it
+
+
 # The shipped configurations whose parameters move light recover them to a tenth.
 
 MOVING_CONFIGS = Path(__file__).resolve().parents[2] / "configs"

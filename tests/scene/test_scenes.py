@@ -10,13 +10,14 @@ import pytest
 from turns import a_few
 
 from reslrb_cli.config.loader import load
+from reslrb_cli.integrators.step import make_integrator, render_image
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.needs import check_supported, look, scene_needs
 from reslrb_cli.scene.parameters import select_parameters, set_values
 from reslrb_cli.scene.visibility import visible_texels
 
 ROOT = Path(__file__).resolve().parents[2]
-NAMES = ("cornell_floor", "grey_room", "caustic_slab", "furnace", "lens_pose", "caustic_heightmap")
+NAMES = ("cornell_floor", "grey_room", "caustic_slab", "furnace", "lens_pose", "caustic_heightmap", "mixed_room")
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
@@ -137,6 +138,35 @@ def test_caustic_is_not_seen_through_the_glass():
     needs = scene_needs(scene, scene.sensors()[0])
     assert needs.has_delta_lobes
     assert needs.has_shading_normals
+
+
+def test_mixed_room_has_light_that_either_side_lacks():
+    """Light paths do not see the mirror; of what both see, connections to the lamp find less than half on the wall."""
+    import mitsuba as mi
+
+    scene = small("mixed_room")
+    image = {name: np.array(mi.render(scene, spp=256, integrator=mi.load_dict(options))).mean(2) for name, options in {
+        "light": {"type": "ptracer", "max_depth": 8},
+        "direct": {"type": "direct", "bsdf_samples": 0, "emitter_samples": 1},
+    }.items()}  # fmt: skip
+    mirror, caustic = np.s_[6:16, 19:22], np.s_[6:14, 10:12]
+    assert image["light"][mirror].max() == 0
+    assert image["light"][caustic].min() > 0.05
+    assert image["direct"][caustic].mean() < 0.1 * image["light"][caustic].mean()
+
+
+def test_the_target_of_the_mixed_room_is_its_image():
+    """By blocks of 16 pixels, against light from both sides, which shares no code with what made it."""
+    import mitsuba as mi
+
+    scene = load_scene(ROOT / "scenes" / "mixed_room" / "scene.xml", {"resx": 128, "resy": 128})
+    both = make_integrator("reslrb", paths="both", estimator="stack", max_depth=8)
+    images = np.array([np.array(render_image(both, scene, 0, seed, 16)) for seed in range(8)])
+    target = np.array(mi.Bitmap(str(ROOT / "scenes" / "mixed_room" / "target.exr")), dtype=np.float64)
+    blocks = images.reshape(8, 8, 16, 8, 16, 3).mean((2, 4, 5))
+    error = blocks.mean(0) - target.reshape(8, 16, 8, 16, 3).mean((1, 3, 4))
+    allowed = 6 * blocks.std(0, ddof=1) / np.sqrt(8) + 0.02 * blocks.mean(0)  # seeds are few, and the target has noise
+    assert (abs(error) < allowed).all()
 
 
 def test_furnace_is_exact():
