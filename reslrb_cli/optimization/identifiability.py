@@ -80,7 +80,10 @@ def shown_texels(problem: Problem, key: str) -> Array | None:
 def _visible(problem: Problem, key: str, pixels: Sequence[Array | None] = ()) -> Array:
     """The texels that views that are trained on show, in these pixels, or in any."""
     sensors = [problem.scene.sensors()[view.sensor] for view in problem.trained]
-    seen, halo = visible_texels(problem.scene, sensors, key, pixels), problem.selection.slot(key).halo
+    seen, halo = (
+        visible_texels(problem.scene, sensors, key, pixels, problem.paths != "light"),
+        problem.selection.slot(key).halo,
+    )
     return seen[:, halo : seen.shape[1] - halo]
 
 

@@ -127,14 +127,16 @@ _CROSSINGS = 8
 
 
 def visible_texels(
-    scene: Any, sensors: Sequence[Any], key: str, pixels: Sequence[np.ndarray[Any, Any] | None] = ()
-) -> np.ndarray[Any, Any]:
+    scene: Any, sensors: Sequence[Any], key: str, pixels: Sequence[np.ndarray[Any, Any] | None] = (),
+    mirrored: bool = False,
+) -> np.ndarray[Any, Any]:  # fmt: skip
     """Which texels of the texture `key` some sensor sees: boolean (H, W).
 
-    `pixels` (H, W) are those of each sensor that count; None, or none at all, where all do.
+    `pixels` (H, W) are those of each sensor that count; None, or none at all, where all do. `mirrored`: what mirrors and
+    clear glass show is seen; camera paths find it.
 
     A texel counts as seen if a primary ray hits the inner quarter of its cell, after see-through surfaces (masks), but
-    not through glass or in mirrors, from where light paths cannot connect to the sensor. For a texture that is not on a
+    else not through glass or in mirrors, from where light paths cannot connect to the sensor. For a texture that is not on a
     surface (an environment map, emission), every texel counts. Texture coordinates outside of [0, 1] are taken to
     repeat.
     """
@@ -153,17 +155,17 @@ def visible_texels(
         rays = min(_RAYS_PER_CELL * max(count, height * width), _MAX_RAYS)
         for number in range(-(-rays // _RAYS_PER_PASS)):
             random = mi.PCG32(size=min(rays, _RAYS_PER_PASS), initstate=dr.opaque(mi.UInt64, number))
-            _mark_seen(scene, sensor, owners, transform, random, seen, (width, height), kept)
+            _mark_seen(scene, sensor, owners, transform, random, seen, (width, height), kept, mirrored)
             dr.eval(seen)
     return np.array(seen).reshape(height, width) > 0
 
 
 def _mark_seen(
     scene: Any, sensor: Any, owners: Sequence[Any], transform: Any, random: Any, seen: Any, size: tuple[int, int],
-    kept: np.ndarray[Any, Any] | None,
+    kept: np.ndarray[Any, Any] | None, mirrored: bool,
 ) -> None:  # fmt: skip
     """Cast one primary ray per lane, through pixels (H, W) that are `kept`, and mark in `seen` the texels, of `size`
-    (width, height), whose inner quarter it hits."""
+    (width, height), whose inner quarter it hits, where `mirrored` by way of mirrors and clear glass, too."""
     time = sensor.shutter_open() + random.next_float32() * sensor.shutter_open_time()
     film = mi.Point2f(random.next_float32(), random.next_float32())
     aperture = mi.Point2f(random.next_float32(), random.next_float32())
@@ -187,9 +189,16 @@ def _mark_seen(
         # Twice, since the remainder of what is below 0 is not above it.
         x, y = ((mi.Int32(dr.floor(c)) % n + n) % n for c, n in zip((cell.x, cell.y), size, strict=True))
         dr.scatter(seen, mi.UInt32(1), mi.UInt32(y * size[0] + x), active & is_owner & inner)
-        active &= mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
-        ray = si.spawn_ray(ray.d)
-        dr.eval(seen, active, ray)
+        null, d = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null), ray.d
+        if mirrored:
+            specular = active & ~null & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            lobe, place = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
+            sample, weight = bsdf.sample(mi.BSDFContext(), si, lobe, place, specular)
+            specular &= dr.any(weight > 0)
+            null, d = null | specular, dr.select(specular, si.to_world(sample.wo), d)
+        active &= null
+        ray = si.spawn_ray(d)
+        dr.eval(seen, active, ray, random)
         if dr.none(active):
             break
 

@@ -336,6 +336,24 @@ def test_crop_window_and_orientation(make_scene):
     assert np.array_equal(visible_texels(scene, scene.sensors(), KEY), expected)
 
 
+def mirrored(make_scene, bsdf):
+    """The floor, which a sensor sees through a pane alone."""
+    film = {"type": "hdrfilm", "width": 16, "height": 16}
+    to_world = mi.ScalarTransform4f().look_at(origin=[0, 0, 3], target=[0, 0, 0], up=[0, 1, 0])
+    pane = mi.ScalarTransform4f().translate([0, 0, 2]).scale(3)
+    return make_scene(camera={"type": "perspective", "fov": 30, "to_world": to_world, "film": film},
+                      pane={"type": "rectangle", "bsdf": bsdf, "to_world": pane})  # fmt: skip
+
+
+def test_what_glass_shows_is_seen_by_camera_paths(make_scene):
+    scene = mirrored(make_scene, {"type": "dielectric"})
+    seen, all_of_it = (visible_texels(scene, scene.sensors(), KEY, (), each) for each in (False, True))
+    assert not seen.any()
+    assert all_of_it.any()
+    scene = mirrored(make_scene, {"type": "conductor"})  # which shows what is behind the sensor
+    assert not visible_texels(scene, scene.sensors(), KEY, (), True).any()
+
+
 def test_pixels_that_are_left_out_show_nothing(make_scene):
     """As a mask has them: those of the film's left half, (H, W)."""
     scene = make_scene()
