@@ -218,7 +218,7 @@ def command(
     film = sensor.film()
     own, whole = ((int(size[0]), int(size[1])) for size in (film.crop_size(), film.size()))
     size = choose_size(own, photo, fixed=own != whole)
-    integrator, reason = _integrator(scene, sensor, description.hides_emitters, scene_file)
+    reason = _why_camera(scene, sensor, description.hides_emitters, scene_file)
     is_integer = photo is not None and photo.is_integer
     proposals = _propose(scene_file, scene, index, wanted, lamps=not is_integer and not description.hides_emitters)
     image, copied = target, photo is not None and photo.size != size
@@ -227,7 +227,7 @@ def command(
         _check_free(image, force)
     text = _first_config(
         path, options, description.variables, sensors, index, proposals, scene=scene_file, target=image,
-        is_integer=is_integer, size=size, film=own, integrator=integrator, reason=reason,
+        is_integer=is_integer, size=size, film=own, reason=reason,
         hides_emitters=description.hides_emitters, depth=find_depth(scene, index),
     )  # fmt: skip
     specs = loads(text, path).parameters
@@ -241,7 +241,7 @@ def command(
     count = sum(proposal.first for proposal in proposals)
     echo(f"{path}{made}: {count} of {len(proposals)} parameters, at {size[0]}x{size[1]} pixels")
     if reason is not None:
-        echo(f"integrator.type: {integrator}, since light paths cannot render this: {reason}")
+        echo(f"integrator.paths: camera, since light paths cannot render this: {reason}")
     echo(f"next: look at it, and `reslrb optimize {path}`" + ("" if target is not None else ", once there is a target"))
 
 
@@ -305,23 +305,21 @@ def _propose(scene_file: Path, scene: mi.Scene, index: int, wanted: tuple[str, .
     return proposals
 
 
-def _integrator(scene: mi.Scene, sensor: mi.Sensor, hides_emitters: bool, file: Path) -> tuple[str, str | None]:
-    """The integrator that can render the scene, and why it is not ours where that cannot.
+def _why_camera(scene: mi.Scene, sensor: mi.Sensor, hides_emitters: bool, file: Path) -> str | None:
+    """Why paths have to begin at the sensor; None where they may begin at the lights, too.
 
-    Raises ConfigError, located in the scene's `file`, where none can.
+    Raises ConfigError, located in the scene's `file`, where no paths can render it.
     """
-    from reslrb_cli.scene.needs import camera_obstacle, check_supported, paths_obstacle
+    from reslrb_cli.scene.needs import check_supported, light_obstacle, paths_obstacle
 
     try:
         check_supported(scene, sensor, hides_emitters)
     except UnsupportedScene as error:
-        obstacle = paths_obstacle(scene, sensor, "camera")
-        if obstacle is None:  # which `paths: auto` takes
-            return "reslrb", None
-        if camera_obstacle(scene, sensor) is None:
-            return "prb", obstacle.partition("; take ")[0]
-        raise ConfigError(file, "", str(error)) from None  # which has words for both
-    return "reslrb", None
+        obstacles = [paths_obstacle(scene, sensor, kind) for kind in ("both", "camera")]
+        if all(obstacles):
+            raise ConfigError(file, "", str(error)) from None  # which has words for both
+        return light_obstacle(scene, sensor, hides_emitters) if obstacles[0] else None
+    return None
 
 
 def _check_free(path: Path, force: bool) -> None:

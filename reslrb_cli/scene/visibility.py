@@ -132,12 +132,12 @@ def visible_texels(
 ) -> np.ndarray[Any, Any]:  # fmt: skip
     """Which texels of the texture `key` some sensor sees: boolean (H, W).
 
-    `pixels` (H, W) are those of each sensor that count; None, or none at all, where all do. `mirrored`: what mirrors and
-    clear glass show is seen; camera paths find it.
+    `pixels` (H, W) are those of each sensor that count; None, or none at all, where all do. `mirrored`: what mirrors
+    and clear glass show is seen; camera paths find it.
 
     A texel counts as seen if a primary ray hits the inner quarter of its cell, after see-through surfaces (masks), but
-    else not through glass or in mirrors, from where light paths cannot connect to the sensor. For a texture that is not on a
-    surface (an environment map, emission), every texel counts. Texture coordinates outside of [0, 1] are taken to
+    else not through glass or in mirrors, from where light paths cannot connect to the sensor. For a texture that is on
+    no surface (an environment map, emission), every texel counts. Texture coordinates outside of [0, 1] are taken to
     repeat.
     """
     params = mi.traverse(scene)

@@ -87,7 +87,8 @@ def test_a_short_run_measures_nothing_and_says_so(experiment, capsys, monkeypatc
     assert code == 0, err
     assert "measuring" not in err
     because = "not measured (over 10 % of this run); "
-    line = f"{because.replace('; ', ':')} estimator stack, guiding off, sequence low_discrepancy"
+    paths = "paths both, 50 % light paths"
+    line = f"{because.replace('; ', ':')} estimator stack, {paths}, guiding off, sequence low_discrepancy"
     assert line in err.splitlines()
     manifest = read_manifest(Path("runs/box"))
     assert manifest["pilot"]["chosen"] == {"estimator": "stack"}
@@ -158,7 +159,7 @@ def test_the_pilot_leaves_the_run_as_it_was(experiment):
         dr.eval(loss)
         return value, float(loss[0]), np.array(problem.optimizer.gradient(KEY)), problem.pilot
 
-    value, loss, _, pilot = first_step()
+    value, loss, _, pilot = first_step("integrator.paths=light")
     assert pilot is not None
     chosen = ", ".join(f"{key}: {entry}" for key, entry in pilot.chosen.items())
     named = first_step(f"integrator={{max_depth: 4, {chosen}}}")

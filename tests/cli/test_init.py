@@ -417,11 +417,11 @@ def test_light_that_cannot_be_sampled_is_left_to_camera_paths(tmp_path: Path, mo
     monkeypatch.chdir(tmp_path)
     assert reslrb("inspect", "shop.xml").exit_code == 0
     assert reslrb("init", "shop.xml", "--target", write_noise(tmp_path / "photo.png", 8, 8)).exit_code == 0
-    assert load(tmp_path / "shop.yaml").integrator.type == "prb"
+    assert load(tmp_path / "shop.yaml").integrator.paths == "camera"
     text = (tmp_path / "shop.yaml").read_text()
     assert "# by paths from the sensor, since light paths cannot render this: Mitsuba cannot sample the rays of" in text
-    assert "integrator.type: prb" not in text
-    refused = reslrb("optimize", "shop.yaml", *settings("integrator.type=reslrb"))
+    assert "integrator.paths: camera" not in text
+    refused = reslrb("optimize", "shop.yaml", *settings("integrator.paths=light"))
     assert refused.exit_code == 2
     assert "scene.file: Mitsuba cannot sample the rays of emitter lamp" in refused.output
 
@@ -431,13 +431,13 @@ def test_it_says_why_paths_from_the_sensor_were_chosen(choices: Path) -> None:
     (choices / "hall.xml").write_text(CHOICES.replace('"perspective" id="floor"', '"orthographic" id="the # floor"'))
     made = reslrb("init", "hall.xml")
     reason = "sensor the # floor is a OrthographicCamera; light paths connect to `perspective` and `thinlens` sensors"
-    assert f"integrator.type: prb, since light paths cannot render this: {reason}" in made.output
+    assert f"integrator.paths: camera, since light paths cannot render this: {reason}" in made.output
     lines = (choices / "hall.yaml").read_text().splitlines()
     place = lines.index("integrator:")
-    comment = [line.strip(" #") for line in lines[place + 1 : lines.index("  type: prb")]]
+    comment = [line.strip(" #") for line in lines[place + 1 : lines.index("  type: reslrb")]]
     assert " ".join(comment) == f"by paths from the sensor, since light paths cannot render this: {reason}"
     assert 1 <= len(comment) <= 2
-    assert load(choices / "hall.yaml").integrator.type == "prb"
+    assert load(choices / "hall.yaml").integrator.paths == "camera"
     made = reslrb("init", "hall.xml", "--sensor", 1, "--force")
     assert "since" not in made.output
     assert "since" not in (choices / "hall.yaml").read_text()

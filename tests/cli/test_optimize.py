@@ -274,32 +274,46 @@ def test_bad_input_is_one_located_line_and_no_run_folder(experiment, capsys, set
 
 
 CAMERA = '<sensor type="perspective" id="camera">\n        <float name="fov" value="50"/>'
+PARALLEL = '<sensor type="orthographic" id="camera">'
 LIGHT = '<emitter type="area" id="light"><rgb name="radiance" value="8, 8, 8"/></emitter>'
 POSTER = '<shape type="rectangle" id="poster_shape">'
 PANE = '<shape type="cube"><transform name="to_world"><translate z="4"/></transform><bsdf type="dielectric"/></shape>'
 FOG = '<shape type="sphere"><bsdf type="null"/><medium name="interior" type="homogeneous"/></shape>'
 #: By name: what is replaced in the scene, by what, with which integrator, and what the error line holds.
 BAD_SCENES = {
-    "orthographic": (CAMERA, '<sensor type="orthographic" id="camera">', "reslrb", "OrthographicCamera"),
-    "glass alone": (POSTER, PANE + POSTER, "reslrb", "specular"),
-    "light for prb": ('type="area" id="light"', 'type="directionalarea" id="light"', "prb", "directionalarea"),
-    "no light": (LIGHT, "", "reslrb", "no emitters"),
-    "medium": (POSTER, FOG + POSTER, "reslrb", "medium"),
-}
+    "orthographic": (CAMERA, PARALLEL, "{type: reslrb, paths: light}", "OrthographicCamera"),
+    "orthographic from both sides": (CAMERA, PARALLEL, "{type: reslrb, paths: both}", "take integrator.paths: camera"),
+    "glass alone": (POSTER, PANE + POSTER, "{type: reslrb, paths: light}", "specular"),
+    "light for prb": ('type="area" id="light"', 'type="directionalarea" id="light"', "{type: prb}", "directionalarea"),
+    "no light": (LIGHT, "", "{type: reslrb}", "no emitters"),
+    "medium": (POSTER, FOG + POSTER, "{type: reslrb}", "medium"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", BAD_SCENES)
 def test_scenes_that_cannot_work_are_refused_before_rendering(experiment, capsys, name):
-    part, other, integrator, reason = BAD_SCENES[name]
+    part, other, setting, reason = BAD_SCENES[name]
     assert part in SCENE
     Path("scene.xml").write_text(SCENE.replace(part, other))
-    code, _, err = reslrb(capsys, "optimize", "box.yaml", "--set", f"integrator.type={integrator}", "--quiet")
+    code, _, err = reslrb(capsys, "optimize", "box.yaml", "--set", f"integrator={setting}", "--quiet")
     lines = [line for line in err.splitlines() if not line.startswith("variant ")]
     assert code == 2
     assert len(lines) == 1, err
     assert lines[0].startswith("box.yaml: scene.file: ") or "/scene.xml: " in lines[0]
     assert reason in lines[0]
     assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize("name", ["orthographic", "glass alone"])
+def test_what_light_paths_cannot_render_camera_paths_do(experiment, capsys, name):
+    """By default; `paths: auto` then is `camera`, or `both`."""
+    part, other, *_ = BAD_SCENES[name]
+    Path("scene.xml").write_text(SCENE.replace(part, other))
+    small = ["run.iterations=2", "run.certainty=false", "integrator={type: reslrb, max_depth: 4}"]
+    code, _, err = reslrb(
+        capsys, "optimize", "box.yaml", *(word for one in small for word in ("--set", one)), "--quiet"
+    )
+    assert code == 0, err
 
 
 def test_a_render_is_written_and_bad_outputs_are_refused(experiment, capsys):

@@ -300,7 +300,7 @@ def test_weights_of_a_file(masked_folder):
     assert error.value.key == "target.mask.file"
 
 
-@pytest.mark.parametrize(("maker", "count"), [("prb", 48), ("reslrb", 0)])
+@pytest.mark.parametrize(("maker", "count"), [("prb", 48), ("reslrb, paths: light", 0)])
 def test_the_border_is_left_out_where_one_is_not_light_traced(masked_folder, maker, count):
     scene = masked_folder / "scene.xml"
     scene.write_text(scene.read_text().replace('rfilter type="box"', 'rfilter type="gaussian"'))
@@ -308,8 +308,9 @@ def test_the_border_is_left_out_where_one_is_not_light_traced(masked_folder, mak
     assert len(left_out(assemble(load(masked_folder / "tiny.yaml", [render])))) == count
     assert not left_out(assemble(load(masked_folder / "tiny.yaml", [render, "target.mask={border: false}"])))
     if maker == "prb":  # paths from the camera lose nothing there
-        same = ["integrator={type: prb, max_depth: 3}", render]
-        assert not left_out(assemble(load(masked_folder / "tiny.yaml", same)))
+        for same in ("type: prb", "paths: camera", "paths: both, light_share: 0.5"):
+            sets = [f"integrator={{{same}, max_depth: 3}}", render]
+            assert not left_out(assemble(load(masked_folder / "tiny.yaml", sets)))
 
 
 @pytest.mark.parametrize(("bsdf", "kind"), [("conductor", "specular"), ("plastic", "mixed")])
