@@ -21,7 +21,7 @@ from reslrb_cli.config.loader import with_integrator
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.autotune.sampling import as_decided
+from reslrb_cli.optimization.autotune.sampling import as_decided, with_sides
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.state import guiding_of, restore_tables
 from reslrb_cli.optimization.views import color_channels, to_tensor
@@ -75,6 +75,8 @@ def load_replay(config: Config) -> Replay:
     if manifest.get("memory"):
         size = _samples_per_pass(manifest["memory"], written)
         integrator = integrator.with_options(samples_per_pass=size, freeze=integrator.freeze)
+    if manifest.get("paths"):
+        integrator = with_sides(integrator, PathsRecord.from_json(manifest["paths"]))
     integrator = as_decided(integrator, guided, None)
     problem = replace(problem, guided=guided, integrator=integrator, samples_per_pass=size)
     _teach(problem, saved, archive)

@@ -27,6 +27,7 @@ from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.views import View
 from reslrb_cli.seeds import seed
 from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor
+from reslrb_cli.transport.camera import CameraHooks, FilmRay, Met, NextEvent, camera_walk
 from reslrb_cli.transport.connection import Connection, forward_derivatives
 from reslrb_cli.transport.emission import Emission, sample_emission
 from reslrb_cli.transport.factors import Product
@@ -42,7 +43,8 @@ class PathVertex:
     """A vertex of a path, and all that the path can be traced again from.
 
     `samples` says which of the step's samples it belongs to, `seed` is their sampler's, `path` its index among `paths`.
-    `vertex` counts from the emitter, 0; `position` is in world space; `surface` is the id of the shape there.
+    `vertex` counts from where the path begins, 0: the emitter, or of camera paths, which `samples` names, the sensor;
+    `position` is in world space; `surface` is the id of the shape there.
     """
 
     samples: str
@@ -119,9 +121,11 @@ QUANTITIES = (
     "connection factor c",
     "derivative of the connection factor, dc",
     "contribution C = E s_1 ... s_{i-1} c_i",
+    "radiance that is met, or that a sampled emitter sends",
+    "derivative of that radiance",
 )
 
-_E, _DE, _S, _DS, _PRODUCT, _C, _DC, _CONTRIBUTION = range(1, len(QUANTITIES))
+_E, _DE, _S, _DS, _PRODUCT, _C, _DC, _CONTRIBUTION, _L, _DL = range(1, len(QUANTITIES))
 
 
 @dataclass
@@ -223,6 +227,60 @@ class SearchHooks(Hooks):
         )
 
 
+class CameraSearch(CameraHooks):
+    """The same of camera paths: at every factor that light is found behind, and at what is found."""
+
+    def __init__(self, samples: Samples) -> None:
+        self.samples = samples
+        self.u = mi.Point2f(0)
+
+    def start(self, first: FilmRay) -> Search:
+        self.u = first.u
+        blank = mi.Point2f(0)
+        return Search(Suspect.none(), Suspect.none(), blank, mi.Bool(False), Suspect.none(), blank)
+
+    def vertex(
+        self, state: Search, vertex: Vertex, met: Met | None, event: NextEvent | None, scattering: Scattering
+    ) -> Search:  # fmt: skip
+        plan, scene, si, P = self.samples.plan, self.samples.scene, vertex.si, vertex.product
+        shape = dr.reinterpret_array(mi.UInt32, si.shape)
+
+        def here(kind: int, value: Any) -> Suspect:
+            return Suspect(mi.UInt32(kind), vertex.depth, si.p, shape, mi.Spectrum(value))
+
+        zero = mi.Spectrum(0)
+        with dr.resume_grad(when=plan.differentiate_bsdfs or plan.differentiate_emission):
+            f_s = tracked_factor(plan, si, vertex.bsdf, scattering, scattering.active)
+            Le_h = zero if met is None else met.radiance()
+            f_c = zero if event is None else evaluate(plan, si, vertex.bsdf, event.wo, event.active)
+            Le_n = zero if event is None else event.radiance(scene, si)
+            df_s, dLe_h, df_c, dLe_n = forward_derivatives(f_s, Le_h, f_c, Le_n)
+        useful, first = plan.differentiates(vertex.bsdf), state.first
+        found, found_at, largest = first, mi.Bool(False), state.largest
+        for light, C, factors in (
+            (met, None if met is None else met.Le * met.weight, ((_L, None if met is None else met.Le), (_DL, dLe_h))),
+            (event, None if event is None else event.c,
+             ((_L, None if event is None else event.Le), (_DL, dLe_n), (_C, None if event is None else event.c))),
+        ):  # fmt: skip
+            if light is None:
+                continue
+            for kind, value in factors:
+                found = found.otherwise(here(kind, value), light.active)
+            if light is event:
+                found = found.otherwise(here(_DC, df_c), light.active & useful)
+            contribution = P.times(C, vertex.depth).scaled(self.samples.scale).value()
+            found = found.otherwise(here(_CONTRIBUTION, contribution), light.active)
+            found_at |= light.active
+            larger = light.active & (dr.max(dr.abs(contribution)) > dr.max(dr.abs(largest.value)))
+            largest = dr.select(larger, here(_CONTRIBUTION, contribution), largest)
+        new = found_at & (found.kind != 0) & (state.found.kind == 0)
+        first = first.otherwise(here(_S, scattering.weight), scattering.active)
+        first = first.otherwise(here(_DS, df_s), scattering.active & useful)
+        product = P.times(scattering.weight, vertex.depth).value()
+        first = first.otherwise(here(_PRODUCT, product), scattering.active)
+        return Search(first, dr.select(new, found, state.found), state.u, state.there, largest, state.largest_u)
+
+
 Array = np.ndarray[Any, Any]
 
 
@@ -239,10 +297,15 @@ def search_paths(samples: Samples, sensor: int, label: str, pixel: tuple[int, in
     """Look at every path of these samples; those that reach `pixel` come first. Parameters have their tangents set."""
     plan, describe = samples.plan, partial(_describe, samples, sensor, label)
     with dr.suspend_grad():
-        with dr.resume_grad():
-            E = sample_emission(samples, samples.sampler())
-            [dE] = forward_derivatives(E.weight) if plan.differentiate_emission else [mi.Spectrum(0)]
-        state = walk(samples, SearchHooks(samples, Emission(E.ray, dr.detach(E.weight), E.emitter), dE, pixel))
+        if plan.camera:
+            first, state = camera_walk(samples, CameraSearch(samples))
+            state.u = state.largest_u = first.u
+            state.there = reaches(samples.film, first.u, pixel)
+        else:
+            with dr.resume_grad():
+                E = sample_emission(samples, samples.sampler())
+                [dE] = forward_derivatives(E.weight) if plan.differentiate_emission else [mi.Spectrum(0)]
+            state = walk(samples, SearchHooks(samples, Emission(E.ray, dr.detach(E.weight), E.emitter), dE, pixel))
         dr.eval(state)
     size = np.array(dr.max(dr.abs(state.largest.value)))
     brightest = int(np.argmax(np.where(np.isfinite(size), size, 0)))
@@ -251,7 +314,7 @@ def search_paths(samples: Samples, sensor: int, label: str, pixel: tuple[int, in
     if lane is not None:
         return Found(describe(state.found, state.u, lane), there, largest)
     with dr.suspend_grad():
-        for suspect, tangent, u, active in _seen_emission(samples) if plan.visible_emission else ():
+        for suspect, tangent, u, active in _seen_emission(samples) if plan.visible_emission and not plan.weighs else ():
             at_pixel = np.array(reaches(samples.film, u, pixel))
             for quantity, value in (("emission E towards the sensor", suspect.value), (QUANTITIES[_DE], tangent)):
                 bad = np.broadcast_to(np.array(active & is_bad(value)), samples.width)
@@ -344,8 +407,8 @@ def _of_view(problem: Problem, iteration: int, view: View) -> Offender | None:
     if witness is not None:
         problem.integrator.preparation.draw_from(witness, problem.scene)
     step = _take_step(problem, view, step_seed)
-    if problem.config.integrator.type not in LIGHT_TRACERS or problem.paths != "light":
-        return _of_step(step, view, None)  # camera paths are not looked at one by one
+    if problem.config.integrator.type not in LIGHT_TRACERS:
+        return _of_step(step, view, None)  # whose paths are not ours
     if not is_attached(problem):
         _set_tangents(problem)
     pixel = None if step.refused is None else step.refused[:2]
@@ -371,6 +434,9 @@ def _parts(
     names = ("max_depth", "rr_depth", "hide_emitters", "sequence")
     shared = {name: options[name] for name in names if name in options}
     tracer = Reslrb.of(estimator="gather", **shared)
+    if isinstance(problem.integrator, Reslrb):
+        own = problem.integrator
+        tracer.have_paths(own.paths, own.light_share, own.preparation.whole)
     # Of what moves light, contributions alone are looked at: `gather` has no derivatives of it.
     params = None if is_attached(problem) else problem.selection.params
     sets = sample_sets(step_seed, problem.config.step_options())
@@ -382,10 +448,14 @@ def _parts(
         tables = [next(noted) if witness.serves(purpose) else None for _, _, purpose in wanted]
         sets = [(sets[place][0] + word, *sets[place][1:]) for place, word, _ in wanted]
     plan = tracer.plan(scene, sensor, params)
+    emitters = tracer.preparation.emitters(scene) if plan.weighs else None
     for (name, samples_seed, spp), table in zip(sets, tables, strict=True):
-        parts = passes(plan, scene, sensor, samples_seed, spp, problem.samples_per_pass, table)
+        size = problem.samples_per_pass
+        parts = passes(plan, scene, sensor, samples_seed, spp, size, table, tracer.light_share, emitters)
         for number, samples in enumerate(parts):
-            yield samples, view.sensor, name if len(parts) == 1 else f"{name}, pass {number + 1}"
+            label = name if len(parts) == 1 else f"{name}, pass {number + 1}"
+            for side in samples.sides():
+                yield side, view.sensor, f"{label}, camera paths" if side.plan.camera else label
 
 
 def _set_tangents(problem: Problem) -> None:

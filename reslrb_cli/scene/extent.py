@@ -255,8 +255,10 @@ def _thin_glass(scene: mi.Scene) -> str | None:
         hit = scene.ray_intersect_preliminary(ray, active=active)
         following = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
         onward = active & following.is_valid()
-        # From the next surface back: this one, or what the ray on has jumped over.
-        returning = following.spawn_ray(-d)
+        # From the next surface back: this one, or what the ray on has jumped over. On the same line: a ray that is
+        # offset along the normal meets an oblique surface elsewhere.
+        own = mi.math.RayEpsilon * (1 + dr.max(dr.abs(following.p)))
+        returning = mi.Ray3f(following.p - own * d, -d)
         back = scene.ray_intersect_preliminary(returning, active=onward)
         offset = mi.math.RayEpsilon * (1 + dr.max(dr.abs(p)))
         jumped = dr.dot(returning(back.t) - p, d)

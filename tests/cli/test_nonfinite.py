@@ -294,6 +294,29 @@ def test_a_clamp_reports_its_bias(spoilt_experiment, capsys):
     assert sum(record["clamped"]["entries"] for record in records) == tally["entries"]
 
 
+@pytest.mark.parametrize("paths", a_few(["camera", "both, light_share: 0.02", "auto"], ["camera", "auto"]))
+def test_camera_paths_are_looked_at(spoilt_experiment, capsys, paths):
+    ours = f"integrator={{type: reslrb, max_depth: 4, estimator: stack, paths: {paths}}}"
+    _, err = optimize(capsys, STOP, "scene.options={wall: spoilt.exr}", ours)
+    _, [offender], out = inspect(capsys, err)
+    where = offender["where"]
+    assert offender["quantity"] in ("connection factor c", "scattering weight s")
+    assert offender["value"][1] == "nan"
+    assert where["surface"] == "wall_shape"
+    if paths == "camera":
+        assert where["samples"].endswith(", camera paths")
+        assert where["vertex"] >= 1
+        assert f"the first at pixel ({', '.join(map(str, offender['pixel']))})" in err
+
+
+def test_lamps_that_camera_paths_find_are_looked_at(spoilt_experiment, capsys):
+    ours = "integrator={type: reslrb, max_depth: 4, paths: camera}"
+    _, err = optimize(capsys, STOP, "scene.options={power: 3.4028236e38}", ours)
+    _, [offender], _ = inspect(capsys, err)
+    assert offender["quantity"] in ("radiance that is met, or that a sampled emitter sends", "connection factor c")
+    assert offender["where"]["samples"].endswith(", camera paths")
+
+
 def test_paths_from_the_sensor_are_not_looked_at(spoilt_experiment, capsys):
     prb = "integrator={type: prb, max_depth: 4}"
     _, err = optimize(capsys, STOP, "scene.options={wall: spoilt.exr}", prb)
