@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 COARSEST = 16
 #: Steps on a grid, and the root mean square of (1)'s logarithm at which it is left.
 STEPS, TOLERANCE = 12, 2e-3
+#: What residual a solution may have, and how much the picture is blurred (pixels) where sharp it led to none.
+GOOD, BLURS = 0.05, (4.0, 2.0, 1.0, 0.5, 0.0)
 #: Powers of picture and light that lead up to these, on the first grid.
 CONTRASTS = (0.2, 0.4, 0.6, 0.8)
 #: Light outside of an aperture that does not fill its rectangle, as a fraction of the most within.
@@ -144,7 +146,13 @@ def solve(
         if n == levels[-1]:  # from even light to the picture's contrasts
             for contrast in CONTRASTS:
                 _newton(state, optics, nu, target, STEPS, contrast)
+        before = _State(state.h, list(state.slopes), size)
         _newton(state, optics, nu, target, STEPS)
+        if state.residual > GOOD:  # edges of the picture are where steps end: from a picture without any
+            steps, state = state.steps, before
+            for width in BLURS:
+                _newton(state, optics, nu, target, STEPS, blur=width)
+            state.steps += steps
     assert state is not None
     return _told(state, optics, picture / picture.mean(), target)
 
@@ -204,7 +212,7 @@ class _Equation:
     """(1) about one h: its residual, and its derivative along a change of h."""
 
     def __init__(
-        self, state: _State, optics: Optics, nu: Array, target: tuple[float, float], contrast: float = 1.0
+        self, state: _State, optics: Optics, nu: Array, target: tuple[float, float], contrast: float = 1.0, blur: float = 0.0
     ) -> None:
         self.cell, self.optics, self.places = state.cell, optics, _face_places(state.h.shape, state.size)
         self.at = _faces(_padded(state.h, state.slopes, self.cell), self.cell)
@@ -216,14 +224,14 @@ class _Equation:
         gx = (self.at[0][1][:, 1:] + self.at[0][1][:, :-1]) / 2
         gy = (self.at[1][2][1:] + self.at[1][2][:-1]) / 2
         mu = optics.arriving(x, y, state.h, gx, gy)
-        mu = _dim(mu)
+        mu = _dim(mu, FADE + blur)
         mu = mu**contrast
         self.mu = mu / mu.mean()
         self.fits = bool(np.all(self.det > 0) and np.all(self.D[0, 0] > 0) and np.all(np.isfinite(self.mu)))
-        self.nu, self.target = nu**contrast, target
+        self.nu, self.target = (scipy.ndimage.gaussian_filter(nu, blur, mode="nearest") if blur else nu) ** contrast, target
         if self.fits:
             even = (target[0] / state.size[0]) * (target[1] / state.size[1])
-            self.F = np.log(self.det / even * sample(self.nu, target, *self.center) / self.mu)
+            self.F = np.log(self.det / even * self._over_cells(self.nu) / self.mu)
             self.F -= self.F.mean()
             self.merit = float(np.sqrt(np.mean(self.F**2)))
         else:
@@ -234,6 +242,15 @@ class _Equation:
 
     def _center(self, T: list[Array]) -> Array:
         return (T[0][:, :, 1:] + T[0][:, :, :-1] + T[1][:, 1:] + T[1][:, :-1]) / 4
+
+    def _over_cells(self, nu: Array, by: tuple[float, float] = (0.0, 0.0)) -> Array:
+        """The mean of nu over what T makes of each cell, moved `by`: of four points."""
+        total = np.zeros(self.det.shape)
+        for a in (-0.25, 0.25):
+            for b in (-0.25, 0.25):
+                u, v = self.center + self.D[:, 0] * (a * self.cell[0]) + self.D[:, 1] * (b * self.cell[1])
+                total += sample(nu, self.target, u + by[0], v + by[1])
+        return total / 4
 
     def linearize(self) -> None:
         """Makes ready for `along` and `step`."""
@@ -246,11 +263,9 @@ class _Equation:
         self.weights = float(np.mean(A[0, 0] * scale)), float(np.mean(A[1, 1] * scale))
         ny, nx = self.nu.shape
         dx, dy = self.target[0] / nx, self.target[1] / ny
-        u, v = self.center
-        value = sample(self.nu, self.target, u, v)
-        self.slope = scale / value * np.stack([
-            (sample(self.nu, self.target, u + dx / 2, v) - sample(self.nu, self.target, u - dx / 2, v)) / dx,
-            (sample(self.nu, self.target, u, v + dy / 2) - sample(self.nu, self.target, u, v - dy / 2)) / dy,
+        self.slope = scale / self._over_cells(self.nu) * np.stack([
+            (self._over_cells(self.nu, (dx / 2, 0)) - self._over_cells(self.nu, (-dx / 2, 0))) / dx,
+            (self._over_cells(self.nu, (0, dy / 2)) - self._over_cells(self.nu, (0, -dy / 2))) / dy,
         ])  # fmt: skip
 
     def along(self, v: Array) -> Array:
@@ -282,13 +297,13 @@ class _Equation:
         return potential(w.reshape(shape))
 
 
-def _dim(mu: Array) -> Array:
-    """mu (ny, nx) with a little light outside of the aperture, so that T is known there too: less within three cells."""
+def _dim(mu: Array, fade: float) -> Array:
+    """mu (ny, nx) with a little light outside of the aperture, so that T is known there too: less and less within a few cells."""
     lit = mu > 0
     if lit.all():
         return mu
     away, nearest = scipy.ndimage.distance_transform_edt(~lit, return_indices=True)
-    return np.where(lit, mu, mu[tuple(nearest)] * np.maximum(DIM, np.exp(-away / FADE)))
+    return np.where(lit, mu, mu[tuple(nearest)] * np.maximum(DIM, np.exp(-away / fade)))
 
 
 def _at_edges(state: _State, optics: Optics, target: tuple[float, float]) -> None:
@@ -306,20 +321,20 @@ def _at_edges(state: _State, optics: Optics, target: tuple[float, float]) -> Non
 
 
 def _newton(
-    state: _State, optics: Optics, nu: Array, target: tuple[float, float], steps: int, contrast: float = 1.0
+    state: _State, optics: Optics, nu: Array, target: tuple[float, float], steps: int, contrast: float = 1.0, blur: float = 0.0
 ) -> None:
     """Newton steps on one grid, each as long as makes (1) hold better."""
-    equation = _started(state, optics, nu, target, contrast)
+    equation = _started(state, optics, nu, target, contrast, blur)
     for _ in range(steps):
         if not equation.fits or equation.merit < TOLERANCE:
             break
         equation.linearize()
         v = equation.step(min(0.1, max(0.01, equation.merit / 10)))
         length = 1.0
-        while length > 1 / 64:
+        while length > 1 / 32:
             trial = _State(state.h + length * v, list(state.slopes), state.size)
             _at_edges(trial, optics, target)
-            next_equation = _Equation(trial, optics, nu, target, contrast)
+            next_equation = _Equation(trial, optics, nu, target, contrast, blur)
             if next_equation.merit < (1 - 0.1 * length) * equation.merit:
                 break
             length /= 2
@@ -330,7 +345,9 @@ def _newton(
     state.residual = equation.merit
 
 
-def _started(state: _State, optics: Optics, nu: Array, target: tuple[float, float], contrast: float) -> _Equation:
+def _started(
+    state: _State, optics: Optics, nu: Array, target: tuple[float, float], contrast: float, blur: float
+) -> _Equation:
     """The equation about a state, which is smoothed until T folds nowhere: convex functions stay so under means."""
     h, slopes = state.h, list(state.slopes)
     for width in (0.0, 0.5, 1.0, 2.0, 4.0):
@@ -340,7 +357,7 @@ def _started(state: _State, optics: Optics, nu: Array, target: tuple[float, floa
             state.h = scipy.ndimage.gaussian_filter(p, width)[ring:-ring, ring:-ring]
             state.slopes = list(slopes)
         _at_edges(state, optics, target)
-        equation = _Equation(state, optics, nu, target, contrast)
+        equation = _Equation(state, optics, nu, target, contrast, blur)
         if equation.fits:
             break
     return equation
@@ -426,3 +443,37 @@ def through_tent(picture: Array) -> Array:
     for axis in (0, 1):
         picture = scipy.ndimage.convolve1d(picture, [1 / 8, 3 / 4, 1 / 8], axis=axis, mode="nearest")
     return picture
+
+
+# ---- dark tones
+
+
+#: Floors that are tried under dark tones, as fractions of the picture's maximum, on a grid of at most so many cells.
+FLOORS, TRIAL = (0.0, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3), 64
+#: How much more than evenly anything may be lengthened before that counts as a tear.
+TORN = 8.0
+
+
+def lifted(picture: Array, floor: float) -> Array:
+    """`picture` with nothing darker than `floor` times its maximum."""
+    return np.maximum(picture, max(floor, 1e-3) * picture.max())
+
+
+def least_floor(
+    optics: Optics, picture: Array, size: tuple[float, float], target: tuple[float, float], start: Array
+) -> float | None:
+    """The least of `FLOORS` with which the transport neither folds nor tears; None where not even the largest will do."""
+    ratio = size[0] / size[1]
+    shape = (round(TRIAL / max(ratio, 1)), round(TRIAL * min(ratio, 1)))
+    fine = min(1.0, TRIAL / max(picture.shape))
+    small = resized(picture, (max(2, round(picture.shape[0] * fine)), max(2, round(picture.shape[1] * fine))))
+
+    def good(floor: float) -> bool:
+        made = solve(optics, lifted(small, floor), size, target, shape, start)
+        return made.converged and not made.folded and made.stretch < TORN
+
+    low, high = -1, len(FLOORS)  # the last that is known to be too low, the first that is known to do
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if good(FLOORS[middle]) else (middle, high)
+    return FLOORS[high] if high < len(FLOORS) else None
