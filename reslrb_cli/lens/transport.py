@@ -13,7 +13,7 @@ from coarse to fine; each Newton step by GMRES, preconditioned by the Laplacian,
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -68,7 +68,7 @@ class Transport:
 
     `h` (ny, nx): the potential; `slopes`: its derivative along the axis at the edges, (left, right, bottom, top);
     `T` (2, ny, nx): where the centres' light goes; `light` (ny, nx): mu, of mass 1; `residual`: root mean square of (1)'s
-    logarithm; `converged`: whether that is small; `error`: sum |pushed - nu| / sum nu, by the picture's pixels;
+    logarithm; `converged`: whether it was small, if need be of a picture blurred by less than a pixel or a few; `error`: sum |pushed - nu| / sum nu, by the picture's pixels;
     `folded`: the share of cells that T turns over; `stretch`: the largest factor by which T lengthens anything, over that
     of the even map; `pushed`: the picture that T makes.
     """
@@ -135,9 +135,8 @@ def solve(
         levels.append((-(-levels[-1][0] // 2), -(-levels[-1][1] // 2)))
     state: _State | None = None
     for n in reversed(levels):
-        x, y = grid(n, size)
         if state is None:
-            state = _first(optics, x, y, size, target, start)
+            state = _State(*_even(start, n, size), size, start)
         else:
             state = _finer(state, n)
         fine = min(1.0, max(n[0] / picture.shape[0], n[1] / picture.shape[1]))
@@ -146,12 +145,16 @@ def solve(
         if n == levels[-1]:  # from even light to the picture's contrasts
             for contrast in CONTRASTS:
                 _newton(state, optics, nu, target, STEPS, contrast)
-        before = _State(state.h, list(state.slopes), size)
+        before = _copied(state)
         _newton(state, optics, nu, target, STEPS)
-        if state.residual > GOOD:  # edges of the picture are where steps end: from a picture without any
+        if state.residual > GOOD:  # steps end at the picture's edges: from a picture without any
             steps, state = state.steps, before
             for width in BLURS:
-                _newton(state, optics, nu, target, STEPS, blur=width)
+                trial = _copied(state)
+                _newton(trial, optics, nu, target, STEPS, blur=width)
+                if trial.residual > GOOD and state.residual < GOOD:
+                    break
+                state = trial
             state.steps += steps
     assert state is not None
     return _told(state, optics, picture / picture.mean(), target)
@@ -167,6 +170,7 @@ class _State:
     h: Array
     slopes: list[Array]
     size: tuple[float, float]
+    start: Array
     residual: float = np.inf
     steps: int = 0
 
@@ -332,7 +336,7 @@ def _newton(
         v = equation.step(min(0.1, max(0.01, equation.merit / 10)))
         length = 1.0
         while length > 1 / 32:
-            trial = _State(state.h + length * v, list(state.slopes), state.size)
+            trial = _State(state.h + length * v, list(state.slopes), state.size, state.start)
             _at_edges(trial, optics, target)
             next_equation = _Equation(trial, optics, nu, target, contrast, blur)
             if next_equation.merit < (1 - 0.1 * length) * equation.merit:
@@ -348,14 +352,19 @@ def _newton(
 def _started(
     state: _State, optics: Optics, nu: Array, target: tuple[float, float], contrast: float, blur: float
 ) -> _Equation:
-    """The equation about a state, which is smoothed until T folds nowhere: convex functions stay so under means."""
+    """The equation about a state, which is smoothed and mixed with the even map until T folds nowhere.
+
+    Convex functions stay so under both, and the even map brings what is close to an edge away from it.
+    """
     h, slopes = state.h, list(state.slopes)
-    for width in (0.0, 0.5, 1.0, 2.0, 4.0):
-        if width:
+    even, even_slopes = _even(state.start, state.h.shape, state.size)
+    for width, part in ((0.0, 0.0), (0.5, 0.0), (1.0, 0.02), (2.0, 0.05), (4.0, 0.2), (4.0, 0.5), (0.0, 1.0)):
+        if width or part:
             ring = int(4 * width) + 1
             p = np.pad(_padded(h, slopes, state.cell), ring - 1, mode="reflect", reflect_type="odd")
-            state.h = scipy.ndimage.gaussian_filter(p, width)[ring:-ring, ring:-ring]
-            state.slopes = list(slopes)
+            smooth = scipy.ndimage.gaussian_filter(p, width)[ring:-ring, ring:-ring]
+            state.h = (1 - part) * smooth + part * (even + np.mean(smooth - even))
+            state.slopes = [(1 - part) * a + part * b for a, b in zip(slopes, even_slopes, strict=True)]
         _at_edges(state, optics, target)
         equation = _Equation(state, optics, nu, target, contrast, blur)
         if equation.fits:
@@ -363,13 +372,17 @@ def _started(
     return equation
 
 
-def _first(
-    optics: Optics, x: Array, y: Array, size: tuple[float, float], target: tuple[float, float], start: Array
-) -> _State:
+def _even(start: Array, shape: tuple[int, int], size: tuple[float, float]) -> tuple[Array, list[Array]]:
+    """h and slopes of the polynomial that `solve` starts from."""
+    x, y = grid(shape, size)
     h = start[0] + start[1] * x + start[2] * y + start[3] * x * x + start[4] * x * y + start[5] * y * y
     hx, hy = start[1] + 2 * start[3] * x + start[4] * y, start[2] + start[4] * x + 2 * start[5] * y
-    slopes = [hx[:, 0], hx[:, -1], hy[0], hy[-1]]
-    return _State(h, slopes, size)
+    half = (start[3] * size[0] / shape[1], start[5] * size[1] / shape[0])  # from the last centres to the edges
+    return h, [hx[:, 0] - half[0], hx[:, -1] + half[0], hy[0] - half[1], hy[-1] + half[1]]
+
+
+def _copied(state: _State) -> _State:
+    return replace(state, slopes=list(state.slopes))
 
 
 def _finer(state: _State, shape: tuple[int, int]) -> _State:
@@ -387,14 +400,14 @@ def _finer(state: _State, shape: tuple[int, int]) -> _State:
     for index, old in enumerate(state.slopes):
         n = shape[0] if index < 2 else shape[1]
         slopes.append(np.interp((np.arange(n) + 0.5) / n, (np.arange(old.size) + 0.5) / old.size, old))
-    return _State(h, slopes, state.size, steps=state.steps)
+    return replace(state, h=h, slopes=slopes, residual=np.inf)
 
 
 def _told(state: _State, optics: Optics, picture: Array, target: tuple[float, float]) -> Transport:
     equation = _Equation(state, optics, picture, target)
     result = Transport(
         state.h, state.slopes, state.size, equation.center, equation.mu, equation.merit,
-        equation.fits and equation.merit < 0.1, steps=state.steps,
+        equation.fits and state.residual < GOOD, steps=state.steps,
     )  # fmt: skip
     lit = equation.mu > 2 * DIM * equation.mu.max()
     D = equation.D * np.array([state.size[0] / target[0], state.size[1] / target[1]])[:, None, None, None]
