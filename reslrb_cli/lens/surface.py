@@ -91,7 +91,10 @@ class Rays:
         up = np.cross(forward, across)
         nod, turn = np.radians(s.tilt)
         up, forward_ = np.cos(nod) * up + np.sin(nod) * forward, np.cos(nod) * forward - np.sin(nod) * up
-        across, normal = np.cos(turn) * across - np.sin(turn) * forward_, np.cos(turn) * forward_ + np.sin(turn) * across
+        across, normal = (
+            np.cos(turn) * across - np.sin(turn) * forward_,
+            np.cos(turn) * forward_ + np.sin(turn) * across,
+        )
         self.middle, self.across, self.up, self.normal = forward * s.distance, across, up, normal
 
     def incoming(self, x: Array, y: Array, h: Array) -> tuple[Array, Array]:

@@ -68,7 +68,7 @@ class Transport:
 
     `h` (ny, nx): the potential; `slopes`: its derivative along the axis at the edges, (left, right, bottom, top);
     `T` (2, ny, nx): where the centres' light goes; `light` (ny, nx): mu, of mass 1; `residual`: root mean square of (1)'s
-    logarithm; `converged`: whether it was small, if need be of a picture blurred by less than a pixel or a few; `error`: sum |pushed - nu| / sum nu, by the picture's pixels;
+    logarithm; `converged`: whether it was small, if need be of a picture blurred by less than a pixel or a few; `error`: sum |pushed - nu| / sum nu, by the picture's pixels, or cells where these are larger;
     `folded`: the share of cells that T turns over; `stretch`: the largest factor by which T lengthens anything, over that
     of the even map; `pushed`: the picture that T makes.
     """
@@ -135,10 +135,7 @@ def solve(
         levels.append((-(-levels[-1][0] // 2), -(-levels[-1][1] // 2)))
     state: _State | None = None
     for n in reversed(levels):
-        if state is None:
-            state = _State(*_even(start, n, size), size, start)
-        else:
-            state = _finer(state, n)
+        state = _State(*_even(start, n, size), size, start) if state is None else _finer(state, n)
         fine = min(1.0, max(n[0] / picture.shape[0], n[1] / picture.shape[1]))
         nu = picture if fine >= 1 else resized(picture, (max(2, round(picture.shape[0] * fine)), max(2, round(picture.shape[1] * fine))))  # fmt: skip
         nu = nu / nu.mean()
@@ -216,7 +213,13 @@ class _Equation:
     """(1) about one h: its residual, and its derivative along a change of h."""
 
     def __init__(
-        self, state: _State, optics: Optics, nu: Array, target: tuple[float, float], contrast: float = 1.0, blur: float = 0.0
+        self,
+        state: _State,
+        optics: Optics,
+        nu: Array,
+        target: tuple[float, float],
+        contrast: float = 1.0,
+        blur: float = 0.0,
     ) -> None:
         self.cell, self.optics, self.places = state.cell, optics, _face_places(state.h.shape, state.size)
         self.at = _faces(_padded(state.h, state.slopes, self.cell), self.cell)
@@ -228,11 +231,14 @@ class _Equation:
         gx = (self.at[0][1][:, 1:] + self.at[0][1][:, :-1]) / 2
         gy = (self.at[1][2][1:] + self.at[1][2][:-1]) / 2
         mu = optics.arriving(x, y, state.h, gx, gy)
-        mu = _dim(mu, FADE + blur)
+        mu = _dim(mu, FADE + blur, DIM * (1 + 2 * blur))
         mu = mu**contrast
         self.mu = mu / mu.mean()
         self.fits = bool(np.all(self.det > 0) and np.all(self.D[0, 0] > 0) and np.all(np.isfinite(self.mu)))
-        self.nu, self.target = (scipy.ndimage.gaussian_filter(nu, blur, mode="nearest") if blur else nu) ** contrast, target
+        self.nu, self.target = (
+            (scipy.ndimage.gaussian_filter(nu, blur, mode="nearest") if blur else nu) ** contrast,
+            target,
+        )
         if self.fits:
             even = (target[0] / state.size[0]) * (target[1] / state.size[1])
             self.F = np.log(self.det / even * self._over_cells(self.nu) / self.mu)
@@ -259,7 +265,9 @@ class _Equation:
     def linearize(self) -> None:
         """Makes ready for `along` and `step`."""
         self.B = [_derivative(self.optics, *of) for of in zip(self.places, self.at, self.T, strict=True)]
-        inverse = np.stack([np.stack([self.D[1, 1], -self.D[0, 1]]), np.stack([-self.D[1, 0], self.D[0, 0]])]) / self.det
+        inverse = (
+            np.stack([np.stack([self.D[1, 1], -self.D[0, 1]]), np.stack([-self.D[1, 0], self.D[0, 0]])]) / self.det
+        )
         middle = (self.B[0][..., 1:] + self.B[0][..., :-1]) / 2
         A = np.einsum("ab...,bc...->ac...", inverse, middle)  # (1) is A : D^2 v, and terms of lower order
         scale = 2 / (A[0, 0] + A[1, 1])
@@ -275,7 +283,10 @@ class _Equation:
     def along(self, v: Array) -> Array:
         """The derivative of (1)'s logarithm along v (ny, nx), whose slopes at the edges are 0, times `scale`."""
         p = np.pad(v, 1, mode="edge")
-        dT = [np.einsum("ab...,b...->a...", B, np.stack(at[1:])) for B, at in zip(self.B, _faces(p, self.cell), strict=True)]
+        dT = [
+            np.einsum("ab...,b...->a...", B, np.stack(at[1:]))
+            for B, at in zip(self.B, _faces(p, self.cell), strict=True)
+        ]
         dD = self._differences(dT)
         trace = np.einsum("ab...,ba...->...", self.inverse, dD)
         return trace + np.einsum("a...,a...->...", self.slope, self._center(dT))
@@ -301,13 +312,13 @@ class _Equation:
         return potential(w.reshape(shape))
 
 
-def _dim(mu: Array, fade: float) -> Array:
-    """mu (ny, nx) with a little light outside of the aperture, so that T is known there too: less and less within a few cells."""
+def _dim(mu: Array, fade: float, dim: float) -> Array:
+    """mu (ny, nx) with a little light outside of the aperture, less with each cell, so that T is known there too."""
     lit = mu > 0
     if lit.all():
         return mu
     away, nearest = scipy.ndimage.distance_transform_edt(~lit, return_indices=True)
-    return np.where(lit, mu, mu[tuple(nearest)] * np.maximum(DIM, np.exp(-away / fade)))
+    return np.where(lit, mu, mu[tuple(nearest)] * np.maximum(dim, np.exp(-away / fade)))
 
 
 def _at_edges(state: _State, optics: Optics, target: tuple[float, float]) -> None:
@@ -325,7 +336,13 @@ def _at_edges(state: _State, optics: Optics, target: tuple[float, float]) -> Non
 
 
 def _newton(
-    state: _State, optics: Optics, nu: Array, target: tuple[float, float], steps: int, contrast: float = 1.0, blur: float = 0.0
+    state: _State,
+    optics: Optics,
+    nu: Array,
+    target: tuple[float, float],
+    steps: int,
+    contrast: float = 1.0,
+    blur: float = 0.0,
 ) -> None:
     """Newton steps on one grid, each as long as makes (1) hold better."""
     equation = _started(state, optics, nu, target, contrast, blur)
@@ -413,7 +430,9 @@ def _told(state: _State, optics: Optics, picture: Array, target: tuple[float, fl
     D = equation.D * np.array([state.size[0] / target[0], state.size[1] / target[1]])[:, None, None, None]
     result.folded = float(np.mean((equation.det <= 0)[lit]))
     result.stretch = float(np.max(np.linalg.norm(np.moveaxis(D, (0, 1), (-2, -1))[lit], 2, axis=(-2, -1))))
-    result.pushed = pushed(equation.center, equation.mu * lit, picture.shape, target)
+    coarse = (min(picture.shape[0], state.h.shape[0]), min(picture.shape[1], state.h.shape[1]))
+    picture = resized(picture, coarse)
+    result.pushed = pushed(equation.center, equation.mu * lit, coarse, target)
     result.error = float(np.abs(result.pushed - through_tent(picture)).mean())
     return result
 

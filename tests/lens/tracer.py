@@ -34,7 +34,7 @@ def bent(d: Array, normal: Array, ratio: float) -> tuple[Array, Array]:
     return out, 1 - (s + p) / 2
 
 
-def caustic(made: Surface, shape: tuple[int, int], rays: int = 480, wider: float = 1.0) -> Array:
+def caustic(made: Surface, shape: tuple[int, int], rays: int = 400, wider: float = 1.0) -> Array:
     """The picture (rows, columns) that light makes on the receiver, as it is looked at, of light per pixel.
 
     `wider`: of a receiver that many times larger, in `shape` pixels.
@@ -99,9 +99,17 @@ def caustic(made: Surface, shape: tuple[int, int], rays: int = 480, wider: float
     if s.through:
         columns = -columns
     w, h = s.picture_size[0] * wider, s.picture_size[1] * wider
-    result = np.zeros(shape)
-    for a in (-0.25, 0.25):  # each ray a pixel wide, in four parts: rays stand in rows, which would be seen
-        for b in (-0.25, 0.25):
-            moved = rows + a * h / shape[0], columns + b * w / shape[1]
-            result += np.histogram2d(*moved, shape, ((-h / 2, h / 2), (-w / 2, w / 2)), weights=light)[0]
-    return result / 4
+    column, row = (columns / w + 0.5) * shape[1] - 0.5, (rows / h + 0.5) * shape[0] - 0.5
+    result = np.zeros((shape[0] + 2, shape[1] + 2))  # each ray a pixel wide, in a frame for what falls just beside
+    seen = (column > -0.5) & (column < shape[1] - 0.5) & (row > -0.5) & (row < shape[0] - 0.5)
+    column, row, light = column[seen] + 1, row[seen] + 1, light[seen]
+    i, j = column.astype(int), row.astype(int)
+    for dj, down in ((0, 1 - row + j), (1, row - j)):
+        for di, across in ((0, 1 - column + i), (1, column - i)):
+            np.add.at(result, (j + dj, i + di), light * down * across)
+    for axis in (0, 1):  # at the picture's edges it is folded back
+        result = np.moveaxis(result, axis, 0)
+        result[1] += result[0]
+        result[-2] += result[-1]
+        result = np.moveaxis(result[1:-1], 0, axis)
+    return result

@@ -1,0 +1,83 @@
+"""Faces of lenses and mirrors, judged by rays that are traced apart (`tracer.py`); what cannot be is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from lens.pictures import smooth
+from lens.tracer import caustic
+from skimage.metrics import structural_similarity
+
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.lens.surface import Setting, shape_surface
+
+LENS = Setting()
+MIRROR = replace(LENS, kind="mirror", incidence=30.0)
+SETTINGS = {
+    "lens": LENS,
+    "lens, point light": replace(LENS, light_distance=300.0, thickness=40.0),
+    "lens, oblique light": replace(LENS, incidence=25.0),
+    "lens, tilted receiver": replace(LENS, tilt=(20.0, 15.0)),
+    "lens, round": replace(LENS, outline="round"),
+    "lens, deep": replace(LENS, distance=80.0, picture_size=(80.0, 80.0), thickness=30.0),
+    "lens, wide": replace(LENS, size=(100.0, 60.0), picture_size=(80.0, 80.0)),
+    "lens, looked at through the receiver": replace(LENS, through=True),
+    "mirror": MIRROR,
+    "mirror, point light": replace(MIRROR, light_distance=500.0),
+    "mirror, tilted receiver": replace(MIRROR, tilt=(-15.0, 20.0)),
+}
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_light_through_the_face_is_the_picture(name: str) -> None:
+    cells = 96 if "round" in name else 128
+    picture = smooth(cells)
+    made = shape_surface(picture, SETTINGS[name], cells, floor=0.05)
+    seen, far = caustic(made, picture.shape), caustic(made, picture.shape, wider=3.0)
+    seen, wanted, inside = seen / seen.mean(), picture / picture.mean(), seen.sum() / far.sum()
+    assert structural_similarity(seen, wanted, data_range=wanted.max()) > 0.95
+    assert np.abs(seen - wanted).mean() < 0.035
+    assert inside > 0.99
+
+
+def test_a_face_is_half_as_deep_at_twice_the_distance() -> None:
+    near = shape_surface(smooth(64), LENS, 64, floor=0.05)
+    far = shape_surface(smooth(64), replace(LENS, distance=400.0), 64, floor=0.05)
+    assert near.relief_at_twice == pytest.approx(far.relief, rel=0.02)
+    assert near.relief_at_twice == pytest.approx(near.relief / 2, rel=0.05)
+    assert f"{near.relief:.3g} mm deep (at 400 mm {near.relief_at_twice:.3g} mm)" in near.summary()
+
+
+def test_a_shallow_lens_and_a_shallow_mirror_have_the_heights_of_the_paraxial_formula() -> None:
+    far = replace(LENS, distance=20_000.0)
+    lens, glass = (shape_surface(smooth(64), one, 64, floor=0.05).heights for one in (far, replace(far, ior=1.8)))
+    np.testing.assert_allclose((lens - lens.mean()) * 0.49, (glass - glass.mean()) * 0.8, atol=2e-3 * np.ptp(lens))
+
+
+@pytest.mark.parametrize(
+    ("changed", "key", "words"),
+    [
+        ({"ior": 1.0}, "ior", "glass and plastics"),
+        ({"distance": 0.0}, "distance", "above 0"),
+        ({"distance": np.nan}, "distance", "above 0"),
+        ({"distance": 60.0, "picture_size": (300.0, 300.0)}, "distance", "index of 1.49 bends light by at most 48 degrees.*would do"),
+        ({"thickness": 2.0}, "thickness", "thickness must be above .* or distance larger"),
+        ({"incidence": 90.0}, "incidence", "between"),
+        ({"tilt": (85.0, 0.0)}, "tilt", "between"),
+        ({"kind": "mirror"}, "incidence", "stands in the mirror's light; 30 degrees do"),
+        ({"size": (0.0, 1.0)}, "size", "above 0"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused(changed: dict[str, object], key: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words) as raised:
+        shape_surface(smooth(32), replace(LENS, **changed), 32, floor=0.1)  # type: ignore[arg-type]
+    assert raised.value.key == key
+
+
+@pytest.mark.parametrize("picture", [np.ones((8, 8)), np.zeros((8, 8)), np.ones((1, 1)), np.full((8, 8), np.nan)])
+def test_pictures_of_nothing_are_refused(picture: np.ndarray) -> None:
+    with pytest.raises(ConfigError) as raised:
+        shape_surface(picture, LENS)
+    assert raised.value.key == "picture"
