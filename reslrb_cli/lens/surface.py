@@ -31,9 +31,9 @@ class Setting:
 
     `size`: width and height of the face; `outline`: round is the ellipse in it. `picture_size`: of the picture on the
     receiver. `light_distance`: of a point light, or the middle of an area light, from the face that it meets first;
-    infinite for parallel light. `incidence` (degrees, about y): between the light's central ray and z. `tilt` (degrees):
-    of the receiver about its horizontal and its vertical axis. `through`: the picture is looked at from behind the
-    receiver.
+    infinite for parallel light. `incidence` (degrees, about y): between the light's central ray and z. `tilt`
+    (degrees): of the receiver about its horizontal and its vertical axis. `through`: the picture is looked at from
+    behind the receiver.
     """
 
     kind: Literal["lens", "mirror"] = "lens"
@@ -54,8 +54,8 @@ class Surface:
     """A face, and what it costs.
 
     `heights` (ny, nx): h at the centres of a grid's cells, row 0 at the least y; of a round face also outside of its
-    outline. `inside` (ny, nx): cells within the outline. `floor`: the fraction of the maximum below which the picture has
-    nothing. `relief`: between the highest and the lowest place, and `relief_at_twice` the distance.
+    outline. `inside` (ny, nx): cells within the outline. `floor`: the fraction of the maximum to which darker parts of
+    the picture were lifted. `relief`: between the highest and the lowest place, and `relief_at_twice` the distance.
     """
 
     setting: Setting
@@ -71,7 +71,7 @@ class Surface:
         return (
             f"{self.relief:.3g} mm deep (at {2 * self.setting.distance:g} mm {self.relief_at_twice:.3g} mm); "
             f"nothing darker than {100 * self.floor:g} % of the brightest; "
-            f"{100 * self.transport.error:.2g} % of the light misplaced"
+            f"{50 * self.transport.error:.2g} % of the light misplaced"
         )
 
 
@@ -98,7 +98,7 @@ class Rays:
         self.middle, self.across, self.up, self.normal = forward * s.distance, across, up, normal
 
     def incoming(self, x: Array, y: Array, h: Array) -> tuple[Array, Array]:
-        """Direction (3, ...) of the light that comes to (x, y, h), in the glass of a lens; what arrives on a plane z = h."""
+        """Direction (3, ...) of light that comes to (x, y, h), of a lens in its glass; light on a plane z = h."""
         s = self.setting
         if s.kind == "mirror":
             if not np.isfinite(s.light_distance):
@@ -212,7 +212,7 @@ def shape_surface(
     twice = _twice(setting, target, inside.shape)
     low = float(made.h[inside].min())
     if setting.kind == "lens" and setting.thickness + low <= 0:
-        raise ConfigError("", "thickness", f"the relief goes {-low:.3g} mm into the glass, {relief:.3g} mm deep in all; "
+        raise ConfigError("", "thickness", f"the relief, {relief:.3g} mm deep, goes {-low:.3g} mm into the glass; "
                           f"thickness must be above {-low:.3g} mm, or distance larger (at {2 * setting.distance:g} mm "
                           f"the relief is {twice:.3g} mm deep)")  # fmt: skip
     return Surface(setting, made.h, inside, floor, relief, twice, made)

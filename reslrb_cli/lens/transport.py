@@ -42,7 +42,7 @@ class Optics(Protocol):
     """Where light goes. Lengths are those of the aperture and of the picture, each about its own centre."""
 
     def hit(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
-        """T (2, ...), of places (x, y) on the aperture with potential h and gradient (gx, gy); NaN where no light goes."""
+        """T (2, ...) of places (x, y) with potential h and gradient (gx, gy); NaN where no light goes."""
 
     def arriving(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
         """mu (...): light that arrives, by area of the aperture, in any unit; 0 outside of the aperture."""
@@ -67,10 +67,11 @@ class Transport:
     """A solution of (1).
 
     `h` (ny, nx): the potential; `slopes`: its derivative along the axis at the edges, (left, right, bottom, top);
-    `T` (2, ny, nx): where the centres' light goes; `light` (ny, nx): mu, of mass 1; `residual`: root mean square of (1)'s
-    logarithm; `converged`: whether it was small, if need be of a picture blurred by less than a pixel or a few; `error`: sum |pushed - nu| / sum nu, by the picture's pixels, or cells where these are larger;
-    `folded`: the share of cells that T turns over; `stretch`: the largest factor by which T lengthens anything, over that
-    of the even map; `pushed`: the picture that T makes.
+    `T` (2, ny, nx): where the centres' light goes; `light` (ny, nx): mu, of mean 1; `residual`: of (1)'s logarithm,
+    root of the mean square over the light; `converged`: whether it became small, if need be of a picture blurred by a few pixels.
+    `error`: sum |pushed - nu| / sum nu, by the picture's pixels, or cells where these are larger; `pushed`: the picture
+    that T makes, mean 1. `folded`: the share of cells that T turns over; `stretch`: the largest factor by which T
+    lengthens anything, over that of the even map. `steps`: Newton steps on all grids.
     """
 
     h: Array
@@ -107,6 +108,12 @@ def resized(values: Array, shape: tuple[int, int]) -> Array:
     return values
 
 
+def _shrunk(picture: Array, part: float) -> Array:
+    """`picture` with `part` of its rows and columns, or as it is where that would be more."""
+    ny, nx = picture.shape
+    return picture if part >= 1 else resized(picture, (max(2, round(ny * part)), max(2, round(nx * part))))
+
+
 def grid(shape: tuple[int, int], size: tuple[float, float]) -> tuple[Array, Array]:
     """x and y (ny, nx) of the centres of a rectangle's cells; row 0 has the least y."""
     ny, nx = shape
@@ -127,8 +134,9 @@ def solve(
     """(1), from the coarsest grid up to `shape`.
 
     `picture` (my, mx), positive, row 0 at the least y: nu on a rectangle of `target` (width, height) about 0; `size`:
-    the aperture's. `start` (6,): polynomial c0 + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2 that sends the aperture about to
-    the picture.
+    the aperture's. `start` (6,): polynomial c0 + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2 that sends the aperture evenly,
+    or about so, to the picture. Where a sharp picture leads to no solution, it is begun with a
+    blurred one.
     """
     levels = [shape]
     while min(levels[-1]) >= 2 * COARSEST:
@@ -136,8 +144,7 @@ def solve(
     state: _State | None = None
     for n in reversed(levels):
         state = _State(*_even(start, n, size), size, start) if state is None else _finer(state, n)
-        fine = min(1.0, max(n[0] / picture.shape[0], n[1] / picture.shape[1]))
-        nu = picture if fine >= 1 else resized(picture, (max(2, round(picture.shape[0] * fine)), max(2, round(picture.shape[1] * fine))))  # fmt: skip
+        nu = _shrunk(picture, max(n[0] / picture.shape[0], n[1] / picture.shape[1]))
         nu = nu / nu.mean()
         if n == levels[-1]:  # from even light to the picture's contrasts
             for contrast in CONTRASTS:
@@ -242,8 +249,8 @@ class _Equation:
         if self.fits:
             even = (target[0] / state.size[0]) * (target[1] / state.size[1])
             self.F = np.log(self.det / even * self._over_cells(self.nu) / self.mu)
-            self.F -= self.F.mean()
-            self.merit = float(np.sqrt(np.mean(self.F**2)))
+            self.F -= np.mean(self.mu * self.F)
+            self.merit = float(np.sqrt(np.mean(self.mu * self.F**2)))
         else:
             self.merit = np.inf
 
@@ -350,7 +357,7 @@ def _newton(
         if not equation.fits or equation.merit < TOLERANCE:
             break
         equation.linearize()
-        v = equation.step(min(0.1, max(0.01, equation.merit / 10)))
+        v = equation.step(min(0.03, max(0.003, equation.merit / 30)))
         length = 1.0
         while length > 1 / 32:
             trial = _State(state.h + length * v, list(state.slopes), state.size, state.start)
@@ -494,11 +501,10 @@ def lifted(picture: Array, floor: float) -> Array:
 def least_floor(
     optics: Optics, picture: Array, size: tuple[float, float], target: tuple[float, float], start: Array
 ) -> float | None:
-    """The least of `FLOORS` with which the transport neither folds nor tears; None where not even the largest will do."""
+    """The least of `FLOORS` with which the transport neither folds nor tears; None where the largest does."""
     ratio = size[0] / size[1]
     shape = (round(TRIAL / max(ratio, 1)), round(TRIAL * min(ratio, 1)))
-    fine = min(1.0, TRIAL / max(picture.shape))
-    small = resized(picture, (max(2, round(picture.shape[0] * fine)), max(2, round(picture.shape[1] * fine))))
+    small = _shrunk(picture, TRIAL / max(picture.shape))
 
     def good(floor: float) -> bool:
         made = solve(optics, lifted(small, floor), size, target, shape, start)

@@ -32,9 +32,8 @@ SETTINGS = {
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_light_through_the_face_is_the_picture(name: str) -> None:
-    cells = 96 if "round" in name else 128
-    picture = smooth(cells)
-    made = shape_surface(picture, SETTINGS[name], cells, floor=0.05)
+    picture = smooth(128)
+    made = shape_surface(picture, SETTINGS[name], 128, floor=0.05)
     seen, far = caustic(made, picture.shape), caustic(made, picture.shape, wider=3.0)
     seen, wanted, inside = seen / seen.mean(), picture / picture.mean(), seen.sum() / far.sum()
     assert structural_similarity(seen, wanted, data_range=wanted.max()) > 0.95
@@ -62,7 +61,7 @@ def test_a_shallow_lens_and_a_shallow_mirror_have_the_heights_of_the_paraxial_fo
         ({"ior": 1.0}, "ior", "glass and plastics"),
         ({"distance": 0.0}, "distance", "above 0"),
         ({"distance": np.nan}, "distance", "above 0"),
-        ({"distance": 60.0, "picture_size": (300.0, 300.0)}, "distance", "index of 1.49 bends light by at most 48 degrees.*would do"),
+        ({"distance": 60.0, "picture_size": (300.0, 300.0)}, "distance", "by at most 48 degrees.*would do"),
         ({"thickness": 2.0}, "thickness", "thickness must be above .* or distance larger"),
         ({"incidence": 90.0}, "incidence", "between"),
         ({"tilt": (85.0, 0.0)}, "tilt", "between"),
