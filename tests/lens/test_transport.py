@@ -70,8 +70,8 @@ def test_the_derivative_of_the_equation_is_that_of_differences() -> None:
 
 def test_a_floor_is_the_least_that_does_not_tear() -> None:
     optics, square = Gradient(np.ones((2, 2)), (1, 1)), (1.0, 1.0)
-    assert least_floor(optics, smooth(64), square, square, even(square, square)) == 0
-    found = least_floor(optics, sharp(64), square, square, even(square, square))
+    assert least_floor(optics, smooth(32), square, square, even(square, square)) == 0
+    found = least_floor(optics, sharp(32), square, square, even(square, square))
     assert found is not None
     assert 0.02 < found <= 0.1
 
