@@ -70,8 +70,8 @@ class Transport:
     `T` (2, ny, nx): where the centres' light goes; `light` (ny, nx): mu, of mean 1; `residual`: of (1)'s logarithm,
     root of the mean square over the light; `converged`: whether it became small, if need be of a picture blurred by a
     few pixels. `error`: sum |pushed - nu| / sum nu, by the picture's pixels, or cells where these are larger; `pushed`:
-    the picture that T makes, mean 1. `folded`: the share of cells that T turns over; `stretch`: the largest factor by which T
-    lengthens anything, over that of the even map. `steps`: Newton steps on all grids.
+    the picture that T makes, mean 1. `folded`: the share of cells that T turns over; `stretch`: the largest factor by
+    which T lengthens anything, over that of the even map. `steps`: Newton steps on all grids.
     """
 
     h: Array
