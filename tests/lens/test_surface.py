@@ -8,15 +8,16 @@ from typing import Literal
 import numpy as np
 import pytest
 from lens.pictures import smooth
-from lens.tracer import caustic
+from lens.tracer import bent, caustic
 from skimage.metrics import structural_similarity
 from turns import a_few
 
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.lens import transport
-from reslrb_cli.lens.surface import Setting, shape_surface
+from reslrb_cli.lens.surface import Rays, Setting, shape_surface
 
 LENS = Setting()
+UP = np.array([0.0, 0.0, 1.0])
 MIRROR = replace(LENS, kind="mirror", incidence=30.0)
 SETTINGS = {
     "lens": LENS,
@@ -55,6 +56,23 @@ def test_a_face_is_half_as_deep_at_twice_the_distance() -> None:
     assert near.relief_at_twice == pytest.approx(far.relief, rel=0.02)
     assert near.relief_at_twice == pytest.approx(near.relief / 2, rel=0.05)
     assert f"{near.relief:.3g} mm deep (at 400 mm {near.relief_at_twice:.3g} mm)" in near.summary()
+
+
+def test_a_point_lights_rays_thin_out_through_the_glass() -> None:
+    distance, thickness, ior = 120.0, 30.0, 1.49
+    rays = Rays(replace(LENS, light_distance=distance, thickness=thickness))
+    r = np.linspace(0.01, 55.0, 20_001)  # where they enter
+    direction, enters = bent(
+        np.stack([r, 0 * r, 0 * r + distance]) / np.hypot(r, distance), UP[:, None] + 0 * r, 1 / ior
+    )
+    _, leaves = bent(direction, UP[:, None] + 0 * r, ior)
+    radius = r + thickness * direction[0] / direction[2]  # where they meet the face
+    solid_angle = distance / np.hypot(r, distance) ** 3 * r
+    light = solid_angle / np.gradient(radius, r) / radius * enters * leaves
+    at = radius < 50
+    zero = np.zeros(int(at.sum()))
+    found = rays.arriving(radius[at], zero, zero, zero, zero)
+    np.testing.assert_allclose(found / found[0], light[at] / light[0], rtol=2e-3)
 
 
 @pytest.mark.parametrize(("kind", "ior", "factor"), [("lens", 1.49, 0.49), ("lens", 1.8, 0.8), ("mirror", 1.49, -2.0)])
