@@ -72,7 +72,14 @@ def test_a_point_lights_rays_thin_out_through_the_glass() -> None:
     at = radius < 50
     zero = np.zeros(int(at.sum()))
     found = rays.arriving(radius[at], zero, zero, zero, zero)
-    np.testing.assert_allclose(found / found[0], light[at] / light[0], rtol=2e-3)
+    np.testing.assert_allclose(found / found[0], light[at] / light[0], rtol=1e-4)
+
+
+def test_a_face_that_leans_towards_oblique_light_gets_more_of_it() -> None:
+    rays, zero = Rays(MIRROR), np.zeros(())
+    level = rays.arriving(zero, zero, zero, zero, zero)
+    leaning = rays.arriving(zero, zero, zero, zero + 0.2, zero)
+    assert leaning / level == pytest.approx(1 + 0.2 * np.tan(np.radians(30)))
 
 
 @pytest.mark.parametrize(("kind", "ior", "factor"), [("lens", 1.49, 0.49), ("lens", 1.8, 0.8), ("mirror", 1.49, -2.0)])
