@@ -22,6 +22,7 @@ ROWS = [
     "config",
     "backend",
     "records",
+    "lens",
     "scene",
     "transport",
     "estimators",
@@ -41,6 +42,7 @@ FOREIGN = {
     "seeds": {"mitsuba", "drjit"},
     "statistics": {"mitsuba", "drjit"},
     "records": {"matplotlib"},
+    "lens": {"mitsuba", "drjit", "matplotlib"},
 }
 
 
@@ -147,6 +149,8 @@ def test_imports_run_one_way() -> None:
         ("transport/walk.py", "from .. import estimators", True),
         ("config/schema.py", "import mitsuba as mi", True),
         ("records/page.py", "from matplotlib import pyplot", True),
+        ("lens/surface.py", "import mitsuba as mi", True),
+        ("lens/surface.py", "from reslrb_cli.scene import images", True),
         ("errors.py", "from reslrb_cli.config import load", True),
         ("helpers.py", "import os", True),
         ("transport/walk.py", "from . import emission\nfrom ..seeds import seed\nimport mitsuba as mi", False),

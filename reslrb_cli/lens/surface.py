@@ -1,0 +1,302 @@
+"""The face of a lens or a mirror that throws a picture: light by Snell's law, heights by `transport.py`.
+
+Lengths in millimetres. The face is z = h(x, y) about the plane z = 0, its normal towards the receiver; light comes to a
+lens from z < 0, through a plane face at z = -thickness, and to a mirror from z > 0. Its central ray meets the middle of
+the face, and the receiver's middle lies on that ray as a flat face sends it on, `distance` away; the receiver stands
+across it, but for its tilt. Up is y on both.
+
+The unknown of the transport is h itself: T(x, y) is where a ray that meets the face at (x, y, h) with the normal
+(-dh/dx, -dh/dy, 1) hits the receiver. So every light, tilt and depth of relief is treated alike and exactly, and no
+normals have to be integrated to heights, of which a part might not be integrable.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.lens import transport
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What throws the picture, and where to.
+
+    `size`: width and height of the face; `outline`: round is the ellipse in it. `picture_size`: of the picture on the
+    receiver. `light_distance`: of a point light, or the middle of an area light, from the face that it meets first;
+    infinite for parallel light. `incidence` (degrees, about y): between the light's central ray and z. `tilt`
+    (degrees): of the receiver about its horizontal and its vertical axis. `through`: the picture is looked at from
+    behind the receiver.
+    """
+
+    kind: Literal["lens", "mirror"] = "lens"
+    size: tuple[float, float] = (100.0, 100.0)
+    outline: Literal["rectangle", "round"] = "rectangle"
+    distance: float = 200.0
+    picture_size: tuple[float, float] = (100.0, 100.0)
+    ior: float = 1.49
+    thickness: float = 20.0
+    light_distance: float = np.inf
+    incidence: float = 0.0
+    tilt: tuple[float, float] = (0.0, 0.0)
+    through: bool = False
+
+
+@dataclass
+class Surface:
+    """A face, and what it costs.
+
+    `heights` (ny, nx): h at the centres of a grid's cells, row 0 at the least y; of a round face also outside of its
+    outline. `inside` (ny, nx): cells within the outline. `floor`: the fraction of the maximum to which darker parts of
+    the picture were lifted. `relief`: between the highest and the lowest place, and `relief_at_twice` the distance.
+    """
+
+    setting: Setting
+    heights: Array
+    inside: NDArray[np.bool_]
+    floor: float
+    relief: float
+    relief_at_twice: float
+    transport: transport.Transport
+
+    def summary(self) -> str:
+        """Depth, floor and errors, in one line."""
+        return (
+            f"{self.relief:.3g} mm deep (at {2 * self.setting.distance:g} mm {self.relief_at_twice:.3g} mm); "
+            f"nothing darker than {100 * self.floor:g} % of the brightest; "
+            f"{50 * self.transport.error:.2g} % of the light misplaced"
+        )
+
+
+class Rays:
+    """Rays of a `Setting`: the `transport.Optics` that its face has."""
+
+    def __init__(self, setting: Setting) -> None:
+        self.setting = s = setting
+        angle = np.radians(s.incidence)
+        side = 1.0 if s.kind == "lens" else -1.0
+        self.toward = np.array([np.sin(angle), 0, side * np.cos(angle)])
+        if np.isfinite(s.light_distance):
+            self.light = -self.toward * s.light_distance - np.array([0, 0, s.thickness if s.kind == "lens" else 0])
+        zero = np.zeros(())
+        forward = self.outgoing(zero, zero, zero, zero, zero)
+        across = np.array([forward[2], 0, -forward[0]]) / np.hypot(forward[0], forward[2])
+        up = np.cross(forward, across)
+        nod, turn = np.radians(s.tilt)
+        up, forward_ = np.cos(nod) * up + np.sin(nod) * forward, np.cos(nod) * forward - np.sin(nod) * up
+        across, normal = (
+            np.cos(turn) * across - np.sin(turn) * forward_,
+            np.cos(turn) * forward_ + np.sin(turn) * across,
+        )
+        self.middle, self.across, self.up, self.normal = forward * s.distance, across, up, normal
+
+    def incoming(self, x: Array, y: Array, h: Array) -> tuple[Array, Array]:
+        """Direction (3, ...) of light that comes to (x, y, h), of a lens in its glass; light on a plane z = h."""
+        s = self.setting
+        if s.kind == "mirror":
+            if not np.isfinite(s.light_distance):
+                return self._everywhere(self.toward, x), np.full(np.shape(x), -self.toward[2])
+            way = np.stack([x - self.light[0], y - self.light[1], h - self.light[2]])
+            length = np.linalg.norm(way, axis=0)
+            return way / length, -way[2] / length**3
+        if not np.isfinite(s.light_distance):
+            bent = self.toward / s.ior
+            bent[2] = np.sqrt(1 - bent[0] ** 2 - bent[1] ** 2)
+            return self._everywhere(bent, x), np.full(np.shape(x), bent[2])
+        # a point light's rays pass the plane face at a radius r about its foot, and meet the other at `radius`
+        gap, deep = -s.thickness - self.light[2], h + s.thickness
+        dx, dy = x - self.light[0], y - self.light[1]
+        radius = np.maximum(np.hypot(dx, dy), 1e-9)
+        r = radius * gap / (gap + deep / s.ior)
+        for _ in range(6):
+            sine = r / np.hypot(r, gap) / s.ior
+            tangent = sine / np.sqrt(1 - sine**2)
+            growth = 1 + deep * gap**2 / np.hypot(r, gap) ** 3 / s.ior / (1 - sine**2) ** 1.5
+            r = r - (r + deep * tangent - radius) / growth
+        cosine = np.sqrt(1 - sine**2)
+        light = gap / np.hypot(r, gap) ** 3 * (r / radius) / growth * _transmitted(gap / np.hypot(r, gap), s.ior)
+        return np.stack([sine * dx / radius, sine * dy / radius, cosine]), light
+
+    def outgoing(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
+        """Direction (3, ...) of the light that leaves; NaN where it is totally reflected."""
+        d, _ = self.incoming(x, y, h)
+        normal = np.stack([-gx, -gy, np.ones_like(gx)]) / np.sqrt(1 + gx * gx + gy * gy)
+        cosine = np.sum(d * normal, axis=0)
+        if self.setting.kind == "mirror":
+            return d - 2 * cosine * normal
+        n = self.setting.ior
+        left = 1 - n * n * (1 - cosine**2)
+        beyond = np.where(left > 0, np.sqrt(np.maximum(left, 0)), np.nan)
+        return n * d + (beyond - n * cosine) * normal
+
+    def hit(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
+        d = self.outgoing(x, y, h, gx, gy)
+        place = np.stack([x, y, h])
+        from_middle = place - self._everywhere(self.middle, x)
+        facing = np.tensordot(self.normal, d, 1)
+        t = -np.tensordot(self.normal, from_middle, 1) / np.where(facing > 1e-3, facing, np.nan)
+        landed = from_middle + np.where(t > 0, t, np.nan) * d
+        return np.stack([np.tensordot(self.across, landed, 1), np.tensordot(self.up, landed, 1)])
+
+    def arriving(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
+        d, plane = self.incoming(x, y, h)
+        meets = (d[2] - d[0] * gx - d[1] * gy) / d[2]  # of a sloped face more or less than of a plane
+        light = plane * np.maximum(meets, 0)
+        if self.setting.kind == "lens":
+            cosine = (d[2] - d[0] * gx - d[1] * gy) / np.sqrt(1 + gx * gx + gy * gy)
+            light = light * _transmitted(cosine, 1 / self.setting.ior)
+        return np.where(within(self.setting, x, y), light, 0.0)
+
+    @staticmethod
+    def _everywhere(vector: Array, like: Array) -> Array:
+        return np.broadcast_to(vector.reshape(3, *[1] * np.ndim(like)), (3, *np.shape(like)))
+
+
+def _transmitted(cosine: Array, eta: float) -> Array:
+    """The part of unpolarised light that passes into a medium `eta` times as dense (Fresnel)."""
+    beyond = np.sqrt(np.maximum(1 - (1 - cosine**2) / eta**2, 0))
+    s = (cosine - eta * beyond) / (cosine + eta * beyond)
+    p = (eta * cosine - beyond) / (eta * cosine + beyond)
+    return 1 - (s * s + p * p) / 2
+
+
+def within(setting: Setting, x: Array, y: Array) -> NDArray[np.bool_]:
+    """Whether (x, y) is inside of the outline."""
+    if setting.outline == "rectangle":
+        return (np.abs(x) <= setting.size[0] / 2) & (np.abs(y) <= setting.size[1] / 2)
+    return (2 * x / setting.size[0]) ** 2 + (2 * y / setting.size[1]) ** 2 <= 1
+
+
+def on_receiver(picture: Array, through: bool) -> Array:
+    """`picture` (row 0 at the top) by the receiver's axes: row 0 at its least y, columns along x; and back again.
+
+    Who looks at the receiver as the light does, with y up, has x to the left; who looks through it, to the right.
+    """
+    return picture[::-1] if through else picture[::-1, ::-1]
+
+
+def shape_surface(
+    picture: Array, setting: Setting, cells: int = 256, floor: float | Literal["auto"] = "auto"
+) -> Surface:
+    """The face that throws `picture` (rows, columns; luminance, row 0 at the top), on `cells` along its longer side.
+
+    Raises ConfigError, its key that of the setting: where there is no such face, and what would do.
+    """
+    _check(picture, setting)
+    rays = Rays(setting)
+    target = on_receiver(np.asarray(picture, np.float64), setting.through)
+    start = _start(rays)
+    if floor == "auto":
+        found = transport.least_floor(rays, target, setting.size, setting.picture_size, start)
+        if found is None:
+            raise ConfigError("", "picture", f"has too much contrast for this {setting.kind}: even with a floor of "
+                              f"{transport.FLOORS[-1]:g} of its maximum light would have to be torn apart; "
+                              "lift its dark parts, or crop it")  # fmt: skip
+        floor = found
+    target = transport.lifted(target, floor)
+    longer = max(setting.size)
+    shape = (max(8, round(cells * setting.size[1] / longer)), max(8, round(cells * setting.size[0] / longer)))
+    made = transport.solve(rays, target, setting.size, setting.picture_size, shape, start)
+    if not made.converged:
+        raise ConfigError("", "distance", f"no face was found that throws this picture {setting.distance:g} mm far; "
+                          "a larger distance or a higher floor may do")  # fmt: skip
+    inside = within(setting, *transport.grid(shape, setting.size))
+    relief = _depth(made.h, inside)
+    twice = _twice(setting, target, inside.shape)
+    low = float(made.h[inside].min())
+    if setting.kind == "lens" and setting.thickness + low <= 0:
+        raise ConfigError("", "thickness", f"the relief, {relief:.3g} mm deep, goes {-low:.3g} mm into the glass; "
+                          f"thickness must be above {-low:.3g} mm, or distance larger (at {2 * setting.distance:g} mm "
+                          f"the relief is {twice:.3g} mm deep)")  # fmt: skip
+    return Surface(setting, made.h, inside, floor, relief, twice, made)
+
+
+def _depth(h: Array, inside: NDArray[np.bool_]) -> float:
+    return float(h[inside].max() - h[inside].min())
+
+
+def _twice(setting: Setting, target: Array, shape: tuple[int, int]) -> float:
+    """The relief (mm) at twice the distance, on a grid of at most 64 cells."""
+    far = replace(setting, distance=2 * setting.distance)
+    coarse = min(1.0, transport.TRIAL / max(shape))
+    small = (max(8, round(shape[0] * coarse)), max(8, round(shape[1] * coarse)))
+    rays = Rays(far)
+    made = transport.solve(rays, transport.resized(target, small), far.size, far.picture_size, small, _start(rays))
+    return _depth(made.h, within(far, *transport.grid(small, far.size)))
+
+
+def _start(rays: Rays) -> Array:
+    """The polynomial of degree 2 (`transport.solve`) that sends the face about evenly to the picture."""
+    s = rays.setting
+    x, y = transport.grid((9, 9), s.size)
+    wanted = np.stack([x * (s.picture_size[0] / s.size[0]), y * (s.picture_size[1] / s.size[1])])
+
+    def misses(c: Array) -> Array:
+        h = c[0] * x + c[1] * y + c[2] * x * x + c[3] * x * y + c[4] * y * y
+        T = rays.hit(x, y, h, c[0] + 2 * c[2] * x + c[3] * y, c[1] + c[3] * x + 2 * c[4] * y)
+        return np.nan_to_num(T - wanted, nan=1e3 * max(s.picture_size)).ravel()
+
+    fit = least_squares(misses, np.zeros(5), x_scale=[1, 1, *[1 / max(s.size)] * 3])
+    return np.concatenate([[0.0], fit.x])
+
+
+# ---- what cannot be
+
+
+def _check(picture: Array, setting: Setting) -> None:
+    s = setting
+    if picture.ndim != 2 or min(picture.shape) < 2:
+        raise ConfigError("", "picture", f"is {' x '.join(map(str, picture.shape))}; it must have 2 x 2 pixels or more")
+    if not np.all(np.isfinite(picture)) or picture.min() < 0:
+        raise ConfigError("", "picture", "has values that are negative or not finite")
+    if picture.max() - picture.min() <= 1e-6 * picture.max():
+        raise ConfigError("", "picture", "is of one colour; there is nothing to throw")
+    for key in ("size", "picture_size"):
+        if min(getattr(s, key)) <= 0:
+            raise ConfigError("", key, "must be above 0 mm")
+    for key in ("distance", "thickness", "light_distance"):
+        if not getattr(s, key) > 0:
+            raise ConfigError("", key, f"is {getattr(s, key):g} mm; it must be above 0")
+    if not -80 <= s.incidence <= 80:
+        raise ConfigError("", "incidence", f"is {s.incidence:g} degrees; it must be between -80 and 80")
+    if max(map(abs, s.tilt)) > 80:
+        raise ConfigError("", "tilt", "must be between -80 and 80 degrees")
+    if s.kind == "lens" and not 1 < s.ior <= 5:
+        raise ConfigError("", "ior", f"is {s.ior:g}; glass and plastics that bend light have 1.3 to 2.0, at most 5")
+    if s.kind == "mirror":
+        angle = np.radians(abs(s.incidence))
+        beside = s.distance * np.sin(2 * angle)
+        needed = s.size[0] / 2 * np.cos(angle) + s.picture_size[0] / 2 * abs(np.cos(2 * angle))
+        if beside < needed:
+            raise ConfigError("", "incidence", f"at {s.incidence:g} degrees the receiver stands in the mirror's light; "
+                              "30 degrees do for pictures of the mirror's size at its distance or more")  # fmt: skip
+    if not _reaches(s):
+        enough = next((f for f in np.geomspace(1, 100, 100) if _reaches(replace(s, distance=s.distance * f))), None)
+        advice = "a smaller picture or tilt" if enough is None else f"a distance of {s.distance * enough:.3g} mm"
+        raise ConfigError("", "distance", f"at {s.distance:g} mm light cannot reach the whole picture: " + (
+            f"an index of {s.ior:g} bends light by at most {np.degrees(np.arccos(1 / s.ior)):.0f} degrees "
+            "before it is totally reflected; " if s.kind == "lens" else "") + f"{advice} would do")  # fmt: skip
+
+
+def _reaches(setting: Setting) -> bool:
+    """Whether a face can send light from its corners and middle to the picture's, and the receiver stands before it.
+
+    N proportional to n_i d_i - n_t d_t lies towards the light's side of the face only if n_i d_i . d_t > n_t: light is
+    bent by less than arccos(1 / n).
+    """
+    rays = Rays(setting)
+    x, y = (a.ravel() for a in transport.grid((3, 3), (1.5 * setting.size[0], 1.5 * setting.size[1])))
+    u, v = x * setting.picture_size[0] / setting.size[0], y * setting.picture_size[1] / setting.size[1]
+    to = rays.middle[:, None] + rays.across[:, None] * u + rays.up[:, None] * v
+    way = to - np.stack([x, y, np.zeros_like(x)])
+    out = way / np.linalg.norm(way, axis=0)
+    d, _ = rays.incoming(x, y, np.zeros_like(x))
+    stands = bool(np.all(to[2] > 0) and np.all(rays.normal @ out > 0.05))
+    return stands and (setting.kind == "mirror" or bool(np.all(setting.ior * np.sum(d * out, axis=0) > 1.02)))

@@ -1,0 +1,517 @@
+"""Transport of light from an aperture to a picture: the equation of Monge and Ampere, solved on a grid by Newton steps.
+
+Unknown is a potential h at the centres of a grid of cells. An `Optics` says where light goes from a point of the
+aperture, given h and its gradient g there: T(x, h, g). Light is conserved where
+
+    nu(T(x)) det DT(x) = mu(x),                                                                                     (1)
+
+mu the light that arrives on the aperture, nu the picture, both of one mass, and where the aperture's edges go to the
+picture's edges. With T = g that is optimal transport for the squared distance (Brenier); with T by Snell's law h is the
+surface itself, so that nothing has to be integrated afterwards (`surface.py`). (1) is solved in its logarithm, on grids
+from coarse to fine; each Newton step by GMRES, preconditioned by the Laplacian, which SciPy's cosine transform inverts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+import scipy.fft
+import scipy.ndimage
+import scipy.sparse.linalg as linalg
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Cells along the shorter side of the first grid.
+COARSEST = 16
+#: Steps on a grid, and the root mean square of (1)'s logarithm at which it is left.
+STEPS, TOLERANCE = 12, 2e-3
+#: What residual a solution may have, and how much the picture is blurred (pixels) where sharp it led to none.
+GOOD, BLURS = 0.05, (4.0, 2.0, 1.0, 0.5, 0.0)
+#: Powers of picture and light that lead up to these, on the first grid.
+CONTRASTS = (0.2, 0.4, 0.6, 0.8)
+#: Light outside of an aperture that does not fill its rectangle, as a fraction of the most within.
+DIM = 0.01
+#: Cells over which it fades there.
+FADE = 0.7
+
+
+class Optics(Protocol):
+    """Where light goes. Lengths are those of the aperture and of the picture, each about its own centre."""
+
+    def hit(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
+        """T (2, ...) of places (x, y) with potential h and gradient (gx, gy); NaN where no light goes."""
+
+    def arriving(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
+        """mu (...): light that arrives, by area of the aperture, in any unit; 0 outside of the aperture."""
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """Optimal transport for the squared distance: T = g; `mu` (ny, nx) is the light on the aperture of `size`."""
+
+    mu: Array
+    size: tuple[float, float]
+
+    def hit(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
+        return np.stack([gx, gy])
+
+    def arriving(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
+        return sample(self.mu, self.size, x, y)
+
+
+@dataclass
+class Transport:
+    """A solution of (1).
+
+    `h` (ny, nx): the potential; `slopes`: its derivative along the axis at the edges, (left, right, bottom, top);
+    `T` (2, ny, nx): where the centres' light goes; `light` (ny, nx): mu, of mean 1; `residual`: of (1)'s logarithm,
+    root of the mean square over the light; `converged`: whether it became small, if need be of a picture blurred by a
+    few pixels. `error`: sum |pushed - nu| / sum nu, by the picture's pixels, or cells where these are larger; `pushed`:
+    the picture that T makes, mean 1. `folded`: the share of cells that T turns over; `stretch`: the largest factor by
+    which T lengthens anything, over that of the even map. `steps`: Newton steps on all grids.
+    """
+
+    h: Array
+    slopes: list[Array]
+    size: tuple[float, float]
+    T: Array
+    light: Array
+    residual: float
+    converged: bool
+    error: float = np.nan
+    folded: float = 0.0
+    stretch: float = 1.0
+    pushed: Array = field(default_factory=lambda: np.empty(0))
+    steps: int = 0
+
+
+def sample(values: Array, size: tuple[float, float], x: Array, y: Array) -> Array:
+    """`values` (ny, nx) of a rectangle of `size` about 0, between centres of cells linearly, at places (x, y)."""
+    ny, nx = values.shape
+    places = np.stack([(y / size[1] + 0.5) * ny - 0.5, (x / size[0] + 0.5) * nx - 0.5])
+    return scipy.ndimage.map_coordinates(values, places, order=1, mode="nearest")
+
+
+def resized(values: Array, shape: tuple[int, int]) -> Array:
+    """`values` (ny, nx) of another number of cells, means over areas: the sum times the cell's area stays."""
+    for axis, n in enumerate(shape):
+        total = np.cumsum(values, axis=axis)
+        total = np.concatenate([np.zeros_like(np.take(total, [0], axis=axis)), total], axis=axis)
+        at = np.linspace(0, values.shape[axis], n + 1)
+        low = np.minimum(at.astype(int), values.shape[axis] - 1)
+        part = np.expand_dims(at - low, tuple(i for i in range(values.ndim) if i != axis))
+        edges = np.take(total, low, axis=axis) * (1 - part) + np.take(total, low + 1, axis=axis) * part
+        values = np.diff(edges, axis=axis) * (n / values.shape[axis])
+    return values
+
+
+def _shrunk(picture: Array, part: float) -> Array:
+    """`picture` with `part` of its rows and columns, or as it is where that would be more."""
+    ny, nx = picture.shape
+    return picture if part >= 1 else resized(picture, (max(2, round(ny * part)), max(2, round(nx * part))))
+
+
+def grid(shape: tuple[int, int], size: tuple[float, float]) -> tuple[Array, Array]:
+    """x and y (ny, nx) of the centres of a rectangle's cells; row 0 has the least y."""
+    ny, nx = shape
+    x = ((np.arange(nx) + 0.5) / nx - 0.5) * size[0]
+    y = ((np.arange(ny) + 0.5) / ny - 0.5) * size[1]
+    xs, ys = np.meshgrid(x, y)
+    return xs, ys
+
+
+def solve(
+    optics: Optics,
+    picture: Array,
+    size: tuple[float, float],
+    target: tuple[float, float],
+    shape: tuple[int, int],
+    start: Array,
+) -> Transport:
+    """(1), from the coarsest grid up to `shape`.
+
+    `picture` (my, mx), positive, row 0 at the least y: nu on a rectangle of `target` (width, height) about 0; `size`:
+    the aperture's. `start` (6,): polynomial c0 + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2 that sends the aperture evenly,
+    or about so, to the picture. Where a sharp picture leads to no solution, it is begun with a
+    blurred one.
+    """
+    levels = [shape]
+    while min(levels[-1]) >= 2 * COARSEST:
+        levels.append((-(-levels[-1][0] // 2), -(-levels[-1][1] // 2)))
+    state: _State | None = None
+    for n in reversed(levels):
+        state = _State(*_even(start, n, size), size, start) if state is None else _finer(state, n)
+        nu = _shrunk(picture, max(n[0] / picture.shape[0], n[1] / picture.shape[1]))
+        nu = nu / nu.mean()
+        if n == levels[-1]:  # from even light to the picture's contrasts
+            for contrast in CONTRASTS:
+                _newton(state, optics, nu, target, STEPS, contrast)
+        before = _copied(state)
+        _newton(state, optics, nu, target, STEPS)
+        if state.residual > GOOD:  # steps end at the picture's edges: from a picture without any
+            steps, state = state.steps, before
+            for width in BLURS:
+                trial = _copied(state)
+                _newton(trial, optics, nu, target, STEPS, blur=width)
+                if trial.residual > GOOD and state.residual < GOOD:
+                    break
+                state = trial
+            state.steps += steps
+    assert state is not None
+    return _told(state, optics, picture / picture.mean(), target)
+
+
+# ---- one grid
+
+
+@dataclass
+class _State:
+    """h on a grid, its slopes at the edges, and what steps know of them."""
+
+    h: Array
+    slopes: list[Array]
+    size: tuple[float, float]
+    start: Array
+    residual: float = np.inf
+    steps: int = 0
+
+    @property
+    def cell(self) -> tuple[float, float]:
+        return self.size[0] / self.h.shape[1], self.size[1] / self.h.shape[0]
+
+
+def _padded(h: Array, slopes: list[Array], cell: tuple[float, float]) -> Array:
+    """h (ny + 2, nx + 2) with a ring of cells by which the derivative at each edge is what `slopes` say."""
+    left, right, bottom, top = slopes
+    wide = np.concatenate([(h[:, 0] - left * cell[0])[:, None], h, (h[:, -1] + right * cell[0])[:, None]], axis=1)
+    bottom, top = np.pad(bottom, 1, mode="edge"), np.pad(top, 1, mode="edge")
+    return np.concatenate([(wide[0] - bottom * cell[1])[None], wide, (wide[-1] + top * cell[1])[None]], axis=0)
+
+
+def _faces(p: Array, cell: tuple[float, float]) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
+    """(h, gx, gy) at the faces across x (ny, nx + 1), and at those across y (ny + 1, nx), of a padded h."""
+    dx, dy = cell
+    row, column = p[1:-1], p[:, 1:-1]
+    along_y, along_x = (p[2:] - p[:-2]) / (2 * dy), (p[:, 2:] - p[:, :-2]) / (2 * dx)
+    return (
+        ((row[:, 1:] + row[:, :-1]) / 2, np.diff(row, axis=1) / dx, (along_y[:, 1:] + along_y[:, :-1]) / 2),
+        ((column[1:] + column[:-1]) / 2, (along_x[1:] + along_x[:-1]) / 2, np.diff(column, axis=0) / dy),
+    )
+
+
+def _face_places(shape: tuple[int, int], size: tuple[float, float]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    ny, nx = shape
+    x, y = grid(shape, size)
+    xe, ye = np.linspace(-0.5, 0.5, nx + 1) * size[0], np.linspace(-0.5, 0.5, ny + 1) * size[1]
+    return tuple(np.meshgrid(xe, y[:, 0])), tuple(np.meshgrid(x[0], ye))  # type: ignore[return-value]
+
+
+def _derivative(optics: Optics, place: tuple[Array, Array], at: tuple[Array, Array, Array], T: Array) -> Array:
+    """B (2, 2, ...): dT / dg, by differences; B[a, b] is that of T's component a by g's component b."""
+    h, gx, gy = at
+    e = 1e-6
+    return np.stack([optics.hit(*place, h, gx + e, gy) - T, optics.hit(*place, h, gx, gy + e) - T], axis=1) / e
+
+
+class _Equation:
+    """(1) about one h: its residual, and its derivative along a change of h."""
+
+    def __init__(
+        self,
+        state: _State,
+        optics: Optics,
+        nu: Array,
+        target: tuple[float, float],
+        contrast: float = 1.0,
+        blur: float = 0.0,
+    ) -> None:
+        self.cell, self.optics, self.places = state.cell, optics, _face_places(state.h.shape, state.size)
+        self.at = _faces(_padded(state.h, state.slopes, self.cell), self.cell)
+        self.T = [optics.hit(*place, *at) for place, at in zip(self.places, self.at, strict=True)]
+        self.D = self._differences(self.T)
+        self.det = self.D[0, 0] * self.D[1, 1] - self.D[0, 1] * self.D[1, 0]
+        self.center = self._center(self.T)
+        x, y = grid(state.h.shape, state.size)
+        gx = (self.at[0][1][:, 1:] + self.at[0][1][:, :-1]) / 2
+        gy = (self.at[1][2][1:] + self.at[1][2][:-1]) / 2
+        mu = optics.arriving(x, y, state.h, gx, gy)
+        mu = _dim(mu, FADE + blur, DIM * (1 + 2 * blur))
+        mu = mu**contrast
+        self.mu = mu / mu.mean()
+        self.fits = bool(np.all(self.det > 0) and np.all(self.D[0, 0] > 0) and np.all(np.isfinite(self.mu)))
+        self.nu, self.target = (
+            (scipy.ndimage.gaussian_filter(nu, blur, mode="nearest") if blur else nu) ** contrast,
+            target,
+        )
+        if self.fits:
+            even = (target[0] / state.size[0]) * (target[1] / state.size[1])
+            self.F = np.log(self.det / even * self._over_cells(self.nu) / self.mu)
+            self.F -= np.mean(self.mu * self.F)
+            self.merit = float(np.sqrt(np.mean(self.mu * self.F**2)))
+        else:
+            self.merit = np.inf
+
+    def _differences(self, T: list[Array]) -> Array:
+        return np.stack([np.diff(T[0], axis=2) / self.cell[0], np.diff(T[1], axis=1) / self.cell[1]], axis=1)
+
+    def _center(self, T: list[Array]) -> Array:
+        return (T[0][:, :, 1:] + T[0][:, :, :-1] + T[1][:, 1:] + T[1][:, :-1]) / 4
+
+    def _over_cells(self, nu: Array, by: tuple[float, float] = (0.0, 0.0)) -> Array:
+        """The mean of nu over what T makes of each cell, moved `by`: of four points."""
+        total = np.zeros(self.det.shape)
+        for a in (-0.25, 0.25):
+            for b in (-0.25, 0.25):
+                u, v = self.center + self.D[:, 0] * (a * self.cell[0]) + self.D[:, 1] * (b * self.cell[1])
+                total += sample(nu, self.target, u + by[0], v + by[1])
+        return total / 4
+
+    def linearize(self) -> None:
+        """Makes ready for `along` and `step`."""
+        self.B = [_derivative(self.optics, *of) for of in zip(self.places, self.at, self.T, strict=True)]
+        inverse = (
+            np.stack([np.stack([self.D[1, 1], -self.D[0, 1]]), np.stack([-self.D[1, 0], self.D[0, 0]])]) / self.det
+        )
+        middle = (self.B[0][..., 1:] + self.B[0][..., :-1]) / 2
+        A = np.einsum("ab...,bc...->ac...", inverse, middle)  # (1) is A : D^2 v, and terms of lower order
+        scale = 2 / (A[0, 0] + A[1, 1])
+        self.scale, self.inverse = scale, inverse * scale
+        self.weights = float(np.mean(A[0, 0] * scale)), float(np.mean(A[1, 1] * scale))
+        ny, nx = self.nu.shape
+        dx, dy = self.target[0] / nx, self.target[1] / ny
+        self.slope = scale / self._over_cells(self.nu) * np.stack([
+            (self._over_cells(self.nu, (dx / 2, 0)) - self._over_cells(self.nu, (-dx / 2, 0))) / dx,
+            (self._over_cells(self.nu, (0, dy / 2)) - self._over_cells(self.nu, (0, -dy / 2))) / dy,
+        ])  # fmt: skip
+
+    def along(self, v: Array) -> Array:
+        """The derivative of (1)'s logarithm along v (ny, nx), whose slopes at the edges are 0, times `scale`."""
+        p = np.pad(v, 1, mode="edge")
+        dT = [
+            np.einsum("ab...,b...->a...", B, np.stack(at[1:]))
+            for B, at in zip(self.B, _faces(p, self.cell), strict=True)
+        ]
+        dD = self._differences(dT)
+        trace = np.einsum("ab...,ba...->...", self.inverse, dD)
+        return trace + np.einsum("a...,a...->...", self.slope, self._center(dT))
+
+    def step(self, accuracy: float) -> Array:
+        """v (ny, nx) by which (1) holds to first order."""
+        shape = self.F.shape
+        ky, kx = (2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in shape)
+        symbol = self.weights[0] * kx[None] / self.cell[0] ** 2 + self.weights[1] * ky[:, None] / self.cell[1] ** 2
+        symbol[0, 0] = 1.0
+
+        def potential(w: Array) -> Array:
+            spectrum = -scipy.fft.dctn(w, norm="ortho", workers=-1) / symbol
+            spectrum[0, 0] = 0
+            return scipy.fft.idctn(spectrum, norm="ortho", workers=-1)
+
+        def apply(w: Array) -> Array:  # the mean of w stands for the constant up to which (1)'s logarithm is known
+            w = w.reshape(shape)
+            return (self.along(potential(w)) + self.scale * w.mean()).ravel()
+
+        operator = linalg.LinearOperator((self.F.size, self.F.size), matvec=apply, dtype=np.float64)
+        w, _ = linalg.gmres(operator, -(self.F * self.scale).ravel(), rtol=accuracy, restart=40, maxiter=2)
+        return potential(w.reshape(shape))
+
+
+def _dim(mu: Array, fade: float, dim: float) -> Array:
+    """mu (ny, nx) with a little light outside of the aperture, less with each cell, so that T is known there too."""
+    lit = mu > 0
+    if lit.all():
+        return mu
+    away, nearest = scipy.ndimage.distance_transform_edt(~lit, return_indices=True)
+    return np.where(lit, mu, mu[tuple(nearest)] * np.maximum(dim, np.exp(-away / fade)))
+
+
+def _at_edges(state: _State, optics: Optics, target: tuple[float, float]) -> None:
+    """Sets the slopes at the edges so that light there goes to the picture's edges."""
+    for _ in range(3):
+        at = _faces(_padded(state.h, state.slopes, state.cell), state.cell)
+        for axis, (place, of) in enumerate(zip(_face_places(state.h.shape, state.size), at, strict=True)):
+            for side, index in enumerate((0, -1)):
+                cut = (slice(None), index) if axis == 0 else (index, slice(None))
+                edge_place, edge = (place[0][cut], place[1][cut]), (of[0][cut], of[1][cut], of[2][cut])
+                T = optics.hit(*edge_place, *edge)
+                B = _derivative(optics, edge_place, edge, T)
+                change = ((side - 0.5) * target[axis] - T[axis]) / B[axis, axis]
+                state.slopes[2 * axis + side] = state.slopes[2 * axis + side] + np.nan_to_num(change)
+
+
+def _newton(
+    state: _State,
+    optics: Optics,
+    nu: Array,
+    target: tuple[float, float],
+    steps: int,
+    contrast: float = 1.0,
+    blur: float = 0.0,
+) -> None:
+    """Newton steps on one grid, each as long as makes (1) hold better."""
+    equation = _started(state, optics, nu, target, contrast, blur)
+    for _ in range(steps):
+        if not equation.fits or equation.merit < TOLERANCE:
+            break
+        equation.linearize()
+        v = equation.step(min(0.03, max(0.003, equation.merit / 30)))
+        length = 1.0
+        while length > 1 / 32:
+            trial = _State(state.h + length * v, list(state.slopes), state.size, state.start)
+            _at_edges(trial, optics, target)
+            next_equation = _Equation(trial, optics, nu, target, contrast, blur)
+            if next_equation.merit < (1 - 0.1 * length) * equation.merit:
+                break
+            length /= 2
+        else:
+            break
+        state.h, state.slopes, equation = trial.h, trial.slopes, next_equation
+        state.steps += 1
+    state.residual = equation.merit
+
+
+def _started(
+    state: _State, optics: Optics, nu: Array, target: tuple[float, float], contrast: float, blur: float
+) -> _Equation:
+    """The equation about a state, which is smoothed and mixed with the even map until T folds nowhere.
+
+    Convex functions stay so under both, and the even map brings what is close to an edge away from it.
+    """
+    h, slopes = state.h, list(state.slopes)
+    even, even_slopes = _even(state.start, state.h.shape, state.size)
+    for width, part in ((0.0, 0.0), (0.5, 0.0), (1.0, 0.02), (2.0, 0.05), (4.0, 0.2), (4.0, 0.5), (0.0, 1.0)):
+        if width or part:
+            ring = int(4 * width) + 1
+            p = np.pad(_padded(h, slopes, state.cell), ring - 1, mode="reflect", reflect_type="odd")
+            smooth = scipy.ndimage.gaussian_filter(p, width)[ring:-ring, ring:-ring]
+            state.h = (1 - part) * smooth + part * (even + np.mean(smooth - even))
+            state.slopes = [(1 - part) * a + part * b for a, b in zip(slopes, even_slopes, strict=True)]
+        _at_edges(state, optics, target)
+        equation = _Equation(state, optics, nu, target, contrast, blur)
+        if equation.fits:
+            break
+    return equation
+
+
+def _even(start: Array, shape: tuple[int, int], size: tuple[float, float]) -> tuple[Array, list[Array]]:
+    """h and slopes of the polynomial that `solve` starts from."""
+    x, y = grid(shape, size)
+    h = start[0] + start[1] * x + start[2] * y + start[3] * x * x + start[4] * x * y + start[5] * y * y
+    hx, hy = start[1] + 2 * start[3] * x + start[4] * y, start[2] + start[4] * x + 2 * start[5] * y
+    half = (start[3] * size[0] / shape[1], start[5] * size[1] / shape[0])  # from the last centres to the edges
+    return h, [hx[:, 0] - half[0], hx[:, -1] + half[0], hy[0] - half[1], hy[-1] + half[1]]
+
+
+def _copied(state: _State) -> _State:
+    return replace(state, slopes=list(state.slopes))
+
+
+def _finer(state: _State, shape: tuple[int, int]) -> _State:
+    """The state on a finer grid, by cubic splines; slopes at the edges go along."""
+    ring = 8  # for splines, whose reach is that of a few cells
+    p = np.pad(_padded(state.h, state.slopes, state.cell), ring, mode="reflect", reflect_type="odd")
+    ny, nx = state.h.shape
+    places = np.meshgrid(
+        (np.arange(shape[0]) + 0.5) * ny / shape[0] + 0.5 + ring,
+        (np.arange(shape[1]) + 0.5) * nx / shape[1] + 0.5 + ring,
+        indexing="ij",
+    )
+    h = scipy.ndimage.map_coordinates(p, places, order=3, mode="nearest")
+    slopes = []
+    for index, old in enumerate(state.slopes):
+        n = shape[0] if index < 2 else shape[1]
+        slopes.append(np.interp((np.arange(n) + 0.5) / n, (np.arange(old.size) + 0.5) / old.size, old))
+    return replace(state, h=h, slopes=slopes, residual=np.inf)
+
+
+def _told(state: _State, optics: Optics, picture: Array, target: tuple[float, float]) -> Transport:
+    equation = _Equation(state, optics, picture, target)
+    result = Transport(
+        state.h, state.slopes, state.size, equation.center, equation.mu, equation.merit,
+        equation.fits and state.residual < GOOD, steps=state.steps,
+    )  # fmt: skip
+    lit = equation.mu > 2 * DIM * equation.mu.max()
+    D = equation.D * np.array([state.size[0] / target[0], state.size[1] / target[1]])[:, None, None, None]
+    result.folded = float(np.mean((equation.det <= 0)[lit]))
+    result.stretch = float(np.max(np.linalg.norm(np.moveaxis(D, (0, 1), (-2, -1))[lit], 2, axis=(-2, -1))))
+    coarse = (min(picture.shape[0], state.h.shape[0]), min(picture.shape[1], state.h.shape[1]))
+    picture = resized(picture, coarse)
+    result.pushed = pushed(equation.center, equation.mu * lit, coarse, target)
+    result.error = float(np.abs(result.pushed - through_tent(picture)).mean())
+    return result
+
+
+def pushed(T: Array, light: Array, shape: tuple[int, int], target: tuple[float, float], fine: int = 4) -> Array:
+    """The picture (shape), of mean 1, that `light` (ny, nx) makes where T (2, ny, nx) brings it, seen through a tent.
+
+    Each cell sends `fine`^2 equal shares, T between centres linearly; each falls on the four nearest pixels.
+    """
+    ny, nx = light.shape
+    at = np.meshgrid(
+        (np.arange(ny * fine) + 0.5) / fine - 0.5, (np.arange(nx * fine) + 0.5) / fine - 0.5, indexing="ij"
+    )
+    reach = [np.pad(t, 1, mode="reflect", reflect_type="odd") for t in T]
+    u, v = (scipy.ndimage.map_coordinates(t, [a + 1 for a in at], order=1) for t in reach)
+    share = np.repeat(np.repeat(light, fine, 0), fine, 1)
+    return splat((u / target[0] + 0.5) * shape[1], (v / target[1] + 0.5) * shape[0], share, shape)
+
+
+def splat(column: Array, row: Array, share: Array, shape: tuple[int, int]) -> Array:
+    """Shares of light at places in pixels, each on the four pixels next to it (what falls outside of all is lost).
+
+    At an edge a tent is folded back, as `through_tent` has it. Mean 1 where nothing is lost.
+    """
+    result = np.zeros(shape)
+    inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
+    total = share.sum()
+    column, row, share = column[inside] - 0.5, row[inside] - 0.5, share[inside]
+    i, j = np.floor(column).astype(int), np.floor(row).astype(int)
+    a, b = column - i, row - j
+    for di, wi in ((0, 1 - a), (1, a)):
+        for dj, wj in ((0, 1 - b), (1, b)):
+            index = np.clip(j + dj, 0, shape[0] - 1) * shape[1] + np.clip(i + di, 0, shape[1] - 1)
+            result += np.bincount(index, wi * wj * share, shape[0] * shape[1]).reshape(shape)
+    return result * (result.size / total)
+
+
+def through_tent(picture: Array) -> Array:
+    """What `splat` makes of light that is even over each pixel of `picture`."""
+    for axis in (0, 1):
+        picture = scipy.ndimage.convolve1d(picture, [1 / 8, 3 / 4, 1 / 8], axis=axis, mode="nearest")
+    return picture
+
+
+# ---- dark tones
+
+
+#: Floors that are tried under dark tones, as fractions of the picture's maximum, on a grid of at most so many cells.
+FLOORS, TRIAL = (0.0, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3), 64
+#: How much more than evenly anything may be lengthened before that counts as a tear.
+TORN = 8.0
+
+
+def lifted(picture: Array, floor: float) -> Array:
+    """`picture` with nothing darker than `floor` times its maximum."""
+    return np.maximum(picture, max(floor, 1e-3) * picture.max())
+
+
+def least_floor(
+    optics: Optics, picture: Array, size: tuple[float, float], target: tuple[float, float], start: Array
+) -> float | None:
+    """The least of `FLOORS` with which the transport neither folds nor tears; None where the largest does."""
+    ratio = size[0] / size[1]
+    shape = (round(TRIAL / max(ratio, 1)), round(TRIAL * min(ratio, 1)))
+    small = _shrunk(picture, TRIAL / max(picture.shape))
+
+    def good(floor: float) -> bool:
+        made = solve(optics, lifted(small, floor), size, target, shape, start)
+        return made.converged and not made.folded and made.stretch < TORN
+
+    low, high = -1, len(FLOORS)  # the last that is known to be too low, the first that is known to do
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if good(FLOORS[middle]) else (middle, high)
+    return FLOORS[high] if high < len(FLOORS) else None

@@ -1,0 +1,21 @@
+"""Pictures to throw, all of them without symmetry."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def smooth(n: int) -> Array:
+    """Two soft lights on soft stripes, darkest 0.1 of the brightest."""
+    x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
+    lights = np.exp(-((x - 0.3) ** 2 + (y - 0.2) ** 2) / 0.08) + 0.7 * np.exp(-((x + 0.4) ** 2 + (y + 0.4) ** 2) / 0.05)
+    return 0.15 + lights + 0.15 * (1 + np.sin(5 * x + 3 * y))
+
+
+def sharp(n: int) -> Array:
+    """A bar and a disc of 1 on black."""
+    x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
+    return 1.0 * (((x - 0.4) ** 2 + (y + 0.3) ** 2 < 0.1) | ((np.abs(y - 0.5) < 0.15) & (x < 0.5)))

@@ -1,0 +1,124 @@
+"""Faces of lenses and mirrors, judged by rays that are traced apart (`tracer.py`); what cannot be is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import pytest
+from lens.pictures import smooth
+from lens.tracer import bent, caustic
+from skimage.metrics import structural_similarity
+from turns import a_few
+
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.lens import transport
+from reslrb_cli.lens.surface import Rays, Setting, shape_surface
+
+LENS = Setting()
+UP = np.array([0.0, 0.0, 1.0])
+MIRROR = replace(LENS, kind="mirror", incidence=30.0)
+SETTINGS = {
+    "lens": LENS,
+    "lens, point light": replace(LENS, light_distance=300.0, thickness=40.0),
+    "lens, oblique light": replace(LENS, incidence=25.0),
+    "lens, tilted receiver": replace(LENS, tilt=(20.0, 15.0)),
+    "lens, round": replace(LENS, outline="round"),
+    "lens, deep": replace(LENS, distance=80.0, picture_size=(80.0, 80.0), thickness=30.0),
+    "lens, wide": replace(LENS, size=(100.0, 60.0), picture_size=(80.0, 80.0)),
+    "lens, looked at through the receiver": replace(LENS, through=True),
+    "mirror": MIRROR,
+    "mirror, point light": replace(MIRROR, light_distance=500.0),
+    "mirror, tilted receiver": replace(MIRROR, tilt=(-15.0, 20.0)),
+}
+FEW = {
+    "lens", "lens, point light", "lens, tilted receiver", "lens, round", "lens, looked at through the receiver",
+    "mirror", "mirror, point light",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", a_few(SETTINGS, FEW))
+def test_light_through_the_face_is_the_picture(name: str) -> None:
+    cells = 96 if name == "lens, round" else 128
+    picture = smooth(cells)
+    made = shape_surface(picture, SETTINGS[name], cells, floor=0.05)
+    seen, far = caustic(made, picture.shape), caustic(made, picture.shape, wider=3.0)
+    seen, wanted, inside = seen / seen.mean(), picture / picture.mean(), seen.sum() / far.sum()
+    assert structural_similarity(seen, wanted, data_range=wanted.max()) > 0.95
+    assert np.abs(seen - wanted).mean() < 0.035
+    assert inside > 0.99
+
+
+def test_a_face_is_half_as_deep_at_twice_the_distance() -> None:
+    near = shape_surface(smooth(64), LENS, 64, floor=0.05)
+    far = shape_surface(smooth(64), replace(LENS, distance=400.0), 64, floor=0.05)
+    assert near.relief_at_twice == pytest.approx(far.relief, rel=0.02)
+    assert near.relief_at_twice == pytest.approx(near.relief / 2, rel=0.05)
+    assert f"{near.relief:.3g} mm deep (at 400 mm {near.relief_at_twice:.3g} mm)" in near.summary()
+
+
+def test_a_point_lights_rays_thin_out_through_the_glass() -> None:
+    distance, thickness, ior = 120.0, 30.0, 1.49
+    rays = Rays(replace(LENS, light_distance=distance, thickness=thickness))
+    r = np.linspace(0.01, 55.0, 20_001)  # where they enter
+    direction, enters = bent(
+        np.stack([r, 0 * r, 0 * r + distance]) / np.hypot(r, distance), UP[:, None] + 0 * r, 1 / ior
+    )
+    _, leaves = bent(direction, UP[:, None] + 0 * r, ior)
+    radius = r + thickness * direction[0] / direction[2]  # where they meet the face
+    solid_angle = distance / np.hypot(r, distance) ** 3 * r
+    light = solid_angle / np.gradient(radius, r) / radius * enters * leaves
+    at = radius < 50
+    zero = np.zeros(int(at.sum()))
+    found = rays.arriving(radius[at], zero, zero, zero, zero)
+    np.testing.assert_allclose(found / found[0], light[at] / light[0], rtol=1e-4)
+
+
+def test_a_face_that_leans_towards_oblique_light_gets_more_of_it() -> None:
+    rays, zero = Rays(MIRROR), np.zeros(())
+    level = rays.arriving(zero, zero, zero, zero, zero)
+    leaning = rays.arriving(zero, zero, zero, zero + 0.2, zero)
+    assert leaning / level == pytest.approx(1 + 0.2 * np.tan(np.radians(30)))
+
+
+@pytest.mark.parametrize(("kind", "ior", "factor"), [("lens", 1.49, 0.49), ("lens", 1.8, 0.8), ("mirror", 1.49, -2.0)])
+def test_far_away_heights_are_those_of_the_paraxial_formula(
+    kind: Literal["lens", "mirror"], ior: float, factor: float
+) -> None:
+    distance = 50_000.0
+    setting = replace(LENS, kind=kind, ior=ior, distance=distance, incidence=0.2 if kind == "mirror" else 0.0)
+    found = shape_surface(smooth(64), setting, 64, floor=0.05).heights
+    x, y = transport.grid((64, 64), LENS.size)
+    start = np.array([0, 0, 0, 0.5, 0, 0.5])
+    even = transport.Gradient(np.ones((2, 2)), LENS.size)
+    phi = transport.solve(even, smooth(64)[::-1, ::-1], LENS.size, LENS.picture_size, (64, 64), start).h
+    expected = (phi - (x * x + y * y) / 2) / (factor * distance)
+    np.testing.assert_allclose(found - found.mean(), expected - expected.mean(), atol=0.01 * np.ptp(expected))
+
+
+@pytest.mark.parametrize(
+    ("changed", "key", "words"),
+    [
+        ({"ior": 1.0}, "ior", "glass and plastics"),
+        ({"distance": 0.0}, "distance", "above 0"),
+        ({"distance": np.nan}, "distance", "above 0"),
+        ({"distance": 60.0, "picture_size": (300.0, 300.0)}, "distance", "by at most 48 degrees.*would do"),
+        ({"thickness": 2.0}, "thickness", "thickness must be above .* or distance larger"),
+        ({"incidence": 90.0}, "incidence", "between"),
+        ({"tilt": (85.0, 0.0)}, "tilt", "between"),
+        ({"kind": "mirror"}, "incidence", "stands in the mirror's light; 30 degrees do"),
+        ({"size": (0.0, 1.0)}, "size", "above 0"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused(changed: dict[str, object], key: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words) as raised:
+        shape_surface(smooth(32), replace(LENS, **changed), 32, floor=0.1)  # type: ignore[arg-type]
+    assert raised.value.key == key
+
+
+@pytest.mark.parametrize("picture", [np.ones((8, 8)), np.zeros((8, 8)), np.ones((1, 1)), np.full((8, 8), np.nan)])
+def test_pictures_of_nothing_are_refused(picture: np.ndarray) -> None:
+    with pytest.raises(ConfigError) as raised:
+        shape_surface(picture, LENS)
+    assert raised.value.key == "picture"

@@ -1,0 +1,91 @@
+"""The transport of light against maps that are known, its derivative, and its floor."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from lens.pictures import sharp, smooth
+
+from reslrb_cli.lens import transport
+from reslrb_cli.lens.transport import Gradient, grid, least_floor, resized, solve, splat, through_tent
+
+SIZE = (2.0, 1.0)
+
+
+def even(size: tuple[float, float], target: tuple[float, float]) -> np.ndarray:
+    return np.array([0, 0, 0, target[0] / size[0] / 2, 0, target[1] / size[1] / 2])
+
+
+def test_a_product_of_densities_goes_by_each_axis_own_quantiles() -> None:
+    shape, target = (48, 96), (3.0, 2.0)
+    source = 1 + 0.5 * np.sin(2 * np.linspace(-1, 1, 96))[None] * np.ones((48, 1))
+    picture = (1.2 + np.sin(4 * np.linspace(-1, 1, 400)))[None] * (1.1 - np.linspace(-1, 1, 300) ** 2)[:, None]
+    made = solve(Gradient(source, SIZE), picture, SIZE, target, shape, even(SIZE, target))
+    assert made.converged
+    assert made.folded == 0
+    assert made.error < 0.03
+    for axis, (mu, nu) in enumerate(((source.sum(0), picture.sum(0)), (source.sum(1), picture.sum(1)))):
+        below = (np.cumsum(mu) - mu / 2) / mu.sum()
+        edges = np.concatenate([[0], np.cumsum(nu)]) / nu.sum()
+        exact = np.interp(below, edges, (np.linspace(0, 1, nu.size + 1) - 0.5) * target[axis])
+        found = made.T[axis].mean(axis=axis)
+        assert np.sqrt(np.mean((found - exact)[2:-2] ** 2)) < 0.1 * target[axis] / mu.size  # of a cell
+
+
+def test_light_is_pushed_to_where_the_picture_has_it() -> None:
+    picture = smooth(128)
+    made = solve(Gradient(np.ones((2, 2)), (1, 1)), picture, (1, 1), (1, 1), (128, 128), even((1, 1), (1, 1)))
+    assert made.converged
+    assert made.error < 0.03
+    assert np.abs(made.pushed - through_tent(picture / picture.mean())).mean() == pytest.approx(made.error)
+
+
+def test_a_round_aperture_fills_the_picture() -> None:
+    x, y = grid((64, 64), (1, 1))
+    light = (x * x + y * y < 0.25) * 1.0
+    made = solve(Gradient(light, (1, 1)), smooth(64), (1, 1), (1, 1), (64, 64), even((1, 1), (1, 1)))
+    assert made.converged
+    assert made.error < 0.03
+
+
+def test_the_derivative_of_the_equation_is_that_of_differences() -> None:
+    size, target = (1.0, 1.0), (1.0, 1.0)
+    x, y = grid((24, 24), size)
+    h, slopes = transport._even(even(size, target), (24, 24), size)
+    h = h + 4e-3 * np.cos(2 * np.pi * (x + 0.5)) * np.cos(np.pi * (y + 0.5))
+    v = np.cos(np.pi * (x + 0.5)) * np.cos(2 * np.pi * (y + 0.5))
+    optics, nu = Gradient(np.ones((2, 2)), size), smooth(96)
+    made = [
+        transport._Equation(transport._State(h + e * v, slopes, size, even(size, target)), optics, nu, target)
+        for e in (-1e-5, 0.0, 1e-5)
+    ]
+    made[1].linearize()
+    found = made[1].along(v) / made[1].scale
+    expected = (made[2].F - made[0].F) / 2e-5
+    inner = (slice(1, -1), slice(1, -1))
+    # the mean of the picture over a cell is differentiated as if all of its points moved with the middle
+    difference = (found - found.mean() - expected)[inner]
+    assert np.sqrt(np.mean(difference**2)) < 0.03 * np.sqrt(np.mean(expected**2))
+
+
+def test_a_floor_is_the_least_that_does_not_tear() -> None:
+    optics, square = Gradient(np.ones((2, 2)), (1, 1)), (1.0, 1.0)
+    assert least_floor(optics, smooth(32), square, square, even(square, square)) == 0
+    found = least_floor(optics, sharp(32), square, square, even(square, square))
+    assert found is not None
+    assert 0.02 < found <= 0.1
+
+
+def test_resizing_keeps_the_light() -> None:
+    picture = smooth(37)
+    for shape in ((11, 20), (37, 37), (50, 90)):
+        assert resized(picture, shape).mean() == pytest.approx(picture.mean(), rel=1e-12)
+
+
+def test_what_is_splatted_evenly_is_seen_through_a_tent() -> None:
+    picture, fine = smooth(16), 32
+    at = (np.arange(16 * fine) + 0.5) / fine
+    column, row = np.meshgrid(at, at)
+    share = np.kron(picture, np.ones((fine, fine)))
+    seen = splat(column.ravel(), row.ravel(), share.ravel(), (16, 16))
+    np.testing.assert_allclose(seen, through_tent(picture / picture.mean()), rtol=1e-3)
