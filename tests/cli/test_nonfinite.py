@@ -298,7 +298,7 @@ def test_a_clamp_reports_its_bias(spoilt_experiment, capsys):
 def test_camera_paths_are_looked_at(spoilt_experiment, capsys, paths):
     ours = f"integrator={{type: reslrb, max_depth: 4, estimator: stack, paths: {paths}}}"
     _, err = optimize(capsys, STOP, "scene.options={wall: spoilt.exr}", ours)
-    _, [offender], out = inspect(capsys, err)
+    _, [offender], _ = inspect(capsys, err)
     where = offender["where"]
     assert offender["quantity"] in ("connection factor c", "scattering weight s")
     assert offender["value"][1] == "nan"
@@ -310,7 +310,7 @@ def test_camera_paths_are_looked_at(spoilt_experiment, capsys, paths):
 
 
 def test_lamps_that_camera_paths_find_are_looked_at(spoilt_experiment, capsys):
-    ours = "integrator={type: reslrb, max_depth: 4, paths: camera}"
+    ours = "integrator={type: reslrb, max_depth: 4, estimator: stack, paths: camera}"
     _, err = optimize(capsys, STOP, "scene.options={power: 3.4028236e38}", ours)
     _, [offender], _ = inspect(capsys, err)
     assert offender["quantity"] in ("radiance that is met, or that a sampled emitter sends", "connection factor c")
@@ -386,11 +386,11 @@ def note(monkeypatch: pytest.MonkeyPatch, module: ModuleType) -> Drawn:
     drawn: Drawn = []
     passes = module.passes
 
-    def noting(plan, scene, sensor, seed, spp, samples_per_pass, table=None):
+    def noting(plan, scene, sensor, seed, spp, samples_per_pass, table=None, *sides):
         entries = {} if table is None else {name: value for name, value in vars(table).items() if dr.is_array_v(value)}
         held = None if table is None else {name: np.array(value) for name, value in entries.items()}
         drawn.append((int(seed[0]), held))
-        return passes(plan, scene, sensor, seed, spp, samples_per_pass, table)
+        return passes(plan, scene, sensor, seed, spp, samples_per_pass, table, *sides)
 
     monkeypatch.setattr(module, "passes", noting)
     return drawn
