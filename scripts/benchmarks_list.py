@@ -9,7 +9,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 RECORDS = ROOT / "docs" / "benchmarks"
 #: Of the experiments in configs/, in the order of the README's table.
-EXPERIMENTS = ("cornell_floor", "caustic_slab", "grey_room", "furnace", "lens_pose", "caustic_heightmap",
+EXPERIMENTS = ("cornell_floor", "mixed_room", "caustic_slab", "grey_room", "furnace", "lens_pose", "caustic_heightmap",
                "paper/figure1", "stiff/lamp", "stiff/plate", "stiff/wall")  # fmt: skip
 #: Whole runs by other integrators: the record's name, what the README calls the run, and its command.
 OTHERS = {

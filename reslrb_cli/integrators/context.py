@@ -14,6 +14,7 @@ import mitsuba as mi
 from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators.differentiated import Differentiated, Motion, attach, bounces, with_shading_normals
 from reslrb_cli.integrators.freezing import Recordings
+from reslrb_cli.scene.catalog import entry_value
 from reslrb_cli.scene.deformation import Surroundings
 from reslrb_cli.scene.graph import SceneGraph, emitted_rays, interpolates_normals
 from reslrb_cli.scene.needs import check_paths, scene_needs
@@ -189,7 +190,8 @@ class Preparation:
         Of what a parameter belongs to nothing changes; whether it tracks derivatives, and is zero, does.
         """
         with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
-            enabled = {key: value for key, value in params.items() if dr.grad_enabled(value)}
+            values = {key: entry_value(params, key) for key in params.properties}
+            enabled = {key: value for key, value in values.items() if dr.grad_enabled(value)}
         these = tuple((key, params.properties[key][2]) for key in enabled)
         if these not in self._differentiated:
             self._differentiated[these] = Differentiated.of(params, enabled)

@@ -79,7 +79,7 @@ def list_parameters(params: Any, values: bool = False) -> list[ParameterInfo]:
 
 def describe(params: Any, key: str, values: bool = False) -> ParameterInfo:
     """Describe one entry of a `mi.traverse` result, with its value where `values` are asked for."""
-    value, node, flags = _value(params, key), params.properties[key][2], int(params.flags(key))
+    value, node, flags = entry_value(params, key), params.properties[key][2], int(params.flags(key))
     differentiable = flags & (int(mi.ParamFlags.NonDifferentiable) | int(mi.ParamFlags.ReadOnly)) == 0
     kind, bits = parameter_kind(params, key), coarse_bits(params, key)
     return ParameterInfo(
@@ -99,7 +99,7 @@ def coarse_bits(params: Any, key: str) -> int | None:
     """The bits with which Mitsuba keeps a texel of the bitmap `key`, where these are fewer than 32; else None."""
     if not key.endswith("data") or not params.properties[key][2].class_name().startswith("BitmapTexture"):
         return None
-    bits = _storage_bits(_value(params, key))
+    bits = _storage_bits(entry_value(params, key))
     return bits if bits is not None and bits < 32 else None
 
 
@@ -121,7 +121,7 @@ def value_shape(value: Any, halo: int = 0) -> tuple[int, ...]:
 
 def _current_value(params: Any, key: str) -> Value | None:
     """The value of one entry of a `mi.traverse` result; None for what is no number."""
-    value = _value(params, key)
+    value = entry_value(params, key)
     array = as_numbers(value)
     if array is None or array.size == 0:
         return None
@@ -154,8 +154,11 @@ def _encoded_value(array: np.ndarray, texture: mi.Texture) -> Value:
     return Value(numbers, float(table.astype(np.float64) @ counts / array.size), float(there.min()), float(there.max()))
 
 
-def _value(params: Any, key: str) -> Any:
-    # Not params[key], which would mark every entry as one that update() has to look at.
+def entry_value(params: Any, key: str) -> Any:
+    """The value of an entry of a `mi.traverse` result; None where there is none, as of a texture that may be missing.
+
+    Not params[key], which would mark every entry as one that update() has to look at, and fails where there is none.
+    """
     value, value_type, node, _ = params.properties[key]
     return value if value_type is None else params.get_property(value, value_type, node)
 

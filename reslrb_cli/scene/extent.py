@@ -12,7 +12,16 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.scene.graph import SceneGraph, bent_faces, bounds, emitted_rays, face_normals, grid, triangles
+from reslrb_cli.scene.graph import (
+    SceneGraph,
+    bent_faces,
+    bounds,
+    emitted_rays,
+    face_normals,
+    grid,
+    sensor_rays,
+    triangles,
+)
 from reslrb_cli.scene.xml.read import quoted
 
 #: The largest ray offset, as a fraction of the scene's size, with which no loss of light is to be seen: that of a room
@@ -197,7 +206,7 @@ def _met(scene: Any, shapes: Sequence[Any]) -> set[tuple[int, int]]:
     place, lane = grid(_RAYS), dr.arange(mi.UInt32, _RAYS**2)
     numbers = [mi.Float(mi.sample_tea_float32(lane, mi.UInt32(k))) for k in range(3)]
     rays = [
-        sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(*numbers[:2]))[0]
+        sensor_rays(sensor, sensor.shutter_open(), place, mi.Point2f(*numbers[:2]))[0]
         for sensor in scene.sensors()[:_SENSORS]
     ]
     with contextlib.suppress(UnsupportedScene):  # which is said where paths from the light are wanted
@@ -246,11 +255,11 @@ def _thin_glass(scene: mi.Scene) -> str | None:
     passing_on = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Transmission)
     d = ray.d
 
-    def goes_on(k: mi.UInt32, o: mi.Point3f, p: mi.Point3f, active: mi.Mask) -> mi.Mask:
+    def goes_on(k: mi.UInt32, o: mi.Point3f, p: mi.Point3f, n: mi.Normal3f, active: mi.Mask) -> mi.Mask:
         return active & (k < _SURFACES)
 
-    def cross(k: mi.UInt32, o: mi.Point3f, p: mi.Point3f, active: mi.Mask) -> tuple[Any, ...]:
-        """From the surface at `p`, which the ray leaves from `o`, to the next one."""
+    def cross(k: mi.UInt32, o: mi.Point3f, p: mi.Point3f, n: mi.Normal3f, active: mi.Mask) -> tuple[Any, ...]:
+        """From the surface at `p` of normal `n`, which the ray leaves from `o`, to the next one."""
         ray = mi.Ray3f(o, d)
         hit = scene.ray_intersect_preliminary(ray, active=active)
         following = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
@@ -261,7 +270,8 @@ def _thin_glass(scene: mi.Scene) -> str | None:
         returning = mi.Ray3f(following.p - own * d, -d)
         back = scene.ray_intersect_preliminary(returning, active=onward)
         offset = mi.math.RayEpsilon * (1 + dr.max(dr.abs(p)))
-        jumped = dr.dot(returning(back.t) - p, d)
+        # As far as it is from p along d: the ray itself, offset along the normal, runs beside that line.
+        jumped = dr.dot(returning(back.t) - p, n) / dr.dot(d, n)
         apart = dr.select(
             onward & back.is_valid() & (jumped > offset * ROUNDING + FAR * following.t),
             jumped,
@@ -269,10 +279,10 @@ def _thin_glass(scene: mi.Scene) -> str | None:
         )
         dr.scatter(gaps, apart / offset, k * _PATHS + index, onward)
         is_passed = onward & mi.has_flag(following.bsdf().flags(), mi.BSDFFlags.Transmission)
-        return k + 1, following.spawn_ray(d).o, following.p, is_passed
+        return k + 1, following.spawn_ray(d).o, following.p, following.n, is_passed
 
-    state = (dr.zeros(mi.UInt32, _PATHS), si.spawn_ray(d).o, si.p, passing_on)
-    dr.while_loop(state, goes_on, cross, labels=("k", "o", "p", "active"), label="thin glass")
+    state = (dr.zeros(mi.UInt32, _PATHS), si.spawn_ray(d).o, si.p, si.n, passing_on)
+    dr.while_loop(state, goes_on, cross, labels=("k", "o", "p", "n", "active"), label="thin glass")
     found = np.array(gaps)
     found = found[np.isfinite(found)]
     near = found[found < LEAST_OFFSETS]

@@ -172,6 +172,17 @@ def emitted_rays(
     return ray, weight
 
 
+def sensor_rays(
+    sensor: mi.Sensor, time: float | mi.Float, place: mi.Point2f, aperture: mi.Point2f
+) -> tuple[mi.Ray3f, mi.Spectrum]:
+    """Rays from a sensor, and their weights, of places on its film and in its aperture, in [0, 1)^2.
+
+    By the call that every sensor has: an irradiance meter has no `sample_ray`.
+    """
+    ray, weight = sensor.sample_ray_differential(time, 0.5, place, aperture, True)
+    return mi.Ray3f(ray), weight
+
+
 def failure(call: Callable[[], object]) -> str | None:
     """Mitsuba's reason, in one line, why it cannot do what `call` asks for; None where it can."""
     try:

@@ -14,7 +14,7 @@ import numpy as np
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene.extent import clipped
-from reslrb_cli.scene.graph import Lamp, SceneGraph, bent_faces, emitted_rays, failure, grid, small_lamps
+from reslrb_cli.scene.graph import Lamp, SceneGraph, bent_faces, emitted_rays, failure, grid, sensor_rays, small_lamps
 
 #: Sensors to which a light path can connect: `sample_direction` is there, and its density is that of `sample_ray`.
 SENSORS = ("PerspectiveCamera", "ThinLensCamera")
@@ -380,7 +380,7 @@ def what_is_seen(scene: Any, sensor: Any, aperture: tuple[float, float] | None =
     """Of the rays through a grid of LOOK^2 cells, row by row, which meet surfaces that are smooth, those that are
     specular alone, and emission (`PrimaryHits`). They start at a point of the `aperture`, by default its middle."""
     lens = mi.Point2f(0.5) if aperture is None else mi.Point2f(*(dr.opaque(mi.Float, place) for place in aperture))
-    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, grid(LOOK), lens, True)
+    ray, _ = sensor_rays(sensor, sensor.shutter_open(), grid(LOOK), lens)
     active = dr.full(mi.Mask, True, LOOK**2)
     smooth, specular, emission = (dr.zeros(mi.Mask, LOOK**2) for _ in range(3))
     for _ in range(CROSSINGS):

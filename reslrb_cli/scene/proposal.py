@@ -19,7 +19,7 @@ import numpy as np
 from reslrb_cli.records.images import write_bitmap
 from reslrb_cli.scene.catalog import ParameterInfo, list_parameters
 from reslrb_cli.scene.export import LOBES
-from reslrb_cli.scene.graph import SceneGraph, grid
+from reslrb_cli.scene.graph import SceneGraph, grid, sensor_rays
 from reslrb_cli.scene.images import decode_srgb, read_bitmap
 
 Image = np.ndarray[Any, Any]
@@ -221,7 +221,7 @@ def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
     sensor = scene.sensors()[index]
     # One for each ray: an irradiance meter makes a single direction of a single one, which Dr.Jit fails to compile.
     aperture = dr.opaque(mi.Point2f, 0.5, shape=_RAYS**2)
-    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, grid(_RAYS), aperture, True)
+    ray, _ = sensor_rays(sensor, sensor.shutter_open(), grid(_RAYS), aperture)
     graph, active, lane = SceneGraph.of(scene), dr.full(mi.Bool, True, _RAYS**2), dr.arange(mi.UInt32, _RAYS**2)
     shares: dict[Any, float] = {}
     for crossing in range(_CROSSINGS):

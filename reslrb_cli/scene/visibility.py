@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.scene.graph import SceneGraph
+from reslrb_cli.scene.graph import SceneGraph, sensor_rays
 from reslrb_cli.scene.needs import CROSSINGS, LOOK, what_is_seen
 
 #: Primary rays are spread over a pixel in so many rows and columns of cells.
@@ -72,7 +72,7 @@ def sees_specular(scene: mi.Scene, sensor: mi.Sensor) -> SeenSpecular:
         jitter = mi.Point2f(random.next_float32(), random.next_float32())
         u = (corner + (mi.Point2f(column, row) + jitter) / CELLS) / mi.Vector2f(width, height)
         aperture = mi.Point2f(random.next_float32(), random.next_float32())
-        ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, u, aperture)
+        ray, _ = sensor_rays(sensor, sensor.shutter_open(), u, aperture)
         only, beside = _first_surfaces(scene, ray, count)
         alone, mixed = alone | only, mixed | beside
         dr.eval(alone, mixed, random)
@@ -169,7 +169,7 @@ def _mark_seen(
     time = sensor.shutter_open() + random.next_float32() * sensor.shutter_open_time()
     film = mi.Point2f(random.next_float32(), random.next_float32())
     aperture = mi.Point2f(random.next_float32(), random.next_float32())
-    ray, _ = sensor.sample_ray(time, 0.5, film, aperture, True)
+    ray, _ = sensor_rays(sensor, time, film, aperture)
     active = mi.Mask(True)
     if kept is not None:
         rows, columns = kept.shape
@@ -244,8 +244,8 @@ def _pixels(scene: mi.Scene, index: int, segments: int) -> np.ndarray:
     pixel = dr.arange(mi.UInt32, count) // _PATHS
     corner = mi.Point2f(pixel % _RAYS, pixel // _RAYS)
     position = (corner + sampler.next_2d()) / _RAYS
-    ray, weight = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, position, sampler.next_2d())
+    ray, weight = sensor_rays(sensor, sensor.shutter_open(), position, sampler.next_2d())
     integrator = mi.load_dict({"type": "path", "max_depth": segments, "rr_depth": DEPTHS[-1] + 1})
-    light, _, _ = integrator.sample(scene, sampler, ray)
+    light, _, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(ray))
     rows = np.array(mi.luminance(mi.Color3f(weight * light)), dtype=np.float64).reshape(_RAYS**2, _PATHS)
     return np.asarray(rows.mean(axis=1))

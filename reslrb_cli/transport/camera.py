@@ -13,6 +13,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.scene.graph import sensor_rays
 from reslrb_cli.transport.bsdf import Scattering, evaluate, scatter, tracked_factor
 from reslrb_cli.transport.connection import Connection, film_density, passage
 from reslrb_cli.transport.densities import Place, density_of_rays
@@ -53,7 +54,7 @@ def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
         per_pixel = mi.Float(count // n_pixels + dr.select(pixel < count % n_pixels, mi.UInt32(1), 0))
     u = mi.Point2f(pixel % int(size[0]), pixel // int(size[0])) + _within_pixel(samples, lane, pixel, per_pixel)
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-    ray, weight = sensor.sample_ray(time, 0.5, u / mi.Vector2f(size), aperture, True)
+    ray, weight = sensor_rays(sensor, time, u / mi.Vector2f(size), aperture)
     near = mi.Float(0)
     if plan.weighs:
         near = mi.Float(mi.traverse(sensor)["near_clip"]) / dr.dot(ray.d, axis_of(sensor))

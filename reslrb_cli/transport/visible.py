@@ -23,7 +23,7 @@ from dataclasses import dataclass, field, replace
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.scene.graph import Lamp
+from reslrb_cli.scene.graph import Lamp, sensor_rays
 from reslrb_cli.transport.connection import connect, forward_derivatives, passage
 from reslrb_cli.transport.emission import sample_time
 from reslrb_cli.transport.film import AdjointImage
@@ -134,7 +134,7 @@ def primary_ray(samples: Samples) -> PrimaryRay:
     time = sample_time(plan, sensor, sampler)
     u = mi.Point2f(pixel % int(size[0]), pixel // int(size[0])) + sampler.next_2d()
     aperture = sampler.next_2d() if plan.needs.thin_lens else mi.Point2f(0.5)
-    ray, weight = sensor.sample_ray(time, 0.5, u / mi.Vector2f(size), aperture, True)
+    ray, weight = sensor_rays(sensor, time, u / mi.Vector2f(size), aperture)
     return PrimaryRay(ray, u, weight * dr.rcp(dr.maximum(per_pixel, 1)), per_pixel > 0)
 
 
