@@ -26,6 +26,7 @@ _SUMMARIES = {
     "optimize": "Recover scene parameters from target images.",
     "render": "Render the scene of a configuration.",
     "export": "Write a run's scene, with what it recovered, for Mitsuba alone.",
+    "lens": "Write an experiment that shapes a lens which throws a picture.",
     "inspect": "List a scene's parameters and what it contains.",
     "bench": "Measure time and memory of gradient steps.",
     "gradcheck": "Compare gradients with references.",

@@ -121,7 +121,7 @@ class Rays:
             growth = 1 + deep * gap**2 / np.hypot(r, gap) ** 3 / s.ior / (1 - sine**2) ** 1.5
             r = r - (r + deep * tangent - radius) / growth
         cosine = np.sqrt(1 - sine**2)
-        light = gap / np.hypot(r, gap) ** 3 * (r / radius) / growth * _transmitted(gap / np.hypot(r, gap), s.ior)
+        light = gap / np.hypot(r, gap) ** 3 * (r / radius) / growth * transmitted(gap / np.hypot(r, gap), s.ior)
         return np.stack([sine * dx / radius, sine * dy / radius, cosine]), light
 
     def outgoing(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
@@ -151,7 +151,7 @@ class Rays:
         light = plane * np.maximum(meets, 0)
         if self.setting.kind == "lens":
             cosine = (d[2] - d[0] * gx - d[1] * gy) / np.sqrt(1 + gx * gx + gy * gy)
-            light = light * _transmitted(cosine, 1 / self.setting.ior)
+            light = light * transmitted(cosine, 1 / self.setting.ior)
         return np.where(within(self.setting, x, y), light, 0.0)
 
     @staticmethod
@@ -159,7 +159,7 @@ class Rays:
         return np.broadcast_to(vector.reshape(3, *[1] * np.ndim(like)), (3, *np.shape(like)))
 
 
-def _transmitted(cosine: Array, eta: float) -> Array:
+def transmitted(cosine: Array, eta: float) -> Array:
     """The part of unpolarised light that passes into a medium `eta` times as dense (Fresnel)."""
     beyond = np.sqrt(np.maximum(1 - (1 - cosine**2) / eta**2, 0))
     s = (cosine - eta * beyond) / (cosine + eta * beyond)

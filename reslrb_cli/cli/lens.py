@@ -1,0 +1,139 @@
+"""`reslrb lens`: an experiment that shapes a lens or a mirror which throws a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import numpy as np
+
+from reslrb_cli.cli.options import writing
+from reslrb_cli.cli.terminal import echo
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.records.atomic import write_atomically
+
+#: Of a picture's longer side, what the film sees about it: light that goes beside the picture counts.
+MARGIN = 0.125
+#: Texels and pixels along the longer side.
+PIXELS = 256
+ITERATIONS = 60
+#: What options are called where a setting of the face goes by another name.
+_OPTIONS = {"picture_size": "--picture-size"}
+
+
+def read_luminance(path: Path) -> np.ndarray:
+    """Linear luminance (H, W) of an image file, upright, what is transparent over white. Raises ConfigError."""
+    from reslrb_cli.scene.images import read_bitmap, read_photo
+
+    image = read_photo(path).image.astype(np.float64)
+    bitmap = read_bitmap(path, upright=True)
+    if bitmap.has_alpha():
+        raw = np.array(bitmap)
+        raw = raw.reshape(*image.shape[:2], -1)
+        alpha = raw[:, :, -1:].astype(np.float64)
+        alpha = np.clip(alpha / np.iinfo(raw.dtype).max if raw.dtype.kind in "ui" else alpha, 0, 1)
+        image = (image if bitmap.premultiplied_alpha() else alpha * image) + 1 - alpha
+    return image @ np.array([0.2126, 0.7152, 0.0722])
+
+
+@click.command("lens")
+@click.argument("picture", metavar="PICTURE", type=click.Path(path_type=Path))
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), default=Path("lens"), show_default=True, help="Folder."
+)
+@click.option("--size", type=float, default=100.0, show_default=True, help="Longer side of the face, in mm.")
+@click.option("--distance", type=float, default=200.0, show_default=True, help="From face to receiver, in mm.")
+@click.option("--picture-size", type=float, help="Longer side of the picture on the receiver, in mm; default: --size.")
+@click.option("--ior", type=float, default=1.49, show_default=True, help="Index of refraction.")
+@click.option("--thickness", type=float, help="Of the lens at its flat face, in mm; default: a quarter of --size.")
+@click.option("--mirror", is_flag=True, help="A mirror in place of a lens.")
+@click.option("--incidence", type=float, help="Between light and a mirror's normal, in degrees.  [default: 30]")
+@click.option("--through", is_flag=True, help="The picture is looked at through the receiver, from behind.")
+@click.option("--floor", type=float, help="Fraction of the maximum to which darker parts are lifted; default: found.")
+@click.option("--pixels", type=click.IntRange(16, 1024), default=PIXELS, show_default=True,
+              help="Of the picture's longer side, and texels of the face's.")  # fmt: skip
+@click.option("--force", is_flag=True, help="Replace files that exist.")
+def command(
+    picture: Path,
+    output: Path,
+    size: float,
+    distance: float,
+    picture_size: float | None,
+    ior: float,
+    thickness: float | None,
+    mirror: bool,
+    incidence: float | None,
+    through: bool,
+    floor: float | None,
+    pixels: int,
+    force: bool,
+) -> None:
+    """Write an experiment that shapes a lens, or a mirror, which throws PICTURE in parallel light.
+
+    `reslrb optimize FOLDER/lens.yaml` takes it. The face begins where a transport of light has it throw the picture
+    already; how deep it is, and how deep at twice the distance, is told before anything is rendered.
+    """
+    from reslrb_cli.backend.variant import set_variant
+    from reslrb_cli.lens import experiment
+    from reslrb_cli.lens.surface import Setting, shape_surface
+    from reslrb_cli.lens.transport import resized
+
+    for option, value in (("--size", size), ("--distance", distance), ("--picture-size", picture_size),
+                          ("--thickness", thickness), ("--ior", ior)):  # fmt: skip
+        if value is not None and not 0 < value < 1e6:
+            raise ConfigError(option, "", f"is {value:g}; it must be above 0")
+    if floor is not None and not 0 <= floor < 1:
+        raise ConfigError("--floor", "", f"is {floor:g}; it must be from 0 to below 1")
+    if incidence is not None and not mirror:
+        raise ConfigError("--incidence", "", "goes with --mirror: light comes to a lens straight")
+    if output.exists() and not output.is_dir():
+        raise ConfigError("--output", "", f"{output} is a file; name a folder")
+    taken = next((p for n in ("lens.yaml", "scene.xml", "face.ply", "target.exr", "start.exr")
+                  if (p := output / n).exists()), None)  # fmt: skip
+    if taken is not None and not force:
+        raise ConfigError("--output", "", f"{taken} exists; --force replaces it")
+    set_variant("auto")
+
+    from reslrb_cli.records.images import write_file
+
+    image = read_luminance(picture)
+    longer = max(image.shape)
+    if longer > pixels:
+        image = resized(image, (max(1, round(image.shape[0] * pixels / longer)),
+                                max(1, round(image.shape[1] * pixels / longer))))  # fmt: skip
+    rows, columns = image.shape
+    share = np.array([columns, rows]) / max(rows, columns)
+    setting = Setting(
+        kind="mirror" if mirror else "lens",
+        size=tuple(size * share),
+        distance=distance,
+        picture_size=tuple((picture_size or size) * share),
+        ior=ior,
+        thickness=size / 4 if thickness is None else thickness,
+        incidence=30.0 if mirror and incidence is None else incidence or 0.0,
+        through=through,
+    )
+    try:
+        surface = shape_surface(image, setting, pixels, "auto" if floor is None else floor)
+    except ConfigError as error:
+        key = error.key
+        source = picture if key == "picture" else _OPTIONS.get(key, f"--{key}")
+        raise ConfigError(source, "", error.message) from None
+    echo(surface.summary())
+    target, irradiance = experiment.target_image(image, surface, MARGIN)
+    film = target.shape[1], target.shape[0]
+    with writing("--output", output):
+        output.mkdir(parents=True, exist_ok=True)
+        ny, nx = surface.heights.shape
+        heights = surface.heights.astype(np.float32)[:, :, None]
+        write_file(output / "start.exr", heights, linear=True)
+        write_file(output / "target.exr", np.repeat(target.astype(np.float32)[:, :, None], 3, 2), linear=True)
+        texts = {
+            "face.ply": experiment.face_ply(setting, nx, ny),
+            "scene.xml": experiment.scene_xml(surface, film, columns, irradiance).encode(),
+            "lens.yaml": experiment.lens_yaml(surface, picture.name, ITERATIONS).encode(),
+        }
+        for name, content in texts.items():
+            write_atomically(output / name, lambda file, content=content: file.write(content))  # type: ignore[misc]
+    echo(f"{output / 'lens.yaml'}: {nx}x{ny} heights, a picture of {columns}x{rows} pixels")
+    echo(f"next: `reslrb optimize {output / 'lens.yaml'}`")
