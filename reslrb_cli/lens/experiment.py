@@ -2,6 +2,7 @@
 
 Text and arrays alone, in millimetres and by the axes of `surface.py`. The lamp is as large as the face looks from it:
 its parallel beam meets the face and nothing beside. The mount is black about the face. The camera stands on the
+receiver's normal: a point, which throws no shadow.
 """
 
 from __future__ import annotations
