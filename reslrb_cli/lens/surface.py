@@ -198,7 +198,7 @@ def shape_surface(
         if found is None:
             raise ConfigError("", "picture", f"has too much contrast for this {setting.kind}: even with a floor of "
                               f"{transport.FLOORS[-1]:g} of its maximum light would have to be torn apart; "
-                              "lift its dark parts, or crop it")  # fmt: skip
+                              "a larger distance, lifted dark parts or a crop may do")  # fmt: skip
         floor = found
     target = transport.lifted(target, floor)
     longer = max(setting.size)

@@ -1,0 +1,87 @@
+"""What `reslrb lens` writes: the scene throws the picture the right way round, as bright as the target says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from reslrb_cli.cli.lens import command
+from reslrb_cli.config.loader import load
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.optimization.loading import load_configured
+from reslrb_cli.records.images import write_file
+from reslrb_cli.scene.images import read_image
+
+OPTIONS = {"lens": [], "mirror": ["--mirror"], "through": ["--through"], "portrait": []}
+
+
+def picture(rows: int, columns: int) -> np.ndarray:
+    """One that no turn and no mirroring maps to itself: a bright blob in the upper left, a weaker one on the right."""
+    y, x = np.mgrid[:rows, :columns] / np.array([rows, columns])[:, None, None]
+    blob = np.exp(-((x - 0.25) ** 2 + (y - 0.2) ** 2) / 0.02) + 0.5 * np.exp(-((x - 0.8) ** 2 + (y - 0.4) ** 2) / 0.02)
+    return 0.3 + 0.7 * blob
+
+
+def flattened(heights: np.ndarray, folder: Path) -> mi.Scene:
+    """The scene in `folder` with `heights` (ny, nx) on its face."""
+    scene = mi.load_file(str(folder / "scene.xml"), optimize=False)
+    params = mi.traverse(scene)
+    at = np.array(params["face.vertex_positions"]).reshape(-1, 3)
+    at[:, 2] = heights.ravel()
+    params["face.vertex_positions"] = at.ravel()
+    params.update()
+    return scene
+
+
+@pytest.mark.parametrize("kind", OPTIONS)
+def test_the_start_throws_the_picture_upright_and_as_bright_as_its_target(kind: str, tmp_path: Path) -> None:
+    wanted = picture(32, 24 if kind == "portrait" else 32)
+    write_file(tmp_path / "p.exr", np.repeat(wanted[:, :, None], 3, 2).astype(np.float32), linear=True)
+    folder = tmp_path / "lens"
+    args = [str(tmp_path / "p.exr"), "-o", str(folder), "--pixels", "32", *OPTIONS[kind]]
+    result = CliRunner().invoke(command, args, catch_exceptions=False)
+    assert result.exit_code == 0
+    assert "mm deep (at 400 mm" in result.output
+    heights = read_image(folder / "start.exr", "linear", signed=True)[:, :, 0]
+    image = np.array(mi.render(flattened(heights, folder), spp=256, seed=1))[:, :, 1]
+    target = read_image(folder / "target.exr")[:, :, 1]
+    rows, columns = wanted.shape
+    beside = 4
+    seen = image[beside : beside + rows, beside : beside + columns]
+    upright = wanted[:, ::-1] if kind == "through" else wanted
+    turns = [upright, upright[::-1], upright[:, ::-1], upright[::-1, ::-1]]
+    likeness = [np.corrcoef(seen.ravel(), turned.ravel())[0, 1] for turned in turns]
+    assert likeness[0] > 0.85
+    assert max(likeness[1:]) < 0.7
+    assert image.sum() == pytest.approx(target.sum(), rel=0.03)  # no brightness by hand
+    assert load_configured(load(folder / "lens.yaml")) is not None
+
+
+BAD = {
+    "distance": (
+        ["--distance", "50", "--picture-size", "400"],
+        "--distance: at 50 mm light cannot reach the whole picture",
+    ),
+    "index": (["--ior", "1"], "--ior: is 1; glass and plastics"),
+    "incidence": (["--mirror", "--incidence", "0"], "--incidence: at 0 degrees the receiver stands in the mirror's"),
+    "size": (["--size", "nan"], "--size: is nan; it must be above 0"),
+    "thickness": (["--thickness", "0.5"], "--thickness: the relief,"),
+    "one colour": ([], "p.exr: is of one colour"),
+    "one pixel": ([], "p.exr: is 1 x 1"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_cannot_be_is_refused_in_one_line_and_nothing_is_written(name: str, tmp_path: Path) -> None:
+    options, line = BAD[name]
+    wanted = {"one colour": np.ones((16, 16)), "one pixel": np.ones((1, 1))}.get(name, picture(16, 16))
+    write_file(tmp_path / "p.exr", np.repeat(wanted[:, :, None], 3, 2).astype(np.float32), linear=True)
+    args = [str(tmp_path / "p.exr"), "-o", str(tmp_path / "lens"), "--pixels", "16", *options]
+    error = CliRunner().invoke(command, args).exception
+    assert isinstance(error, ConfigError)
+    assert line in str(error)
+    assert not (tmp_path / "lens").exists()
