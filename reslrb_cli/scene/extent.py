@@ -255,23 +255,22 @@ def _thin_glass(scene: mi.Scene) -> str | None:
     passing_on = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Transmission)
     d = ray.d
 
-    def goes_on(k: mi.UInt32, o: mi.Point3f, p: mi.Point3f, n: mi.Normal3f, active: mi.Mask) -> mi.Mask:
+    def goes_on(k: mi.UInt32, o: mi.Point3f, p: mi.Point3f, active: mi.Mask) -> mi.Mask:
         return active & (k < _SURFACES)
 
-    def cross(k: mi.UInt32, o: mi.Point3f, p: mi.Point3f, n: mi.Normal3f, active: mi.Mask) -> tuple[Any, ...]:
-        """From the surface at `p` of normal `n`, which the ray leaves from `o`, to the next one."""
+    def cross(k: mi.UInt32, o: mi.Point3f, p: mi.Point3f, active: mi.Mask) -> tuple[Any, ...]:
+        """From the surface at `p`, which the ray leaves from `o`, to the next one."""
         ray = mi.Ray3f(o, d)
         hit = scene.ray_intersect_preliminary(ray, active=active)
         following = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
         onward = active & following.is_valid()
-        # From the next surface back: this one, or what the ray on has jumped over. On the same line: a ray that is
-        # offset along the normal meets an oblique surface elsewhere.
+        # Back from the next surface, on the line through p: to this one, or to what the ray on has jumped over. Rays
+        # are offset along the normal, so that they themselves run beside that line, and meet what is oblique elsewhere.
         own = mi.math.RayEpsilon * (1 + dr.max(dr.abs(following.p)))
-        returning = mi.Ray3f(following.p - own * d, -d)
-        back = scene.ray_intersect_preliminary(returning, active=onward)
+        behind = p + (dr.dot(following.p - p, d) - own) * d
+        back = scene.ray_intersect_preliminary(mi.Ray3f(behind, -d), active=onward)
         offset = mi.math.RayEpsilon * (1 + dr.max(dr.abs(p)))
-        # As far as it is from p along d: the ray itself, offset along the normal, runs beside that line.
-        jumped = dr.dot(returning(back.t) - p, n) / dr.dot(d, n)
+        jumped = dr.dot(behind - p, d) - back.t
         apart = dr.select(
             onward & back.is_valid() & (jumped > offset * ROUNDING + FAR * following.t),
             jumped,
@@ -279,10 +278,10 @@ def _thin_glass(scene: mi.Scene) -> str | None:
         )
         dr.scatter(gaps, apart / offset, k * _PATHS + index, onward)
         is_passed = onward & mi.has_flag(following.bsdf().flags(), mi.BSDFFlags.Transmission)
-        return k + 1, following.spawn_ray(d).o, following.p, following.n, is_passed
+        return k + 1, following.spawn_ray(d).o, following.p, is_passed
 
-    state = (dr.zeros(mi.UInt32, _PATHS), si.spawn_ray(d).o, si.p, si.n, passing_on)
-    dr.while_loop(state, goes_on, cross, labels=("k", "o", "p", "n", "active"), label="thin glass")
+    state = (dr.zeros(mi.UInt32, _PATHS), si.spawn_ray(d).o, si.p, passing_on)
+    dr.while_loop(state, goes_on, cross, labels=("k", "o", "p", "active"), label="thin glass")
     found = np.array(gaps)
     found = found[np.isfinite(found)]
     near = found[found < LEAST_OFFSETS]
