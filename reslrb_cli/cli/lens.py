@@ -16,7 +16,7 @@ from reslrb_cli.records.atomic import write_atomically
 MARGIN = 0.125
 #: Texels and pixels along the longer side.
 PIXELS = 256
-ITERATIONS = 60
+ITERATIONS = 100
 #: What options are called where a setting of the face goes by another name.
 _OPTIONS = {"picture_size": "--picture-size"}
 
@@ -122,16 +122,17 @@ def command(
     echo(surface.summary())
     target, irradiance = experiment.target_image(image, surface, MARGIN)
     film = target.shape[1], target.shape[0]
+    rate = experiment.steady_rate(surface, film, columns)
     with writing("--output", output):
         output.mkdir(parents=True, exist_ok=True)
         ny, nx = surface.heights.shape
-        heights = surface.heights.astype(np.float32)[:, :, None]
+        heights = experiment.at_vertices(surface).astype(np.float32)[:, :, None]
         write_file(output / "start.exr", heights, linear=True)
         write_file(output / "target.exr", np.repeat(target.astype(np.float32)[:, :, None], 3, 2), linear=True)
         texts = {
             "face.ply": experiment.face_ply(setting, nx, ny),
             "scene.xml": experiment.scene_xml(surface, film, columns, irradiance).encode(),
-            "lens.yaml": experiment.lens_yaml(surface, picture.name, ITERATIONS).encode(),
+            "lens.yaml": experiment.lens_yaml(surface, picture.name, ITERATIONS, rate).encode(),
         }
         for name, content in texts.items():
             write_atomically(output / name, lambda file, content=content: file.write(content))  # type: ignore[misc]

@@ -11,8 +11,10 @@ import json
 from typing import Any
 
 import numpy as np
+import scipy.ndimage
 from numpy.typing import NDArray
 
+from reslrb_cli.lens import transport
 from reslrb_cli.lens.surface import Array, Rays, Setting, Surface, transmitted
 
 #: Reflectance of the receiver, and its width in pictures.
@@ -26,31 +28,42 @@ _GAP = 1.0
 
 
 def lit_share(surface: Surface) -> float:
-    """Of the light of a beam of the face's size, the part that leaves it: Fresnel's losses of both of a lens."""
+    """Light that leaves the face, over that of a beam as large as a flat face looks from it: slopes, Fresnel's law."""
     setting = surface.setting
-    if setting.kind == "mirror":
-        return 1.0
     h, (ny, nx) = surface.heights, surface.heights.shape
     gy, gx = (np.gradient(h, step, axis=i) for i, step in enumerate((setting.size[1] / ny, setting.size[0] / nx)))
-    x, y = vertices(setting, nx, ny)
+    x, y = transport.grid((ny, nx), setting.size)
     rays = Rays(setting)
     _, plane = rays.incoming(x, y, h)
-    share = rays.arriving(x, y, h, gx, gy) / plane * transmitted(np.array(1.0), setting.ior)
+    share = rays.arriving(x, y, h, gx, gy) / plane
+    if setting.kind == "lens":
+        share = share * transmitted(np.array(1.0), setting.ior)
     return float(np.mean(share[surface.inside]))
 
 
 def vertices(setting: Setting, nx: int, ny: int) -> tuple[Array, Array]:
-    """x and y (mm; ny, nx) of the vertices of a face: the centres of its texels."""
-    x = ((np.arange(nx) + 0.5) / nx - 0.5) * setting.size[0]
-    y = ((np.arange(ny) + 0.5) / ny - 0.5) * setting.size[1]
+    """x and y (mm; ny, nx) of the vertices of a face, from edge to edge; each lies at a texel's centre of the map."""
+    x, y = (np.linspace(-side / 2, side / 2, n) for side, n in zip(setting.size, (nx, ny), strict=True))
     xs, ys = np.meshgrid(x, y)
     return xs, ys
+
+
+def at_vertices(surface: Surface) -> Array:
+    """Heights (ny, nx) at `vertices`: cubic between the cells of a surface, and parabolas on to its edges."""
+    h = surface.heights
+    for axis in (0, 1):
+        h = np.moveaxis(h, axis, 0)
+        h = np.concatenate([[3 * h[0] - 3 * h[1] + h[2]], h, [3 * h[-1] - 3 * h[-2] + h[-3]]])
+        h = np.moveaxis(h, 0, axis)
+    at = [np.linspace(0.5, n + 0.5, n) for n in surface.heights.shape]  # cells of the padded map
+    places = np.stack(np.meshgrid(*at, indexing="ij"))
+    return np.asarray(scipy.ndimage.map_coordinates(h, places, order=3, mode="mirror"))
 
 
 def face_ply(setting: Setting, nx: int, ny: int) -> bytes:
     """The flat face as a binary PLY: a grid with normals along +z and texture coordinates, v along y."""
     x, y = vertices(setting, nx, ny)
-    u, v = x / setting.size[0] + 0.5, y / setting.size[1] + 0.5
+    u, v = np.meshgrid((np.arange(nx) + 0.5) / nx, (np.arange(ny) + 0.5) / ny)
     zero = np.zeros_like(x)
     points = np.stack([x, y, zero, zero, zero, zero + 1, u, v], axis=-1).reshape(-1, 8).astype("<f4")
     corner = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)).ravel()
@@ -86,30 +99,28 @@ def target_image(picture: Array, surface: Surface, margin: float) -> tuple[Array
     top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
     seen = lifted[:, ::-1] if setting.through else lifted
     target[top : top + picture.shape[0], left : left + picture.shape[1]] = seen
-    beam = np.prod(lamp_size(setting, surface.heights.shape[1], surface.heights.shape[0])) * lit_share(surface)
+    beam = np.prod(lamp_size(setting)) * lit_share(surface)
     return target, float(np.pi / ALBEDO * np.prod(setting.picture_size) / beam)
 
 
-def lamp_size(setting: Setting, nx: int, ny: int) -> tuple[float, float]:
-    """Width and height (mm) of a beam that covers a face's mesh, which ends at the centres of its outermost texels."""
-    return (
-        setting.size[0] * (1 - 1 / nx) * float(np.cos(np.radians(setting.incidence))),
-        setting.size[1] * (1 - 1 / ny),
-    )
+def lamp_size(setting: Setting) -> tuple[float, float]:
+    """Width and height (mm) of a beam that covers a face."""
+    return setting.size[0] * float(np.cos(np.radians(setting.incidence))), setting.size[1]
 
 
 def scene_xml(surface: Surface, film: tuple[int, int], pixels: int, irradiance: float) -> str:
     """The scene of a face; `pixels` of the `film`'s width are the picture's."""
     setting, rays = surface.setting, Rays(surface.setting)
-    ny, nx = surface.heights.shape
     is_lens = setting.kind == "lens"
     beam = rays.toward
     start = -beam * setting.distance if not is_lens else np.array([0.0, 0.0, -setting.thickness - _GAP])
     away = _CAMERA * setting.distance
     seen = setting.picture_size[0] * film[0] / pixels
     fov = 2 * np.degrees(np.arctan(seen / 2 / away))
-    wide, high = lamp_size(setting, nx, ny)
-    mesh = setting.size[0] * (1 - 1 / nx) / 2, setting.size[1] * (1 - 1 / ny) / 2
+    wide, high = lamp_size(setting)
+    if not is_lens:  # oblique light meets what stands out of the plane beside it; what misses the mirror is lost
+        wide += 2 * surface.relief * abs(float(np.sin(np.radians(setting.incidence))))
+    mesh = setting.size[0] / 2, setting.size[1] / 2
     reach = 2 * max(setting.size)
     material = (
         f'<bsdf type="dielectric" id="glass">\n        <float name="int_ior" value="{setting.ior:.9g}"/>\n'
@@ -185,7 +196,24 @@ def scene_xml(surface: Surface, film: tuple[int, int], pixels: int, irradiance: 
 """
 
 
-def lens_yaml(surface: Surface, name: str, iterations: int) -> str:
+#: Of the rate with which steps of the finest ripples would begin to grow: tried at 48, 128 and 256 texels.
+_STEADY = 0.7
+
+
+def steady_rate(surface: Surface, film: tuple[int, int], pixels: int) -> float:
+    """A rate (mm^2) of gradient descent on the mean squared difference from a target of mean 1.
+
+    A ripple of height a and as fine as the texels (pitch p) turns light by b a / p (b: index - 1, for a mirror 2),
+    moves it by the distance f times that, and changes the light of a pixel (q wide) by b f a / (p q) of itself. The
+    second derivative by one height is the square of that over the number of pixels, and the rate its inverse.
+    """
+    setting = surface.setting
+    bend = 2.0 if setting.kind == "mirror" else setting.ior - 1
+    pitch, pixel = setting.size[0] / surface.heights.shape[1], setting.picture_size[0] / pixels
+    return _STEADY * film[0] * film[1] * (pitch * pixel / (bend * setting.distance)) ** 2
+
+
+def lens_yaml(surface: Surface, name: str, iterations: int, rate: float) -> str:
     """The configuration, which begins at the heights in `start.exr`."""
     ny, nx = surface.heights.shape
     return f"""# The {surface.setting.kind} that throws {json.dumps(name)}: {surface.summary()}.
@@ -204,7 +232,8 @@ integrator:
   max_depth: {4 if surface.setting.kind == "lens" else 3}
 loss: {{type: l2}}
 # Not Adam: it takes steps as large for what noise says as for what the image does, and a rough face folds the light.
-optimizer: {{type: sgd, momentum: 0.9, learning_rate: 1, schedule: cosine}}
+# The rate is about what the finest ripples bear; a larger one tears the face, a smaller one takes longer.
+optimizer: {{type: sgd, momentum: 0.9, learning_rate: {rate:.3g}, schedule: cosine}}
 run:
   iterations: {iterations}
   spp: 64
