@@ -17,6 +17,8 @@ MARGIN = 0.125
 #: Texels and pixels along the longer side.
 PIXELS = 256
 ITERATIONS = 100
+#: Vertices of the face per cell of the start, along each side.
+FINER = int(__import__("os").environ.get("FINER", 2))
 #: What options are called where a setting of the face goes by another name.
 _OPTIONS = {"picture_size": "--picture-size"}
 
@@ -122,17 +124,16 @@ def command(
     echo(surface.summary())
     target, irradiance = experiment.target_image(image, surface, MARGIN)
     film = target.shape[1], target.shape[0]
-    rate = experiment.steady_rate(surface, film, columns)
     with writing("--output", output):
         output.mkdir(parents=True, exist_ok=True)
-        ny, nx = surface.heights.shape
-        heights = experiment.at_vertices(surface).astype(np.float32)[:, :, None]
+        ny, nx = (FINER * cells for cells in surface.heights.shape)
+        heights = experiment.at_vertices(surface, nx, ny).astype(np.float32)[:, :, None]
         write_file(output / "start.exr", heights, linear=True)
         write_file(output / "target.exr", np.repeat(target.astype(np.float32)[:, :, None], 3, 2), linear=True)
         texts = {
             "face.ply": experiment.face_ply(setting, nx, ny),
             "scene.xml": experiment.scene_xml(surface, film, columns, irradiance).encode(),
-            "lens.yaml": experiment.lens_yaml(surface, picture.name, ITERATIONS, rate).encode(),
+            "lens.yaml": experiment.lens_yaml(surface, nx, ny, picture.name, ITERATIONS).encode(),
         }
         for name, content in texts.items():
             write_atomically(output / name, lambda file, content=content: file.write(content))  # type: ignore[misc]

@@ -54,11 +54,13 @@ class Optimizer(Choice):
     learning_rate: Positive = 0.02
     """Step size at the first iteration, in the parameter's units; in those of its `transform`, where it has one; with
     `scale: auto`, as a share of the measured length."""
-    scale: Literal["none", "auto"] = "none"
+    scale: Literal["none", "auto", "curvature"] = "none"
     """`auto`: before the first iteration, measure for each parameter the length by which it would have to change to
     make up the image where it has an effect, and how large its gradient is, and let the optimizer move each in units of
     its own: one learning rate serves parameters that differ by orders of magnitude, and `epsilon` does not matter.
-    Learning rates are then shares of that length: 0.02 is 2 % a step."""
+    Learning rates are then shares of that length: 0.02 is 2 % a step.
+    `curvature`, for `sgd`: measure the largest curvature of the loss by each parameter, and divide gradients by it. A
+    learning rate of 1 is then the step that ends at the bottom in the steepest direction; the default is 0.5."""
     schedule: Literal["constant", "cosine", "exponential"] = "constant"
     """How the learning rate runs from its first value to its last."""
     final_fraction: float = Field(default=0.01, gt=0, le=1)
@@ -73,6 +75,19 @@ class Optimizer(Choice):
     def _check_schedule(self) -> Self:
         if self.schedule == "constant" and "final_fraction" in self.model_fields_set:
             raise located("final_fraction", "has no effect on a constant learning rate; set `schedule` or remove it")
+        return self
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_rate(cls, values: Any) -> Any:
+        if isinstance(values, dict) and values.get("scale") == "curvature":
+            return {"learning_rate": 0.5, **values}
+        return values
+
+    @model_validator(mode="after")
+    def _check_scale(self) -> Self:
+        if self.scale == "curvature" and self.type != "sgd":
+            raise located("scale", f"curvature goes with type: sgd; steps of {self.type} do not grow with gradients")
         return self
 
     @model_serializer(mode="wrap")

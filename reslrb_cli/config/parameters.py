@@ -219,6 +219,16 @@ class Settings:
     learning_rate: float | None = None
     resolution: tuple[int, int] | None = None
     word: str = ""
+    smoothing: float | None = None
+
+
+class Precondition(Section):
+    """Smooth steps ("large steps", Nicolet, Jacobson and Jakob 2021): the optimizer moves v, the parameter is
+    (1 - l² Δ)⁻¹ v."""
+
+    laplacian: Annotated[float, Field(gt=0, le=10)]
+    """l, as a share of the longer side of a map, a texture or a mesh: the same on a finer one. What is finer than l goes
+    less far in a step; of gradient descent, by the fourth power of its size over l."""
 
 
 class ParameterSpec(Section):
@@ -249,6 +259,8 @@ class ParameterSpec(Section):
     """Step size of this parameter, in the optimizer's units; null: the optimizer's."""
     resolution: Annotated[Size, few("texels")] | None = None
     """[width, height] in texels to which a texture is resampled before the start."""
+    precondition: Precondition | None = None
+    """Smooth steps, for textures, heightmaps and the vertices of meshes; null: none."""
 
     @property
     def names(self) -> list[str]:
@@ -290,8 +302,9 @@ class ParameterSpec(Section):
 
         resolution = self.resolution if self.heightmap is None else self.heightmap.resolution
         return Settings(
-            of("initial", "scene"), of("bounds"), of("transform", "none"), of("learning_rate"), resolution, word
-        )
+            of("initial", "scene"), of("bounds"), of("transform", "none"), of("learning_rate"), resolution, word,
+            None if self.precondition is None else self.precondition.laplacian,
+        )  # fmt: skip
 
     @model_validator(mode="after")
     def _check_kind(self) -> Self:
@@ -309,6 +322,8 @@ class ParameterSpec(Section):
             raise located("resolution", "belongs into `heightmap`, which has its own; remove it here")
         if self.motion is not None and self.resolution is not None:
             raise located("resolution", "has no effect on a motion, which is no texture; remove it")
+        if self.motion is not None and self.precondition is not None:
+            raise located("precondition", "has no effect on a motion; remove it")
         return self
 
     @model_validator(mode="after")

@@ -48,14 +48,15 @@ def vertices(setting: Setting, nx: int, ny: int) -> tuple[Array, Array]:
     return xs, ys
 
 
-def at_vertices(surface: Surface) -> Array:
+def at_vertices(surface: Surface, nx: int, ny: int) -> Array:
     """Heights (ny, nx) at `vertices`: cubic between the cells of a surface, and parabolas on to its edges."""
     h = surface.heights
     for axis in (0, 1):
         h = np.moveaxis(h, axis, 0)
         h = np.concatenate([[3 * h[0] - 3 * h[1] + h[2]], h, [3 * h[-1] - 3 * h[-2] + h[-3]]])
         h = np.moveaxis(h, 0, axis)
-    at = [np.linspace(0.5, n + 0.5, n) for n in surface.heights.shape]  # cells of the padded map
+    cells = surface.heights.shape
+    at = [np.linspace(0.5, n + 0.5, count) for n, count in zip(cells, (ny, nx), strict=True)]  # of the padded map
     places = np.stack(np.meshgrid(*at, indexing="ij"))
     return np.asarray(scipy.ndimage.map_coordinates(h, places, order=3, mode="mirror"))
 
@@ -174,7 +175,9 @@ def scene_xml(surface: Surface, film: tuple[int, int], pixels: int, irradiance: 
             <integer name="width" value="$resx"/>
             <integer name="height" value="$resy"/>
             <string name="pixel_format" value="rgb"/>
-            <rfilter type="gaussian"/>
+            <rfilter type="tent">  <!-- nearly a pixel, and smooth enough to be differentiated -->
+                <float name="radius" value="0.75"/>
+            </rfilter>
         </film>
         <sampler type="independent"/>
     </sensor>
@@ -196,26 +199,8 @@ def scene_xml(surface: Surface, film: tuple[int, int], pixels: int, irradiance: 
 """
 
 
-#: Of the rate with which steps of the finest ripples would begin to grow: tried at 48, 128 and 256 texels.
-_STEADY = 0.7
-
-
-def steady_rate(surface: Surface, film: tuple[int, int], pixels: int) -> float:
-    """A rate (mm^2) of gradient descent on the mean squared difference from a target of mean 1.
-
-    A ripple of height a and as fine as the texels (pitch p) turns light by b a / p (b: index - 1, for a mirror 2),
-    moves it by the distance f times that, and changes the light of a pixel (q wide) by b f a / (p q) of itself. The
-    second derivative by one height is the square of that over the number of pixels, and the rate its inverse.
-    """
-    setting = surface.setting
-    bend = 2.0 if setting.kind == "mirror" else setting.ior - 1
-    pitch, pixel = setting.size[0] / surface.heights.shape[1], setting.picture_size[0] / pixels
-    return _STEADY * film[0] * film[1] * (pitch * pixel / (bend * setting.distance)) ** 2
-
-
-def lens_yaml(surface: Surface, name: str, iterations: int, rate: float) -> str:
+def lens_yaml(surface: Surface, nx: int, ny: int, name: str, iterations: int) -> str:
     """The configuration, which begins at the heights in `start.exr`."""
-    ny, nx = surface.heights.shape
     return f"""# The {surface.setting.kind} that throws {json.dumps(name)}: {surface.summary()}.
 # Begin with
 #     reslrb optimize lens.yaml
@@ -227,13 +212,13 @@ target:
 parameters:
   - heightmap: {{mesh: face, resolution: [{nx}, {ny}]}}  # mm along +z
     initial: {{file: start.exr}}  # by transport of light: docs/lens.md
+    precondition: {{laplacian: 0.03}}  # smooth steps: without them the finest ripples decide how long one may be
 integrator:
   type: reslrb
   max_depth: {4 if surface.setting.kind == "lens" else 3}
 loss: {{type: l2}}
 # Not Adam: it takes steps as large for what noise says as for what the image does, and a rough face folds the light.
-# The rate is about what the finest ripples bear; a larger one tears the face, a smaller one takes longer.
-optimizer: {{type: sgd, momentum: 0.9, learning_rate: {rate:.3g}, schedule: cosine}}
+optimizer: {{type: sgd, momentum: 0.9, scale: curvature, learning_rate: 1, schedule: cosine}}
 run:
   iterations: {iterations}
   spp: 64

@@ -28,7 +28,7 @@ from reslrb_cli.optimization.nonfinite import (
 )
 from reslrb_cli.optimization.optimizers import clamp_gradients
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.sensitivity import rescale
+from reslrb_cli.optimization.sensitivity import measure_curvatures, rescale
 from reslrb_cli.optimization.state import State, put, standing
 from reslrb_cli.optimization.views import View
 from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
@@ -82,9 +82,9 @@ def step(
         put(problem, state)
     clock = StepClock(state.elapsed_s)
     scaling, clamped, clamp, clamp_sums = state.scaling, None, state.clamp, state.clamp_sums
-    if config.optimizer.scale == "auto" and scaling is None:
+    if config.optimizer.scale != "none" and scaling is None:
         with clock.counted():
-            scaling = rescale(problem)
+            scaling = rescale(problem) if config.optimizer.scale == "auto" else measure_curvatures(problem)
     errors = problem.meter.errors(problem.selection.array)
     held_out = problem.held_out_loss() if iteration % HELD_OUT_EVERY == 0 else None
     with clock.step() as times:

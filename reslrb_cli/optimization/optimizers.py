@@ -8,7 +8,7 @@ Reparameterisations (`Transform`, `Variable`): the optimiser moves an unconstrai
     softplus  x = log(1 + exp(u))                        positive; relative well below 1, absolute well above
 
 By the chain rule dL/du = dL/dx T'(u), which is applied to the gradient once it is there: a step's kernels know nothing
-of it. T is increasing, entry by entry.
+of it. T is increasing, entry by entry. Smooth steps (`precondition`) come before it: x = T(S v).
 
 Updates (`Optimizer`): one optimiser for each parameter rather than one for all, so that a parameter whose gradient is
 not finite can sit an iteration out with its moments and its count of steps as they were.
@@ -39,7 +39,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -48,6 +48,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.optimization.nonfinite import count_nonfinite, flat
+from reslrb_cli.optimization.precondition import Smoother
 from reslrb_cli.records.metrics import Clamped
 
 Bounds = tuple[float, float] | None
@@ -104,26 +105,29 @@ def _inverse_softplus(x: Any) -> Any:
 
 @dataclass
 class Variable:
-    """What the optimiser moves in place of a parameter x: v, with x = T(length * v), x within its bounds.
+    """What the optimiser moves in place of a parameter x: v, with x = T(length * S v), x within its bounds.
 
-    The gradient that it is given is `gain` times dL/dv. Both numbers are 1 until they are measured (`sensitivity.py`),
-    and reach kernels as data, so that their values compile nothing.
+    S is 1, or a `Smoother`. The gradient that it is given is `gain` times dL/dv. Both numbers are 1 until they are
+    measured (`sensitivity.py`), and reach kernels as data, so that their values compile nothing.
     """
 
     transform: Transform | None
     bounds: Bounds
     length: float = 1.0
     gain: float = 1.0
+    smoother: Smoother | None = None
 
     def to_scene(self, v: Any) -> Any:
         """x of v."""
-        u = v * _opaque(v, self.length)
+        u = self._u(v)
         x = u if self.transform is None else self.transform.forward(u)
         return x if self.bounds is None else dr.clip(x, self.bounds[0], self.bounds[1])  # rounding may have left them
 
     def from_scene(self, x: Any) -> Any:
         """v of x."""
         u = x if self.transform is None else self.transform.inverse(x)
+        if self.smoother is not None:
+            u = self.smoother.roughen(u)
         return self.clamp(u * _opaque(x, 1 / self.length))
 
     def clamp(self, v: Any) -> Any:
@@ -131,14 +135,23 @@ class Variable:
         ends = self.bounds if self.transform is None else (self.transform.low, self.transform.high)
         if ends is None:
             return v
-        return dr.clip(v, *(_opaque(v, end / self.length) for end in ends))
+        if self.smoother is None:
+            return dr.clip(v, *(_opaque(v, end / self.length) for end in ends))
+        u = self._u(v)
+        if not dr.any(flat((u < ends[0]) | (u > ends[1])))[0]:
+            return v  # as it is: there and back, it would be rounded anew in each step
+        return self.smoother.roughen(dr.clip(u, *ends)) * _opaque(v, 1 / self.length)
 
     def chain(self, v: Any, gradient: Any) -> Any:
         """`gain` times dL/dv, of dL/dx."""
         result = gradient * _opaque(v, self.length) * _opaque(v, self.gain)
-        if self.transform is None:
-            return result
-        return result * self.transform.derivative(v * _opaque(v, self.length))
+        if self.transform is not None:
+            result = result * self.transform.derivative(self._u(v))
+        return result if self.smoother is None else self.smoother.adjoint(result)
+
+    def _u(self, v: Any) -> Any:
+        u = v * _opaque(v, self.length)
+        return u if self.smoother is None else self.smoother.smooth(u)
 
 
 def _opaque(like: Any, number: float) -> Any:
@@ -156,9 +169,9 @@ OPTIMIZERS: dict[str, Callable[..., Any]] = {
 class Optimizer:
     """Holds the parameters and updates them; values it hands out receive gradients.
 
-    `rates`, `bounds` and `transforms` are per key: a rate of None is `learning_rate`, bounds of None are none, and so
-    is a transform that is left out. What it hands out, and the gradients that it takes, are the scene's; a parameter
-    with a `Variable` is moved by way of that. Raises KeyError for an unknown `type`.
+    `rates`, `bounds`, `transforms` and `smoothers` are per key: a rate of None is `learning_rate`, bounds of None are
+    none, and so are a transform and a smoother that are left out. What it hands out, and the gradients that it takes,
+    are the scene's; a parameter with a `Variable` is moved by way of that. Raises KeyError for an unknown `type`.
     """
 
     def __init__(
@@ -170,6 +183,7 @@ class Optimizer:
         rates: Mapping[str, float | None],
         bounds: Mapping[str, tuple[float, float] | None],
         transforms: Mapping[str, Transform | None] | None = None,
+        smoothers: Mapping[str, Smoother] | None = None,
     ) -> None:
         self._rates = {key: float(rates[key] or learning_rate) for key in values}
         self._bounds = {key: bounds[key] for key in values}
@@ -182,9 +196,9 @@ class Optimizer:
         self.stands_at: object = None
         for key, value in values.items():
             self._own[key][key] = value
-            transform = (transforms or {}).get(key)
-            if transform is not None:
-                self.set_variable(key, Variable(transform, bounds[key]))
+            transform, smoother = (transforms or {}).get(key), (smoothers or {}).get(key)
+            if transform is not None or smoother is not None:
+                self.set_variable(key, Variable(transform, bounds[key], smoother=smoother))
 
     def keys(self) -> list[str]:
         """The keys of the parameters."""
@@ -278,8 +292,9 @@ class Optimizer:
             steepness = np.full_like(value, 1 - own.momentum)
         if key not in self._variables:
             return 1 / steepness
-        result: np.ndarray[Any, Any] = self.slope(key) ** 2 / self._variables[key].gain / steepness
-        return result
+        variable = self._variables[key]
+        result: np.ndarray[Any, Any] = self.slope(key) ** 2 / variable.gain / steepness
+        return result if variable.smoother is None else result * variable.smoother.gain
 
     def squares(self, key: str) -> tuple[Any, float] | None:
         """The running mean of the squares of what the optimiser is handed, as it keeps it, and its decay; None of one
@@ -294,7 +309,7 @@ class Optimizer:
         variable, moved = self.variable(key), dr.detach(self._own[key][key])
         if key not in self._variables:
             return np.ones(int(np.array(moved).size))
-        return np.array(variable.chain(moved, type(moved)(1)), dtype=np.float64).ravel()
+        return np.array(variable.chain(moved, dr.zeros(type(moved), dr.shape(moved)) + 1), dtype=np.float64).ravel()
 
     def rate(self, key: str) -> float:
         """The learning rate of a parameter, before any schedule."""
@@ -335,7 +350,7 @@ class Optimizer:
             kept = moments[key]
             if key in units:
                 before = self.variable(key)
-                self._variables[key] = Variable(before.transform, before.bounds, *units[key])
+                self._variables[key] = replace(before, length=units[key][0], gain=units[key][1])
                 self._scene[key] = _leaf(values[key])
             elif key in self._variables:
                 del self._variables[key], self._scene[key]

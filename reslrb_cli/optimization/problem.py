@@ -16,6 +16,7 @@ from reslrb_cli.optimization.decisions import Allowance, MemoryPlan
 from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.optimization.loading import BETWEEN_SPP, render_in_passes
 from reslrb_cli.optimization.optimizers import Optimizer, make_transform
+from reslrb_cli.optimization.precondition import make_smoother
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, Jsonable, PathsRecord, SequenceRecord
 from reslrb_cli.scene.parameters import Selection
@@ -169,4 +170,9 @@ def make_optimizer(config: Config, selection: Selection) -> Optimizer:
         rates={key: spec.learning_rate for key, spec in specs.items()},
         bounds={key: spec.bounds for key, spec in specs.items()},
         transforms={key: make_transform(spec.transform, spec.bounds) for key, spec in specs.items()},
+        smoothers={
+            key: make_smoother(selection.array(key), selection.faces(key), spec.smoothing)
+            for key, spec in specs.items()
+            if spec.smoothing is not None
+        },
     )

@@ -19,6 +19,15 @@ about 3 %, so that neither rounding nor curvature decides.
 Units in which one learning rate serves parameters of any sensitivity (`rescale`): step lengths from
 `Sensitivity.length` make all parameters equally fast, and dividing gradients by the root mean square of a sample keeps
 an absolute epsilon, as Adam has it, out of the matter.
+
+Units for gradient descent (`measure_curvatures`, `scale: curvature`): the largest curvature lambda of the loss in what
+the optimiser moves, v, by power iteration on differences of gradients at common random numbers,
+
+    H d = (g(v + h d) - g(v - h d)) / (2 h),   d <- H d / |H d|,   lambda = |H d|,
+
+h such that the image changes by about 3 %. The gradient is then divided by lambda, and by the number of parameters:
+blocks whose norm is 1 leave that of a positive matrix at most at their number. A rate of 1 is Newton's step along the
+steepest direction; descent converges below a rate of 2, while the curvature is the start's.
 """
 
 from __future__ import annotations
@@ -36,7 +45,7 @@ from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import gradient_step, render_image
 from reslrb_cli.optimization.decisions import Scaled, Sensitivity
-from reslrb_cli.optimization.optimizers import Bounds, Transform, Variable
+from reslrb_cli.optimization.optimizers import Bounds, Transform
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array, rms
@@ -194,7 +203,7 @@ def rescale(problem: Problem) -> list[Scaled]:
             continue
         variable, value = optimizer.variable(row.key), dr.detach(optimizer[row.key])
         length = own_length(variable.transform, variable.bounds, value, row.length)
-        unit = Variable(variable.transform, variable.bounds, length)
+        unit = replace(variable, length=length, gain=1.0)
         slope = np.array(unit.chain(unit.from_scene(value), type(value)(size)), dtype=np.float64)
         unit.gain = 1 / rms(slope)
         optimizer.set_variable(row.key, unit)
@@ -205,6 +214,86 @@ def rescale(problem: Problem) -> list[Scaled]:
         measured[place] = replace(row, own_length=length, first_step=rms(np.array(dr.maximum(up, down))))
     problem.apply()
     return measured
+
+
+#: Differences of gradients from which the largest curvature is taken.
+POWER_ITERATIONS = 8
+
+
+def measure_curvatures(problem: Problem) -> list[Scaled]:
+    """Measure, and let gradient descent move each parameter in units of its steepest curvature; return that.
+
+    A parameter without an effect on the image stays as it is.
+    """
+    optimizer, measured = problem.optimizer, []
+    starts = {key: dr.detach(optimizer[key]) for key in problem.selection.keys}
+    problem.apply()
+    base = see_images(problem)
+    for key, start in starts.items():
+        variable = optimizer.variable(key)
+        v = variable.from_scene(start)
+        gradient = _gradient_at(problem, key, v)
+        row = Scaled(key, gradient.size, rms(np.array(start)), rms(gradient), 0.0)
+        found = _steepest(problem, key, v, gradient, base)
+        optimizer.set_value(key, start)
+        if found > 0:
+            unit = replace(variable, gain=1 / (found * len(starts)))
+            optimizer.set_variable(key, unit)
+            rate = problem.selection.spec(key).learning_rate or problem.config.optimizer.learning_rate
+            step = _like(v, gradient * (unit.gain * rate))
+            first = rms(np.array(unit.to_scene(v - step)) - np.array(start))
+            row = replace(row, curvature=found, own_length=1.0, first_step=first)
+        measured.append(row)
+    problem.apply()
+    return measured
+
+
+def _steepest(problem: Problem, key: str, v: Any, gradient: Array, base: Sequence[Array]) -> float:
+    """The largest curvature of the loss in `v`, what the optimiser moves of `key`; 0 where nothing is seen of it."""
+    size = math.sqrt(sum(float(np.square(image).sum()) for image in base))
+    direction = gradient / (np.linalg.norm(gradient) or 1.0)
+    step = 0.01 * (rms(np.array(v)) or 1.0) * math.sqrt(gradient.size)
+    variable = problem.optimizer.variable(key)
+    for _ in range(TRIALS):
+        problem.apply({key: variable.to_scene(v + _like(v, step * direction))})
+        images = zip(see_images(problem), base, strict=True)
+        change = math.sqrt(sum(float(np.square(a - b).sum()) for a, b in images)) / (size or 1.0)
+        if not 0 < change < math.inf:
+            step *= 1e3 if change == 0 else 1e-3
+            continue
+        if LEAST <= change <= MOST:
+            break
+        step *= AIM / change
+    else:
+        return 0.0
+    found = 0.0
+    for _ in range(POWER_ITERATIONS):
+        ends = [_gradient_at(problem, key, v + _like(v, side * step * direction)) for side in (1, -1)]
+        bent = (ends[0] - ends[1]) / (2 * step)
+        before, found = found, float(np.linalg.norm(bent))
+        if not 0 < found < math.inf:
+            return 0.0
+        direction = bent / found
+        if before:  # as large a change of the image as before
+            step *= math.sqrt(before / found)
+    return found
+
+
+def _gradient_at(problem: Problem, key: str, v: Any) -> Array:
+    """dL/dv in a row where the optimiser has `v` of `key`, always from the same samples."""
+    optimizer = problem.optimizer
+    variable = optimizer.variable(key)
+    optimizer.set_value(key, variable.to_scene(v))
+    problem.apply()
+    sample_gradient(problem, problem.integrator, 0, _PURPOSE, problem.config.run.spp)
+    row = np.array(variable.chain(v, optimizer.gradient(key)), dtype=np.float64).ravel()
+    take_gradient(problem)
+    return finite(row)
+
+
+def _like(value: Any, row: Array) -> Any:
+    """The numbers of `row` as an array of the type and shape of `value`."""
+    return type(value)(row.reshape(np.array(value).shape).astype(np.float32))
 
 
 def own_length(transform: Transform | None, bounds: Bounds, value: Any, length: float) -> float:
@@ -234,3 +323,10 @@ def step_line(row: Scaled, transform: str, learning_rate: float) -> str:
         first = f"a factor of {math.exp(min(row.own_length * learning_rate, 700.0)):.3g}, up or down"
     steps = f"{row.own_length:.3g} times the learning rate{_MOVED[transform]}"
     return f"{row.key} moves in steps of {steps}, at first by {first}"
+
+
+def curvature_line(row: Scaled, learning_rate: float) -> str:
+    """What the user is told of one parameter in units of its curvature."""
+    if row.own_length is None:
+        return f"{row.key} has no effect on the image where it starts; it is not scaled"
+    return f"{row.key} moves by {row.first_step or 0.0:.3g} at first, at {learning_rate:g} of what its steepness bears"

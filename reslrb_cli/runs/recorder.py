@@ -23,7 +23,7 @@ from reslrb_cli.optimization.decisions import Scaled
 from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.nonfinite import Findings
 from reslrb_cli.optimization.problem import Problem, saved_spp
-from reslrb_cli.optimization.sensitivity import step_line
+from reslrb_cli.optimization.sensitivity import curvature_line, step_line
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
 from reslrb_cli.records.atomic import Reserve, remove_parts, size_of
@@ -271,13 +271,15 @@ class Recording:
                 self.page.refresh()
 
     def _tell_scaling(self, measured: Sequence[Scaled]) -> None:
-        """Note what was measured for `scale: auto`, and say what it makes of a step."""
+        """Note what was measured for `scale`, and say what it makes of a step."""
         self.manifest.scaling = [row.to_json() for row in measured]
         for row in measured:
             spec = self.problem.selection.spec(row.key)
             rate = spec.learning_rate or self.problem.config.optimizer.learning_rate
             level = logging.WARNING if row.own_length is None else logging.INFO
-            logger.log(level, f"scale auto: {step_line(row, spec.transform, rate)}")
+            scale = self.problem.config.optimizer.scale
+            line = curvature_line(row, rate) if scale == "curvature" else step_line(row, spec.transform, rate)
+            logger.log(level, f"scale {scale}: {line}")
 
     def _note_memory(self, peak: float) -> None:
         """Note the memory that was used, where there is a budget; warn the first time that it is above that."""

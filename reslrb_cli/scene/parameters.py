@@ -115,6 +115,16 @@ class Selection:
         self.deformation.place()
         self.params.update()
 
+    def is_map(self, key: str) -> bool:
+        """Whether `key` is a texture or a heightmap of two texels at least, whose sides do not meet."""
+        slot = self.slot(key)
+        return slot.is_texture and not slot.halo and min(slot.get().shape[:2]) > 1
+
+    def faces(self, key: str) -> np.ndarray[Any, Any] | None:
+        """The triangles (3 m indices) of the mesh whose vertices' positions `key` is; None of what is none."""
+        mesh, _, name = key.rpartition(".")
+        return np.array(self.params[f"{mesh}.faces"]) if name == "vertex_positions" else None
+
     def slot(self, key: str) -> ParameterValue:
         """The value of `key`, to be read and set; `update` has to follow."""
         return ParameterValue(self._holder(key), key)
@@ -143,6 +153,8 @@ def select_parameters(scene: mi.Scene, specs: Sequence[ParameterSpec], source: o
         if settings.bounds is not None:
             check_bounds(slot, value, settings.bounds, place)
         check_transform(slot, value, settings, place)
+        if settings.smoothing is not None and not (selection.is_map(key) or selection.faces(key) is not None):
+            raise place.fail("precondition", f"smooths textures, heightmaps and vertices; `{key}` is none of them")
         if settings.initial != "scene" or settings.resolution is not None:
             slot.set(value)
     selection.update()

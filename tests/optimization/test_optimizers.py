@@ -11,6 +11,7 @@ import pytest
 
 from reslrb_cli.optimization.loop import SCHEDULES, learning_rate_factor
 from reslrb_cli.optimization.optimizers import OPTIMIZERS, Optimizer, Variable, make_transform
+from reslrb_cli.optimization.precondition import make_smoother
 from reslrb_cli.records.clock import StepClock
 
 # Optimisers against their published formulas; clamping, rates, parameters that sit out.
@@ -331,3 +332,80 @@ def test_the_state_holds_the_variable():
     )
     np.testing.assert_allclose(optimizer.moments()["p"]["variable"], np.log(0.5), rtol=1e-6)
     assert optimizer.units() == {"p": (1.0, 1.0)}
+
+
+# --- smooth steps -----------------------------------------------------------------------------------------------------
+
+
+def sphere_mesh():
+    """Vertices (3 n) and triangles (3 m) of a coarse sphere whose seam has two indices for each place."""
+    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 13), np.linspace(0.2, np.pi - 0.2, 8))
+    points = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
+    points[:, -1] = points[:, 0]
+    at = np.arange(8 * 13).reshape(8, 13)
+    corner = at[:-1, :-1].ravel()
+    faces = np.concatenate(
+        [np.stack([corner, corner + 1, corner + 14], 1), np.stack([corner, corner + 14, corner + 13], 1)]
+    )
+    return points.reshape(-1), faces.ravel()
+
+
+def smoothers():
+    rng = np.random.default_rng(3)
+    points, faces = sphere_mesh()
+    return {
+        "map": (make_smoother(np.zeros((12, 20, 2)), None, 0.2), rng.normal(size=(12, 20, 2))),
+        "mesh": (make_smoother(points, faces, 0.3), points + 0.0),
+    }
+
+
+@pytest.mark.parametrize("kind", ["map", "mesh"])
+def test_smooth_and_back_and_the_gradient_between(kind):
+    smoother, value = smoothers()[kind]
+    operator, rng = smoother.operator, np.random.default_rng(4)
+    np.testing.assert_allclose(operator.smooth(operator.roughen(value)), value, rtol=1e-9, atol=1e-9)
+    v, g = operator.roughen(value), rng.normal(size=value.shape)
+    # <S v, g> = <v, S' g>, on what the optimiser can reach: vertices at one place are one
+    assert np.sum(operator.smooth(v) * g) == pytest.approx(np.sum(v * operator.adjoint(g)), rel=1e-9)
+    assert np.std(operator.smooth(g)) < 0.5 * np.std(g)
+    np.testing.assert_allclose(operator.smooth(np.ones_like(value)), 1, rtol=1e-9)  # a constant has nothing to smooth
+
+
+def test_a_length_means_the_same_on_a_finer_map():
+    """A cosine of wavelength w is damped by 1 / (1 + (2 pi l / w)^2), however fine the map."""
+    damped = []
+    for size in (32, 128):
+        wave = np.cos(2 * np.pi * 2 * (np.arange(size) + 0.5) / size)[:, None, None] * np.ones((1, size, 1))
+        damped.append(np.max(make_smoother(wave, None, 0.1).operator.smooth(wave)) / np.max(wave))
+    assert damped == pytest.approx([1 / (1 + (2 * np.pi * 0.1 * 2) ** 2)] * 2, rel=0.01)
+
+
+@pytest.mark.parametrize("type", ["adam", "sgd"])
+@pytest.mark.parametrize("bounds", [None, (0.3, 0.7)])
+def test_a_preconditioned_step_is_smooth_and_within_bounds(type, bounds):
+    size = 32
+    value = mi.TensorXf(np.full((size, size, 1), 0.5, np.float32))
+    smoother = make_smoother(np.array(value), None, 0.1)
+    optimizer = Optimizer(type, 0.2, {}, {"p": value}, {"p": None}, {"p": bounds}, smoothers={"p": smoother})
+    noise = np.random.default_rng(0).normal(size=(size, size, 1)).astype(np.float32)
+    for _ in range(4):
+        dr.set_grad(optimizer["p"], mi.TensorXf(30 * (noise + 0.2)))
+        assert optimizer.step(1.0) == {}
+    moved = np.array(optimizer["p"])[:, :, 0]
+    if bounds is None:
+        assert 0 < np.abs(np.diff(moved, axis=0)).max() < 0.2 * np.ptp(moved)
+    else:
+        assert (moved.min(), moved.max()) == pytest.approx(bounds)
+
+
+def test_its_response_is_what_one_entry_alone_gets():
+    size, rate = 64, 0.1
+    value = mi.TensorXf(np.zeros((size, size, 1), np.float32))
+    smoother = make_smoother(np.array(value), None, 0.03)
+    optimizer = Optimizer("sgd", rate, {}, {"p": value}, {"p": None}, {"p": None}, smoothers={"p": smoother})
+    expected = optimizer.response("p")[0]
+    at = np.zeros((size, size, 1), np.float32)
+    at[32, 32] = 1
+    dr.set_grad(optimizer["p"], mi.TensorXf(at))
+    optimizer.step(1.0)
+    assert -np.array(optimizer["p"])[32, 32, 0] / rate == pytest.approx(expected, rel=0.15)  # a mean, edges included

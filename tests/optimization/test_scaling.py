@@ -12,13 +12,21 @@ import pytest
 from turns import a_few
 
 from reslrb_cli.config.loader import load
+from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.decisions import Scaled
 from reslrb_cli.optimization.identifiability import find_reached
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.optimizers import Optimizer, Variable, make_transform
-from reslrb_cli.optimization.sensitivity import measure_sensitivities, own_length, rescale, step_line
+from reslrb_cli.optimization.sensitivity import (
+    curvature_line,
+    measure_curvatures,
+    measure_sensitivities,
+    own_length,
+    rescale,
+    step_line,
+)
 from reslrb_cli.optimization.state import standing
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
@@ -190,3 +198,42 @@ def test_the_line_of_what_is_not_scaled_says_why():
     )
     row = Scaled("lamp.intensity.value", 3, 1.0, 0.0, 0.0, change=1.0, curvature=1.0, length=1.0)
     assert "no gradient" in step_line(row, "log", 0.1)
+
+
+# --- units of curvature -----------------------------------------------------------------------------------------------
+
+LAMP_ALONE = ["parameters=[{key: lamp.intensity.value, initial: [2e6, 4e6, 1e6]}]", "run.measuring=0",
+              "optimizer={type: sgd, scale: curvature}"]  # fmt: skip
+
+
+def test_the_curvature_of_a_lamp_is_that_of_the_image_it_makes():
+    """The image I_c = x_c a, so that the mean of (I - T)^2 has the curvature 2 mean(a_c^2) / 3 along channel c."""
+    problem = assemble(load(CONFIG, [*TINY, *LAMP_ALONE]))
+    x = problem.selection.array(LAMP).astype(np.float64)
+    before = np.array(problem.optimizer[LAMP])
+    (row,) = measure_curvatures(problem)
+    a = np.array(problem.render(0, 512, 0, "test"), dtype=np.float64) / x
+    assert row.curvature == pytest.approx(2 * np.mean(a**2, axis=(0, 1)).max() / 3, rel=0.1)
+    np.testing.assert_array_equal(np.array(problem.optimizer[LAMP]), before)
+    assert curvature_line(row, 0.5).startswith(f"{LAMP} moves by {row.first_step:.3g} at first")
+
+
+@pytest.mark.parametrize(("rate", "ends"), [(1.0, "below"), (3.0, "above")])
+def test_a_rate_of_one_ends_at_the_bottom_and_three_leaves_it(rate, ends):
+    sets = [*TINY, *LAMP_ALONE, "run.iterations=12", f"optimizer.learning_rate={rate}"]
+    problem = assemble(load(CONFIG, sets))
+    problem = find_reached(problem)
+    losses = [record.loss for record in optimize(problem)]
+    assert losses[-1] < 0.2 * losses[0] if ends == "below" else losses[-1] > losses[0]
+
+
+def test_curvature_is_for_gradient_descent_alone():
+    with pytest.raises(ConfigError, match="optimizer.scale: curvature goes with type: sgd"):
+        load(CONFIG, ["optimizer={type: adam, scale: curvature}"])
+    assert load(CONFIG, ["optimizer={type: sgd, scale: curvature}"]).optimizer.learning_rate == 0.5
+
+
+def test_what_cannot_be_smoothed_is_refused_where_it_stands():
+    config = load(CONFIG, [*TINY, "parameters=[{key: lamp.intensity.value, precondition: {laplacian: 0.1}}]"])
+    with pytest.raises(ConfigError, match=r"parameters\[0\].precondition: smooths textures, heightmaps and vertices"):
+        assemble(config)

@@ -1,0 +1,141 @@
+"""Smooth steps: what the optimiser moves is rougher than the parameter by a Laplacian ("large steps").
+
+    x = S v,   S = (1 - l^2 Δ)^-1,   dL/dv = S dL/dx            Nicolet, Jacobson and Jakob 2021, eq. 9 to 12
+
+S is symmetric. A step of gradient descent is S^2 dL/dx: what is finer than l goes by the fourth power of its fineness
+less far. That is what a surface that refracts light needs: light that it throws changes with the surface's second
+derivatives, so that the curvature of a loss grows with the fourth power, and without S the finest ripple that the map
+can hold decides how far a step may go. l is a share of the longer side, so that it means the same on a finer map.
+
+    maps, textures      Δ by differences of neighbours, no flow through the edges: diagonal in the cosine transform
+    vertices of a mesh  Δ of its graph, in units of its mean edge: a sparse LU decomposition, made once
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import scipy.fft
+import scipy.sparse as sparse
+import scipy.sparse.linalg as linalg
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Smoother:
+    """S of one parameter and its inverse, on arrays of Dr.Jit's of the parameter's type.
+
+    `gain` is the mean over the entries of what S^2 makes of a gradient of one entry alone, at that entry.
+    """
+
+    operator: MapOperator | MeshOperator
+
+    @property
+    def gain(self) -> float:
+        """The mean of the diagonal of S^2."""
+        return self.operator.gain
+
+    def smooth(self, value: Any) -> Any:
+        """S `value`, evaluated."""
+        return self._through(self.operator.smooth, value)
+
+    def roughen(self, value: Any) -> Any:
+        """The inverse of `smooth`."""
+        return self._through(self.operator.roughen, value)
+
+    def adjoint(self, gradient: Any) -> Any:
+        """The gradient by v, of that by S v."""
+        return self._through(self.operator.adjoint, gradient)
+
+    def _through(self, function: Any, value: Any) -> Any:
+        array = np.array(dr.detach(value), dtype=np.float64)
+        return type(value)(function(array).astype(np.float32))
+
+
+class MapOperator:
+    """S on textures and heightmaps (height, width, channels) of at least two texels; `length` is l."""
+
+    def __init__(self, shape: tuple[int, ...], length: float) -> None:
+        texels = length * max(shape[:2])  # l in texels, which are square
+        along = [2 - 2 * np.cos(np.pi * np.arange(size) / size) for size in shape[:2]]
+        self.shape = shape
+        self.eigenvalues = 1 + texels**2 * (along[0][:, None] + along[1])[:, :, None]
+        self.gain = float(np.mean(self.eigenvalues**-2.0))
+
+    def smooth(self, value: Array) -> Array:
+        """S `value`."""
+        return self._scaled(value, 1 / self.eigenvalues)
+
+    adjoint = smooth  # S is symmetric
+
+    def roughen(self, value: Array) -> Array:
+        """The inverse of `smooth`."""
+        return self._scaled(value, self.eigenvalues)
+
+    def _scaled(self, value: Array, factors: Array) -> Array:
+        spectrum = scipy.fft.dctn(value.reshape(self.shape), axes=(0, 1), norm="ortho")
+        return np.asarray(scipy.fft.idctn(spectrum * factors, axes=(0, 1), norm="ortho")).reshape(value.shape)
+
+
+class MeshOperator:
+    """S on the vertices' positions (3 n) of a mesh with `faces` (3 m indices), by its graph; `length` is l.
+
+    Vertices that share a place but not an index, as along the seams of textures, are one.
+    """
+
+    def __init__(self, positions: Array, faces: NDArray[Any], length: float) -> None:
+        points = positions.reshape(-1, 3)
+        _, self._one, self._sizes = np.unique(points, axis=0, return_inverse=True, return_counts=True)
+        self._one = self._one.ravel()
+        corners = self._one[faces.reshape(-1, 3).astype(np.int64)]
+        edges = np.unique(np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])), axis=0)
+        edges = edges[edges[:, 0] != edges[:, 1]]
+        n = len(self._sizes)
+        first = np.zeros(n, np.int64)
+        first[self._one[::-1]] = np.arange(len(points))[::-1]
+        ends = points[first][edges]
+        mean = float(np.mean(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)))
+        extent = float(np.max(points.max(axis=0) - points.min(axis=0)))
+        rows, columns = edges.T
+        joined = sparse.coo_matrix((np.ones(len(edges)), (rows, columns)), shape=(n, n))
+        joined = joined + joined.T
+        laplacian = sparse.diags(np.asarray(joined.sum(axis=1)).ravel()) - joined
+        self._matrix = (sparse.identity(n) + (length * extent / mean) ** 2 * laplacian).tocsc()
+        self._solve = linalg.splu(self._matrix)
+        self.gain = self._mean_square()
+
+    def smooth(self, value: Array) -> Array:
+        """S `value`."""
+        return self._spread(self._solve.solve(self._gathered(value) / self._sizes[:, None]), value)
+
+    def adjoint(self, gradient: Array) -> Array:
+        """The gradient by v: each of the vertices at a place has its part."""
+        return self._spread(self._solve.solve(self._gathered(gradient)) / self._sizes[:, None], gradient)
+
+    def roughen(self, value: Array) -> Array:
+        """The inverse of `smooth`."""
+        return self._spread(self._matrix @ (self._gathered(value) / self._sizes[:, None]), value)
+
+    def _gathered(self, value: Array) -> Array:
+        """By place, the sum over the vertices that share it."""
+        total = np.zeros((len(self._sizes), 3))
+        np.add.at(total, self._one, value.reshape(-1, 3))
+        return total
+
+    def _spread(self, value: Any, like: Array) -> Array:
+        return np.asarray(value[self._one]).reshape(like.shape)
+
+    def _mean_square(self) -> float:
+        """The mean of the diagonal of S^2, by Hutchinson's estimate from 8 fixed vectors of signs."""
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(len(self._sizes), 8))
+        return float(np.mean(self._solve.solve(signs) ** 2))
+
+
+def make_smoother(value: NDArray[Any], faces: NDArray[Any] | None, length: float) -> Smoother:
+    """S for a map (height, width, channels), or for vertices' positions (3 n) of a mesh with `faces`."""
+    return Smoother(MapOperator(value.shape, length) if faces is None else MeshOperator(value, faces, length))
