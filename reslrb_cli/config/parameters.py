@@ -227,8 +227,8 @@ class Precondition(Section):
     (1 - l² Δ)⁻¹ v."""
 
     laplacian: Annotated[float, Field(gt=0, le=10)]
-    """l, as a share of the longer side of a map, a texture or a mesh: the same on a finer one. What is finer than l goes
-    less far in a step; of gradient descent, by the fourth power of its size over l."""
+    """l, as a share of the longer side of a map, a texture or a mesh: the same on a finer one. What is finer than l
+    goes less far in a step; of gradient descent, by the fourth power of its size over l."""
 
 
 class ParameterSpec(Section):
