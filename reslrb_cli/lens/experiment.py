@@ -216,6 +216,7 @@ def steady_rate(surface: Surface, film: tuple[int, int], pixels: int) -> float:
 def lens_yaml(surface: Surface, name: str, iterations: int, rate: float) -> str:
     """The configuration, which begins at the heights in `start.exr`."""
     ny, nx = surface.heights.shape
+    s = surface.setting
     return f"""# The {surface.setting.kind} that throws {json.dumps(name)}: {surface.summary()}.
 # Begin with
 #     reslrb optimize lens.yaml
@@ -237,6 +238,9 @@ optimizer: {{type: sgd, momentum: 0.9, learning_rate: {rate:.3g}, schedule: cosi
 run:
   iterations: {iterations}
   spp: 64
+fabrication:  # mm; what `reslrb export` makes a solid of
+  {{kind: {s.kind}, thickness: {s.thickness:.9g}, outline: {s.outline}, ior: {s.ior:g},
+   size: [{s.size[0]:.9g}, {s.size[1]:.9g}]}}
 """
 
 
