@@ -251,6 +251,36 @@ class RunConfig(Section):
         return folder_name(self.name)
 
 
+# --- solids -----------------------------------------------------------------------------------------------------------
+
+
+class Fabrication(Section):
+    """The solid behind a face of heights, in millimetres: what `reslrb export` makes of a run, and what it checks."""
+
+    kind: Literal["lens", "mirror"] = Field(default="lens", description="What the face does with light.")
+    faces: Annotated[
+        list[Annotated[str, Field(min_length=1)]],
+        Field(min_length=1, max_length=2),
+        must(each_once, lambda _: "must name each mesh once"),
+    ] = Field(default=["face"])
+    """Ids of the meshes that are its faces: the front, a grid about z = 0 with its outside towards +z, and where that
+    is free as well the back, a grid about z = -thickness with its outside towards -z. One alone: the back is flat."""
+    thickness: Positive = Field(description="From z = 0 down to the back, in mm.")
+    outline: Literal["rectangle", "round"] = "rectangle"
+    """`round`: the ellipse of this size; of the face what is outside is cut off."""
+    size: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = None
+    """Width and height of the face in mm, about x = y = 0; null: as large as its mesh."""
+    rim: Annotated[float, Field(ge=0)] = Field(default=0.0, description="Width of a flat rim about the face, in mm.")
+    ior: Annotated[float, Field(gt=1, le=5)] = Field(default=1.49, description="Index of refraction of a lens.")
+    tool_radius: Positive | None = None
+    """Radius of the ball that cuts the faces, in mm; it does not get into hollows that are narrower."""
+    min_thickness: Positive | None = Field(default=None, description="Least thickness that the material bears, in mm.")
+    sun: Annotated[float, Field(ge=0, lt=90)] = Field(default=0.53, description="Diameter of the light, in degrees.")
+    receiver: Annotated[str, Field(min_length=1)] = Field(
+        default="screen", description="Id of what the light falls on."
+    )
+
+
 class Config(Section):
     """One experiment, checked; its paths are absolute."""
 
@@ -266,6 +296,7 @@ class Config(Section):
     loss: AnyLoss = Field(default=L2(), description="How image and target are compared.")
     optimizer: AnyOptimizer = Field(default=Adam(), description="How parameters follow their gradient.")
     run: RunConfig = Field(default_factory=lambda: RunConfig(), description="Iterations, samples, seed and output.")
+    fabrication: Fabrication | None = Field(default=None, description="The solid that a lens or a mirror is made as.")
 
     _source: Path = PrivateAttr(default=Path("config.yaml"))
 

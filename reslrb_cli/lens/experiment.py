@@ -201,6 +201,7 @@ def scene_xml(surface: Surface, film: tuple[int, int], pixels: int, irradiance: 
 
 def lens_yaml(surface: Surface, nx: int, ny: int, name: str, iterations: int) -> str:
     """The configuration, which begins at the heights in `start.exr`."""
+    s = surface.setting
     return f"""# The {surface.setting.kind} that throws {json.dumps(name)}: {surface.summary()}.
 # Begin with
 #     reslrb optimize lens.yaml
@@ -222,6 +223,9 @@ optimizer: {{type: sgd, momentum: 0.9, scale: curvature, learning_rate: 1, sched
 run:
   iterations: {iterations}
   spp: 64
+fabrication:  # mm; what `reslrb export` makes a solid of
+  {{kind: {s.kind}, thickness: {s.thickness:.9g}, outline: {s.outline}, ior: {s.ior:g},
+   size: [{s.size[0]:.9g}, {s.size[1]:.9g}]}}
 """
 
 

@@ -238,16 +238,19 @@ def export_scene(
     integrator: Mapping[str, object],
     folder: Path,
     source: object,
+    beside: Mapping[str, Callable[[Path], object]] | None = None,
 ) -> None:
     """Write what `description` says, with the values that `params` have of `keys`, and an integrator, to `folder`.
 
     `params` are of a scene that was built from the description, which is changed. `integrator` has its type and
-    options. The folder appears once it is whole, and Mitsuba has read the same values back from it. Raises ConfigError,
-    located in `source` and the key, where a value cannot be said, and OSError.
+    options; `beside` are more files, by name, and who writes each. The folder appears once it is whole, and Mitsuba has
+    read the same values back from it. Raises ConfigError, located in `source` and the key, where a value cannot be
+    said, and OSError.
     """
     replacing, root = Replacing(description, params, source), description.root
     for key in keys:
         replacing.put(key)
+    replacing.writers |= beside or {}  # before assets, which take other names than these
     replacing.copy_assets()
     options = [
         root.new({bool: "boolean", int: "integer"}.get(type(value), "float"), name=name, value=str(value).lower())

@@ -1,0 +1,472 @@
+"""The solid behind a face of heights: a closed mesh in millimetres, its files, and what a maker wants to know of it.
+
+It stands as in the scene: the face about z = 0 with its outside towards +z, the back at z = -thickness, y up. Front and
+back are the triangles with which light was traced, unchanged but where a round outline cuts them. About the face there
+may be a flat rim, a little below the face's lowest edge, so that nothing of it stands in the face's light.
+
+Faces are height fields over grids: no two points of one lie above each other, so that front and back cross where the
+solid's thickness along z is not above 0, and nowhere else.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reslrb_cli.config.schema import Fabrication
+from reslrb_cli.errors import ConfigError
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+#: From the lowest place of a face's edge down to its rim, in mm: walls of no height would be triangles of no area.
+RIM_STEP = 0.1
+
+#: Vertices nearer to a round outline than this part of the grid's pitch are moved onto it: no slivers are cut off.
+_NEAR = 0.1
+
+#: Of the size of a face: what counts as the same place, and as the size that was asked for.
+_SAME, _SIZE = 1e-5, 1e-3
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A face over a grid: `points` (ny nx, 3; mm, rows of one y, the least first), `triangles` (n, 3), counterclockwise
+    as seen from +z; `x` (nx,) and `y` (ny,). `name` is its mesh's id."""
+
+    name: str
+    points: Array
+    triangles: Indices
+    x: Array
+    y: Array
+
+    @property
+    def z(self) -> Array:
+        """z of the vertices (ny, nx)."""
+        return self.points[:, 2].reshape(len(self.y), len(self.x))
+
+    @property
+    def half(self) -> tuple[float, float]:
+        """Half its width and height."""
+        return float(np.ptp(self.x)) / 2, float(np.ptp(self.y)) / 2
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A closed mesh: `points` (n, 3) in mm, `triangles` (m, 3), counterclockwise as seen from outside."""
+
+    points: Array
+    triangles: Indices
+
+    @property
+    def volume(self) -> float:
+        """In mm^3, by the divergence theorem."""
+        a, b, c = (self.points[self.triangles[:, k]] for k in range(3))
+        return float(np.sum(np.cross(a, b) * c)) / 6
+
+    @property
+    def extent(self) -> list[float]:
+        """Width, height and depth, in mm."""
+        return [float(side) for side in np.ptp(self.points, axis=0)]
+
+
+# ---- from meshes to a solid
+
+
+def as_sheet(name: str, points: Array, triangles: Indices) -> Sheet:
+    """The grid that a mesh is: vertices (n, 3), triangles (m, 3) of either winding.
+
+    Raises ConfigError, its key `fabrication.faces`, where it is none, or no height field.
+    """
+    points = np.asarray(points, np.float64)
+
+    def fail(why: str) -> ConfigError:
+        return ConfigError("", "fabrication.faces", f"`{name}` {why}; a solid is made of a rectangular grid of heights "
+                           "along z, as `reslrb lens` writes it")  # fmt: skip
+
+    if not np.all(np.isfinite(points)):
+        raise fail("has vertices that are not finite")
+    lines, at = [], []
+    for axis in (0, 1):
+        values = np.sort(points[:, axis])
+        new = np.flatnonzero(np.diff(values, prepend=-np.inf) > _SAME * max(np.ptp(values), 1e-30))
+        lines.append(values[new])
+        at.append(np.searchsorted(values[new], points[:, axis] + _SAME * np.ptp(values)) - 1)
+    (x, y), (column, row) = lines, at
+    place = row * len(x) + column
+    if min(len(x), len(y)) < 3 or len(points) != len(x) * len(y) or len(np.unique(place)) < len(points):
+        raise fail(f"has {len(points)} vertices that lie on no grid")
+    if any(np.ptp(np.diff(line)) > 1e-2 * np.diff(line).mean() for line in (x, y)):
+        raise fail("has vertices at uneven distances")
+    ordered = np.empty_like(points)
+    ordered[place] = points
+    corners = place[np.asarray(triangles, np.int64)]
+    area = _areas(ordered, corners)
+    if area.sum() < 0:
+        corners, area = corners[:, ::-1], -area
+    if area.min(initial=1.0) <= 0 or abs(area.sum() / (np.ptp(x) * np.ptp(y)) - 1) > 1e-4:
+        raise fail("folds, or has holes")
+    return Sheet(name, ordered, corners, x, y)
+
+
+def _areas(points: Array, triangles: Indices) -> Array:
+    """Areas (m,) of triangles as seen from +z, below 0 where they are clockwise."""
+    a, b, c = (points[triangles[:, k], :2] for k in range(3))
+    u, v = b - a, c - a
+    return np.asarray((u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / 2)
+
+
+def make_solid(sheets: Sequence[Sheet], plan: Fabrication) -> Solid:
+    """The solid whose front is the first of `sheets`, and its back the second, or flat.
+
+    Raises ConfigError, its key below `fabrication`: faces that cross, or that are not of the size that is asked for.
+    """
+    half = sheets[0].half if plan.size is None else (plan.size[0] / 2, plan.size[1] / 2)
+    for sheet in sheets:
+        if any(abs(a - b) > _SIZE * b for a, b in zip(sheet.half, half, strict=True)):
+            raise ConfigError("", "fabrication.size", f"is {2 * half[0]:g} x {2 * half[1]:g} mm, and `{sheet.name}` "
+                              f"{2 * sheet.half[0]:g} x {2 * sheet.half[1]:g}")  # fmt: skip
+        middle = sheet.x.mean(), sheet.y.mean()
+        if max(map(abs, middle)) > _SIZE * max(half):
+            raise ConfigError("", "fabrication.faces", f"the middle of `{sheet.name}` is at x = {middle[0]:.3g}, "
+                              f"y = {middle[1]:.3g}; it must be at 0")  # fmt: skip
+    thin = least_thickness(sheets, plan)
+    if thin <= 0:
+        raise ConfigError("", "fabrication.thickness", f"{plan.thickness:g} mm: front and back cross, by {-thin:.3g} "
+                          f"mm; it must be above {plan.thickness - thin:.4g}")  # fmt: skip
+    build = _Building(sheets[0].half)
+    outer = build.add_face(sheets[0], plan, 1)
+    if len(sheets) == 2:
+        build.zip(build.add_face(sheets[1], plan, -1), outer)
+    else:
+        # A point in its middle and the outline: the flat back needs no grid.
+        below = build.copy(outer, -plan.thickness)
+        build.zip(below, outer)
+        middle_point = build.add(np.array([[0.0, 0.0, -plan.thickness]]))[0]
+        turned = np.roll(below, -1)
+        build.triangles.append(np.stack([np.full_like(below, middle_point), turned, below], 1))
+    solid = Solid(np.concatenate(build.points), np.concatenate(build.triangles))
+    if not is_closed(solid.triangles):
+        raise ConfigError("", "fabrication.faces", "the faces make no closed solid: their edges are not one outline")
+    return solid
+
+
+class _Building:
+    """Vertices and triangles of a solid, as they come; loops of vertices are counterclockwise as seen from +z."""
+
+    def __init__(self, half: tuple[float, float]) -> None:
+        self.half = np.array(half)
+        self.points: list[Array] = []
+        self.triangles: list[Indices] = []
+        self._count = 0
+
+    def add(self, points: Array) -> Indices:
+        """Their indices."""
+        self.points.append(points)
+        self._count += len(points)
+        return np.arange(self._count - len(points), self._count)
+
+    def copy(self, loop: Indices, z: float, scale: Array | float = 1.0) -> Indices:
+        """New vertices at `loop`'s x and y, times `scale`, and at `z`."""
+        at = np.concatenate(self.points)[loop]
+        return self.add(np.column_stack([at[:, :2] * scale, np.full(len(at), z)]))
+
+    def add_face(self, sheet: Sheet, plan: Fabrication, side: int) -> Indices:
+        """Add a face, whose outside is towards +z or -z by `side`, and its rim; the loop about them."""
+        points, triangles = sheet.points, sheet.triangles
+        if plan.outline == "round":
+            points, triangles = cut_round(sheet, (self.half[0], self.half[1]))
+        first = self.add(points)[0]
+        self.triangles.append(first + (triangles if side > 0 else triangles[:, ::-1]))
+        edge = first + edge_loop(triangles)
+        if plan.rim == 0:
+            return edge
+        z = side * (float(np.min(side * points[edge - first, 2])) - RIM_STEP)
+        inner = self.copy(edge, z)
+        outer = self.copy(edge, z, 1 + plan.rim / self.half)
+        self.zip(*((inner, edge) if side > 0 else (edge, inner)))
+        self.zip(*((outer, inner) if side > 0 else (inner, outer)))
+        return outer
+
+    def zip(self, lower: Indices, upper: Indices) -> None:
+        """Add the wall between two loops, its outside outwards, however many vertices each of them has."""
+        points = np.concatenate(self.points)
+        loops, angles = [], []
+        for loop in (lower, upper):
+            x, y = (points[loop, :2] / self.half).T
+            angle = np.arctan2(y, x) % (2 * np.pi)
+            start = int(np.argmin(angle))
+            loop, angle = np.roll(loop, -start), np.roll(angle, -start)
+            loops.append([*loop.tolist(), int(loop[0])])
+            angles.append([*angle.tolist(), float(angle[0]) + 2 * np.pi])
+        (low, high), (at, beside) = loops, angles
+        i, j, made = 0, 0, []
+        while i < len(low) - 1 or j < len(high) - 1:
+            if j == len(high) - 1 or (i < len(low) - 1 and at[i + 1] <= beside[j + 1]):
+                made.append((low[i], low[i + 1], high[j]))
+                i += 1
+            else:
+                made.append((low[i], high[j + 1], high[j]))
+                j += 1
+        self.triangles.append(np.array(made, np.int64))
+
+
+def edge_loop(triangles: Indices) -> Indices:
+    """The vertices about a sheet, counterclockwise: the edges that only one triangle has. Of several loops one."""
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    n = int(edges.max()) + 1
+    open_ones = edges[~np.isin(edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0])]
+    after = dict(open_ones.tolist())
+    start = vertex = int(open_ones[0, 0])
+    loop = [start]
+    while (vertex := after[vertex]) != start and len(loop) <= len(after):
+        loop.append(vertex)
+    return np.array(loop, np.int64)
+
+
+def is_closed(triangles: Indices) -> bool:
+    """Whether each edge is met by two triangles, in opposite directions."""
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    n = int(edges.max()) + 1
+    there, back = edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0]
+    return len(np.unique(there)) == len(there) and np.array_equal(np.sort(there), np.sort(back))
+
+
+def cut_round(sheet: Sheet, half: tuple[float, float]) -> tuple[Array, Indices]:
+    """Vertices and triangles of what of a face is within the ellipse of these half axes, cut where it crosses edges."""
+    points, triangles = sheet.points.copy(), sheet.triangles
+    axes = np.array(half)
+    far = np.linalg.norm(points[:, :2] / axes, axis=1)
+    pitch = min(sheet.x[1] - sheet.x[0], sheet.y[1] - sheet.y[0])
+    near = np.abs(far - 1) * min(half) < _NEAR * pitch
+    slope_y, slope_x = np.gradient(sheet.z, sheet.y, sheet.x)
+    moved = points[near, :2] * (1 / far[near] - 1)[:, None]
+    points[near, 2] += slope_x.ravel()[near] * moved[:, 0] + slope_y.ravel()[near] * moved[:, 1]
+    points[near, :2] += moved
+    side = np.where(near, 0, np.sign(far - 1)).astype(np.int64)
+    sides = side[triangles]
+    kept = triangles[np.all(sides <= 0, axis=1)]
+    made: list[Array] = []
+    known: dict[tuple[int, int], int] = {}
+
+    def crossing(p: int, q: int) -> int:
+        """The vertex where the edge from `p`, within, to `q`, outside, meets the ellipse."""
+        if (p, q) not in known:
+            a, d = points[p, :2] / axes, (points[q, :2] - points[p, :2]) / axes
+            half_b, c = a @ d, a @ a - 1
+            t = -c / (half_b + np.sqrt(half_b**2 - (d @ d) * c))  # the root above 0, without cancellation
+            known[p, q] = len(points) + len(made)
+            made.append(points[p] + t * (points[q] - points[p]))
+        return known[p, q]
+
+    clipped = []
+    for corners in triangles[np.any(sides < 0, axis=1) & np.any(sides > 0, axis=1)].tolist():
+        polygon = []
+        for p, q in zip(corners, [*corners[1:], corners[0]], strict=True):
+            if side[p] <= 0:
+                polygon.append(p)
+            if side[p] * side[q] < 0:
+                polygon.append(crossing(p, q) if side[p] < 0 else crossing(q, p))
+        clipped += [(polygon[0], polygon[k], polygon[k + 1]) for k in range(1, len(polygon) - 1)]
+    everything = np.concatenate([points, np.array(made).reshape(-1, 3)])
+    both = np.concatenate([kept, np.array(clipped, np.int64).reshape(-1, 3)])
+    used, renamed = np.unique(both, return_inverse=True)
+    return everything[used], renamed.reshape(-1, 3).astype(np.int64)
+
+
+# ---- what a maker wants to know
+
+
+def within(sheet: Sheet, plan: Fabrication) -> NDArray[np.bool_]:
+    """Which vertices (ny, nx) lie within the outline."""
+    if plan.outline == "rectangle":
+        return np.ones(sheet.z.shape, bool)
+    a, b = sheet.half
+    return np.asarray((sheet.x[None, :] / a) ** 2 + (sheet.y[:, None] / b) ** 2 <= 1)
+
+
+def least_thickness(sheets: Sequence[Sheet], plan: Fabrication) -> float:
+    """The least thickness along z within the outline, rim included (mm; below 0 where front and back cross)."""
+    from scipy.interpolate import RegularGridInterpolator
+
+    front = sheets[0]
+    low = [sheet.z[within(sheet, plan)] for sheet in sheets]
+    if len(sheets) == 1:
+        thin = float(low[0].min()) + plan.thickness
+    else:
+        thin = np.inf
+        for sheet, other, sign in ((front, sheets[1], 1), (sheets[1], front, -1)):
+            points = sheet.points[within(sheet, plan).ravel()]
+            places = np.clip(points[:, 1::-1], [other.y[0], other.x[0]], [other.y[-1], other.x[-1]])
+            there = RegularGridInterpolator((other.y, other.x), other.z)(places)
+            thin = min(thin, float(np.min(sign * (points[:, 2] - there))))
+    if plan.rim > 0:
+        edges = [_edge_heights(sheet, plan) for sheet in sheets]
+        back = -plan.thickness if len(sheets) == 1 else float(edges[1].max()) + RIM_STEP
+        thin = min(thin, float(edges[0].min()) - RIM_STEP - back)
+    return thin
+
+
+def _edge_heights(sheet: Sheet, plan: Fabrication) -> Array:
+    """z of the vertices about a face."""
+    points, triangles = sheet.points, sheet.triangles
+    if plan.outline == "round":
+        points, triangles = cut_round(sheet, sheet.half)
+    return np.asarray(points[edge_loop(triangles), 2])
+
+
+def hollows(sheet: Sheet, plan: Fabrication, side: int) -> Array:
+    """The larger principal curvature (1/mm) of each inner vertex within the outline, above 0 where it is hollow.
+
+    By central differences of the heights, as seen from outside, which is towards +z or -z by `side`.
+    """
+    h, dx, dy = side * sheet.z, float(np.diff(sheet.x).mean()), float(np.diff(sheet.y).mean())
+    c = h[1:-1, 1:-1]
+    p, q = (h[1:-1, 2:] - h[1:-1, :-2]) / (2 * dx), (h[2:, 1:-1] - h[:-2, 1:-1]) / (2 * dy)
+    r, t = (h[1:-1, 2:] - 2 * c + h[1:-1, :-2]) / dx**2, (h[2:, 1:-1] - 2 * c + h[:-2, 1:-1]) / dy**2
+    s = (h[2:, 2:] - h[2:, :-2] - h[:-2, 2:] + h[:-2, :-2]) / (4 * dx * dy)
+    w = 1 + p * p + q * q
+    mean = ((1 + q * q) * r - 2 * p * q * s + (1 + p * p) * t) / (2 * w**1.5)
+    gauss = (r * t - s * s) / w**2
+    larger = mean + np.sqrt(np.maximum(mean**2 - gauss, 0))
+    return np.asarray(larger[within(sheet, plan)[1:-1, 1:-1]])
+
+
+def steepest(sheet: Sheet, plan: Fabrication) -> float:
+    """The largest angle (degrees) between a triangle of the face, within the outline, and the plane z = 0."""
+    points, triangles = sheet.points, sheet.triangles
+    if plan.outline == "round":
+        points, triangles = cut_round(sheet, sheet.half)
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    return float(np.degrees(np.arctan2(np.linalg.norm(normal[:, :2], axis=1), np.abs(normal[:, 2])).max()))
+
+
+def outwards(sheet: Sheet, plan: Fabrication, side: int) -> Array:
+    """Heights (ny, nx; mm) above the flat face, outwards: row 0 at the greatest y, columns along x."""
+    return (sheet.z if side > 0 else -plan.thickness - sheet.z)[::-1]
+
+
+def scaled(heights: Array, inside: NDArray[np.bool_]) -> tuple[NDArray[np.uint16], float, float]:
+    """Heights as 16-bit numbers n (what is not `inside` clipped), with `offset` and `step`: h = offset + step n."""
+    low, high = float(heights[inside].min()), float(heights[inside].max())
+    step = (high - low) / 65535
+    numbers = np.rint((np.clip(heights, low, high) - low) / step) if step > 0 else np.zeros_like(heights)
+    return numbers.astype(np.uint16), low, step
+
+
+def measured(solid: Solid, sheets: Sequence[Sheet], plan: Fabrication) -> dict[str, Any]:
+    """What fabrication.json says, in mm, mm^3 and degrees; `warnings` are sentences."""
+    thin, warnings, faces = least_thickness(sheets, plan), [], {}
+    for sheet, side in zip(sheets, (1, -1), strict=False):
+        inside, curvature = within(sheet, plan), hollows(sheet, plan, side)
+        sharpest = float(curvature.max(initial=0.0))
+        z = sheet.z[inside]
+        face: dict[str, Any] = {
+            "grid": [len(sheet.x), len(sheet.y)],
+            "relief": float(np.ptp(z)),
+            "smallest_concave_radius": 1 / sharpest if sharpest > 1e-9 else None,
+            "steepest_slope_degrees": steepest(sheet, plan),
+        }
+        if plan.tool_radius is not None:
+            narrow = float(np.mean(curvature > 1 / plan.tool_radius)) if curvature.size else 0.0
+            face["share_narrower_than_tool"] = narrow
+            if narrow > 0:
+                warnings.append(f"the tool does not get into {100 * narrow:.2g} % of `{sheet.name}`: its radius is "
+                                f"{plan.tool_radius:g} mm, that of hollows {1 / sharpest:.3g} mm and more")  # fmt: skip
+        faces[sheet.name] = face
+    if plan.min_thickness is not None and thin < plan.min_thickness:
+        warnings.append(f"at its thinnest it is {thin:.3g} mm thick, less than {plan.min_thickness:g} mm; add "
+                        f"{plan.min_thickness - thin:.3g} mm to fabrication.thickness")  # fmt: skip
+    return {
+        "unit": "mm",
+        "kind": plan.kind,
+        "outline": plan.outline,
+        "extent": solid.extent,
+        "thickness": plan.thickness,
+        "least_thickness": thin,
+        "rim": plan.rim,
+        "volume_mm3": solid.volume,
+        "triangles": len(solid.triangles),
+        "tool_radius": plan.tool_radius,
+        "min_thickness": plan.min_thickness,
+        "faces": faces,
+        "warnings": warnings,
+    }
+
+
+def summary(numbers: dict[str, Any]) -> list[str]:
+    """What `measured` found, in lines: the solid, its faces, the warnings."""
+    wide, high, deep = numbers["extent"]
+    lines = [f"{wide:.4g} x {high:.4g} x {deep:.4g} mm, {numbers['volume_mm3'] / 1000:.4g} cm^3, at its thinnest "
+             f"{numbers['least_thickness']:.3g} mm; {numbers['triangles']} triangles"]  # fmt: skip
+    for name, face in numbers["faces"].items():
+        radius, slope = face["smallest_concave_radius"], face["steepest_slope_degrees"]
+        hollow = "nowhere hollow" if radius is None else f"hollows of {radius:.3g} mm in radius and more"
+        lines.append(f"{name}: {face['relief']:.3g} mm deep, slopes up to {slope:.3g} degrees, {hollow}")
+    return lines + numbers["warnings"]
+
+
+# ---- files
+
+
+def stl(solid: Solid) -> bytes:
+    """Binary STL: normals by the right-hand rule, 32-bit floats; it has no unit, and is read as mm."""
+    corners = solid.points[solid.triangles].astype("<f4")
+    a, b, c = (corners[:, k].astype(np.float64) for k in range(3))
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    records: NDArray[Any] = np.zeros(len(corners), [("normal", "<f4", 3), ("at", "<f4", (3, 3)), ("extra", "<u2")])
+    records["normal"], records["at"] = normal, corners
+    # Not "solid": by that word files in text begin.
+    return b"reslrb, millimetres".ljust(80) + np.uint32(len(corners)).astype("<u4").tobytes() + records.tobytes()
+
+
+def ply(solid: Solid) -> bytes:
+    """Binary PLY, 32-bit floats, in mm."""
+    faces: NDArray[Any] = np.empty(len(solid.triangles), [("n", "u1"), ("at", "<i4", 3)])
+    faces["n"], faces["at"] = 3, solid.triangles
+    head = (
+        "ply\nformat binary_little_endian 1.0\ncomment millimetres\n"
+        f"element vertex {len(solid.points)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    return head.encode() + solid.points.astype("<f4").tobytes() + faces.tobytes()
+
+
+def obj(solid: Solid) -> bytes:
+    """OBJ, in mm."""
+    lines = ["# millimetres"]
+    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in solid.points.tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (solid.triangles + 1).tolist()]
+    return "\n".join([*lines, ""]).encode()
+
+
+def three_mf(solid: Solid) -> bytes:
+    """3MF in mm, by lib3mf. Raises ImportError where that is not installed."""
+    import lib3mf
+
+    wrapper = lib3mf.get_wrapper()
+    model = wrapper.CreateModel()
+    model.SetUnit(lib3mf.ModelUnit.MilliMeter)
+    mesh = model.AddMeshObject()
+    mesh.SetName("solid")
+    points, triangles = solid.points.astype("<f4"), solid.triangles.astype("<u4")
+    positions = (lib3mf.Position * len(points)).from_buffer_copy(points.tobytes())
+    corners = (lib3mf.Triangle * len(triangles)).from_buffer_copy(triangles.tobytes())
+    mesh.SetGeometry(positions, corners)
+    model.AddBuildItem(mesh, wrapper.GetIdentityTransform())
+    with tempfile.TemporaryDirectory(prefix="reslrb-3mf-") as folder:
+        path = Path(folder) / "solid.3mf"
+        model.QueryWriter("3mf").WriteToFile(str(path))
+        return path.read_bytes()
+
+
+#: What writes a solid, by the suffix of its file.
+WRITERS: dict[str, Callable[[Solid], bytes]] = {".stl": stl, ".3mf": three_mf, ".obj": obj, ".ply": ply}

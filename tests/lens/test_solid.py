@@ -1,0 +1,303 @@
+"""Solids: closed, of the volume that the heights have, read back by other code; what cannot be is refused."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+from cli.tiny import done, reslrb
+from lens.test_experiment import picture
+
+from reslrb_cli.cli import export
+from reslrb_cli.config.schema import Fabrication
+from reslrb_cli.errors import ConfigError, ExitCode
+from reslrb_cli.lens import solid as solids
+from reslrb_cli.lens.solid import Sheet, as_sheet, make_solid, measured
+from reslrb_cli.records.images import write_file
+from reslrb_cli.scene.images import read_image
+
+SIZE = (60.0, 40.0)
+Heights = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def ripples(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return 2 * np.sin(x / 7) * np.cos(y / 5 + 0.3) + 0.02 * x
+
+
+def grid(heights: Heights, nx: int = 61, ny: int = 41, size: tuple[float, float] = SIZE) -> tuple[Any, Any]:
+    """Vertices and triangles of a face."""
+    x, y = np.meshgrid(*(np.linspace(-s / 2, s / 2, n) for s, n in zip(size, (nx, ny), strict=True)))
+    at = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)).ravel()
+    cells = [np.stack([at, at + 1, at + nx + 1], 1), np.stack([at, at + nx + 1, at + nx], 1)]
+    return np.stack([x, y, heights(x, y)], -1).reshape(-1, 3), np.concatenate(cells)
+
+
+def sheet(heights: Heights = ripples, *shape: int, name: str = "face") -> Sheet:
+    return as_sheet(name, *grid(heights, *shape))
+
+
+def plan(**options: Any) -> Fabrication:
+    return Fabrication(**{"thickness": 8.0, **options})
+
+
+def under(height: Heights) -> Heights:
+    """A free back 8 mm below, of another shape."""
+    return lambda x, y: -8 - 0.7 * height(y, x)
+
+
+#: Of a height field's solid: its options, whether its back is free, and the area about the face.
+SHAPES: dict[str, tuple[dict[str, Any], bool, float]] = {
+    "rectangle": ({}, False, 0.0),
+    "both faces": ({"faces": ["face", "back"]}, True, 0.0),
+    "rim": ({"rim": 5.0}, False, 70.0 * 50 - 60 * 40),
+    "both faces, rim": ({"faces": ["face", "back"], "rim": 5.0}, True, 70.0 * 50 - 60 * 40),
+    "round": ({"outline": "round"}, False, 0.0),
+    "round, rim": ({"outline": "round", "rim": 5.0}, False, np.pi * (35 * 25 - 30 * 20)),
+    "round, both faces, rim": ({"outline": "round", "faces": ["face", "back"], "rim": 2.0}, True,
+                               np.pi * (32 * 22 - 30 * 20)),
+    "mirror": ({"kind": "mirror"}, False, 0.0),
+}  # fmt: skip
+
+
+def integral(heights: Heights, outline: str) -> float:
+    """That of the heights over the face, in mm^3: by the middles of fine cells."""
+    x, y = np.meshgrid(*((np.arange(1500) + 0.5) / 1500 * s - s / 2 for s in SIZE))
+    inside = (2 * x / SIZE[0]) ** 2 + (2 * y / SIZE[1]) ** 2 <= 1 if outline == "round" else np.ones_like(x)
+    return float(np.mean(heights(x, y) * inside) * SIZE[0] * SIZE[1])
+
+
+def edge_heights(heights: Heights, outline: str) -> np.ndarray:
+    t = np.linspace(0, 2 * np.pi, 20001)
+    x, y = np.cos(t), np.sin(t)
+    if outline == "rectangle":
+        x, y = (v / np.maximum(np.abs(x), np.abs(y)) for v in (x, y))
+    return heights(x * SIZE[0] / 2, y * SIZE[1] / 2)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_a_solid_is_closed_outward_and_of_the_heights_volume(name: str) -> None:
+    options, both, beside = SHAPES[name]
+    wanted = plan(**options)
+    # Grids of different numbers of vertices: the walls between them have to meet both.
+    sheets = [sheet(ripples, 241, 161)] + ([sheet(under(ripples), 150, 101, name="back")] if both else [])
+    solid = make_solid(sheets, wanted)
+    volume = integral(ripples, wanted.outline) - integral(
+        under(ripples) if both else lambda x, y: np.full_like(x, -8.0), wanted.outline
+    )
+    front = edge_heights(ripples, wanted.outline).min() - 0.1
+    back = edge_heights(under(ripples), wanted.outline).max() + 0.1 if both else -8.0
+    volume += beside * (front - back)
+    assert solid.volume == pytest.approx(volume, rel=1e-3)
+    for kind, written in (("stl", solids.stl), ("ply", solids.ply), ("obj", solids.obj)):
+        read = trimesh.load(io.BytesIO(written(solid)), file_type=kind)
+        assert read.is_watertight  # each edge in two triangles
+        assert read.is_winding_consistent  # in opposite directions
+        assert read.euler_number == 2
+        assert len(read.faces) == len(solid.triangles)
+        assert read.area_faces.min() > 0
+        assert read.volume == pytest.approx(volume, rel=1e-3)  # above 0: normals point outwards
+        assert np.array(read.extents) == pytest.approx(solid.extent, rel=1e-6)
+
+
+def test_stl_has_the_normals_of_its_triangles() -> None:
+    content = solids.stl(make_solid([sheet()], plan()))
+    records = np.frombuffer(content[84:], [("n", "<f4", 3), ("at", "<f4", (3, 3)), ("extra", "<u2")])
+    assert int(np.frombuffer(content[80:84], "<u4")[0]) == len(records)
+    read = trimesh.load(io.BytesIO(content), file_type="stl", process=False)
+    assert np.sum(records["n"] * read.face_normals, axis=1) == pytest.approx(1, abs=1e-5)
+
+
+def test_the_front_is_the_mesh_as_light_met_it() -> None:
+    points, triangles = grid(ripples)
+    shuffled = np.random.default_rng(3).permutation(len(points))
+    inverse = np.argsort(shuffled)
+    mixed = as_sheet("face", points[shuffled], inverse[triangles][:, ::-1])
+    solid = make_solid([mixed], plan())
+    corners = {tuple(sorted(map(tuple, solid.points[t]))) for t in solid.triangles}
+    assert {tuple(sorted(map(tuple, points[t]))) for t in triangles} <= corners
+    assert mixed.z == pytest.approx(sheet().z)
+
+
+def test_a_round_outline_follows_its_ellipse() -> None:
+    points, triangles = solids.cut_round(sheet(), (30, 20))
+    edge = points[solids.edge_loop(triangles)]
+    assert np.hypot(edge[:, 0] / 30, edge[:, 1] / 20) == pytest.approx(1, abs=1e-12)
+    assert solids._areas(points, triangles).min() > 0
+    # Where it is cut the face stays what it was, but for what a moved vertex of a bent face is off it.
+    assert edge[:, 2] == pytest.approx(ripples(edge[:, 0], edge[:, 1]), abs=0.02)
+
+
+@pytest.mark.parametrize("outline", ["rectangle", "round"])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_sphere_s_radius_slope_and_relief_are_told(sign: int, outline: str) -> None:
+    radius = 90.0
+
+    def cap(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return sign * (radius - np.sqrt(radius**2 - x**2 - y**2))
+
+    wanted = plan(outline=outline, thickness=9.0, tool_radius=100.0, min_thickness=9.5)
+    faces = [sheet(cap)]
+    told = measured(make_solid(faces, wanted), faces, wanted)
+    face = told["faces"]["face"]
+    far = np.hypot(30, 20) if outline == "rectangle" else 30
+    relief = radius - np.sqrt(radius**2 - far**2)
+    assert face["relief"] == pytest.approx(relief, rel=2e-3)
+    assert face["steepest_slope_degrees"] == pytest.approx(np.degrees(np.arcsin(far / radius)), rel=0.03)
+    assert told["least_thickness"] == pytest.approx(9 if sign > 0 else 9 - relief, abs=0.01)
+    if sign > 0:
+        assert face["smallest_concave_radius"] == pytest.approx(radius, rel=2e-3)
+        assert face["share_narrower_than_tool"] == 1
+        assert told["warnings"][0].startswith("the tool does not get into 1e+02 % of `face`")
+    else:
+        assert face["smallest_concave_radius"] is None
+        assert face["share_narrower_than_tool"] == 0
+    assert "less than 9.5 mm; add" in told["warnings"][-1]
+    # Of a back, whose outside is below, the other sign is hollow.
+    below = solids.hollows(faces[0], wanted, -1)
+    assert below.max() == pytest.approx(-1 / radius if sign > 0 else 1 / radius, rel=2e-3)
+
+
+def test_hollows_are_found_whichever_way_they_run() -> None:
+    wanted = plan()
+    for angle in (0.0, 0.5, 1.1):
+
+        def trough(x: np.ndarray, y: np.ndarray, angle: float = angle) -> np.ndarray:
+            return (x * np.cos(angle) + y * np.sin(angle)) ** 2 / (2 * 25)
+
+        # Of a parabola the radius is least where it is flat.
+        assert 1 / solids.hollows(sheet(trough), wanted, 1).max() == pytest.approx(25, rel=1e-3)
+
+
+def test_heights_in_16_bits_are_what_they_were() -> None:
+    heights = sheet().z
+    numbers, offset, step = solids.scaled(heights, np.ones(heights.shape, bool))
+    assert numbers.dtype == np.uint16
+    assert (numbers.min(), numbers.max()) == (0, 65535)
+    assert np.abs(offset + step * numbers - heights).max() <= 0.5001 * step
+    flat, offset, step = solids.scaled(np.full((3, 3), 2.5), np.ones((3, 3), bool))
+    assert (flat.max(), offset, step) == (0, 2.5, 0)
+
+
+def test_what_makes_no_solid_is_refused() -> None:
+    points, triangles = grid(ripples)
+    torn, scattered, holed = points.copy(), points.copy(), triangles[:-7]
+    torn[5, 2] = np.nan
+    scattered[900, 0] += 0.3
+    dome = sheet(lambda x, y: -(x**2) / 450)  # 2 mm deep, at its edge
+    back = as_sheet("back", *grid(lambda x, y: np.full_like(x, -1.5)))
+    one = sheet()
+    cases: list[tuple[Callable[[], object], str]] = [
+        (lambda: as_sheet("face", torn, triangles), "fabrication.faces: `face` has vertices that are not finite"),
+        (lambda: as_sheet("face", scattered, triangles), "vertices that lie on no grid"),
+        (lambda: as_sheet("face", points[:-1], triangles[:10]), "vertices that lie on no grid"),
+        (lambda: as_sheet("face", points, holed), "folds, or has holes"),
+        (lambda: as_sheet("face", points, np.concatenate([triangles, triangles[:1, ::-1]])), "folds, or has holes"),
+        (lambda: make_solid([dome], plan(thickness=1.5)),
+         "fabrication.thickness: 1.5 mm: front and back cross, by 0.5 mm; it must be above 2"),
+        (lambda: make_solid([one, back], plan(faces=["face", "back"])), "front and back cross"),
+        (lambda: make_solid([dome], plan(thickness=2.05, rim=3.0)), "cross, by 0.05 mm"),
+        (lambda: make_solid([one], plan(size=[60.0, 41.0])), "fabrication.size: is 60 x 41 mm, and `face` 60 x 40"),
+        (lambda: make_solid([as_sheet("face", points + np.array([1.0, 0, 0]), triangles)], plan()), "must be at 0"),
+    ]  # fmt: skip
+    for make, line in cases:
+        with pytest.raises(ConfigError) as error:
+            make()
+        assert line in str(error.value)
+    assert make_solid([dome], plan(thickness=2.05)).volume > 0  # it is the rim that crosses above
+
+
+# ---- by the command
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
+    """The folder of a run of a lens, one iteration from its start."""
+    folder = tmp_path_factory.mktemp("solid")
+    image = np.repeat(picture(16, 12)[:, :, None], 3, 2).astype(np.float32)
+    write_file(folder / "p.exr", image, linear=True)
+    done("lens", folder / "p.exr", "-o", folder / "lens", "--pixels", "16")
+    done("optimize", folder / "lens/lens.yaml", "--set", f"run.output={folder}/runs", "--set", "run.iterations=1",
+         "--set", "run.spp=4", "--set", "run.final_spp=4", "--set", "run.certainty=false")  # fmt: skip
+    return folder / "runs/lens"
+
+
+def test_a_run_s_folder_holds_the_solid_that_its_scene_shows(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    said = done("export", run, "-o", out, "--set", "fabrication.min_thickness=30").output
+    told = json.loads((out / "fabrication.json").read_text())
+    face = mi.traverse(mi.load_file(str(out / "scene.xml"), optimize=False))
+    points = np.array(face["face.vertex_positions"]).reshape(-1, 3)
+    read = trimesh.load(out / "lens.stl")
+    assert read.is_watertight
+    assert told["volume_mm3"] == pytest.approx(read.volume, rel=1e-6)
+    assert told["extent"] == pytest.approx(read.extents.tolist(), rel=1e-6)
+    assert read.bounds[0, 2] == -25  # a quarter of the size
+    corners = {tuple(point) for point in np.asarray(read.vertices, np.float32).tolist()}
+    assert {tuple(point) for point in points.tolist()} <= corners
+    assert "lens.stl: 75 x 100 x" in said
+    assert "less than 30 mm; add" in said
+    assert told["warnings"][0] in said
+    # Heights: as seen from the receiver's side, y up.
+    map = told["faces"]["face"]["heights"]
+    wanted = points[:, 2].reshape(16, 12)[::-1]
+    numbers = np.array(mi.Bitmap(str(out / "heights.png")))
+    assert numbers.dtype == np.uint16
+    step = map["png"]["step"]
+    assert np.abs(map["png"]["offset"] + step * numbers.reshape(16, 12) - wanted).max() <= 0.51 * step
+    exact = read_image(out / "heights.exr", "linear", signed=True)[:, :, 0]
+    assert np.array_equal(exact, wanted)
+    assert map["pitch"] == pytest.approx([75 / 11, 100 / 15])
+
+
+def test_3mf_is_read_back_in_millimetres(run: Path, tmp_path: Path) -> None:
+    pytest.importorskip("lib3mf")
+    done("export", run, "-o", tmp_path / "a.3mf")
+    done("export", run, "-o", tmp_path / "a.stl")
+    with zipfile.ZipFile(tmp_path / "a.3mf") as archive:
+        model = ElementTree.fromstring(archive.read("3D/3dmodel.model"))
+    assert model.get("unit") == "millimeter"
+    space = {"m": model.tag[1:].partition("}")[0]}
+    points = [[float(v.get(axis, "")) for axis in "xyz"] for v in model.iterfind(".//m:vertex", space)]
+    triangles = [[int(t.get(f"v{k}", "")) for k in (1, 2, 3)] for t in model.iterfind(".//m:triangle", space)]
+    assert len(list(model.iterfind(".//m:build/m:item", space))) == 1
+    read, other = trimesh.Trimesh(points, triangles), trimesh.load(tmp_path / "a.stl")
+    assert read.is_watertight
+    assert read.is_winding_consistent
+    assert read.volume == pytest.approx(other.volume, rel=1e-5)
+    assert read.bounds == pytest.approx(other.bounds, abs=1e-4)
+
+
+def test_files_that_cannot_be_are_refused_in_one_line(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "there.stl").write_bytes(b"")
+    monkeypatch.setattr(export, "_writes_3mf", lambda: False)
+    for name, settings, line in (
+        ("there.stl", (), "there.stl exists; name a file that does not exist yet"),
+        ("a.stl", ("fabrication=null",), "a.stl: name a folder; of a scene a solid is made where"),
+        ("a.3mf", (), "a.3mf: 3MF needs lib3mf, which is missing: pip install 'reslrb[fabrication]'"),
+        ("a.stl", ("fabrication.thickness=1",), "fabrication.thickness: 1 mm: front and back cross, by"),
+        ("out", ("fabrication.thickness=1",), "fabrication.thickness: 1 mm: front and back cross, by"),
+        ("a.stl", ("fabrication.faces=[plate]",), "fabrication.faces[0]: there is no mesh `plate` in the scene"),
+        ("a.stl", ("fabrication.faces=[face, face]",), "fabrication.faces: must name each mesh once"),
+        ("a.stl", ("fabrication.thickness=0",), "fabrication.thickness: must be"),
+    ):
+        options = [word for setting in settings for word in ("--set", setting)]
+        result = reslrb("export", run, "-o", tmp_path / name, *options)
+        assert isinstance(result.exception, ConfigError) or result.exit_code == ExitCode.USAGE
+        assert line in f"{result.output}{result.exception}"
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["there.stl"]
+    # A folder has what can be written, and the line says what is missing.
+    said = done("export", run, "-o", tmp_path / "out").output
+    assert "lens.3mf is left out, since lib3mf is missing" in said
+    assert {"lens.stl", "lens.obj", "lens.ply"} < {path.name for path in (tmp_path / "out").iterdir()}
+    assert not (tmp_path / "out/lens.3mf").exists()
