@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import click
 import numpy as np
@@ -20,7 +21,7 @@ ITERATIONS = 100
 #: Vertices of the face per cell of the start, along each side.
 FINER = 2
 #: What options are called where a setting of the face goes by another name.
-_OPTIONS = {"picture_size": "--picture-size"}
+_OPTIONS = {"picture_size": "--picture-size", "light_distance": "--light-distance"}
 
 
 def read_luminance(path: Path) -> np.ndarray:
@@ -50,6 +51,17 @@ def read_luminance(path: Path) -> np.ndarray:
 @click.option("--thickness", type=float, help="Of the lens at its flat face, in mm; default: a quarter of --size.")
 @click.option("--mirror", is_flag=True, help="A mirror in place of a lens.")
 @click.option("--incidence", type=float, help="Between light and a mirror's normal, in degrees.  [default: 30]")
+@click.option("--outline", type=click.Choice(["rectangle", "round"]), default="rectangle", show_default=True,
+              help="Of the face; round is the ellipse in it.")  # fmt: skip
+@click.option("--tilt", type=float, nargs=2, default=(0.0, 0.0), metavar="NOD TURN",
+              help="Of the receiver about its horizontal and its vertical axis, in degrees.")  # fmt: skip
+@click.option("--light-distance", type=float, help="Of a point light from the face, in mm; default: parallel light.")
+@click.option(
+    "--sun", type=float, default=0.0, metavar="DEGREES", help="Angular diameter of parallel light: 0.53 of the sun."
+)
+@click.option("--both", is_flag=True, help="Both faces of a lens are free; the second one begins flat.")
+@click.option("--margin", type=float, default=MARGIN, show_default=True,
+              help="What the film sees about the picture, of its longer side: light there counts as lost.")  # fmt: skip
 @click.option("--through", is_flag=True, help="The picture is looked at through the receiver, from behind.")
 @click.option("--floor", type=float, help="Fraction of the maximum to which darker parts are lifted; default: found.")
 @click.option("--pixels", type=click.IntRange(16, 1024), default=PIXELS, show_default=True,
@@ -65,6 +77,12 @@ def command(
     thickness: float | None,
     mirror: bool,
     incidence: float | None,
+    outline: Literal["rectangle", "round"],
+    tilt: tuple[float, float],
+    light_distance: float | None,
+    sun: float,
+    both: bool,
+    margin: float,
     through: bool,
     floor: float | None,
     pixels: int,
@@ -81,16 +99,25 @@ def command(
     from reslrb_cli.lens.transport import resized
 
     for option, value in (("--size", size), ("--distance", distance), ("--picture-size", picture_size),
-                          ("--thickness", thickness), ("--ior", ior)):  # fmt: skip
+                          ("--thickness", thickness), ("--ior", ior),
+                          ("--light-distance", light_distance)):  # fmt: skip
         if value is not None and not 0 < value < 1e6:
             raise ConfigError(option, "", f"is {value:g}; it must be above 0")
     if floor is not None and not 0 <= floor < 1:
         raise ConfigError("--floor", "", f"is {floor:g}; it must be from 0 to below 1")
+    if not 0 <= sun < 10:
+        raise ConfigError("--sun", "", f"is {sun:g} degrees; it must be from 0 to below 10, 0.53 of the sun itself")
+    if not 0 <= margin <= 1:
+        raise ConfigError("--margin", "", f"is {margin:g}; it must be from 0 to 1, as far as the receiver reaches")
+    if sun and light_distance is not None:
+        raise ConfigError("--sun", "", "is of parallel light, and --light-distance of a point; leave one out")
+    if both and mirror:
+        raise ConfigError("--both", "", "goes with a lens: a mirror has one face")
     if incidence is not None and not mirror:
         raise ConfigError("--incidence", "", "goes with --mirror: light comes to a lens straight")
     if output.exists() and not output.is_dir():
         raise ConfigError("--output", "", f"{output} is a file; name a folder")
-    taken = next((p for n in ("lens.yaml", "scene.xml", "face.ply", "target.exr", "start.exr")
+    taken = next((p for n in ("lens.yaml", "scene.xml", "face.ply", "back.ply", "target.exr", "start.exr")
                   if (p := output / n).exists()), None)  # fmt: skip
     if taken is not None and not force:
         raise ConfigError("--output", "", f"{taken} exists; --force replaces it")
@@ -112,6 +139,9 @@ def command(
         picture_size=tuple((picture_size or size) * share),
         ior=ior,
         thickness=size / 4 if thickness is None else thickness,
+        outline=outline,
+        light_distance=np.inf if light_distance is None else light_distance,
+        tilt=tilt,
         incidence=30.0 if mirror and incidence is None else incidence or 0.0,
         through=through,
     )
@@ -122,7 +152,10 @@ def command(
         source = picture if key == "picture" else _OPTIONS.get(key, f"--{key}")
         raise ConfigError(source, "", error.message) from None
     echo(surface.summary())
-    target, irradiance = experiment.target_image(image, surface, MARGIN)
+    if outline == "round" and light_distance is not None and (mirror or rows != columns):
+        raise ConfigError("--outline", "", "round goes with parallel light, or with a point light and a lens for a "
+                          "square picture: a lamp's cone meets no other face all round")  # fmt: skip
+    target, power = experiment.target_image(image, surface, margin)
     film = target.shape[1], target.shape[0]
     with writing("--output", output):
         output.mkdir(parents=True, exist_ok=True)
@@ -132,9 +165,11 @@ def command(
         write_file(output / "target.exr", np.repeat(target.astype(np.float32)[:, :, None], 3, 2), linear=True)
         texts = {
             "face.ply": experiment.face_ply(setting, nx, ny),
-            "scene.xml": experiment.scene_xml(surface, film, columns, irradiance).encode(),
-            "lens.yaml": experiment.lens_yaml(surface, nx, ny, picture.name, ITERATIONS).encode(),
+            "scene.xml": experiment.scene_xml(surface, film, columns, power, sun, both).encode(),
+            "lens.yaml": experiment.lens_yaml(surface, nx, ny, picture.name, ITERATIONS, sun, both).encode(),
         }
+        if both:
+            texts["back.ply"] = experiment.face_ply(setting, nx, ny, back=True)
         for name, content in texts.items():
             write_atomically(output / name, lambda file, content=content: file.write(content))  # type: ignore[misc]
     echo(f"{output / 'lens.yaml'}: {nx}x{ny} heights, a picture of {columns}x{rows} pixels")

@@ -1,7 +1,8 @@
 """What `reslrb lens` writes about a face: the scene, its mesh and the configuration that shapes it further.
 
-Text and arrays alone, in millimetres and by the axes of `surface.py`. The lamp is as large as the face looks from it:
-its parallel beam meets the face and nothing beside. The mount is black about the face. The camera stands on the
+Text and arrays alone, in millimetres and by the axes of `surface.py`. The lamp of parallel light is as large as the
+face looks from it: its beam meets the face and nothing beside. A light of the sun's angle is `SUNS` such lamps, a point
+light a spot whose cone ends at the face's corners. The mount is black about the face. The camera stands on the
 receiver's normal: a point, which throws no shadow.
 """
 
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
 
 from reslrb_cli.lens import transport
 from reslrb_cli.lens.surface import Array, Rays, Setting, Surface, transmitted
@@ -26,19 +28,20 @@ _CAMERA = 0.75
 #: Between the lamp of a lens and its plane face, in mm.
 _GAP = 1.0
 
+#: Directions in which the light of a sun comes; each of them is parallel.
+SUNS = 19
 
-def lit_share(surface: Surface) -> float:
-    """Light that leaves the face, over that of a beam as large as a flat face looks from it: slopes, Fresnel's law."""
+
+def leaving(surface: Surface) -> float:
+    """Light (mm^2) that leaves the face, of parallel light of irradiance 1, or of a point light of intensity 1."""
     setting = surface.setting
     h, (ny, nx) = surface.heights, surface.heights.shape
     gy, gx = (np.gradient(h, step, axis=i) for i, step in enumerate((setting.size[1] / ny, setting.size[0] / nx)))
     x, y = transport.grid((ny, nx), setting.size)
-    rays = Rays(setting)
-    _, plane = rays.incoming(x, y, h)
-    share = rays.arriving(x, y, h, gx, gy) / plane
-    if setting.kind == "lens":
-        share = share * transmitted(np.array(1.0), setting.ior)
-    return float(np.mean(share[surface.inside]))
+    light = float(np.sum(Rays(setting).arriving(x, y, h, gx, gy))) * np.prod(setting.size) / (nx * ny)
+    if setting.kind == "lens" and not np.isfinite(setting.light_distance):
+        light = light * float(transmitted(np.array(1.0), setting.ior))  # a point light has that of its plane face in it
+    return float(light)
 
 
 def vertices(setting: Setting, nx: int, ny: int) -> tuple[Array, Array]:
@@ -57,20 +60,27 @@ def at_vertices(surface: Surface, nx: int, ny: int) -> Array:
         h = np.moveaxis(h, 0, axis)
     cells = surface.heights.shape
     at = [np.linspace(0.5, n + 0.5, count) for n, count in zip(cells, (ny, nx), strict=True)]  # of the padded map
-    places = np.stack(np.meshgrid(*at, indexing="ij"))
-    return np.asarray(scipy.ndimage.map_coordinates(h, places, order=3, mode="mirror"))
+    # not ndimage's spline, which takes what lies beyond the edges for a mirror image: a dome's edge would be bent
+    spline = RectBivariateSpline(*(np.arange(n) for n in h.shape), h)
+    return np.asarray(spline(*at))
 
 
-def face_ply(setting: Setting, nx: int, ny: int) -> bytes:
-    """The flat face as a binary PLY: a grid with normals along +z and texture coordinates, v along y."""
+def face_ply(setting: Setting, nx: int, ny: int, back: bool = False) -> bytes:
+    """The flat face as a binary PLY: a grid with normals along +z and texture coordinates, v along y.
+
+    The `back` lies at z = -thickness with normals along -z.
+    """
     x, y = vertices(setting, nx, ny)
     u, v = np.meshgrid((np.arange(nx) + 0.5) / nx, (np.arange(ny) + 0.5) / ny)
     zero = np.zeros_like(x)
-    points = np.stack([x, y, zero, zero, zero, zero + 1, u, v], axis=-1).reshape(-1, 8).astype("<f4")
+    z, normal = (-setting.thickness, -1.0) if back else (0.0, 1.0)
+    points = np.stack([x, y, zero + z, zero, zero, zero + normal, u, v], axis=-1).reshape(-1, 8).astype("<f4")
     corner = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)).ravel()
     cells = np.concatenate([
         np.stack([corner, corner + 1, corner + nx + 1], 1), np.stack([corner, corner + nx + 1, corner + nx], 1)
     ])  # fmt: skip
+    if back:
+        cells = cells[:, ::-1]
     faces: NDArray[Any] = np.empty(len(cells), dtype=[("n", "u1"), ("at", "<i4", 3)])
     faces["n"], faces["at"] = 3, cells
     names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz", "u", "v"))
@@ -88,7 +98,7 @@ def film_size(shape: tuple[int, int], margin: float) -> tuple[int, int]:
 
 
 def target_image(picture: Array, surface: Surface, margin: float) -> tuple[Array, float]:
-    """What the film is to see, and the irradiance of the beam with which its mean inside of the picture is 1.
+    """What the film is to see, and the light's irradiance or intensity with which its mean inside of the picture is 1.
 
     (H, W), of the picture (luminance, row 0 at the top) with its dark parts lifted to the floor. No light is lost.
     """
@@ -100,27 +110,74 @@ def target_image(picture: Array, surface: Surface, margin: float) -> tuple[Array
     top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
     seen = lifted[:, ::-1] if setting.through else lifted
     target[top : top + picture.shape[0], left : left + picture.shape[1]] = seen
-    beam = np.prod(lamp_size(setting)) * lit_share(surface)
-    return target, float(np.pi / ALBEDO * np.prod(setting.picture_size) / beam)
+    return target, float(np.pi / ALBEDO * np.prod(setting.picture_size) / leaving(surface))
 
 
-def lamp_size(setting: Setting) -> tuple[float, float]:
-    """Width and height (mm) of a beam that covers a face."""
-    return setting.size[0] * float(np.cos(np.radians(setting.incidence))), setting.size[1]
+def lamps(surface: Surface, power: float, sun: float) -> str:
+    """The light: parallel, of a sun's diameter (degrees), or a point's; `power` is its irradiance, or intensity."""
+    setting, rays = surface.setting, Rays(surface.setting)
+    beam = rays.toward
+    if np.isfinite(setting.light_distance):
+        angle = np.degrees(_half_cone(surface))
+        to = _triple(rays.light + beam)
+        return f"""    <emitter type="spot" id="beam">
+        <rgb name="intensity" value="{power:.9g}"/>
+        <float name="cutoff_angle" value="{angle:.6g}"/>
+        <float name="beam_width" value="{angle:.6g}"/>
+        <transform name="to_world">
+            <lookat origin="{_triple(rays.light)}" target="{to}" up="0, 1, 0"/>
+        </transform>
+    </emitter>"""
+    wide, high = setting.size[0] * float(np.cos(np.radians(setting.incidence))), setting.size[1]
+    start = np.array([0.0, 0.0, -setting.thickness - _GAP]) if setting.kind == "lens" else -beam * setting.distance
+    if setting.kind == "mirror" and setting.outline == "rectangle":
+        # oblique light meets what stands out of the plane beside it; what passes the mirror is lost
+        wide += 2 * surface.relief * abs(float(np.sin(np.radians(setting.incidence))))
+    shape = "rectangle" if setting.outline == "rectangle" else "disk"
+    if not sun:
+        return _plane(shape, "lamp", (wide, high), start, beam, np.array([0.0, 1, 0]), _emitter("beam", power))
+    # A sunflower's spiral of directions, each as much of the disk; the lamps stand so far away that none hides another,
+    # and their beams are wider than the face by what an end of it lies nearer than the middle.
+    radius = np.radians(sun) / 2
+    far = 4 * max(setting.size) / (radius * np.sqrt(np.pi / SUNS))
+    side, up, parts = np.cross(np.array([0.0, 1, 0]), beam), np.array([0.0, 1, 0]), []
+    wider = 2 * (setting.thickness if setting.kind == "lens" else surface.relief) * radius
+    for k in range(SUNS):
+        r, turn = radius * np.sqrt((k + 0.5) / SUNS), k * np.pi * (3 - np.sqrt(5))
+        toward = beam + r * np.cos(turn) * side + r * np.sin(turn) * up
+        toward /= np.linalg.norm(toward)
+        parts.append(_plane(shape, f"lamp{k}", (wide + wider, high + wider), -far * toward, toward, up,
+                            _emitter(f"beam{k}", power / SUNS)))  # fmt: skip
+    return "\n".join(parts)
 
 
-def scene_xml(surface: Surface, film: tuple[int, int], pixels: int, irradiance: float) -> str:
-    """The scene of a face; `pixels` of the `film`'s width are the picture's."""
+def _half_cone(surface: Surface) -> float:
+    """The angle (radians) between a point light's axis and its rays to a face's corners, or on average to its edge."""
+    setting, rays = surface.setting, Rays(surface.setting)
+    is_round = setting.outline == "round"
+    turn = np.radians(np.arange(0, 360, 5) if is_round else np.array([45, 135, 225, 315]))
+    radius = 0.5 if is_round else np.sqrt(0.5)
+    x, y = radius * setting.size[0] * np.cos(turn), radius * setting.size[1] * np.sin(turn)
+    ny, nx = surface.heights.shape
+    cells = [(y / setting.size[1] + 0.5) * ny - 0.5, (x / setting.size[0] + 0.5) * nx - 0.5]
+    d, _ = rays.incoming(x, y, scipy.ndimage.map_coordinates(surface.heights, cells, order=1, mode="nearest"))
+    # of a lens, in the air before its plane face
+    angles = np.arccos(rays.toward @ d) if setting.kind == "mirror" else np.arcsin(setting.ior * np.hypot(d[0], d[1]))
+    return float(np.mean(angles) if is_round else np.max(angles))
+
+
+def scene_xml(
+    surface: Surface, film: tuple[int, int], pixels: int, power: float, sun: float = 0.0, both: bool = False
+) -> str:
+    """The scene of a face; `pixels` of the `film`'s width are the picture's. `power` and `sun` are those of `lamps`.
+
+    With `both` the back is a mesh, `back.ply`, too.
+    """
     setting, rays = surface.setting, Rays(surface.setting)
     is_lens = setting.kind == "lens"
-    beam = rays.toward
-    start = -beam * setting.distance if not is_lens else np.array([0.0, 0.0, -setting.thickness - _GAP])
     away = _CAMERA * setting.distance
     seen = setting.picture_size[0] * film[0] / pixels
     fov = 2 * np.degrees(np.arctan(seen / 2 / away))
-    wide, high = lamp_size(setting)
-    if not is_lens:  # oblique light meets what stands out of the plane beside it; what misses the mirror is lost
-        wide += 2 * surface.relief * abs(float(np.sin(np.radians(setting.incidence))))
     mesh = setting.size[0] / 2, setting.size[1] / 2
     reach = 2 * max(setting.size)
     material = (
@@ -135,6 +192,11 @@ def scene_xml(surface: Surface, film: tuple[int, int], pixels: int, irradiance: 
                    np.array([0.0, 1, 0]), '<ref id="glass"/>')
         if is_lens else ""
     )  # fmt: skip
+    if both:
+        back = """    <shape type="ply" id="back">
+        <string name="filename" value="back.ply"/>
+        <ref id="glass"/>
+    </shape>"""
     beside, across = reach - mesh[0], reach - mesh[1]
     edges = [(beside, 2 * reach, sign * (reach + mesh[0]) / 2, 0.0) for sign in (1, -1)]
     edges += [(2 * mesh[0], across, 0.0, sign * (reach + mesh[1]) / 2) for sign in (1, -1)]
@@ -146,11 +208,6 @@ def scene_xml(surface: Surface, film: tuple[int, int], pixels: int, irradiance: 
     screen = _rectangle(
         "screen", (SCREEN * setting.picture_size[0], SCREEN * setting.picture_size[1]), rays.middle, -rays.normal,
         rays.up, f'<bsdf type="diffuse">\n            <rgb name="reflectance" value="{ALBEDO:g}"/>\n        </bsdf>',
-    )  # fmt: skip
-    lamp = _rectangle(
-        "lamp", (wide, high), start, beam, np.array([0.0, 1, 0]),
-        '<ref id="black"/>\n        <emitter type="directionalarea" id="beam">\n'
-        f'            <rgb name="radiance" value="{irradiance:.9g}"/>\n        </emitter>',
     )  # fmt: skip
     camera = rays.middle - away * rays.normal
     return f"""<?xml version="1.0" encoding="utf-8"?>
@@ -194,14 +251,24 @@ def scene_xml(surface: Surface, film: tuple[int, int], pixels: int, irradiance: 
 {back}
 {mount}
 {screen}
-{lamp}
+{lamps(surface, power, sun)}
 </scene>
 """
 
 
-def lens_yaml(surface: Surface, nx: int, ny: int, name: str, iterations: int) -> str:
-    """The configuration, which begins at the heights in `start.exr`."""
+def lens_yaml(
+    surface: Surface, nx: int, ny: int, name: str, iterations: int, sun: float = 0.0, both: bool = False
+) -> str:
+    """The configuration, which begins at the heights in `start.exr`; the back, where it is free, begins flat."""
     s = surface.setting
+    more = (
+        f"""  - heightmap: {{mesh: back, resolution: [{nx}, {ny}]}}  # mm along -z
+    precondition: {{laplacian: 0.03}}
+"""
+        if both
+        else ""
+    )
+    also = ("\n   faces: [face, back]," if both else "") + (f" sun: {sun:g}," if sun else "")
     return f"""# The {surface.setting.kind} that throws {json.dumps(name)}: {surface.summary()}.
 # Begin with
 #     reslrb optimize lens.yaml
@@ -214,7 +281,7 @@ parameters:
   - heightmap: {{mesh: face, resolution: [{nx}, {ny}]}}  # mm along +z
     initial: {{file: start.exr}}  # by transport of light: docs/lens.md
     precondition: {{laplacian: 0.03}}  # smooth steps: without them the finest ripples decide how long one may be
-integrator:
+{more}integrator:
   type: reslrb
   max_depth: {4 if surface.setting.kind == "lens" else 3}
 loss: {{type: l2}}
@@ -224,7 +291,7 @@ run:
   iterations: {iterations}
   spp: 64
 fabrication:  # mm; what `reslrb export` makes a solid of
-  {{kind: {s.kind}, thickness: {s.thickness:.9g}, outline: {s.outline}, ior: {s.ior:g},
+  {{kind: {s.kind}, thickness: {s.thickness:.9g}, outline: {s.outline}, ior: {s.ior:g},{also}
    size: [{s.size[0]:.9g}, {s.size[1]:.9g}]}}
 """
 
@@ -233,14 +300,26 @@ def _triple(vector: Array) -> str:
     return ", ".join(f"{value + 0.0:.9g}" for value in vector)
 
 
+def _emitter(id: str, irradiance: float) -> str:
+    return (
+        f'<ref id="black"/>\n        <emitter type="directionalarea" id="{id}">\n'
+        f'            <rgb name="radiance" value="{irradiance:.9g}"/>\n        </emitter>'
+    )
+
+
 def _rectangle(id: str, size: tuple[float, float], middle: Array, normal: Array, up: Array, content: str) -> str:
-    """A rectangle that faces along `normal`, its width across `up`."""
-    across = np.cross(up, normal)
+    return _plane("rectangle", id, size, middle, normal, up, content)
+
+
+def _plane(type: str, id: str, size: tuple[float, float], middle: Array, normal: Array, up: Array, content: str) -> str:
+    """A rectangle, or a disk, that faces along `normal`, its height along what of `up` is across that."""
+    across = np.cross(up, normal) / np.linalg.norm(np.cross(up, normal))
+    up = np.cross(normal, across)
     matrix = np.eye(4)
     matrix[:3, 0], matrix[:3, 1] = across * size[0] / 2, up * size[1] / 2
     matrix[:3, 2], matrix[:3, 3] = normal, middle
     values = " ".join(f"{value + 0.0:.9g}" for value in matrix.ravel())
-    return f"""    <shape type="rectangle" id="{id}">
+    return f"""    <shape type="{type}" id="{id}">
         <transform name="to_world">
             <matrix value="{values}"/>
         </transform>

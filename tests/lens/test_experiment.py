@@ -16,7 +16,20 @@ from reslrb_cli.optimization.loading import load_configured
 from reslrb_cli.records.images import write_file
 from reslrb_cli.scene.images import read_image
 
-OPTIONS = {"lens": [], "mirror": ["--mirror"], "through": ["--through"], "portrait": []}
+OPTIONS = {
+    "lens": [],
+    "mirror": ["--mirror"],
+    "through": ["--through"],
+    "portrait": [],
+    "round": ["--outline", "round"],
+    "tilt": ["--tilt", "10", "20"],
+    "point": ["--light-distance", "300", "--thickness", "50"],
+    "round_point": ["--light-distance", "300", "--thickness", "50", "--outline", "round"],
+    "sun": ["--sun", "0.53"],
+    "both": ["--both"],
+    "mirror_point": ["--mirror", "--light-distance", "300"],
+    "mirror_tilt": ["--mirror", "--tilt", "0", "15"],
+}
 
 
 def picture(rows: int, columns: int) -> np.ndarray:
@@ -42,7 +55,7 @@ def test_the_start_throws_the_picture_upright_and_as_bright_as_its_target(kind: 
     wanted = picture(32, 24 if kind == "portrait" else 32)
     write_file(tmp_path / "p.exr", np.repeat(wanted[:, :, None], 3, 2).astype(np.float32), linear=True)
     folder = tmp_path / "lens"
-    args = [str(tmp_path / "p.exr"), "-o", str(folder), "--pixels", "32", *OPTIONS[kind]]
+    args = [str(tmp_path / "p.exr"), "-o", str(folder), "--pixels", "32", "--floor", "0.2", *OPTIONS[kind]]
     result = CliRunner().invoke(command, args, catch_exceptions=False)
     assert result.exit_code == 0
     assert "mm deep (at 400 mm" in result.output
