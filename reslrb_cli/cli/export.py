@@ -110,6 +110,7 @@ def read_solid(config: Config, plan: Fabrication, params: mi.SceneParameters) ->
     import numpy as np
 
     from reslrb_cli.lens.solid import as_sheet, make_solid
+    from reslrb_cli.scene.graph import interpolates_normals
 
     sheets = []
     try:
@@ -118,7 +119,8 @@ def read_solid(config: Config, plan: Fabrication, params: mi.SceneParameters) ->
             if any(key not in params.properties for key in keys):
                 raise ConfigError("", f"fabrication.faces[{i}]", f"there is no mesh `{name}` in the scene")
             points, triangles = (np.array(params[key]).reshape(-1, 3) for key in keys)
-            sheets.append(as_sheet(name, points, triangles))
+            smooth = interpolates_normals(params.properties[keys[0]][2])
+            sheets.append(as_sheet(name, points, triangles, smooth))
         return sheets, make_solid(sheets, plan)
     except ConfigError as error:
         raise ConfigError(config.source, error.key, error.message) from None

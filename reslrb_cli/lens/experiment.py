@@ -186,6 +186,7 @@ def scene_xml(surface: Surface, film: tuple[int, int], pixels: int, irradiance: 
 
     <shape type="ply" id="face">
         <string name="filename" value="face.ply"/>
+        <boolean name="face_normals" value="true"/>
         <ref id="glass"/>
     </shape>
 {back}
