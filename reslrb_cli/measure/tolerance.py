@@ -30,7 +30,9 @@ def closed_by_ball(heights: Array, pitch: Sequence[float], radius: float) -> Arr
 
     `pitch`: of columns and of rows, in the unit of the heights.
     """
-    reach = [max(1, int(radius / step)) for step in pitch]
+    relief = float(np.ptp(heights))
+    widest = radius if relief >= radius else (2 * radius * relief - relief**2) ** 0.5  # what can touch anything
+    reach = [max(1, int(widest / step)) for step in pitch]
     y, x = np.mgrid[-reach[1] : reach[1] + 1, -reach[0] : reach[0] + 1]
     far = (x * pitch[0]) ** 2 + (y * pitch[1]) ** 2
     ball = np.sqrt(np.maximum(radius**2 - far, 0)) - radius
@@ -161,12 +163,12 @@ class Bench:
 
     def sun(self, spp: int) -> Array:
         """What light as wide as `plan.sun` throws: the mean over its directions."""
-        half, total = self.plan.sun / 2, 0.0
+        half, images = self.plan.sun / 2, []
         for x, y in _DIRECTIONS:
             angle = float(np.hypot(x, y))
             turned = {} if angle == 0 else self.turned(self.lamps, (x / angle, y / angle, 0), half * angle)
-            total = total + self.image(turned, max(1, spp // len(_DIRECTIONS)))
-        return np.asarray(total / len(_DIRECTIONS))
+            images.append(self.image(turned, max(1, spp // len(_DIRECTIONS))))
+        return np.asarray(np.mean(images, axis=0))
 
 
 def tolerances(
