@@ -10,6 +10,7 @@ solid's thickness along z is not above 0, and nowhere else.
 
 from __future__ import annotations
 
+import locale
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -468,10 +469,14 @@ def three_mf(solid: Solid) -> bytes:
     corners = (lib3mf.Triangle * len(triangles)).from_buffer_copy(triangles.tobytes())
     mesh.SetGeometry(positions, corners)
     model.AddBuildItem(mesh, wrapper.GetIdentityTransform())
-    with tempfile.TemporaryDirectory(prefix="reslrb-3mf-") as folder:
-        path = Path(folder) / "solid.3mf"
-        model.QueryWriter("3mf").WriteToFile(str(path))
-        return path.read_bytes()
+    before = locale.setlocale(locale.LC_ALL)  # lib3mf leaves it at C, where files of text are taken for ASCII
+    try:
+        with tempfile.TemporaryDirectory(prefix="reslrb-3mf-") as folder:
+            path = Path(folder) / "solid.3mf"
+            model.QueryWriter("3mf").WriteToFile(str(path))
+            return path.read_bytes()
+    finally:
+        locale.setlocale(locale.LC_ALL, before)
 
 
 #: What writes a solid, by the suffix of its file.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import locale
 import re
 import shutil
 import zipfile
@@ -290,7 +291,9 @@ def test_interpolated_normals_are_warned_of(run: Path, tmp_path: Path) -> None:
 
 def test_3mf_is_read_back_in_millimetres(run: Path, tmp_path: Path) -> None:
     pytest.importorskip("lib3mf")
+    before = locale.setlocale(locale.LC_ALL)
     done("export", run, "-o", tmp_path / "a.3mf")
+    assert locale.setlocale(locale.LC_ALL) == before
     done("export", run, "-o", tmp_path / "a.stl")
     with zipfile.ZipFile(tmp_path / "a.3mf") as archive:
         model = ElementTree.fromstring(archive.read("3D/3dmodel.model"))
