@@ -21,8 +21,10 @@ from reslrb_cli.lens.solid import Array, Sheet
 #: Of the distance, of the index, and in degrees: by how much each is off.
 DISTANCE, INDEX, TURN = 0.02, 0.005, 1.0
 
-#: Directions of a light as wide as the sun: its middle, and six on the circle that halves what is within and without.
-_DIRECTIONS = [(0.0, 0.0), *((np.cos(a) / 2**0.5, np.sin(a) / 2**0.5) for a in np.arange(6) * np.pi / 3)]
+#: Directions of a light as wide as the sun, by its radius: its middle, and six on a circle, on average as far from the
+#: middle (squared: a half) as those of an even disc.
+_DIRECTIONS = [(0.0, 0.0), *((np.cos(a) * (7 / 12) ** 0.5, np.sin(a) * (7 / 12) ** 0.5)
+                             for a in np.arange(6) * np.pi / 3)]  # fmt: skip
 
 
 def closed_by_ball(heights: Array, pitch: Sequence[float], radius: float) -> Array:

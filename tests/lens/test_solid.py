@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import locale
@@ -291,6 +292,8 @@ def test_interpolated_normals_are_warned_of(run: Path, tmp_path: Path) -> None:
 
 def test_3mf_is_read_back_in_millimetres(run: Path, tmp_path: Path) -> None:
     pytest.importorskip("lib3mf")
+    with contextlib.suppress(locale.Error):  # a machine without it
+        locale.setlocale(locale.LC_CTYPE, "C.UTF-8")
     before = locale.setlocale(locale.LC_ALL)
     done("export", run, "-o", tmp_path / "a.3mf")
     assert locale.setlocale(locale.LC_ALL) == before

@@ -118,6 +118,32 @@ def test_a_lens_is_turned_with_both_of_its_faces_about_the_front_s_middle(folder
     assert turned[corner, 2] - points[corner, 2] == pytest.approx(-np.sin(np.radians(1)) * points[corner, 0], abs=0.01)
 
 
+def test_a_wide_light_is_the_mean_of_turned_ones_that_spread_as_a_disc_does(folder: Path) -> None:
+    made, angles = bench(folder), []
+    turned = made.turned
+    made.turned = lambda ids, axis, degrees: (angles.append((axis, degrees)), turned(ids, axis, degrees))[1]  # type: ignore
+    made.plan = Fabrication(thickness=25.0, sun=4.0)
+    wide, planned = made.sun(56), made.render(56)
+    assert all(np.linalg.norm(axis) == pytest.approx(1) for axis, _ in angles)
+    # Of a disc of radius R the mean of the squared distance from its middle is R^2 / 2.
+    assert sum(degrees**2 for _, degrees in angles) / (len(angles) + 1) == pytest.approx(2.0**2 / 2)
+    assert sum(np.array(axis) * degrees for axis, degrees in angles) == pytest.approx(0, abs=1e-9)
+    assert wide.std() < planned.std()  # blurred
+    assert wide.sum() == pytest.approx(planned.sum(), rel=0.05)
+
+
+def test_meshes_are_moved_as_shapes_are(folder: Path) -> None:
+    made = bench(folder)
+    by = mi.ScalarTransform4f().translate([1, 2, 3])
+    values = made.moved(["face", "back"], by)
+    before, after = (np.array(v).reshape(-1, 3) for v in (made.params["face.vertex_positions"],
+                                                         values["face.vertex_positions"]))  # fmt: skip
+    assert after - before == pytest.approx(np.broadcast_to([1.0, 2, 3], before.shape), abs=1e-4)
+    moved, there = (np.ravel(matrix @ mi.Point3f(0)) for matrix in (values["back.to_world"],
+                                                                   made.params["back.to_world"]))  # fmt: skip
+    assert moved - there == pytest.approx([1, 2, 3], abs=1e-4)
+
+
 def test_a_tool_s_ball_is_put_on_the_face_s_own_vertices(folder: Path) -> None:
     made = bench(folder)
     before = np.array(made.params["face.vertex_positions"]).reshape(-1, 3)
