@@ -158,18 +158,18 @@ class Bench:
             values[key] = mi.Float(points.astype(np.float32).ravel())
         return values
 
-    def image(self, values: dict[str, Any], spp: int) -> Array:
+    def image(self, values: dict[str, Any], spp: int, seed: int = 0) -> Array:
         """The scene with these parameters, rendered."""
         with self._changed(values):
-            return self.render(spp)
+            return self.render(spp, seed)
 
     def sun(self, spp: int) -> Array:
         """What light as wide as `plan.sun` throws: the mean over its directions."""
         half, images = self.plan.sun / 2, []
-        for x, y in _DIRECTIONS:
+        for i, (x, y) in enumerate(_DIRECTIONS):  # each with noise of its own, so that it averages out
             angle = float(np.hypot(x, y))
             turned = {} if angle == 0 else self.turned(self.lamps, (x / angle, y / angle, 0), half * angle)
-            images.append(self.image(turned, max(1, spp // len(_DIRECTIONS))))
+            images.append(self.image(turned, max(1, spp // len(_DIRECTIONS)), i))
         return np.asarray(np.mean(images, axis=0))
 
 

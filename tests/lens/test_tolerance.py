@@ -129,6 +129,11 @@ def test_a_wide_light_is_the_mean_of_turned_ones_that_spread_as_a_disc_does(fold
     assert sum(degrees**2 for _, degrees in angles) / (len(angles) + 1) == pytest.approx(2.0**2 / 2)
     assert sum(np.array(axis) * degrees for axis, degrees in angles) == pytest.approx(0, abs=1e-9)
     assert wide.std() < planned.std()  # blurred
+    # As little noise as so many samples have: that of light of no width is that of an image.
+    made.plan = Fabrication(thickness=25.0, sun=1e-6)
+    exact = made.render(1024, seed=99)
+    noise = [float(np.mean((image - exact) ** 2)) for image in (made.sun(56), planned)]
+    assert noise[0] < 2.5 * noise[1]  # of equal seeds it is about seven times as large
     assert wide.sum() == pytest.approx(planned.sum(), rel=0.05)
 
 
