@@ -7,7 +7,7 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     "-o", "--output", required=True, type=click.Path(path_type=Path),
     help="Folder to make, which must not exist yet; or a file, .stl, .3mf, .obj or .ply, of the solid alone.",
 )  # fmt: skip
-def command(run: Path, overrides: tuple[str, ...], output: Path) -> None:
+@click.option("--tolerances", is_flag=True, help="Of a lens or a mirror also render what it throws where light, "
+              "distance, index and tool are not as planned; takes about 15 images of run.final_spp.")  # fmt: skip
+def command(run: Path, overrides: tuple[str, ...], output: Path, tolerances: bool) -> None:
     """Write the scene of the run in the folder RUN with the values that it recovered.
 
     FOLDER/scene.xml and what lies beside it are all that Mitsuba needs: `mi.load_file("FOLDER/scene.xml")`. Variables
@@ -44,6 +46,9 @@ def command(run: Path, overrides: tuple[str, ...], output: Path) -> None:
     from reslrb_cli.lens.solid import WRITERS
 
     config = read_recovered(run, overrides)
+    if tolerances and (config.fabrication is None or output.suffix.lower() in WRITERS):
+        raise ConfigError("--tolerances", "", "goes with a folder, and a run whose configuration has a section "
+                          "`fabrication`")  # fmt: skip
     plan, writer = config.fabrication, WRITERS.get(output.suffix.lower())
     if writer is None:
         check_folder(output)
@@ -69,11 +74,13 @@ def command(run: Path, overrides: tuple[str, ...], output: Path) -> None:
                 write_atomically(output, lambda file: file.write(content))
             tell_solid(output, plan, sheets, solid)
             return
-        beside = solid_files(plan, sheets, solid)
     moves = moves_anything(config, selection)
     check_integrator(config, config.integrator, scene, sensors, moves)
     paths = paths_of(config.integrator, scene, sensors, moves)
     integrator, why = choose_integrator(config, scene, selection.params, paths)
+    if plan is not None:
+        off = measure_tolerances(config, scene, selection.params, sheets, integrator) if tolerances else {}
+        beside = solid_files(plan, sheets, solid, off)
     with writing("--output", output):
         export_scene(described[0], selection.params, selection.scene_keys, integrator, output, run, beside)
     echo(f"{output / 'scene.xml'}: {', '.join(selection.keys)}; rendered by {integrator['type']}{why}")
@@ -110,6 +117,7 @@ def read_solid(config: Config, plan: Fabrication, params: mi.SceneParameters) ->
     import numpy as np
 
     from reslrb_cli.lens.solid import as_sheet, make_solid
+    from reslrb_cli.scene.graph import interpolates_normals
 
     sheets = []
     try:
@@ -118,14 +126,50 @@ def read_solid(config: Config, plan: Fabrication, params: mi.SceneParameters) ->
             if any(key not in params.properties for key in keys):
                 raise ConfigError("", f"fabrication.faces[{i}]", f"there is no mesh `{name}` in the scene")
             points, triangles = (np.array(params[key]).reshape(-1, 3) for key in keys)
-            sheets.append(as_sheet(name, points, triangles))
+            smooth = interpolates_normals(params.properties[keys[0]][2])
+            sheets.append(as_sheet(name, points, triangles, smooth))
         return sheets, make_solid(sheets, plan)
     except ConfigError as error:
         raise ConfigError(config.source, error.key, error.message) from None
 
 
-def solid_files(plan: Fabrication, sheets: Sequence[Sheet], solid: Solid) -> dict[str, Callable[[Path], object]]:
-    """Who writes what an exported folder holds of a solid, by the file's name; without 3MF where lib3mf is missing."""
+def measure_tolerances(
+    config: Config, scene: mi.Scene, params: mi.SceneParameters, sheets: Sequence[Sheet], integrator: dict[str, object]
+) -> dict[str, dict[str, Any]]:
+    """What the scene throws where something is not as planned, line by line (`measure/tolerance.py`). Raises
+    ConfigError."""
+    import mitsuba as mi
+    import numpy as np
+
+    from reslrb_cli.measure.tolerance import Bench
+    from reslrb_cli.measure.tolerance import tolerances as measure
+    from reslrb_cli.optimization.loading import choose_sensors
+    from reslrb_cli.scene.images import read_photo
+
+    assert config.fabrication is not None
+    sensor = choose_sensors(config, scene)[0]
+    files = config.target.file
+    if files is None or len(files) != 1:
+        raise ConfigError("--tolerances", "", "what is thrown is compared with target.file, which has to be one image")
+    target = read_photo(files[0]).image.astype(np.float64) @ np.array([0.2126, 0.7152, 0.0722])
+    width, height = (int(n) for n in scene.sensors()[sensor].film().crop_size())
+    if target.shape != (height, width):
+        raise ConfigError("--tolerances", "", f"target.file has {target.shape[1]}x{target.shape[0]} pixels, the film "
+                          f"{width}x{height}")  # fmt: skip
+    try:
+        bench = Bench(scene, params, config.fabrication, mi.load_dict(dict(integrator)), sensor)
+    except ConfigError as error:
+        raise ConfigError(config.source, error.key, error.message) from None
+    return measure(bench, sheets, target, config.run.final_spp, echo)
+
+
+def solid_files(
+    plan: Fabrication, sheets: Sequence[Sheet], solid: Solid, off: dict[str, dict[str, Any]]
+) -> dict[str, Callable[[Path], object]]:
+    """Who writes what an exported folder holds of a solid, by the file's name; without 3MF where lib3mf is missing.
+
+    `off`: what was measured of tolerances.
+    """
     import mitsuba as mi
     import numpy as np
 
@@ -153,6 +197,8 @@ def solid_files(plan: Fabrication, sheets: Sequence[Sheet], solid: Solid) -> dic
             "rows": "from the greatest y to the least; columns from the least x",
             "pitch": [float(np.diff(line).mean()) for line in (sheet.x, sheet.y)],
         }
+    if off:
+        numbers["tolerances"] = off
     files["fabrication.json"] = lambda path: path.write_text(json.dumps(numbers, indent=2) + "\n")
     return files
 

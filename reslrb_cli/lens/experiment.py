@@ -246,6 +246,7 @@ def scene_xml(
 
     <shape type="ply" id="face">
         <string name="filename" value="face.ply"/>
+        <boolean name="face_normals" value="true"/>
         <ref id="glass"/>
     </shape>
 {back}

@@ -10,6 +10,7 @@ solid's thickness along z is not above 0, and nowhere else.
 
 from __future__ import annotations
 
+import locale
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -38,13 +39,15 @@ _SAME, _SIZE = 1e-5, 1e-3
 @dataclass(frozen=True)
 class Sheet:
     """A face over a grid: `points` (ny nx, 3; mm, rows of one y, the least first), `triangles` (n, 3), counterclockwise
-    as seen from +z; `x` (nx,) and `y` (ny,). `name` is its mesh's id."""
+    as seen from +z; `x` (nx,) and `y` (ny,). `name` is its mesh's id. `smooth`: its mesh has interpolated normals, by
+    which light went elsewhere than its triangles send it."""
 
     name: str
     points: Array
     triangles: Indices
     x: Array
     y: Array
+    smooth: bool = False
 
     @property
     def z(self) -> Array:
@@ -79,7 +82,7 @@ class Solid:
 # ---- from meshes to a solid
 
 
-def as_sheet(name: str, points: Array, triangles: Indices) -> Sheet:
+def as_sheet(name: str, points: Array, triangles: Indices, smooth: bool = False) -> Sheet:
     """The grid that a mesh is: vertices (n, 3), triangles (m, 3) of either winding.
 
     Raises ConfigError, its key `fabrication.faces`, where it is none, or no height field.
@@ -112,7 +115,7 @@ def as_sheet(name: str, points: Array, triangles: Indices) -> Sheet:
         corners, area = corners[:, ::-1], -area
     if area.min(initial=1.0) <= 0 or abs(area.sum() / (np.ptp(x) * np.ptp(y)) - 1) > 1e-4:
         raise fail("folds, or has holes")
-    return Sheet(name, ordered, corners, x, y)
+    return Sheet(name, ordered, corners, x, y, smooth)
 
 
 def _areas(points: Array, triangles: Indices) -> Array:
@@ -381,6 +384,10 @@ def measured(solid: Solid, sheets: Sequence[Sheet], plan: Fabrication) -> dict[s
                 warnings.append(f"the tool does not get into {100 * narrow:.2g} % of `{sheet.name}`: its radius is "
                                 f"{plan.tool_radius:g} mm, that of hollows {1 / sharpest:.3g} mm and more")  # fmt: skip
         faces[sheet.name] = face
+        if sheet.smooth:
+            warnings.append(f"`{sheet.name}` was shaped with interpolated normals, which a solid does not have: it "
+                            'throws another picture; give the mesh <boolean name="face_normals" value="true"/> in the '
+                            "scene's file, and shape it again")  # fmt: skip
     if plan.min_thickness is not None and thin < plan.min_thickness:
         warnings.append(f"at its thinnest it is {thin:.3g} mm thick, less than {plan.min_thickness:g} mm; add "
                         f"{plan.min_thickness - thin:.3g} mm to fabrication.thickness")  # fmt: skip
@@ -462,10 +469,14 @@ def three_mf(solid: Solid) -> bytes:
     corners = (lib3mf.Triangle * len(triangles)).from_buffer_copy(triangles.tobytes())
     mesh.SetGeometry(positions, corners)
     model.AddBuildItem(mesh, wrapper.GetIdentityTransform())
-    with tempfile.TemporaryDirectory(prefix="reslrb-3mf-") as folder:
-        path = Path(folder) / "solid.3mf"
-        model.QueryWriter("3mf").WriteToFile(str(path))
-        return path.read_bytes()
+    before = locale.setlocale(locale.LC_ALL)  # lib3mf leaves it at C, where files of text are taken for ASCII
+    try:
+        with tempfile.TemporaryDirectory(prefix="reslrb-3mf-") as folder:
+            path = Path(folder) / "solid.3mf"
+            model.QueryWriter("3mf").WriteToFile(str(path))
+            return path.read_bytes()
+    finally:
+        locale.setlocale(locale.LC_ALL, before)
 
 
 #: What writes a solid, by the suffix of its file.

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
+import locale
+import re
+import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -258,9 +262,41 @@ def test_a_run_s_folder_holds_the_solid_that_its_scene_shows(run: Path, tmp_path
     assert map["pitch"] == pytest.approx([75 / 11, 100 / 15])
 
 
+def test_the_solid_throws_what_the_run_s_scene_shows(run: Path, tmp_path: Path) -> None:
+    said = done("export", run, "-o", tmp_path / "out").output
+    assert "interpolated" not in said
+    text = (tmp_path / "out/scene.xml").read_text()
+    shown = mi.load_file(str(tmp_path / "out/scene.xml"), optimize=False)
+    trimesh.load(tmp_path / "out/lens.stl").export(tmp_path / "out/read.obj", include_normals=False)
+    own, faces = re.subn(r'<shape type="\w+" id="(face|back)">.*?</shape>', "", text, flags=re.DOTALL)
+    assert faces == 2
+    made = """<shape type="obj"><string name="filename" value="read.obj"/><boolean name="face_normals" value="true"/>
+        <ref id="glass"/></shape></scene>"""
+    (tmp_path / "out/made.xml").write_text(own.replace("</scene>", made))
+    images = [np.array(mi.render(scene, spp=64, seed=1)) for scene in (
+        shown, mi.load_file(str(tmp_path / "out/made.xml"), optimize=False))]  # fmt: skip
+    # The same light paths, but for rounding.
+    assert np.abs(images[0] - images[1]).mean() < 1e-3 * images[0].mean()
+
+
+def test_interpolated_normals_are_warned_of(run: Path, tmp_path: Path) -> None:
+    done("export", run, "-o", tmp_path / "out")
+    folder = tmp_path / "smooth"
+    shutil.copytree(run.parents[1] / "lens", folder)
+    scene = (folder / "scene.xml").read_text()
+    assert scene.count('<boolean name="face_normals" value="true"/>') == 1
+    (folder / "scene.xml").write_text(scene.replace('<boolean name="face_normals" value="true"/>', ""))
+    said = done("export", run, "-o", tmp_path / "b.stl", "--set", f"scene.file={folder}/scene.xml").output
+    assert "`face` was shaped with interpolated normals, which a solid does not have" in said
+
+
 def test_3mf_is_read_back_in_millimetres(run: Path, tmp_path: Path) -> None:
     pytest.importorskip("lib3mf")
+    with contextlib.suppress(locale.Error):  # a machine without it
+        locale.setlocale(locale.LC_CTYPE, "C.UTF-8")
+    before = locale.setlocale(locale.LC_ALL)
     done("export", run, "-o", tmp_path / "a.3mf")
+    assert locale.setlocale(locale.LC_ALL) == before
     done("export", run, "-o", tmp_path / "a.stl")
     with zipfile.ZipFile(tmp_path / "a.3mf") as archive:
         model = ElementTree.fromstring(archive.read("3D/3dmodel.model"))

@@ -1,0 +1,212 @@
+"""What a finished lens or mirror throws where things are not as planned: its light, its place, its glass, its tool.
+
+Each is a rendering of the scene with what it is about really moved, by the integrator that Mitsuba has for it. Where
+turning moves the picture as a whole the shift is told, and taken out before the picture is compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import scipy.ndimage
+
+from reslrb_cli.config.schema import Fabrication
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.lens.solid import Array, Sheet
+
+#: Of the distance, of the index, and in degrees: by how much each is off.
+DISTANCE, INDEX, TURN = 0.02, 0.005, 1.0
+
+#: Directions of a light as wide as the sun, by its radius: its middle, and six on a circle, on average as far from the
+#: middle (squared: a half) as those of an even disc.
+_DIRECTIONS = [(0.0, 0.0), *((np.cos(a) * (7 / 12) ** 0.5, np.sin(a) * (7 / 12) ** 0.5)
+                             for a in np.arange(6) * np.pi / 3)]  # fmt: skip
+
+
+def closed_by_ball(heights: Array, pitch: Sequence[float], radius: float) -> Array:
+    """Heights (ny, nx) that a ball of this `radius` leaves, coming from above: their grey closing by it.
+
+    `pitch`: of columns and of rows, in the unit of the heights.
+    """
+    relief = float(np.ptp(heights))
+    widest = radius if relief >= radius else (2 * radius * relief - relief**2) ** 0.5  # what can touch anything
+    reach = [max(1, int(widest / step)) for step in pitch]
+    y, x = np.mgrid[-reach[1] : reach[1] + 1, -reach[0] : reach[0] + 1]
+    far = (x * pitch[0]) ** 2 + (y * pitch[1]) ** 2
+    ball = np.sqrt(np.maximum(radius**2 - far, 0)) - radius
+    lifted = np.pad(heights, [(reach[1],) * 2, (reach[0],) * 2], mode="edge")
+    closed = scipy.ndimage.grey_closing(lifted, footprint=far <= radius**2, structure=ball)
+    return np.asarray(closed[reach[1] : -reach[1], reach[0] : -reach[0]])
+
+
+def figures(image: Array, target: Array) -> dict[str, float]:
+    """Of luminances (H, W): SSIM and L1 within the picture, and the part of the light on the film that goes there.
+
+    The picture is the rectangle about what of the target is not black. Each image is divided by its mean there; SSIM is
+    scikit-image's, data_range the target's maximum.
+    """
+    from skimage.metrics import structural_similarity
+
+    rows, columns = (np.flatnonzero(np.any(target > 0, axis=axis)) for axis in (1, 0))
+    inside = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    seen, wanted = image[inside], target[inside]
+    seen, wanted = seen / max(float(seen.mean()), 1e-30), wanted / wanted.mean()
+    return {
+        "ssim": float(structural_similarity(seen, wanted, data_range=float(wanted.max()))),
+        "l1": float(np.abs(seen - wanted).mean()),
+        "inside": float(image[inside].sum() / max(float(image.sum()), 1e-30)),
+    }
+
+
+def shift_between(image: Array, reference: Array) -> Array:
+    """By how many (rows, columns) `image` lies farther on than `reference`, to a tenth of a pixel."""
+    from skimage.registration import phase_cross_correlation
+
+    return -np.asarray(phase_cross_correlation(reference, image, upsample_factor=10)[0])
+
+
+class Bench:
+    """A scene whose parts can be moved, and put back; `params` are those of its own."""
+
+    def __init__(
+        self, scene: mi.Scene, params: mi.SceneParameters, plan: Fabrication, integrator: mi.Integrator, sensor: int
+    ) -> None:
+        self.scene, self.params, self.plan, self.sensor = scene, params, plan, sensor
+        self._integrator = integrator
+        self.lamps = [shape.id() for shape in scene.shapes() if shape.is_emitter()]
+        self.camera = scene.sensors()[sensor].id()
+        if f"{plan.receiver}.to_world" not in params.properties:
+            raise ConfigError("", "fabrication.receiver", f"there is no `{plan.receiver}` in the scene with a to_world")
+
+    def render(self, spp: int, seed: int = 0) -> Array:
+        """Luminance (H, W)."""
+        image = np.array(mi.render(self.scene, integrator=self._integrator, sensor=self.sensor, spp=spp, seed=seed))
+        if image.ndim == 2 or image.shape[2] == 1:
+            return image.reshape(image.shape[:2]).astype(np.float64)
+        return np.asarray(image[:, :, :3].astype(np.float64) @ [0.2126, 0.7152, 0.0722])
+
+    @contextmanager
+    def _changed(self, values: dict[str, Any]) -> Iterator[None]:
+        before = {key: type(self.params[key])(self.params[key]) for key in values}
+        try:
+            for key, value in values.items():
+                self.params[key] = value
+            self.params.update()
+            yield
+        finally:
+            for key, value in before.items():
+                self.params[key] = value
+            self.params.update()
+
+    def moved(self, ids: Sequence[str], by: mi.ScalarTransform4f) -> dict[str, Any]:
+        """The parameters of what has these ids, where `by` puts them."""
+        values: dict[str, Any] = {}
+        for id in ids:
+            if (key := f"{id}.vertex_positions") in self.params.properties and f"{id}.to_world" not in (
+                self.params.properties
+            ):
+                points = np.array(self.params[key]).reshape(-1, 3)
+                matrix = np.array(by.matrix)
+                values[key] = mi.Float((points @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32).ravel())
+            elif (key := f"{id}.to_world") in self.params.properties:
+                values[key] = type(self.params[key])(by.matrix) @ self.params[key]
+        return values
+
+    def turned(self, ids: Sequence[str], axis: Sequence[float], degrees: float) -> dict[str, Any]:
+        """The same, turned about an axis through the face's middle."""
+        return self.moved(ids, mi.ScalarTransform4f().rotate(list(axis), degrees))
+
+    def farther(self, part: float) -> dict[str, Any]:
+        """Receiver and camera, farther along the way to the receiver by that part of it."""
+        key = f"{self.plan.receiver}.to_world"
+        middle = np.ravel(self.params[key] @ mi.Point3f(0)).astype(float)
+        way = mi.ScalarTransform4f().translate((part * middle).tolist())
+        return self.moved([self.plan.receiver, self.camera], way)
+
+    def denser(self, by: float) -> dict[str, Any]:
+        """The index of the glass."""
+        found = {}
+        for key in self.params.properties:
+            if key.endswith(".eta"):
+                with suppress(TypeError, ValueError):
+                    value = float(np.ravel(self.params[key])[0])
+                    if abs(value - self.plan.ior) < 1e-4:
+                        found[key] = type(self.params[key])(value + by)
+        return found
+
+    def solid_parts(self) -> list[str]:
+        """Ids of the faces, and of the flat back."""
+        return [*self.plan.faces, *(["back"] if "back" not in self.plan.faces else [])]
+
+    def tooled(self, sheets: Sequence[Sheet], radius: float) -> dict[str, Any]:
+        """The faces as a ball of this radius leaves them."""
+        values = {}
+        for sheet, side in zip(sheets, (1, -1), strict=False):
+            pitch = [float(np.diff(line).mean()) for line in (sheet.x, sheet.y)]
+            left = side * closed_by_ball(side * sheet.z, pitch, radius)
+            key = f"{sheet.name}.vertex_positions"
+            points = np.array(self.params[key]).reshape(-1, 3)
+            column, row = (
+                np.rint((points[:, axis] - line[0]) / step).astype(int)
+                for axis, (line, step) in enumerate(zip((sheet.x, sheet.y), pitch, strict=True))
+            )
+            points[:, 2] = left[row, column]
+            values[key] = mi.Float(points.astype(np.float32).ravel())
+        return values
+
+    def image(self, values: dict[str, Any], spp: int, seed: int = 0) -> Array:
+        """The scene with these parameters, rendered."""
+        with self._changed(values):
+            return self.render(spp, seed)
+
+    def sun(self, spp: int) -> Array:
+        """What light as wide as `plan.sun` throws: the mean over its directions."""
+        half, images = self.plan.sun / 2, []
+        for i, (x, y) in enumerate(_DIRECTIONS):  # each with noise of its own, so that it averages out
+            angle = float(np.hypot(x, y))
+            turned = {} if angle == 0 else self.turned(self.lamps, (x / angle, y / angle, 0), half * angle)
+            images.append(self.image(turned, max(1, spp // len(_DIRECTIONS)), i))
+        return np.asarray(np.mean(images, axis=0))
+
+
+def tolerances(
+    bench: Bench, sheets: Sequence[Sheet], target: Array, spp: int, say: Callable[[str], None] = lambda _: None
+) -> dict[str, dict[str, Any]]:
+    """`figures` against the luminance `target` (H, W) as planned and where that is off, by what is.
+
+    `shift` (columns, rows; pixels) is that of the whole picture where something was turned; it is taken out first.
+    """
+    plan, both = bench.plan, bench.solid_parts()
+    planned = bench.render(spp)
+    found: dict[str, dict[str, Any]] = {}
+
+    def tell(name: str, image: Array, turned: bool = False) -> None:
+        entry: dict[str, Any] = {}
+        if turned:
+            rows, columns = (float(value) for value in shift_between(image, planned))
+            image = scipy.ndimage.shift(image, (-rows, -columns), order=1)
+            entry["shift"] = [columns, rows]
+        found[name] = figures(image, target) | entry
+        moved = f", shifted by {np.hypot(*entry['shift']):.2g} pixels" if turned else ""
+        say(f"{name}: SSIM {found[name]['ssim']:.3f}, {100 * found[name]['inside']:.3g} % of the light inside{moved}")
+
+    tell("as planned", planned)
+    if plan.sun > 0 and bench.lamps:
+        tell(f"light of {plan.sun:g} degrees", bench.sun(spp))
+    for sign in (1, -1):
+        tell(f"distance {sign * 100 * DISTANCE:+g} %", bench.image(bench.farther(sign * DISTANCE), spp))
+    if plan.kind == "lens":
+        for sign in (1, -1):
+            tell(f"index {sign * INDEX:+g}", bench.image(bench.denser(sign * INDEX), spp))
+    for what, ids in (("light", bench.lamps), (plan.kind, both)):
+        for name, axis in (("x", (1, 0, 0)), ("y", (0, 1, 0))):
+            if ids:
+                turned = bench.image(bench.turned(ids, axis, TURN), spp)
+                tell(f"{what} turned by {TURN:g} degree about {name}", turned, turned=True)
+    if plan.tool_radius is not None:
+        tell(f"cut by a ball of {plan.tool_radius:g} mm", bench.image(bench.tooled(sheets, plan.tool_radius), spp))
+    return found

@@ -1,0 +1,177 @@
+"""Tolerances: what was moved is moved, as in a scene's file, and is put back; balls cut what they can."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from cli.tiny import done, reslrb
+from lens.test_experiment import picture
+
+from reslrb_cli.config.schema import Fabrication
+from reslrb_cli.lens.solid import as_sheet
+from reslrb_cli.measure import tolerance
+from reslrb_cli.measure.tolerance import Bench, closed_by_ball, figures, shift_between
+from reslrb_cli.records.images import write_file
+
+PTRACER = {"type": "ptracer", "max_depth": 4}
+FLAT = Fabrication(thickness=25.0)
+
+
+def test_a_ball_leaves_what_it_fits_into_and_fills_what_it_does_not() -> None:
+    x = np.linspace(-20, 20, 81)
+    wide = np.tile(30 - np.sqrt(30**2 - x**2), (5, 1))  # a trough of 30 mm in radius
+    pitch = (float(x[1] - x[0]), 20.0)
+    middle = slice(16, -16)  # beyond the edge the trough does not go on
+    assert closed_by_ball(wide, pitch, 10)[2, middle] == pytest.approx(wide[2, middle], abs=0.02)
+    filled = closed_by_ball(np.minimum(wide, 2), pitch, 60)[2]
+    # A ball of 60 mm lies on the brims of what is 2 mm deep, which are at 11 mm.
+    assert filled.min() == pytest.approx(2 - (60 - np.sqrt(60**2 - 11**2)), abs=1e-6)
+    slit = np.zeros((5, 81))
+    slit[:, 40] = -5
+    left = closed_by_ball(slit, pitch, 3)[2, 40]
+    assert left == pytest.approx(np.sqrt(9 - pitch[0] ** 2) - 3, abs=1e-6)  # between brims one pitch from its middle
+
+
+def test_shift_and_figures_are_those_of_what_was_done_to_a_picture() -> None:
+    target = np.zeros((48, 48))
+    target[8:40, 8:40] = picture(32, 32)
+    moved = np.roll(target, (2, -3), axis=(0, 1))
+    assert shift_between(moved, target) == pytest.approx([2, -3], abs=0.11)
+    assert figures(3 * target, target) == pytest.approx({"ssim": 1, "l1": 0, "inside": 1})
+    worse = figures(moved + 0.1, target)
+    assert worse["ssim"] < 0.9
+    assert worse["inside"] < 0.9
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
+    """A lens at its start, a run of one iteration from there, and that exported with its tolerances."""
+    folder = tmp_path_factory.mktemp("tolerance")
+    write_file(folder / "p.exr", np.repeat(picture(16, 16)[:, :, None], 3, 2).astype(np.float32), linear=True)
+    done("lens", folder / "p.exr", "-o", folder / "lens", "--pixels", "16")
+    done("optimize", folder / "lens/lens.yaml", "--set", f"run.output={folder}/runs", "--set", "run.iterations=1",
+         "--set", "run.spp=4", "--set", "run.final_spp=64", "--set", "run.certainty=false")  # fmt: skip
+    said = done("export", folder / "runs/lens", "-o", folder / "out", "--tolerances", "--set",
+                "fabrication.tool_radius=40").output  # fmt: skip
+    (folder / "said.txt").write_text(said)
+    return folder
+
+
+def bench(folder: Path) -> Bench:
+    scene = mi.load_file(str(folder / "out/scene.xml"), optimize=False)
+    return Bench(scene, mi.traverse(scene), FLAT, mi.load_dict(PTRACER), 0)
+
+
+def in_file(folder: Path, id: str, before: str) -> mi.Scene:
+    """The exported scene with a transform more for the shape or sensor `id`, at the end of its own."""
+    text = (folder / "out/scene.xml").read_text()
+    place = re.search(rf'id="{id}">.*?</transform>', text, re.DOTALL)
+    assert place is not None
+    end = place.end() - len("</transform>")
+    (folder / "out/moved.xml").write_text(text[:end] + before + text[end:])
+    return mi.load_file(str(folder / "out/moved.xml"), optimize=False)
+
+
+@pytest.mark.parametrize("name", ["lamp", "screen", "index"])
+def test_what_is_moved_is_what_a_scene_of_its_own_shows(name: str, folder: Path) -> None:
+    made = bench(folder)
+    planned = made.render(16)
+    if name == "lamp":
+        values = made.turned(["lamp"], (0, 1, 0), 1.0)
+        other = in_file(folder, "lamp", '<rotate y="1" angle="1"/>')
+    elif name == "screen":
+        values = made.farther(0.02)
+        in_file(folder, "screen", '<translate z="4"/>')
+        text = (folder / "out/moved.xml").read_text()
+        (folder / "out/scene2.xml").write_text(text)
+        place = re.search(r'id="camera">.*?</transform>', text, re.DOTALL)
+        assert place is not None
+        end = place.end() - len("</transform>")
+        (folder / "out/moved.xml").write_text(text[:end] + '<translate z="4"/>' + text[end:])
+        other = mi.load_file(str(folder / "out/moved.xml"), optimize=False)
+    else:
+        values = made.denser(0.005)
+        text = (folder / "out/scene.xml").read_text()
+        assert 'value="1.49"' in text
+        (folder / "out/moved.xml").write_text(text.replace('value="1.49"', 'value="1.495"'))
+        other = mi.load_file(str(folder / "out/moved.xml"), optimize=False)
+    seen = made.image(values, 16)
+    wanted = Bench(other, mi.traverse(other), FLAT, mi.load_dict(PTRACER), 0).render(16)
+    assert np.abs(seen - wanted).mean() < 3e-4 * wanted.mean()  # the same light paths
+    assert np.abs(seen - planned).mean() > 4e-3 * wanted.mean()
+    assert np.array_equal(made.render(16), planned)  # all is back in its place
+
+
+def test_a_lens_is_turned_with_both_of_its_faces_about_the_front_s_middle(folder: Path) -> None:
+    made = bench(folder)
+    points = np.array(made.params["face.vertex_positions"]).reshape(-1, 3)
+    values = made.turned(made.solid_parts(), (0, 1, 0), 1.0)
+    assert set(values) == {"face.vertex_positions", "back.to_world"}
+    turned = np.array(values["face.vertex_positions"]).reshape(-1, 3)
+    assert np.linalg.norm(turned, axis=1) == pytest.approx(np.linalg.norm(points, axis=1), abs=1e-4)
+    corner = np.argmax(points[:, 0])
+    assert turned[corner, 2] - points[corner, 2] == pytest.approx(-np.sin(np.radians(1)) * points[corner, 0], abs=0.01)
+
+
+def test_a_wide_light_is_the_mean_of_turned_ones_that_spread_as_a_disc_does(folder: Path) -> None:
+    made, angles = bench(folder), []
+    turned = made.turned
+    made.turned = lambda ids, axis, degrees: (angles.append((axis, degrees)), turned(ids, axis, degrees))[1]  # type: ignore
+    made.plan = Fabrication(thickness=25.0, sun=4.0)
+    wide, planned = made.sun(56), made.render(56)
+    assert all(np.linalg.norm(axis) == pytest.approx(1) for axis, _ in angles)
+    # Of a disc of radius R the mean of the squared distance from its middle is R^2 / 2.
+    assert sum(degrees**2 for _, degrees in angles) / (len(angles) + 1) == pytest.approx(2.0**2 / 2)
+    assert sum(np.array(axis) * degrees for axis, degrees in angles) == pytest.approx(0, abs=1e-9)
+    assert wide.std() < planned.std()  # blurred
+    # As little noise as so many samples have: that of light of no width is that of an image.
+    made.plan = Fabrication(thickness=25.0, sun=1e-6)
+    exact = made.render(1024, seed=99)
+    noise = [float(np.mean((image - exact) ** 2)) for image in (made.sun(56), planned)]
+    assert noise[0] < 2.5 * noise[1]  # of equal seeds it is about seven times as large
+    assert wide.sum() == pytest.approx(planned.sum(), rel=0.05)
+
+
+def test_meshes_are_moved_as_shapes_are(folder: Path) -> None:
+    made = bench(folder)
+    by = mi.ScalarTransform4f().translate([1, 2, 3])
+    values = made.moved(["face", "back"], by)
+    before, after = (np.array(v).reshape(-1, 3) for v in (made.params["face.vertex_positions"],
+                                                         values["face.vertex_positions"]))  # fmt: skip
+    assert after - before == pytest.approx(np.broadcast_to([1.0, 2, 3], before.shape), abs=1e-4)
+    moved, there = (np.ravel(matrix @ mi.Point3f(0)) for matrix in (values["back.to_world"],
+                                                                   made.params["back.to_world"]))  # fmt: skip
+    assert moved - there == pytest.approx([1, 2, 3], abs=1e-4)
+
+
+def test_a_tool_s_ball_is_put_on_the_face_s_own_vertices(folder: Path) -> None:
+    made = bench(folder)
+    before = np.array(made.params["face.vertex_positions"]).reshape(-1, 3)
+    sheet = as_sheet("face", before, np.array(made.params["face.faces"]).reshape(-1, 3))
+    after = np.array(made.tooled([sheet], 1e-3)["face.vertex_positions"]).reshape(-1, 3)
+    assert after == pytest.approx(before, abs=1e-4)  # a ball that fits everywhere
+    rough = np.array(made.tooled([sheet], 60.0)["face.vertex_positions"]).reshape(-1, 3)
+    assert np.all(rough[:, 2] >= before[:, 2] - 1e-4)
+    assert np.max(rough[:, 2] - before[:, 2]) > 0.05
+
+
+def test_the_command_tells_all_of_them(folder: Path) -> None:
+    told = json.loads((folder / "out/fabrication.json").read_text())["tolerances"]
+    assert list(told) == [
+        "as planned", "light of 0.53 degrees", "distance +2 %", "distance -2 %", "index +0.005", "index -0.005",
+        "light turned by 1 degree about x", "light turned by 1 degree about y", "lens turned by 1 degree about x",
+        "lens turned by 1 degree about y", "cut by a ball of 40 mm",
+    ]  # fmt: skip
+    said = (folder / "said.txt").read_text()
+    assert all(f"{name}: SSIM {entry['ssim']:.3f}, " in said for name, entry in told.items())
+    # Light that is turned goes the distance times the angle aside: 200 mm, pixels of 100 / 16 mm.
+    for axis in "xy":
+        shift = told[f"light turned by {tolerance.TURN:g} degree about {axis}"]["shift"]
+        assert np.hypot(*shift) == pytest.approx(200 * np.tan(np.radians(1)) / (100 / 16), abs=0.15)
+    result = reslrb("export", folder / "runs/lens", "-o", folder / "a.stl", "--tolerances")
+    assert "goes with a folder" in f"{result.output}{result.exception}"
