@@ -82,6 +82,103 @@ def test_a_nan_is_not_hidden(name):
     assert np.isnan(np.array(make_loss(name)(image, mi.TensorXf(np.ones((1, 2, 1), dtype=np.float32)))))
 
 
+# Fitted scales and pyramids, against double precision.
+
+
+def level(image, weights):
+    """The next level of a pyramid and its weights, by NumPy, in double precision."""
+    rows, columns = range(0, image.shape[0], 2), range(0, image.shape[1], 2)
+    blocks = [[(slice(r, r + 2), slice(c, c + 2)) for c in columns] for r in rows]
+    sums = np.array([[weights[block].sum(axis=(0, 1)) for block in row] for row in blocks])
+    means = np.array([[(weights * image)[block].sum(axis=(0, 1)) for block in row] for row in blocks])
+    return means / np.maximum(sums, 1e-300), sums
+
+
+def pyramid_in_numpy(function, scales, image, target, weights):
+    levels = []
+    for _ in range(scales):
+        levels.append((weights / weights.mean() * function(image, target)).mean())
+        (image, coarse), (target, _) = level(image, weights), level(target, weights)
+        weights = coarse
+    return np.mean(levels)
+
+
+def fitted_in_numpy(function, scales, image, target, weights):
+    scale = (weights * image * target).sum() / (weights * image**2).sum()
+    return pyramid_in_numpy(function, scales, scale * image, target, weights)
+
+
+def view_of(name, target, weights, **more):
+    view = View(0, make_loss(name, **options(name), **more), fits=True)
+    view.see(target.astype(np.float32), weights)
+    return view
+
+
+@pytest.mark.parametrize("scales", [1, 3])
+@pytest.mark.parametrize("fits", [True, False])
+@pytest.mark.parametrize("masked", [True, False])
+@pytest.mark.parametrize("name", LOSSES)
+def test_scaled_losses_and_their_gradients_are_those_of_finite_differences(name, masked, fits, scales):
+    image, target = images((6, 7, 3))
+    image, target = 3 * image + 0.1, target + 0.1
+    weights = np.ones((6, 7))
+    if masked:
+        weights[1:4, 2], weights[0, 5:], weights[4:, 0] = 0, 0.5, 0
+    view = view_of(name, target, weights, scales=scales)
+    view.fits = fits
+    full = np.broadcast_to(weights[:, :, None], image.shape)
+    of = fitted_in_numpy if fits else pyramid_in_numpy
+    given = np.where(full > 0, image, np.nan).astype(np.float32)
+    leaf = mi.TensorXf(given)
+    dr.enable_grad(leaf)
+    loss = view.objective(leaf)
+    assert float(loss[0]) == pytest.approx(of(REFERENCES[name][0], scales, image, target, full), rel=1e-5)
+    dr.backward(loss)
+    found, expected = np.array(leaf.grad), np.zeros(image.shape)
+    for place in np.ndindex(image.shape):
+        step = np.zeros(image.shape)
+        step[place] = 1e-6
+        up, down = (of(REFERENCES[name][0], scales, image + side * step, target, full) for side in (1, -1))
+        expected[place] = (up - down) / 2e-6
+    assert np.linalg.norm(found - expected) < 1e-3 * np.linalg.norm(expected)
+    np.testing.assert_allclose(found, expected, rtol=5e-3, atol=5e-3 * np.abs(expected).max() * 0.1)
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_brightness_is_no_part_of_a_fitted_loss(name):
+    image, target = images((6, 7, 3))
+    view = view_of(name, target, None)
+    once, thrice = (view.objective(mi.TensorXf((k * image).astype(np.float32)))[0] for k in (1, 3))
+    assert once == pytest.approx(thrice, rel=1e-5)
+    leaf = mi.TensorXf(image.astype(np.float32))
+    dr.enable_grad(leaf)
+    dr.backward(view.objective(leaf))
+    along, size = (np.array(leaf.grad) * image).sum(), np.abs(np.array(leaf.grad) * image).sum()
+    assert abs(along) < 1e-5 * size
+
+
+@pytest.mark.parametrize("name", ["l2", "relative_l2"])
+def test_noise_leaves_a_fitted_gradient_unbiased(name):
+    """dL/dI of two noisy halves, in the mean over many, is that of the mean image, by each pixel."""
+    rng, rounds = np.random.default_rng(4), 4000
+    image, target = (each[:6, :6, :1] + 0.3 for each in images((6, 6, 1)))
+    view, rows = view_of(name, target, None, scales=2), []
+    tall = [mi.TensorXf(each.astype(np.float32)) for each in (image, np.stack([image, image]))]
+    expected = []
+    for leaf in tall:
+        dr.enable_grad(leaf)
+        dr.backward(view.objective(leaf))
+        expected.append(np.array(leaf.grad))
+    np.testing.assert_allclose(expected[1].sum(axis=0), expected[0], rtol=1e-4, atol=1e-6)
+    for _ in range(rounds):
+        noisy = image * rng.gamma(2.0, 0.5, (2, *image.shape))
+        leaf = mi.TensorXf(noisy.astype(np.float32))
+        dr.enable_grad(leaf)
+        dr.backward(view.objective(leaf))
+        rows.append(np.array(leaf.grad).sum(axis=0).ravel())
+    compare(np.array(rows), expected[0].ravel())
+
+
 # Exposures that are recovered: their gradient, and where the images cannot tell them from parameters.
 
 #: Exposures that gradients are taken at.

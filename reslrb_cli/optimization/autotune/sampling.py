@@ -175,7 +175,7 @@ def lessons(problem: Problem) -> float:
 def sizes(problem: Problem, longer: float, planned: float = race.PLANNED) -> race.Sizes:
     """The samples of the run's steps, and what is planned of those that are taken here."""
     run, adjoint = problem.config.run, problem.config.adjoint
-    call = run.spp // race.sets_of(problem.config)
+    call = run.spp // race.sets_of(problem.config) // problem.config.halves
     part = min(problem.samples_per_pass or call, call)
     entries = sum(problem.selection.array(key).size for key in problem.selection.keys)
     sets = run.spp / call * len(problem.drawn(0))
