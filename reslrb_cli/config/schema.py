@@ -400,7 +400,6 @@ class Config(Section):
             _check_passes(own or self.integrator, self.target.render.spp, key, "target.render.spp")
         return self
 
-
     def _check_halves(self) -> None:
         """Raise an error, located, where samples have no two halves, or a view has its brightness from two places."""
         sets = self.run.batches if self.adjoint == "batched" else 1

@@ -226,8 +226,8 @@ class Results:
         self._take("final")
 
     def see(self, moment: str, view: View, image: Array, scale: float = 1.0) -> None:
-        """Take the saved image of a view, as its loss takes it (`Problem.see`), at `initial` or `final`, and the `scale`
-        that suits the target; every view in turn."""
+        """Take the saved image of a view, as its loss takes it (`Problem.see`), at `initial` or `final`, and the
+        `scale` that suits the target; every view in turn."""
         if (images := self.images.get(moment)) is not None:
             loss = view.objective(mi.TensorXf(np.ascontiguousarray(image, dtype=np.float32)))
             if view.fits and moment == "final":

@@ -146,9 +146,7 @@ def best_scale(
     return dr.select(there, along / dr.select(there, square, 1), 1)
 
 
-def fitted(
-    loss: Loss, image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /
-) -> mi.Float:
+def fitted(loss: Loss, image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float:
     """The loss of s I, with s = <I, T> / <I, I> (`best_scale`), of an image (H, W, C) or of two halves (2, H, W, C).
 
     Its derivative is  s l(s I) + L_s ds/dI,  with l the derivative of the loss. L_s = <l(s I), I> has the image twice:
@@ -338,7 +336,8 @@ class View:
 
     `made` is the target (H, W, C), without alpha; None until there is one, which `target` raises LookupError for.
     `weights`, of the same shape with a mean of 1, say what its entries count, 0 of those that `masked` leaves out;
-    None where all are the same. `fits`: the image is scaled to suit the target (`fitted`). What is `held_out` is not trained on, and has a loss of its own.
+    None where all are the same. `fits`: the image is scaled to suit the target (`fitted`). What is `held_out` is not
+    trained on, and has a loss of its own.
     """
 
     sensor: int
@@ -436,7 +435,8 @@ def view_records(views: list[View]) -> list[dict[str, Any]]:
 
 
 def make_views(config: Config, scene: mi.Scene) -> list[View]:
-    """The views of an experiment, without their targets. Raises ConfigError as `wanted_views` does, and for too many scales."""
+    """The views of an experiment, without their targets. Raises ConfigError as `wanted_views`, and for too many
+    scales."""
     wanted, views = wanted_views(config, scene), []
     total = sum(one.part for one in wanted if not one.held_out)
     for one in wanted:
