@@ -130,38 +130,53 @@ def _product(first: mi.TensorXf, second: mi.TensorXf, weights: mi.TensorXf | Non
 
 
 def best_scale(
-    halves: tuple[mi.TensorXf, mi.TensorXf], target: mi.TensorXf, weights: mi.TensorXf | None = None
+    halves: tuple[mi.TensorXf, mi.TensorXf],
+    target: mi.TensorXf,
+    weights: mi.TensorXf | None = None,
+    across: bool = False,
 ) -> mi.Float:
     """s = <I, T> / <I, I>, of width 1, attached, I the mean of two images of one expectation (H, W, C); 1, without a
-    derivative, where neither product is positive, as for black images.
+    derivative, where not both products are positive, as of black images.
 
     The value of <I, I> is that of the two, whose noise is independent, times each other; its derivative is 2 <I, dI>,
-    which noise of I leaves unbiased where dI has other samples.
+    which noise of I leaves unbiased where dI has other samples, or `across`, <I_a, dI_b> + <I_b, dI_a>.
     """
-    image = 0.5 * (halves[0] + halves[1])
-    square = _product(image, image, weights)
-    square = dr.detach(_product(*halves, weights)) + (square - dr.detach(square))
+    image, square = 0.5 * (halves[0] + halves[1]), _product(*halves, weights)
+    if not across:
+        whole = _product(image, image, weights)
+        square = dr.detach(square) + (whole - dr.detach(whole))
     along = _product(image, target, weights)
     there = (square > 0) & (along > 0)
     return dr.select(there, along / dr.select(there, square, 1), 1)
 
 
-def fitted(loss: Loss, image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float:
+def fitted(
+    loss: Loss,
+    image: mi.TensorXf,
+    target: mi.TensorXf,
+    weights: mi.TensorXf | None = None,
+    /,
+    across: bool = False,
+) -> mi.Float:
     """The loss of s I, with s = <I, T> / <I, I> (`best_scale`), of an image (H, W, C) or of two halves (2, H, W, C).
 
     Its derivative is  s l(s I) + L_s ds/dI,  with l the derivative of the loss. L_s = <l(s I), I> has the image twice:
     it is taken as the mean of <l(s I_a), I_b> and <l(s I_b), I_a>. So every product of noise with itself is gone from
     the derivative of a loss that is quadratic in the image; that of one image given twice is the exact derivative.
+    `across`: the derivative with respect to I_a has I_b in place of I, and the other way round: no path of a half sees
+    a delta that it helped to make.
     """
     first, second = halves_of(image)
-    factor = best_scale((first, second), target, weights)
-    fixed = dr.detach(factor)
+    factor = best_scale((first, second), target, weights, across)
+    fixed, one, other = dr.detach(factor), dr.detach(first), dr.detach(second)
     value = loss(fixed * (0.5 * (first + second)), target, weights)
     change = factor - fixed  # 0, with a derivative
-    first, second = dr.detach(first), dr.detach(second)
-    for one, other in ((first, second), (second, first)):
-        along = loss(fixed * one + change * other, target, weights)
-        value = value + 0.5 * (along - dr.detach(along))
+    parts = [loss(fixed * a + change * b, target, weights) for a, b in ((one, other), (other, one))]
+    if across:
+        value = dr.detach(value)
+        parts += [loss(fixed * (b + (a - dr.detach(a))), target, weights) for a, b in ((first, other), (second, one))]
+    for part in parts:
+        value = value + 0.5 * (part - dr.detach(part))
     return value
 
 
@@ -336,14 +351,15 @@ class View:
 
     `made` is the target (H, W, C), without alpha; None until there is one, which `target` raises LookupError for.
     `weights`, of the same shape with a mean of 1, say what its entries count, 0 of those that `masked` leaves out;
-    None where all are the same. `fits`: the image is scaled to suit the target (`fitted`). What is `held_out` is not
-    trained on, and has a loss of its own.
+    None where all are the same. `fits`: the image is scaled to suit the target (`fitted`, `across` as there). What is
+    `held_out` is not trained on, and has a loss of its own.
     """
 
     sensor: int
     loss: Loss
     share: float = 1.0
     fits: bool = False
+    across: bool = False
     made: mi.TensorXf | None = None
     weights: mi.TensorXf | None = None
     exposure: Exposure = field(default_factory=Exposure)
@@ -377,7 +393,7 @@ class View:
     def judge(self, image: mi.TensorXf) -> mi.Float:
         """The same of an image that has its exposure, and the target's channels."""
         target = self.target
-        loss = functools.partial(fitted, self.loss) if self.fits else self.loss
+        loss = functools.partial(fitted, self.loss, across=self.across) if self.fits else self.loss
         if not self.fits:
             image = whole_of(image)
         if self.weights is None:
@@ -445,7 +461,8 @@ def make_views(config: Config, scene: mi.Scene) -> list[View]:
         options = kind.options()
         fits = options.pop("scale", "none") == "fitted"
         loss = make_loss(kind.type, **options)
-        views.append(View(one.sensor, loss, share, fits=fits, held_out=one.held_out, wanted=one))
+        across = config.adjoint == "correlated"
+        views.append(View(one.sensor, loss, share, fits=fits, across=across, held_out=one.held_out, wanted=one))
         width, height = (int(size) for size in scene.sensors()[one.sensor].film().crop_size())
         if 2 ** (kind.scales - 1) > max(width, height):
             place = "loss" if one.loss is None else f"views[{len(views) - 1}].loss"

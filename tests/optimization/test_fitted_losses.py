@@ -53,7 +53,7 @@ def view_of(name, target, weights, **more):
 
 
 @pytest.mark.parametrize("scales", [1, 3])
-@pytest.mark.parametrize("fits", [True, False])
+@pytest.mark.parametrize("fits", [True, False, "across"])
 @pytest.mark.parametrize("masked", [True, False])
 @pytest.mark.parametrize("name", LOSSES)
 def test_scaled_losses_and_their_gradients_are_those_of_finite_differences(name, masked, fits, scales):
@@ -63,7 +63,7 @@ def test_scaled_losses_and_their_gradients_are_those_of_finite_differences(name,
     if masked:
         weights[1:4, 2], weights[0, 5:], weights[4:, 0] = 0, 0.5, 0
     view = view_of(name, target, weights, scales=scales)
-    view.fits = fits
+    view.fits, view.across = bool(fits), fits == "across"
     full = np.broadcast_to(weights[:, :, None], image.shape)
     of = fitted_in_numpy if fits else pyramid_in_numpy
     given = np.where(full > 0, image, np.nan).astype(np.float32)
@@ -175,7 +175,7 @@ def test_a_rendered_parameter_at_equal_seeds(folder, name, fits):
     assert found == pytest.approx((up - down) / 2e-6, rel=5e-3)
 
 
-@pytest.mark.parametrize("adjoint", ["batched", "independent"])
+@pytest.mark.parametrize("adjoint", ["batched", "independent", "correlated"])
 def test_a_step_is_unbiased_through_halves(folder, adjoint):
     problem = make(folder, f"run.adjoint={adjoint}", "run.spp=32")
     [view] = problem.views
