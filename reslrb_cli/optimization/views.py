@@ -358,14 +358,14 @@ class View:
     sensor: int
     loss: Loss
     share: float = 1.0
-    fits: bool = False
-    across: bool = False
     made: mi.TensorXf | None = None
     weights: mi.TensorXf | None = None
     exposure: Exposure = field(default_factory=Exposure)
     held_out: bool = False
     wanted: Wanted = field(default_factory=Wanted)
     masked: Masked = field(default_factory=Masked)
+    fits: bool = False
+    across: bool = False
 
     @property
     def target(self) -> mi.TensorXf:
