@@ -253,3 +253,19 @@ def test_nothing_is_written_of_what_is_not_asked_for(folder):
 def test_a_whole_image_is_the_mean_of_its_halves():
     image = np.arange(24, dtype=np.float32).reshape(2, 2, 2, 3)
     np.testing.assert_array_equal(np.array(whole_of(to_tensor(image))), image.mean(axis=0))
+
+
+def test_each_view_has_its_own_factor_and_those_held_out_too(folder):
+    """Light is scattered once, so that half the reflectance makes half the image, which no loss sees."""
+    scene = folder / "scene.xml"
+    first = scene.read_text()
+    sensor = first[first.index("<sensor") : first.index("</sensor>") + len("</sensor>")]
+    scene.write_text(first.replace("</scene>", sensor.replace('"0, 0, 4"', '"1, 0, 4"') + "</scene>"))
+    problem = make(folder, "scene.sensors=all", "run.held_out=[1]", "run.spp=16")
+    values, found = problem.values(), []
+    for factor in (1.0, 0.5):
+        problem.selection.set_arrays({KEY: np.float32(factor) * values[KEY]})
+        scales = [view.scale(problem.see(view, 256, 0, "test")) for view in problem.views]
+        found.append([problem.held_out_loss(), *scales])
+    assert found[0][0] == pytest.approx(found[1][0], rel=1e-4)
+    np.testing.assert_allclose(np.array(found[1][1:]), 2 * np.array(found[0][1:]), rtol=1e-4)
