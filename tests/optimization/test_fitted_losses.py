@@ -269,3 +269,11 @@ def test_each_view_has_its_own_factor_and_those_held_out_too(folder):
         found.append([problem.held_out_loss(), *scales])
     assert found[0][0] == pytest.approx(found[1][0], rel=1e-4)
     np.testing.assert_allclose(np.array(found[1][1:]), 2 * np.array(found[0][1:]), rtol=1e-4)
+
+
+def test_a_run_that_measures_what_pays_does_so_in_halves(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    done("optimize", "tiny.yaml", *settings(
+        "loss.scale=fitted", "run.spp=16", "run.iterations=4", "run.measuring=1", "integrator.guiding=auto",
+    ))  # fmt: skip
+    assert len(read_metrics("runs/tiny")) == 4

@@ -168,14 +168,14 @@ def lessons(problem: Problem) -> float:
     """How often tables of guided emission learn in an iteration of the run, in the mean over all of it."""
     run, sensors = problem.config.run, len(problem.trained)
     each = run.batches - (run.first_batch == "image") if problem.config.adjoint == "batched" else 1
-    gradients = run.iterations * each * len(problem.drawn(0)) / sensors
+    gradients = run.iterations * each * problem.config.halves * len(problem.drawn(0)) / sensors
     return learnings(max(round(gradients), 1)) * sensors / run.iterations
 
 
 def sizes(problem: Problem, longer: float, planned: float = race.PLANNED) -> race.Sizes:
     """The samples of the run's steps, and what is planned of those that are taken here."""
     run, adjoint = problem.config.run, problem.config.adjoint
-    call = run.spp // race.sets_of(problem.config) // problem.config.halves
+    call = run.spp // race.sets_of(problem.config)
     part = min(problem.samples_per_pass or call, call)
     entries = sum(problem.selection.array(key).size for key in problem.selection.keys)
     sets = run.spp / call * len(problem.drawn(0))
