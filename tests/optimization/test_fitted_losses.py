@@ -14,7 +14,7 @@ from optimization.test_losses import LOSSES, REFERENCES, images, options
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.integrators.protocol import whole_of
-from reslrb_cli.integrators.step import gradient_step, known_step, render_image
+from reslrb_cli.integrators.step import gradient_step, known_step, render_image, sample_sets
 from reslrb_cli.measure.comparison import sidak
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
@@ -277,3 +277,19 @@ def test_a_run_that_measures_what_pays_does_so_in_halves(folder, monkeypatch):
         "loss.scale=fitted", "run.spp=16", "run.iterations=4", "run.measuring=1", "integrator.guiding=auto",
     ))  # fmt: skip
     assert len(read_metrics("runs/tiny")) == 4
+
+
+@pytest.mark.parametrize("adjoint", ["batched", "independent", "correlated"])
+def test_sample_sets_are_the_halves_of_a_step(folder, adjoint):
+    problem = make(folder, f"run.adjoint={adjoint}", "run.spp=16")
+    [view], given = problem.views, problem.config.step_options()
+    problem.apply()
+    step = gradient_step(
+        problem.integrator, problem.scene, 0, view.objective, seed=3, params=problem.selection.params, **given
+    )
+    take_gradient(problem)
+    sets = sample_sets(3, given)
+    assert [spp for _, _, spp in sets] == [problem.config.set_spp] * len(sets)
+    rendered = [np.array(render_image(problem.integrator, problem.scene, 0, int(at[0]), spp)) for _, at, spp in sets]
+    expected = np.mean(rendered if adjoint == "batched" else rendered[:2], axis=0)
+    np.testing.assert_allclose(np.array(step.image), expected, rtol=1e-4, atol=1e-5)
