@@ -14,6 +14,21 @@ class Loss(Choice):
     """A mean over pixels and channels of a function of the image I and the target T."""
 
     type: str
+    scale: Literal["none", "fitted"] = "none"
+    """`fitted`: in each step, and for each view by itself, the image is multiplied by s = <I, T> / <I, I> before it is
+    compared, sums over the pixels inside the mask and all channels: how bright the image is does not matter, and the
+    gradient goes through s. <I, I> is taken between two halves of the samples, since noise would make s too small."""
+    scales: Annotated[int, Field(ge=1, le=16)] = 1
+    """The loss is the mean over so many levels of a pyramid of image and target, each of half the resolution of the
+    level before (means of 2x2 pixels by their weights): 1 compares pixels alone, more also what is seen from afar."""
+
+    @model_serializer(mode="wrap")
+    def _without_unasked(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        values: dict[str, Any] = handler(self)
+        for name, usual in (("scale", "none"), ("scales", 1)):
+            if values.get(name) == usual:
+                del values[name]
+        return values
 
 
 class L2(Loss):

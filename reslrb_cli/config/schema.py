@@ -306,13 +306,34 @@ class Config(Section):
         run = self.run
         if run.adjoint != "auto":
             return run.adjoint
-        fits = run.spp % run.batches == 0 and _passes_divide(self.integrator, run.spp // run.batches)
+        parts = run.batches * self.halves
+        fits = run.spp % parts == 0 and _passes_divide(self.integrator, run.spp // parts)
         return "batched" if fits else "independent"
+
+    @property
+    def losses(self) -> list[AnyLoss]:
+        """The losses of all views, `loss` first."""
+        return [self.loss, *(view.loss for view in self.views or () if view.loss is not None)]
+
+    @property
+    def halves(self) -> Literal[1, 2]:
+        """How many sets each set of a step's samples is made of: 2 where a loss needs two images (`scale: fitted`)."""
+        return 2 if any(loss.scale == "fitted" for loss in self.losses) else 1
+
+    @property
+    def by_pixel(self) -> bool:
+        """Whether every loss looks at each pixel by itself."""
+        return all(loss.scale == "none" and loss.scales == 1 for loss in self.losses)
+
+    @property
+    def set_spp(self) -> int:
+        """Samples per pixel of each set of a step's samples."""
+        return self.run.spp // ((self.run.batches if self.adjoint == "batched" else 1) * self.halves)
 
     def samples_obstacle(self, pixels: int) -> str | None:
         """Why the samples of a step cannot be traced with films of so many `pixels`, and what would be right."""
         run, own = self.run, self.integrator.options().get("samples_per_pass")
-        spp = run.spp // run.batches if self.adjoint == "batched" else run.spp
+        spp = self.set_spp
         if run.memory_budget is not None:
             own = largest_pass(spp, pixels)  # passes are chosen
         obstacle = passes_obstacle(spp, own, pixels, splits=self.integrator.type in ("reslrb", "walk_ad", "trajectory"))
@@ -333,6 +354,8 @@ class Config(Section):
         options: dict[str, Any] = {"spp": self.run.spp, "adjoint": self.adjoint}
         if self.adjoint == "batched":
             options |= {"batches": self.run.batches, "first_batch": self.run.first_batch}
+        if self.halves == 2:
+            options["halves"] = True
         return options
 
     @property
@@ -387,6 +410,8 @@ class Config(Section):
             if self.run.spp % self.run.batches:
                 raise located("run.batches", f"{self.run.batches} does not divide run.spp, which is {self.run.spp}")
             _check_passes(self.integrator, self.run.spp // self.run.batches, "integrator", "run.spp / run.batches")
+        if self.halves == 2:
+            self._check_halves()
         if self.run.adjoint == "correlated" and self.integrator.options().get("weight") == "adjoint":
             raise located(
                 "integrator.weight",
@@ -405,6 +430,23 @@ class Config(Section):
             key = "integrator" if own is None else "target.render.integrator"
             _check_passes(own or self.integrator, self.target.render.spp, key, "target.render.spp")
         return self
+
+    def _check_halves(self) -> None:
+        """Raise an error, located, where samples have no two halves, or a view has its brightness from two places."""
+        sets = self.run.batches if self.adjoint == "batched" else 1
+        if self.run.spp % (2 * sets):
+            reason = f"must be a multiple of {2 * sets}, not {self.run.spp}: loss.scale: fitted takes samples in halves"
+            raise located("run.spp", reason)
+        _check_passes(self.integrator, self.set_spp, "integrator", f"run.spp / {2 * sets}, by loss.scale: fitted")
+        shared = self.target.exposure if isinstance(self.target.exposure, list) else [self.target.exposure]
+        for number, view in enumerate(self.views or [None]):
+            own, key = (self.loss, "loss.scale") if view is None or view.loss is None else (view.loss, "loss.scale")
+            if view is not None and view.loss is not None:
+                key = f"views[{number}].{key}"
+            exposures = shared if view is None or view.exposure is None else [view.exposure]
+            if own.scale == "fitted" and any(isinstance(each, str) for each in exposures):
+                place = "target.exposure" if view is None or view.exposure is None else f"views[{number}].exposure"
+                raise located(key, f"cannot be fitted beside {place}, which is recovered: both scale the image")
 
 
 def _passes_divide(integrator: Integrator, spp: int) -> bool:

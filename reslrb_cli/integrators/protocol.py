@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeAlias
@@ -54,14 +55,35 @@ class StepIntegrator(Protocol):
 
 
 def first_channels(image: mi.TensorXf, count: int) -> mi.TensorXf:
-    """`image[:, :, :count]`, whose derivative keeps a NaN.
+    """`image[..., :count]`, whose derivative keeps a NaN.
 
     That of a slice adds up with atomics, which drop it on a CPU (`transport.factors.showing`).
     """
-    height, width, channels = image.shape
+    *pixels, channels = image.shape
     if channels == count:
         return image
-    lane = dr.arange(mi.UInt32, height * width * count)
+    lane = dr.arange(mi.UInt32, math.prod(pixels) * count)
     index = lane // count * channels + lane % count
     flat = dr.gather(type(image.array), image.array, index, True, dr.ReduceMode.Permute)
-    return type(image)(flat, (height, width, count))
+    return type(image)(flat, (*pixels, count))
+
+
+def halves_of(image: mi.TensorXf) -> tuple[mi.TensorXf, mi.TensorXf]:
+    """The images (H, W, C) of the two halves of a set of samples, (2, H, W, C); of one image that image twice."""
+    if len(image.shape) == 3:
+        return image, image
+    shape = image.shape[1:]
+    lane = dr.arange(mi.UInt32, math.prod(shape))
+    first, second = (
+        dr.gather(type(image.array), image.array, lane + half * math.prod(shape), True, dr.ReduceMode.Permute)
+        for half in (0, 1)
+    )
+    return type(image)(first, shape), type(image)(second, shape)
+
+
+def whole_of(image: mi.TensorXf) -> mi.TensorXf:
+    """The image (H, W, C) of a set of samples, the mean of their two halves (2, H, W, C) where it has such."""
+    if len(image.shape) == 3:
+        return image
+    first, second = halves_of(image)
+    return 0.5 * (first + second)

@@ -4,6 +4,9 @@ correlated     one set of samples for image and gradient; what naive AD of one r
 independent    the gradient's samples have a seed of their own; what `mi.render` does
 batched        the samples in batches, each with delta from the image of those before it (`_batched`)
 
+With `halves`, each of these sets of samples is two, of half the samples each, and images are (2, H, W, C): where a loss
+multiplies an image by itself, it takes the two, whose noise is independent (`Halves`).
+
 Derivatives of a loss that are not finite are refused, which is to say taken for 0, and counted (`Refused`). One NaN in
 dL/dI would make a gradient NaN wherever a path of that pixel passes, and some estimators would lose it on the way. Both
 are done in the kernel that computes dL/dI, and nobody waits for the count but who reads it.
@@ -25,7 +28,7 @@ from reslrb_cli.estimators.base import one_of
 from reslrb_cli.integrators.baselines import NaiveAD, Replayed
 from reslrb_cli.integrators.context import resolve_sensor
 from reslrb_cli.integrators.plugin import TRACERS, make_tracer
-from reslrb_cli.integrators.protocol import Job, StepIntegrator
+from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator, halves_of, whole_of
 
 Adjoint = Literal["correlated", "independent", "batched"]
 FirstBatch = Literal["image", "again"]
@@ -34,13 +37,14 @@ Objective = Callable[[Any], Any]
 #: Told of an image and of the dL/dI that its samples were differentiated with.
 OnSamples: TypeAlias = "Callable[[mi.TensorXf, mi.TensorXf], None]"
 BATCH_STREAM = 0xBA7C4E5  # keeps the batches' seeds apart from those of passes and of the second samples
+HALF_STREAM = 0x4A1F5  # and those of halves from all of these
 NONE = 0xFFFFFFFF
 
 
 @dataclass
 class Refused:
     """Entries of dL/dI that were not finite: how many, and the first one's flat index, of width 1; the shape of dL/dI,
-    (H, W, C)."""
+    (H, W, C), or of halves (2, H, W, C)."""
 
     count: mi.UInt32 = field(default_factory=lambda: dr.zeros(mi.UInt32, 1))
     first: mi.UInt32 = field(default_factory=lambda: dr.full(mi.UInt32, NONE, 1))
@@ -61,8 +65,8 @@ class Refused:
         index = int(self.first[0])
         if index == NONE:
             return None
-        _, width, channels = self.shape
-        return index // channels % width, index // channels // width, index % channels
+        height, width, channels = self.shape[-3:]
+        return index // channels % width, index // channels // width % height, index % channels
 
 
 @dataclass
@@ -106,6 +110,77 @@ def interface_of(integrator: StepIntegrator | mi.Integrator) -> StepIntegrator:
     return NaiveAD(integrator) if isinstance(integrator, mi.AdjointIntegrator) else Replayed(integrator)
 
 
+class Halves:
+    """`work` with images (2, H, W, C), of two independent halves of a job's samples, of which the image is the mean.
+
+    A dL/dI of that shape holds the derivatives with respect to each half's image. Raises ValueError for samples per
+    pixel that are not even.
+    """
+
+    def __init__(self, work: StepIntegrator) -> None:
+        self.work, self.image_apart = work, work.image_apart
+
+    def image(self, job: Job) -> mi.TensorXf:
+        """The images, without derivatives."""
+        return _both(*(self.work.image(half) for half in half_jobs(job)))
+
+    def backward(self, job: Job, gradient: mi.TensorXf) -> None:
+        """Add the gradient of the objective with dL/dI `gradient`."""
+        for half, own in zip(half_jobs(job), _apart(gradient), strict=True):
+            self.work.backward(half, own)
+
+    def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
+        """The images, and the gradient of the same samples with the dL/dI that `derivative(images)` returns."""
+        first, second = half_jobs(job)
+        images: list[mi.TensorXf] = []
+
+        def of_first(image: mi.TensorXf) -> mi.TensorXf:
+            gradients: list[mi.TensorXf] = []
+
+            def of_second(other: mi.TensorXf) -> mi.TensorXf:
+                images.append(_both(image, other))
+                gradients.extend(_apart(derivative(images[0])))
+                return gradients[1]
+
+            self.work.correlated(second, of_second)
+            return gradients[0]
+
+        self.work.correlated(first, of_first)  # the first half is traced, then the second; then both are differentiated
+        return images[0]
+
+    def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
+        """The images, and the gradient of the same samples, where dL/dI is known before either."""
+        parts = zip(half_jobs(job), _apart(gradient), strict=True)
+        return _both(*(self.work.known(half, own) for half, own in parts))
+
+
+def half_jobs(job: Job) -> tuple[Job, Job]:
+    """The two halves of a job. Raises ValueError where its samples per pixel are not even."""
+    if job.spp < 2 or job.spp % 2:
+        raise ValueError(f"the samples per pixel of a set ({job.spp}) must be even, where they are halved")
+    first, second = (replace(job, seed=seed, spp=job.spp // 2) for seed in half_seeds(job.seed))
+    return first, second
+
+
+def half_seeds(seed: mi.UInt32 | int) -> list[mi.UInt32]:
+    """The seeds of the two halves of a set of samples."""
+    seeds = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(HALF_STREAM + half))[0] for half in (0, 1)]
+    dr.make_opaque(seeds)
+    return seeds
+
+
+def _both(first: mi.TensorXf, second: mi.TensorXf) -> mi.TensorXf:
+    """Two images (H, W, C) as one tensor (2, H, W, C), detached."""
+    flat = dr.concat((dr.detach(first.array), dr.detach(second.array)))
+    return type(first)(flat, (2, *first.shape))
+
+
+def _apart(gradient: mi.TensorXf) -> tuple[mi.TensorXf, mi.TensorXf]:
+    parts = halves_of(gradient)
+    dr.eval(parts)
+    return parts
+
+
 def render_image(integrator: StepIntegrator, scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int
                  ) -> mi.TensorXf:  # fmt: skip
     """The image (H, W, C) without derivatives."""
@@ -126,6 +201,7 @@ def gradient_step(
     batches: int = 4,
     first_batch: FirstBatch = "image",
     on_samples: OnSamples | None = None,
+    halves: bool = False,
 ) -> StepResult:
     """Render, evaluate `objective(image)`, and add its gradient to every parameter of the scene that tracks one.
 
@@ -134,7 +210,9 @@ def gradient_step(
     `on_image` is called once the image and the loss are evaluated, where a step has such a moment. `batches` and
     `first_batch` belong to `adjoint="batched"`, whose loss is that of all samples' image. `on_samples` is called with
     the image of each set of samples that is differentiated, and with the dL/dI that it is differentiated with: what
-    the image alone is multiplied by has its derivative from the same samples.
+    the image alone is multiplied by has its derivative from the same samples. With `halves`, what `objective` and
+    `on_samples` are given are the images (2, H, W, C) of two halves of the samples (`protocol.whole_of`), whose number
+    has to be even in every set.
 
     `spp` of 0 are the sensor's own number. Raises ValueError for numbers out of their range and for words that are
     none of the above, and BackendError under a variant of Mitsuba that reslrb does not work with.
@@ -147,6 +225,8 @@ def gradient_step(
     if isinstance(seed, Integral):
         _check_number("seed", seed, 0, 2**32 - 1)
     work, job = interface_of(integrator), _job(scene, sensor, seed, spp, params)
+    if halves:
+        work = Halves(work)
     if adjoint == "batched":
         return _batched(work, job, objective, batches, first_batch, on_samples)
     losses: list[mi.Float | mi.TensorXf] = []
@@ -167,7 +247,7 @@ def gradient_step(
     else:
         image = work.image(job)
         _differentiate(work, replace(job, seed=second_seed(job.seed)), derivative(image), on_samples)
-    return StepResult(image, losses[0], refused)
+    return StepResult(whole_of(image), losses[0], refused)
 
 
 def known_step(
@@ -188,12 +268,15 @@ def known_step(
 def cross_step(
     integrator: StepIntegrator | mi.Integrator, scene: mi.Scene, sensor: mi.Sensor | int, objective: Objective, *,
     image_seed: int, seed: int, spp: int, params: mi.SceneParameters | None = None, on_samples: OnSamples | None = None,
+    halves: bool = False,
 ) -> None:  # fmt: skip
     """Add the gradient by the samples of `seed`, with dL/dI from the image of those of `image_seed`.
 
     Equal seeds are what `correlated` does, others `independent`. The rest is as in `gradient_step`.
     """
     work, job = interface_of(integrator), _job(scene, sensor, seed, spp, params)
+    if halves:
+        work = Halves(work)
     image = work.image(replace(job, seed=dr.opaque(mi.UInt32, image_seed)))
     _, gradient = _derivative(objective, image, Refused())
     _differentiate(work, job, gradient, on_samples)
@@ -247,7 +330,7 @@ def _batched(
         others = (image * batches - first) / (batches - 1)
         _, gradient = _derivative(objective, others, refused)
         _differentiate(integrator, parts[0], gradient * share, on_samples)
-    return StepResult(image, dr.detach(objective(image)), refused)
+    return StepResult(whole_of(image), dr.detach(objective(image)), refused)
 
 
 def _derivative(
@@ -270,6 +353,12 @@ def _derivative(
 def sample_sets(seed: int, options: dict[str, Any]) -> list[tuple[str, mi.UInt32, int]]:
     """The sets of samples of a step with these options (`Config.step_options`): name, seed, samples per pixel."""
     spp, adjoint = options["spp"], options["adjoint"]
+    if options.get("halves"):
+        return [
+            (f"{name}, half {half + 1}", own, each // 2)
+            for name, whole, each in sample_sets(seed, options | {"halves": False})
+            for half, own in enumerate(half_seeds(whole))
+        ]
     if adjoint == "batched":
         seeds = batch_seeds(seed, options["batches"])
         return [(f"batch {b + 1}", batch, spp // len(seeds)) for b, batch in enumerate(seeds)]

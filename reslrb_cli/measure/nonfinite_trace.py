@@ -103,11 +103,15 @@ def purposes(problem: Problem, view: View) -> list[tuple[int, str, Purpose]]:
     options = problem.config.step_options()
     gradient = Purpose.GRADIENT if problem.on_samples(view) is None else Purpose.BOTH
     if options["adjoint"] == "correlated":
-        return [(0, "", Purpose.BOTH)]
-    if options["adjoint"] == "independent":
-        return [(0, "", Purpose.IMAGE), (1, "", gradient)]
-    found = [(0, "", Purpose.IMAGE), *((b, "", Purpose.BOTH) for b in range(1, options["batches"]))]
-    return [*found, (0, ", again", gradient)] if options["first_batch"] == "again" else found
+        found = [(0, "", Purpose.BOTH)]
+    elif options["adjoint"] == "independent":
+        found = [(0, "", Purpose.IMAGE), (1, "", gradient)]
+    else:
+        found = [(0, "", Purpose.IMAGE), *((b, "", Purpose.BOTH) for b in range(1, options["batches"]))]
+        found += [(0, ", again", gradient)] if options["first_batch"] == "again" else []
+    if options.get("halves"):
+        return [(2 * place + half, word, purpose) for place, word, purpose in found for half in (0, 1)]
+    return found
 
 
 #: What may not be finite; `Suspect.kind` is the index.

@@ -14,6 +14,7 @@ from reslrb_cli.config.loader import loads
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.integrators.protocol import whole_of
 from reslrb_cli.integrators.step import gradient_step, known_step
 from reslrb_cli.measure.scenes import small
 from reslrb_cli.measure.workers import Begun, scratch_bytes
@@ -152,7 +153,7 @@ class Stepper(Steps):
         self.size = (int(width), int(height))
         self.texels = sum(shape[0] * shape[1] for shape in texture_shapes(self.problem).values())
         image = _noise(*self.size, int(film.base_channels_count()))
-        self._given = image if objective == "fixed" else lambda seen: dr.mean(dr.square(seen - image).array)
+        self._given = image if objective == "fixed" else lambda seen: dr.mean(dr.square(whole_of(seen) - image).array)
 
     def step(self, round: int, cold: bool, release: bool) -> dict[str, Any]:
         """Take one step and measure it, `cold` ones also their memory; others are taken twice, and the second counts.

@@ -97,8 +97,9 @@ def measure_correlated_bias(problem: Problem) -> CorrelatedBias | None:
     run = problem.config.run
     if problem.config.adjoint != "correlated":
         return None
-    unit = problem.samples_per_pass or 1
-    part = PART if problem.config.loss.type in QUADRATIC else 1
+    unit = (problem.samples_per_pass or 1) * problem.config.halves
+    fitted = problem.config.halves == 2  # which is not quadratic
+    part = PART if problem.config.loss.type in QUADRATIC and not fitted else 1
     spp = max(run.spp // part // unit * unit, unit)
     rounds = min(ROUNDS, int(SHARE * run.iterations * run.spp / (2 * spp)))
     if rounds < FEWEST_ROUNDS:
@@ -125,7 +126,7 @@ def _gradient(problem: Problem, number: int, image: str, spp: int) -> dict[str, 
             integrator, problem.scene, view.sensor, view.objective,
             seed=seed(run.seed, number, view.sensor, _IMAGES[0]),
             image_seed=seed(run.seed, number, view.sensor, image), spp=spp, params=problem.selection.params,
-            on_samples=problem.on_samples(view),
+            on_samples=problem.on_samples(view), halves=problem.config.halves == 2,
         )  # fmt: skip
     return take_gradient(problem)
 

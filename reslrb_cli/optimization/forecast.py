@@ -187,7 +187,7 @@ def make_forecast(
     parts["images of a step, gradients, what is kept of paths (reservoir)"] = rest
     between = run.iterations // run.images_every if run.images_every else 0
     images = 2 * saved_spp(problem, between=False) + between * saved_spp(problem, between=True)
-    has_verdicts = run.certainty and run.iterations >= LEAST_ITERATIONS
+    has_verdicts = run.certainty and config.by_pixel and run.iterations >= LEAST_ITERATIONS
     return Forecast(
         **{**vars(steps), "peak": sum(parts.values())},
         parts=parts,

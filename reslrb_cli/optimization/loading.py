@@ -201,7 +201,7 @@ def settled_config(integrator: ReslrbConfig, chosen: dict[str, Any], paths: str)
 
 def pass_spp(config: Config) -> int:
     """Samples per pixel of each pass of a step's gradient; where passes are chosen by `run.memory_budget`, at most."""
-    call = config.run.spp // config.run.batches if config.adjoint == "batched" else config.run.spp
+    call = config.set_spp
     return min(samples_per_pass(config) or call, call)
 
 

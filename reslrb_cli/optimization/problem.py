@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config.schema import Config
@@ -127,8 +128,8 @@ class Problem:
         if not views:
             return None
         spp = saved_spp(self, between=True)
-        images = (self.render(view.sensor, spp, 0, "held out") for view in views)
-        losses = [float(view.compare(to_tensor(image))[0]) for view, image in zip(views, images, strict=True)]
+        images = (self.see(view, spp, 0, "held out") for view in views)
+        losses = [float(view.compare(image)[0]) for view, image in zip(views, images, strict=True)]
         return float(np.mean(losses))
 
     def on_samples(self, view: View) -> OnSamples | None:
@@ -152,6 +153,16 @@ class Problem:
         return render_in_passes(
             self.integrator, self.scene, sensor, spp, config.run.seed, iteration, purpose, self.samples_per_pass
         )
+
+    def see(self, view: View, spp: int, iteration: int, purpose: str) -> mi.TensorXf:
+        """The same of a view, as its loss takes it: (H, W, C), or the images (2, H, W, C) of two halves of the samples
+        where they tell its scale."""
+        if not view.fits:
+            return to_tensor(self.render(view.sensor, spp, iteration, purpose))
+        unit = self.samples_per_pass or 1
+        half = min(unit, spp) * max(spp // (2 * min(unit, spp)), 1)
+        images = [self.render(view.sensor, half, iteration, f"{purpose}, half {number}") for number in (1, 2)]
+        return to_tensor(np.stack(images))
 
     @functools.cached_property
     def meter(self) -> ErrorMeter:

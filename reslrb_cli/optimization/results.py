@@ -207,6 +207,7 @@ class Results:
         self._last: dict[str, float] = {}
         self._values: dict[str, dict[str, Any]] = {key: {} for key in problem.selection.keys}
         self._losses: list[float] = []
+        self._scales: dict[str, float] = {}
         self.images = {"initial": Images(), "final": Images()}
         self._errors: dict[str, list[float]] = {}
         self._take("initial")
@@ -224,10 +225,13 @@ class Results:
         self._last = self.meter.errors(self.problem.selection.array)
         self._take("final")
 
-    def see(self, moment: str, view: View, image: Array) -> None:
-        """Take the saved image (H, W, C) of a view, at `initial` or `final`; every view in turn."""
+    def see(self, moment: str, view: View, image: Array, scale: float = 1.0) -> None:
+        """Take the saved image of a view, as its loss takes it (`Problem.see`), at `initial` or `final`, and the
+        `scale` that suits the target; every view in turn."""
         if (images := self.images.get(moment)) is not None:
             loss = view.objective(mi.TensorXf(np.ascontiguousarray(image, dtype=np.float32)))
+            if view.fits and moment == "final":
+                self._scales[str(view.sensor)] = scale
             (images.held_out if view.held_out else images.trained).append(float(loss[0]))
 
     def _take(self, moment: str) -> None:
@@ -242,7 +246,8 @@ class Results:
         quantity and shape, the share of entries that light and sensor reach, the root mean square of the truth over
         those (`scale`), and `initial`, `final` and `true` values (`summary`). `loss_trend` says how loss and noise were
         at the start and the end, null for a short run; `image_loss` is that of the saved images, which have less noise,
-        of views that are trained on, and `held_out` the mean of those that are not; `worse` are the keys whose error
+        of views that are trained on (`fitted_scale`: what the final ones are multiplied by, by sensor, with
+        `loss.scale: fitted` alone), and `held_out` the mean of those that are not; `worse` are the keys whose error
         ended above its start. `samples` are those of a step and of a rendered target, null without one.
         """
         trend = find_trend(self._losses)
@@ -266,6 +271,8 @@ class Results:
             "worse": worse,
             "samples": {"step": run.spp, "target": None if render is None else render.spp},
         }
+        if self._scales:
+            found["fitted_scale"] = self._scales
         return {name: finite(value) for name, value in found.items()}
 
     def _about(self, key: str) -> dict[str, Any]:

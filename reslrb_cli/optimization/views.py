@@ -3,7 +3,8 @@
 - `Loss`: how an image is compared with its target. Each takes the image I, (H, W, C) and attached to the AD graph, the
   target T of the same shape, both in linear radiance, and what each entry weighs, of that shape too with a mean of 1
   (None: all the same). It returns a width-1 array: a mean over pixels and channels, so that it depends neither on the
-  resolution nor on how many pixels are left out.
+  resolution nor on how many pixels are left out. `fitted` and `pyramid` make others of them: the image multiplied by
+  what suits the target best, and the mean over several resolutions.
 - `Exposure`: what a view's image is multiplied by before it is compared: a number, or one that is recovered with the
   rest. The model is  target = exposure * image,  with one exposure E for all channels or one for each. The derivative
   of a loss L(E I) with respect to E is the sum over pixels of dL/dI I / E: it takes the samples that the other
@@ -33,7 +34,7 @@ from reslrb_cli.config.parameters import Settings
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.views import Mask, ViewSpec
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.integrators.protocol import first_channels
+from reslrb_cli.integrators.protocol import first_channels, halves_of, whole_of
 from reslrb_cli.optimization.loading import choose_sensors
 from reslrb_cli.scene.cameras import read_cameras
 from reslrb_cli.scene.parameters import Selection
@@ -84,9 +85,99 @@ LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2, "relative_l2": relative_l2, "log_
 QUADRATIC = ("l2", "relative_l2")
 
 
-def make_loss(type: str, **options: float) -> Loss:
-    """Return the loss of that name with its options bound. Raises KeyError for an unknown name."""
-    return functools.partial(LOSSES[type], **options)
+def make_loss(type: str, scales: int = 1, **options: float) -> Loss:
+    """Return the loss of that name with its options bound, of so many `scales`. Raises KeyError for an unknown name."""
+    loss = functools.partial(LOSSES[type], **options)
+    return loss if scales == 1 else functools.partial(pyramid, loss, scales)
+
+
+def pyramid(
+    loss: Loss, scales: int, image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /
+) -> mi.Float:
+    """The mean of a loss over `scales` levels, the first of which are image and target themselves.
+
+    Each pixel of a level is the mean of 2x2 of the level before by their weights, and weighs as much as those together:
+    one along an odd border has fewer, and what is left out is no part of any.
+    """
+    total = loss(image, target, weights)
+    if weights is None:
+        weights = dr.full(mi.TensorXf, 1, image.shape)
+    for _ in range(1, scales):
+        coarse = _sums(weights)
+        image, target = (_sums(weights * each) / dr.maximum(coarse, 1e-30) for each in (image, target))
+        weights = coarse / dr.mean(coarse, axis=None)
+        total = total + loss(image, target, weights)
+    return total / scales
+
+
+def _sums(image: mi.TensorXf) -> mi.TensorXf:
+    """The sums over 2x2 pixels of an image (H, W, C), (ceil(H / 2), ceil(W / 2), C), attached."""
+    height, width, channels = image.shape
+    shape = ((height + 1) // 2, (width + 1) // 2, channels)
+    lane = dr.arange(mi.UInt32, math.prod(shape))
+    channel, column = lane % channels, 2 * (lane // channels % shape[1])
+    row, total = 2 * (lane // (channels * shape[1])), dr.zeros(mi.Float, math.prod(shape))
+    for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        inside = (row + down < height) & (column + right < width)
+        index = ((row + down) * width + column + right) * channels + channel
+        # Each entry has one place to go: the derivative needs no atomics, and is the same every time.
+        total += dr.gather(mi.Float, image.array, index, inside, dr.ReduceMode.Permute)
+    return mi.TensorXf(total, shape)
+
+
+def _product(first: mi.TensorXf, second: mi.TensorXf, weights: mi.TensorXf | None) -> mi.Float:
+    return _mean(first * second, weights)
+
+
+def best_scale(
+    halves: tuple[mi.TensorXf, mi.TensorXf],
+    target: mi.TensorXf,
+    weights: mi.TensorXf | None = None,
+    across: bool = False,
+) -> mi.Float:
+    """s = <I, T> / <I, I>, of width 1, attached, I the mean of two images of one expectation (H, W, C); 1, without a
+    derivative, where not both products are positive, as of black images.
+
+    The value of <I, I> is that of the two, whose noise is independent, times each other; its derivative is 2 <I, dI>,
+    which noise of I leaves unbiased where dI has other samples, or `across`, <I_a, dI_b> + <I_b, dI_a>.
+    """
+    image, square = 0.5 * (halves[0] + halves[1]), _product(*halves, weights)
+    if not across:
+        whole = _product(image, image, weights)
+        square = dr.detach(square) + (whole - dr.detach(whole))
+    along = _product(image, target, weights)
+    there = (square > 0) & (along > 0)
+    return dr.select(there, along / dr.select(there, square, 1), 1)
+
+
+def fitted(
+    loss: Loss,
+    image: mi.TensorXf,
+    target: mi.TensorXf,
+    weights: mi.TensorXf | None = None,
+    /,
+    across: bool = False,
+) -> mi.Float:
+    """The loss of s I, with s = <I, T> / <I, I> (`best_scale`), of an image (H, W, C) or of two halves (2, H, W, C).
+
+    Its derivative is  s l(s I) + L_s ds/dI,  with l the derivative of the loss. L_s = <l(s I), I> has the image twice:
+    it is taken as the mean of <l(s I_a), I_b> and <l(s I_b), I_a>. So every product of noise with itself is gone from
+    the derivative of a loss that is quadratic in the image; that of one image given twice is the exact derivative.
+    `across`: the derivative with respect to I_a has I_b in place of I, and the other way round: no path of a half sees
+    a delta that it helped to make.
+    """
+    first, second = halves_of(image)
+    factor = best_scale((first, second), target, weights, across)
+    fixed, one, other = dr.detach(factor), dr.detach(first), dr.detach(second)
+    value = loss(fixed * (0.5 * (first + second)), target, weights)
+    change = factor - fixed  # 0, with a derivative
+    parts = [loss(fixed * a + change * b, target, weights) for a, b in ((one, other), (other, one))]
+    if across:
+        value = dr.detach(value)
+        parts += [loss(fixed * (b + (a - dr.detach(a))), target, weights) for a, b in ((first, other), (second, one))]
+    for part in parts:
+        value = value + 0.5 * (part - dr.detach(part))
+    return value
 
 
 Array = np.ndarray[Any, Any]
@@ -260,7 +351,8 @@ class View:
 
     `made` is the target (H, W, C), without alpha; None until there is one, which `target` raises LookupError for.
     `weights`, of the same shape with a mean of 1, say what its entries count, 0 of those that `masked` leaves out;
-    None where all are the same. What is `held_out` is not trained on, and has a loss of its own.
+    None where all are the same. `fits`: the image is scaled to suit the target (`fitted`, `across` as there). What is
+    `held_out` is not trained on, and has a loss of its own.
     """
 
     sensor: int
@@ -272,6 +364,8 @@ class View:
     held_out: bool = False
     wanted: Wanted = field(default_factory=Wanted)
     masked: Masked = field(default_factory=Masked)
+    fits: bool = False
+    across: bool = False
 
     @property
     def target(self) -> mi.TensorXf:
@@ -290,16 +384,31 @@ class View:
         self.made = to_tensor(target)
 
     def compare(self, image: mi.TensorXf) -> mi.Float:
-        """The loss of an (H, W, C) image, of width 1, attached; alpha is left out, the view's exposure applied."""
+        """The loss of an image, of width 1, attached; alpha is left out, the view's exposure applied.
+
+        The image is (H, W, C), or (2, H, W, C) of two halves of its samples, which `fitted` makes use of.
+        """
         return self.judge(self.exposure.applied(first_channels(image, self.target.shape[2])))
 
     def judge(self, image: mi.TensorXf) -> mi.Float:
         """The same of an image that has its exposure, and the target's channels."""
         target = self.target
+        loss = functools.partial(fitted, self.loss, across=self.across) if self.fits else self.loss
+        if not self.fits:
+            image = whole_of(image)
         if self.weights is None:
-            return self.loss(image, target)
+            return loss(image, target)
         # Whatever stands in a pixel that is left out, also if it is not finite, has neither loss nor derivative.
-        return self.loss(dr.select(self.weights > 0, image, target), target, self.weights)
+        return loss(dr.select(self.weights > 0, image, target), target, self.weights)
+
+    def scale(self, image: mi.TensorXf) -> float:
+        """What an image as in `compare` is multiplied by, beside the exposure: 1, unless it is `fitted`."""
+        if not self.fits:
+            return 1.0
+        exposed = self.exposure.applied(first_channels(image, self.target.shape[2]))
+        if self.weights is not None:
+            exposed = dr.select(self.weights > 0, exposed, self.target)
+        return float(best_scale(halves_of(exposed), self.target, self.weights)[0])
 
     def kept(self, image: Array) -> Array:
         """An image of the target's shape, 0 where pixels are left out."""
@@ -342,14 +451,23 @@ def view_records(views: list[View]) -> list[dict[str, Any]]:
 
 
 def make_views(config: Config, scene: mi.Scene) -> list[View]:
-    """The views of an experiment, without their targets. Raises ConfigError as `wanted_views` does."""
+    """The views of an experiment, without their targets. Raises ConfigError as `wanted_views`, and for too many
+    scales."""
     wanted, views = wanted_views(config, scene), []
     total = sum(one.part for one in wanted if not one.held_out)
     for one in wanted:
         kind = one.loss or config.loss
         share = 1.0 if one.held_out else one.part / total
-        loss = make_loss(kind.type, **kind.options())
-        views.append(View(one.sensor, loss, share, held_out=one.held_out, wanted=one))
+        options = kind.options()
+        fits = options.pop("scale", "none") == "fitted"
+        loss = make_loss(kind.type, **options)
+        across = config.adjoint == "correlated"
+        views.append(View(one.sensor, loss, share, fits=fits, across=across, held_out=one.held_out, wanted=one))
+        width, height = (int(size) for size in scene.sensors()[one.sensor].film().crop_size())
+        if 2 ** (kind.scales - 1) > max(width, height):
+            place = "loss" if one.loss is None else f"views[{len(views) - 1}].loss"
+            reason = f"{kind.scales} levels need an image of at least {2 ** (kind.scales - 1)} pixels, not"
+            raise ConfigError(config.source, f"{place}.scales", f"{reason} {width}x{height}")
     return views
 
 

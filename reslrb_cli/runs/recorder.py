@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.errors import MachineError, NonFinite, describe, is_machine_fault, tell
+from reslrb_cli.integrators.protocol import whole_of
 from reslrb_cli.optimization.decisions import Scaled
 from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.nonfinite import Findings
@@ -26,6 +27,7 @@ from reslrb_cli.optimization.problem import Problem, saved_spp
 from reslrb_cli.optimization.sensitivity import curvature_line, step_line
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
+from reslrb_cli.optimization.views import Exposure
 from reslrb_cli.records.atomic import Reserve, remove_parts, size_of
 from reslrb_cli.records.checkpoint import (
     NONFINITE_FILE_NAME,
@@ -353,7 +355,11 @@ class Recording:
 
     def _measure_certainty(self) -> None:
         last = self.course.last
-        if last is None or self.done < LEAST_ITERATIONS or not self.problem.config.run.certainty:
+        config = self.problem.config
+        if last is None or self.done < LEAST_ITERATIONS or not config.run.certainty:
+            return
+        if not config.by_pixel:
+            logger.info("how certain the values are is not measured: it takes a loss of each pixel by itself")
             return
         logger.info("measuring how certain the values are")
         self.certainty = self.course.certainty.measure(self.done, last.elapsed_s, self._stop)
@@ -412,10 +418,13 @@ class Recording:
         if name == "final":
             logger.info(f"rendering the final image: {spp} spp")
         for view in self.problem.views:
-            image = self.problem.render(view.sensor, spp, self.done, "saved image")
+            seen = self.problem.see(view, spp, self.done, "saved image")
+            image, scale = np.array(whole_of(seen)), view.scale(seen)
             exposed = view.exposure.of_array(image)  # as the target is
+            if view.fits:
+                exposed = Exposure(view.exposure.fixed * scale).of_array(image)
             self._write_image(name, view.sensor, exposed)
-            self.course.results.see(name, view, image)
+            self.course.results.see(name, view, np.array(seen), scale)
             if name == "final":
                 suffix = self._image_name("", view.sensor)
                 towards = self.problem.image_gradient(view, image)

@@ -59,8 +59,7 @@ class Judge:
         problem.selection.set_arrays(values)
         total = 0.0
         for view in problem.trained:
-            image = problem.render(view.sensor, self.spp, 0, _PURPOSE)
-            total += float(view.objective(mi.TensorXf(np.ascontiguousarray(image)))[0])
+            total += float(view.objective(problem.see(view, self.spp, 0, _PURPOSE))[0])
         return total
 
     def error(self, values: dict[str, Array]) -> float | None:

@@ -168,8 +168,8 @@ def is_auto(config: Config, option: str) -> bool:
 
 
 def sets_of(config: Config) -> int:
-    """The sets of a step's samples that have one dL/dI each."""
-    return config.run.batches if config.adjoint == "batched" else 1
+    """The sets that a step's samples are traced in: those that have one dL/dI each, or the halves of these."""
+    return (config.run.batches if config.adjoint == "batched" else 1) * config.halves
 
 
 def situation(problem: Problem) -> dict[str, Any]:
