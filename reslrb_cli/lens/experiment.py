@@ -195,6 +195,7 @@ def scene_xml(
     if both:
         back = """    <shape type="ply" id="back">
         <string name="filename" value="back.ply"/>
+        <boolean name="face_normals" value="true"/>
         <ref id="glass"/>
     </shape>"""
     beside, across = reach - mesh[0], reach - mesh[1]
