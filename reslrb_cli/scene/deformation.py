@@ -291,6 +291,12 @@ class Deformation:
         self.values[name] = _opaque(dr.zeros(mi.TensorXf, (*resolution[::-1], 1)))
         self.quantities[name] = "length"
 
+    def laid_over(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (N, 3) and texture coordinates (N, 2) of the first mesh that the heightmap `name` displaces, as it
+        began."""
+        moved = next(each for each in self._moved.values() if each.heightmap == name)
+        return np.array(moved.base).T, np.array(moved.texcoords).T
+
     def place(self) -> list[Any]:
         """Give the scene what follows from the values; `params.update()` has to follow. Returns what to evaluate."""
         for key, moved in self._moved.items():

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.parameters import HEIGHTMAP, WORDS, ParameterSpec, Settings
+from reslrb_cli.config.parameters import HEIGHTMAP, REGULARIZERS, WORDS, ParameterSpec, Settings
 from reslrb_cli.scene.catalog import ParameterInfo, describe, list_parameters
 from reslrb_cli.scene.deformation import Deformation, Movable, find_movable
 from reslrb_cli.scene.values import ParameterValue, Place, check_bounds, check_transform, initial_array, settle
@@ -56,6 +56,29 @@ class Selection:
     def spec(self, key: str) -> Settings:
         """What the configuration says about the selected `key`."""
         return self.specs[key]
+
+    def kind(self, key: str) -> str:
+        """What regularizers take `key` for: `heightmap`, `bitmap`, `mesh`; "" for anything else."""
+        slot = self.slot(key)
+        if key in self.deformation.values:
+            return HEIGHTMAP if key.endswith(f".{HEIGHTMAP}") else ""
+        if key.endswith(".vertex_positions"):
+            return "mesh"
+        return "bitmap" if slot.is_texture and not slot.halo and not slot.is_signed else ""
+
+    def check_regularizers(self, key: str, place: Place) -> None:
+        """Raise ConfigError for what has no meaning for `key`, or cannot be twice."""
+        kind, seen = self.kind(key), set()
+        for number, each in enumerate(self.specs[key].regularizers):
+            at = f"regularizers[{number}].type"
+            if not kind:
+                raise place.fail(at, f"`{key}` has no surface; heightmaps, bitmaps and vertex_positions have one")
+            if each.type not in REGULARIZERS[kind]:
+                would = ", ".join(REGULARIZERS[kind])
+                raise place.fail(at, f"{each.type} has no meaning for `{key}`, a {kind}; {would} would do")
+            if each.type in seen:
+                raise place.fail(at, f"{each.type} stands twice; give it once, with the sum of the weights")
+            seen.add(each.type)
 
     def value(self, key: str) -> Any:
         """The current value of `key`, as Dr.Jit has it."""
@@ -141,8 +164,11 @@ def select_parameters(scene: mi.Scene, specs: Sequence[ParameterSpec], source: o
         slot = selection.slot(key)
         value = initial_array(slot, settings.initial, settings.resolution, place)
         if settings.bounds is not None:
-            check_bounds(slot, value, settings.bounds, place)
+            plate = any(each.type == "thickness" for each in settings.regularizers)
+            held = Place(place.source, place.key, lambda _: "regularizers") if plate else place
+            check_bounds(slot, value, settings.bounds, held)
         check_transform(slot, value, settings, place)
+        selection.check_regularizers(key, place)
         if settings.initial != "scene" or settings.resolution is not None:
             slot.set(value)
     selection.update()
