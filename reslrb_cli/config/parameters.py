@@ -19,6 +19,7 @@ from reslrb_cli.config.base import (
     ByType,
     Choice,
     ConfigPath,
+    Count,
     Positive,
     Section,
     Size,
@@ -118,6 +119,22 @@ _TEXELS = must(
 )
 
 
+_GRID = must(
+    lambda grid: min(size_of(grid)) >= 2 and size_of(grid)[0] * size_of(grid)[1] <= PIXELS,
+    lambda grid: f"must be at least 2, and have at most {PIXELS} vertices, not {grid}",
+)
+
+
+def size_of(grid: int | tuple[int, int]) -> tuple[int, int]:
+    """[width, height] of what may be one number for both."""
+    return (grid, grid) if isinstance(grid, int) else grid
+
+
+_Grid = Annotated[
+    Annotated[Count, mark("number")] | Annotated[Size, mark("list")], by_kind("a number or [width, height]"), _GRID
+]
+
+
 class HeightmapSpec(Section):
     """Displacement of a mesh along its initial normals, in scene units: a texture over its texture coordinates."""
 
@@ -126,6 +143,10 @@ class HeightmapSpec(Section):
     resolution: Annotated[Size, _TEXELS]
     """[width, height] in texels, at least 2 each, looked up bilinearly; beyond the centres of the outermost texels it
     goes on as they are."""
+    grid: _Grid | None = None
+    """Vertices along each edge, a number or [width, height]: makes a mesh of this size of a `rectangle`, or of a mesh
+    that is one, of four vertices. They reach from edge to edge, and their texture coordinates are the centres of as
+    many texels. null: the mesh stays as it is."""
 
 
 _POINT = must(

@@ -102,7 +102,10 @@ class Movable:
     def heightmap_obstacle(self) -> str | None:
         """Why no heightmap can displace it; None where one can."""
         if not self.by_vertices:
-            return f"`{self.id}` is a {self.node.class_name()}; a heightmap displaces the vertices of a mesh"
+            why = f"`{self.id}` is a {self.node.class_name()}; a heightmap displaces the vertices of a mesh"
+            return (
+                f"{why}; `grid: 257` in `heightmap` makes one of it" if self.node.class_name() == "Rectangle" else why
+            )
         if not self.node.has_vertex_texcoords():
             return f"`{self.id}` has no texture coordinates, over which a heightmap is laid; give the mesh some"
         return None

@@ -19,6 +19,7 @@ import numpy as np
 from reslrb_cli.config.parameters import HEIGHTMAP, REGULARIZERS, WORDS, ParameterSpec, Settings
 from reslrb_cli.scene.catalog import ParameterInfo, describe, list_parameters
 from reslrb_cli.scene.deformation import Deformation, Movable, find_movable
+from reslrb_cli.scene.load import warn_once
 from reslrb_cli.scene.values import ParameterValue, Place, check_bounds, check_transform, initial_array, settle
 
 
@@ -219,6 +220,7 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
                 deformation.add_motion(items, spec.motion.pivot, spec.motion.free)
             elif spec.heightmap is not None:
                 deformation.add_heightmap(items, spec.heightmap.resolution)
+                _warn_of_finer(items, spec.heightmap.resolution)
             for name, word in zip(spec.names, spec.motion.free if spec.motion is not None else ("",), strict=True):
                 chosen[name], origin[name] = spec.settings(word), index
             continue
@@ -234,6 +236,16 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
             tied[keys[0]], keys = keys[1:], keys[:1]
         chosen |= dict.fromkeys(keys, spec.settings())
     return Selection(params, chosen, tied, deformation), origin
+
+
+def _warn_of_finer(items: tuple[Movable, ...], resolution: tuple[int, int]) -> None:
+    """Warn, once, of a map with more texels than its meshes have vertices: what lies between these has no effect."""
+    vertices, (width, height) = sum(item.node.vertex_count() for item in items), resolution
+    if width * height > vertices:
+        hint = f"; `grid: [{width}, {height}]` makes one as fine of a rectangle" if vertices == 4 * len(items) else ""
+        ids = " and ".join(f"`{item.id}`" for item in items)
+        warn_once(f"the heightmap of {ids}, {width}x{height}, is finer than the mesh, of {vertices} vertices: "
+                  f"what lies between these has no effect{hint}")  # fmt: skip
 
 
 def _movables(params: mi.SceneParameters, spec: ParameterSpec, place: Place, origin: dict[str, int]
