@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.records.run_folder import read_value
 
 ROOT = Path(__file__).parents[2]
 QUAD = """ply
@@ -117,27 +118,37 @@ def test_a_map_finer_than_its_mesh_is_warned_of_once(tmp_path, caplog, with_quad
     assert "`grid: [7, 5]`" in found[1]
 
 
-def test_a_run_on_a_grid_is_exported_and_gone_on_with(tmp_path):
+def test_a_run_on_a_grid_is_exported_and_gone_on_with(tmp_path, monkeypatch):
     import mitsuba as mi
     from click.testing import CliRunner
 
     from reslrb_cli.cli import main
 
-    configured(tmp_path, "mesh: back, resolution: [4, 4]")  # writes the file
+    monkeypatch.chdir(tmp_path)
+    configured(tmp_path, "mesh: back, resolution: [4, 4], grid: 5")  # writes the file
     sets = ["parameters=[{heightmap: {mesh: back, resolution: [4, 4], grid: 5}, "
-            "regularizers: [{type: thickness, thickness: 0.05, least: 0.1}]}]",
-            "target={render: {spp: 4}}", "scene.size=[8,8]", "run.spp=4", "run.final_spp=4"]  # fmt: skip
+            "regularizers: [{type: laplacian, weight: 1e-3}, {type: thickness, thickness: 0.05, least: 0.1}]}]",
+            "target={render: {spp: 4}}", "scene.size=[8,8]", "run.spp=4", "run.final_spp=4",
+            "optimizer={type: sgd, learning_rate: 0.003}"]  # fmt: skip
 
     def call(*words):
         result = CliRunner().invoke(main, [str(word) for word in words])
         assert result.exit_code == 0, result.output
         return result.output
 
-    options = [word for line in sets for word in ("--set", line)]
-    told = call("optimize", tmp_path / "c.yaml", *options, "--set", "run.iterations=2", "-o", tmp_path / "run")
+    def optimize(name, iterations):
+        options = [word for line in [*sets, f"run.iterations={iterations}"] for word in ("--set", line)]
+        return call("optimize", "c.yaml", *options, "--set", f"run.name={name}")
+
+    told = optimize("run", 2)
     assert "thickness of back.heightmap" in told
-    assert "Regularizers" in (tmp_path / "run/report.html").read_text()
-    call("export", tmp_path / "run", "-o", tmp_path / "out")
+    assert "regularizer of back.heightmap" in (tmp_path / "runs/run/report.html").read_text()
+    optimize("whole", 4)
+    call("optimize", "--resume", "runs/run", "--set", "run.iterations=4")
+    heights = [read_value(tmp_path / "runs" / name, "back.heightmap") for name in ("run", "whole")]
+    assert np.array_equal(*heights)
+    assert np.ptp(heights[0]) > 0
+    call("export", "runs/run", "-o", "out")
     scene = mi.load_file(str(tmp_path / "out/scene.xml"))
     [back] = [shape for shape in scene.shapes() if shape.id() == "back"]
     assert back.vertex_count() == 25
