@@ -144,6 +144,65 @@ def test_cost_and_gradient_are_added_once_a_step(tmp_path):
     assert problem.held() == {key: 0}
 
 
+def test_heights_never_cross_the_back_and_are_counted(tmp_path):
+    import drjit as dr
+
+    problem = regularized(tmp_path, "[{type: thickness, thickness: 0.05, least: 0.1}]")
+    key, pushed = "face.heightmap", np.zeros((8, 8, 1), np.float32)
+    pushed[2, 1:4] = 1e6
+    dr.set_grad(problem.optimizer[key], type(problem.optimizer[key])(pushed))
+    problem.optimizer.step(1.0)
+    problem.apply()
+    heights = problem.selection.array(key)
+    assert heights[2, 1:4] == pytest.approx(0.01 - 0.05)
+    assert np.count_nonzero(heights) == 3
+    assert problem.held() == {key: 3}
+
+
+def test_vertices_of_a_scene_have_a_laplacian(tmp_path):
+    """Of a flat face it is zero, and one vertex that stands out is pulled back."""
+    problem = regularized(tmp_path, "[{type: laplacian}]", "key: face.vertex_positions")
+    key = "face.vertex_positions"
+    flat = np.array(problem.selection.array(key), np.float64)
+    cost = problem.regularizers[key]["laplacian"]
+    points = flat.reshape(-1, 3)
+    middle = int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))
+    up = int(np.argmin(np.ptp(points, axis=0)))  # a flat face's normal
+    points = points.copy()
+    points[middle, up] += 0.01
+    rest, (value, gradient) = cost(flat)[0], cost(points.ravel())
+    assert value > 1e3 * max(rest, 1e-12)
+    assert gradient.reshape(-1, 3)[middle, up] > 0
+
+
+def test_a_bitmap_is_measured_in_its_texture_coordinates(tmp_path):
+    import mitsuba as mi
+
+    from reslrb_cli.optimization.problem import make_regularizers
+    from reslrb_cli.scene.load import load_scene
+    from reslrb_cli.scene.parameters import select_parameters
+
+    ramp = np.tile(np.linspace(0.1, 0.9, 8, dtype=np.float32)[None, :, None], (8, 1, 3))
+    mi.util.write_bitmap(str(tmp_path / "ramp.exr"), ramp, write_async=False)
+    (tmp_path / "s.xml").write_text("""<scene version="3.0.0"><sensor type="perspective"/><emitter type="constant"/>
+        <shape type="rectangle"><bsdf type="diffuse" id="wall"><texture type="bitmap" name="reflectance">
+        <string name="filename" value="ramp.exr"/></texture></bsdf></shape></scene>""")
+    costs = []
+    for size in (8, 32):
+        listed = [{"type": "total_variation"}, {"type": "laplacian"}]
+        spec = ParameterSpec(key="*.reflectance.data", resolution=(size, size), regularizers=listed)
+        selection = select_parameters(load_scene(tmp_path / "s.xml"), [spec], "c.yaml")
+        [(key, made)] = make_regularizers(selection).items()
+        costs.append(made["total_variation"](np.asarray(selection.array(key), np.float64))[0])
+        assert made["laplacian"](np.ones((size, size, 3)))[0] == 0
+    slope = 3**0.5 * 0.8 / 7 * 8
+    assert costs[0] == pytest.approx(slope, rel=2e-3)
+    assert costs[1] == pytest.approx(slope, rel=0.15)  # resampling makes the rim flat
+    bad = ParameterSpec(key="*.reflectance.data", regularizers=[{"type": "curvature", "radius": 1.0}])
+    with pytest.raises(ConfigError, match="a bitmap; total_variation, laplacian would do"):
+        select_parameters(load_scene(tmp_path / "s.xml"), [bad], "c.yaml")
+
+
 @pytest.mark.parametrize("batches", [1, 4])
 def test_a_run_records_it(tmp_path, batches):
     from reslrb_cli.optimization.loop import optimize
