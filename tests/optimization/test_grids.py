@@ -23,12 +23,12 @@ property float v
 element face 2
 property list uchar int vertex_indices
 end_header
--2 -1 0 0 0
-2 -1 0 1 0
-2 1 0 1 1
--2 1 0 0 1
-3 0 1 2
-3 0 2 3
+-1 -1 0 0 0
+3 -1 0 1 0
+3 1 0 1 1
+-1 1 0 0 1
+3 1 2 3
+3 1 3 0
 """
 
 
@@ -75,7 +75,7 @@ def with_quad(tmp_path):
     begin = xml.index('<shape type="rectangle" id="back">')
     end = xml.index("</shape>", begin)
     quad = """<shape type="ply" id="back"><string name="filename" value="quad.ply"/>
-        <transform name="to_world"><translate z="-1"/></transform><ref id="glass"/>"""
+        <transform name="to_world"><scale x="2"/><translate z="-1"/></transform><ref id="glass"/>"""
     path = tmp_path / "scene.xml"
     folder = ROOT / "scenes/caustic_heightmap"
     xml = (xml[:begin] + quad + xml[end:]).replace('value="face', f'value="{folder}/face')
@@ -88,7 +88,7 @@ def test_so_does_a_mesh_of_four_vertices(tmp_path, with_quad):
 
     problem = assemble_scene(configured(tmp_path, "mesh: back, resolution: [4, 4], grid: 5", with_quad))
     x, y, z = positions(problem).reshape(5, 5, 3).transpose(2, 0, 1)
-    assert np.allclose(x, np.linspace(-2, 2, 5), atol=1e-6)
+    assert np.allclose(x, np.linspace(-2, 6, 5), atol=1e-6)
     assert np.allclose(y, np.linspace(-1, 1, 5)[:, None], atol=1e-6)
     assert np.allclose(z, -1)
 

@@ -203,21 +203,22 @@ def test_a_bitmap_is_measured_in_its_texture_coordinates(tmp_path):
         select_parameters(load_scene(tmp_path / "s.xml"), [bad], "c.yaml")
 
 
-@pytest.mark.parametrize("batches", [1, 4])
-def test_a_run_records_it(tmp_path, batches):
+@pytest.mark.parametrize("spp", [2, 8])
+def test_a_run_records_it(tmp_path, spp):
     from reslrb_cli.optimization.loop import optimize
 
-    sets = ["scene.size=[8,8]", "run.iterations=2", f"run.spp={batches * 2}", "target={render: {spp: 4}}",
+    sets = ["scene.size=[8,8]", "run.iterations=2", f"run.spp={spp}", "target={render: {spp: 4}}",
             "optimizer={type: sgd, learning_rate: 1.0e-30}"]  # fmt: skip
-    listed = "[{type: thickness, thickness: 1, least: 1.5, weight: 2}]"
+    listed = "[{type: thickness, thickness: 1, least: 1.5, weight: 1.0e+9}]"
     problem = regularized(tmp_path, listed, sets=sets)
     from reslrb_cli.optimization.targets import make_targets
 
     problem = replace(make_targets(problem, lambda line: None), truth={})
     records = list(optimize(problem))
     costs = [record.regularized.costs["face.heightmap"]["thickness"] for record in records]
-    area = problem.regularizers["face.heightmap"]["thickness"](np.zeros((8, 8, 1)))[0]
+    area, gradient = problem.regularizers["face.heightmap"]["thickness"](np.zeros((8, 8, 1)))
     assert costs == [pytest.approx(area)] * 2
+    assert records[0].grad_norm == pytest.approx(np.linalg.norm(gradient), rel=1e-4)  # the image's is next to nothing
     assert json.loads(records[0].to_json())["regularized"]["held"] == {"face.heightmap": 0}
 
 
