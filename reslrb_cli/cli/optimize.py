@@ -183,7 +183,8 @@ def _run(
     if not quiet:
         for line in parameter_lines(manifest.results, terminal_width()):
             echo(line)
-    tallies = [str(tally) for tally in (course.nonfinite, course.clamped) if tally.iterations]
+    kept = course.nonfinite, course.clamped, course.regularized
+    tallies = [str(tally) for tally in kept if tally.iterations]
     page = place.path if "page" in manifest.missing else place.path / "report.html"
     echo(last_line(status.value, manifest.results, tallies, os.path.relpath(page)))
     return ExitCode.DONE if status is Status.FINISHED else ExitCode.INTERRUPTED

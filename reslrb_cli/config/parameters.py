@@ -15,7 +15,11 @@ from typing_extensions import Self
 
 from reslrb_cli.config.base import (
     MARK,
+    NEEDS_TYPE,
+    ByType,
+    Choice,
     ConfigPath,
+    Count,
     Positive,
     Section,
     Size,
@@ -115,6 +119,22 @@ _TEXELS = must(
 )
 
 
+_GRID = must(
+    lambda grid: min(size_of(grid)) >= 2 and size_of(grid)[0] * size_of(grid)[1] <= PIXELS,
+    lambda grid: f"must be at least 2, and have at most {PIXELS} vertices, not {grid}",
+)
+
+
+def size_of(grid: int | tuple[int, int]) -> tuple[int, int]:
+    """[width, height] of what may be one number for both."""
+    return (grid, grid) if isinstance(grid, int) else grid
+
+
+_Grid = Annotated[
+    Annotated[Count, mark("number")] | Annotated[Size, mark("list")], by_kind("a number or [width, height]"), _GRID
+]
+
+
 class HeightmapSpec(Section):
     """Displacement of a mesh along its initial normals, in scene units: a texture over its texture coordinates."""
 
@@ -123,6 +143,10 @@ class HeightmapSpec(Section):
     resolution: Annotated[Size, _TEXELS]
     """[width, height] in texels, at least 2 each, looked up bilinearly; beyond the centres of the outermost texels it
     goes on as they are."""
+    grid: _Grid | None = None
+    """Vertices along each edge, a number or [width, height]: makes a mesh of this size of a `rectangle`, or of a mesh
+    that is one, of four vertices. They reach from edge to edge, and their texture coordinates are the centres of as
+    many texels. null: the mesh stays as it is."""
 
 
 _POINT = must(
@@ -206,6 +230,77 @@ _Key = Annotated[
 ]
 
 
+# --- what its value costs besides -------------------------------------------------------------------------------------
+
+
+class Regularizer(Choice):
+    """An integral over the parameter's surface, in scene units, that is added to the loss once a step."""
+
+    type: str
+    weight: Positive = 1.0
+    """Factor of the integral in what is minimised."""
+
+
+class Curvature(Regularizer, json_schema_extra=NEEDS_TYPE):
+    """The concave curvature k of a heightmap, seen from outside, beyond a tool's: integral of max(0, k - 1/radius)²."""
+
+    type: Literal["curvature"] = "curvature"
+    """Of a heightmap: integral of max(0, k - 1/radius)², k the larger principal curvature, positive in hollows."""
+    radius: Positive = Field(description="Radius of the tool's ball, in scene units.")
+
+
+class Slope(Regularizer, json_schema_extra=NEEDS_TYPE):
+    """The slope of a heightmap beyond an angle: integral of max(0, slope - tan(degrees))²."""
+
+    type: Literal["slope"] = Field(default="slope", description="Of a heightmap: integral of max(0, slope - tan)².")
+    degrees: float = Field(ge=0, lt=90, description="Angle up to which slopes cost nothing.")
+
+
+class Thickness(Regularizer, json_schema_extra=NEEDS_TYPE):
+    """A plate that is too thin: integral of max(0, least - (thickness + h))²."""
+
+    type: Literal["thickness"] = "thickness"
+    """Of a heightmap h: integral of max(0, least - (thickness + h))². After each step heights are held where the plate
+    has a tenth of `least`, so that its faces never cross; how many were is recorded."""
+    thickness: Positive = Field(description="Of the plate where the heightmap is 0, in scene units.")
+    least: Positive = Field(description="Below this it costs, in scene units.")
+
+    @property
+    def lowest(self) -> float:
+        """The height at which it is held."""
+        return _HELD * self.least - self.thickness
+
+
+#: Share of `least` that a plate always keeps.
+_HELD = 0.1
+
+
+class TotalVariation(Regularizer, json_schema_extra=NEEDS_TYPE):
+    """Integral of sqrt(|gradient|² + epsilon²) - epsilon, channels together."""
+
+    type: Literal["total_variation"] = "total_variation"
+    """Of a heightmap or a bitmap: integral of sqrt(g² + epsilon²) - epsilon, g the gradient of all channels."""
+    epsilon: Positive = Field(default=1e-3, description="Gradients well below this cost as their square.")
+
+
+class Laplacian(Regularizer, json_schema_extra=NEEDS_TYPE):
+    """Integral of the square of the Laplacian."""
+
+    type: Literal["laplacian"] = "laplacian"
+    """Of a heightmap, a bitmap or a mesh's vertex positions: integral of the square of the Laplacian; of a mesh over
+    its surface as it begins, by cotangents, vertices at its rim left out."""
+
+
+AnyRegularizer = Annotated[Curvature | Slope | Thickness | TotalVariation | Laplacian, ByType("")]
+
+#: What has a meaning for each kind of parameter.
+REGULARIZERS = {
+    "heightmap": ("curvature", "slope", "thickness", "total_variation", "laplacian"),
+    "bitmap": ("total_variation", "laplacian"),
+    "mesh": ("laplacian",),
+}
+
+
 # --- what is recovered ------------------------------------------------------------------------------------------------
 
 
@@ -220,6 +315,7 @@ class Settings:
     resolution: tuple[int, int] | None = None
     word: str = ""
     smoothing: float | None = None
+    regularizers: tuple[Regularizer, ...] = ()
 
 
 class Precondition(Section):
@@ -261,6 +357,10 @@ class ParameterSpec(Section):
     """[width, height] in texels to which a texture is resampled before the start."""
     precondition: Precondition | None = None
     """Smooth steps, for textures, heightmaps and the vertices of meshes; null: none."""
+    regularizers: list[AnyRegularizer] = Field(default=[], max_length=16)
+    """What the value itself costs: integrals over its surface, added to the loss once a step, and recorded beside it.
+    Lengths are the scene's; of a bitmap they are those of its texture coordinates. The value hardly depends on the
+    resolution."""
 
     @property
     def names(self) -> list[str]:
@@ -301,10 +401,13 @@ class ParameterSpec(Section):
             return value.words().get(word, default) if isinstance(value, ByWord) else value
 
         resolution = self.resolution if self.heightmap is None else self.heightmap.resolution
-        return Settings(
-            of("initial", "scene"), of("bounds"), of("transform", "none"), of("learning_rate"), resolution, word,
-            None if self.precondition is None else self.precondition.laplacian,
-        )  # fmt: skip
+        bounds, lowest = of("bounds"), [each.lowest for each in self.regularizers if isinstance(each, Thickness)]
+        if lowest:
+            low, high = bounds or (-math.inf, math.inf)
+            bounds = max(low, *lowest), high
+        smoothing = None if self.precondition is None else self.precondition.laplacian
+        rest = of("transform", "none"), of("learning_rate"), resolution, word, smoothing, tuple(self.regularizers)
+        return Settings(of("initial", "scene"), bounds, *rest)
 
     @model_validator(mode="after")
     def _check_kind(self) -> Self:
@@ -361,6 +464,9 @@ class ParameterSpec(Section):
                 raise located(at("bounds"), reason)
             numbers = [said.initial] if isinstance(said.initial, float) else said.initial
             for number in numbers if isinstance(numbers, list) else ():
+                if any(number < each.lowest for each in self.regularizers if isinstance(each, Thickness)):
+                    reason = f"{number:g} leaves less than a tenth of the least thickness in `regularizers`; raise it"
+                    raise located(at("initial"), reason)
                 if not low <= number <= high:
                     raise located(at("initial"), f"{number:g} is outside of the bounds [{low:g}, {high:g}]")
         return self

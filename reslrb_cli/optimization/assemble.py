@@ -25,7 +25,7 @@ from reslrb_cli.optimization.loading import (
 )
 from reslrb_cli.optimization.memory import check_announced, check_described, check_films, outlook
 from reslrb_cli.optimization.moving import check_moving, moves_anything
-from reslrb_cli.optimization.problem import Problem, make_optimizer
+from reslrb_cli.optimization.problem import Problem, make_optimizer, make_regularizers
 from reslrb_cli.optimization.state import begin_as, decide_as, reach_as
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.views import expose, make_views
@@ -111,6 +111,7 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
         moves=moves,
         optimizer=make_optimizer(config, selection),
         samples_per_pass=samples_per_pass(config),
+        regularizers=make_regularizers(selection),
         quantities={
             key: "" if key in selection.factors else selection.quantity(key) or quantity(selection.params, key)
             for key in selection.keys

@@ -14,6 +14,7 @@ import numpy as np
 
 from reslrb_cli.config.integrators import Integrator
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.parameters import size_of
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.integrators.context import sensors_in_words
@@ -21,7 +22,7 @@ from reslrb_cli.integrators.freezing import MOST_PATHS_APART
 from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import make_integrator, render_image
-from reslrb_cli.scene.load import load_scene, warn_once
+from reslrb_cli.scene.load import load_scene, make_grid, warn_once
 from reslrb_cli.scene.needs import (
     camera_finds_nothing,
     check_camera_paths,
@@ -31,6 +32,7 @@ from reslrb_cli.scene.needs import (
     scene_needs,
     stock_clip,
 )
+from reslrb_cli.scene.values import Place
 from reslrb_cli.scene.xml.read import Description
 from reslrb_cli.seeds import seed
 
@@ -100,7 +102,17 @@ def load_configured(
     """
     scene = config.scene
     keys = selected_keys(config) if selects else []
-    return load_scene(scene.file, scene.options, scene.strict, scene.size, scene.cameras, look, keys, warn)
+
+    def see(description: Description) -> None:
+        for number, spec in enumerate(config.parameters if selects else ()):
+            if spec.heightmap is not None and spec.heightmap.grid is not None:
+                place = Place(config.source, f"parameters[{number}]")
+                for id in spec.heightmap.mesh:
+                    make_grid(description, id, size_of(spec.heightmap.grid), place)
+        if look is not None:
+            look(description)
+
+    return load_scene(scene.file, scene.options, scene.strict, scene.size, scene.cameras, see, keys, warn)
 
 
 def selected_keys(config: Config) -> list[str]:

@@ -32,7 +32,7 @@ from reslrb_cli.optimization.sensitivity import measure_curvatures, rescale
 from reslrb_cli.optimization.state import State, put, standing
 from reslrb_cli.optimization.views import View
 from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
-from reslrb_cli.records.metrics import Record
+from reslrb_cli.records.metrics import Record, Regularized
 from reslrb_cli.seeds import seed
 
 #: Of a run's progress (0 to 1) and the final fraction. The cosine is half a period of one (Loshchilov and Hutter 2017,
@@ -89,7 +89,7 @@ def step(
     held_out = problem.held_out_loss() if iteration % HELD_OUT_EVERY == 0 else None
     with clock.step() as times:
         split = Split()
-        loss, squares, counts, refused = gradient(problem, iteration, split)
+        loss, squares, counts, refused, costs = gradient(problem, iteration, split)
         dr.eval(loss, squares, counts)
     factor = learning_rate_factor(
         config.optimizer.schedule, iteration, config.run.iterations, config.optimizer.final_fraction, progress()
@@ -140,6 +140,7 @@ def step(
         nonfinite_by_parameter=found.by_parameter,
         clamped=clamped,
         held_out=held_out,
+        regularized=None if costs is None else Regularized(costs, problem.held()),
     )
 
 
@@ -214,15 +215,16 @@ class Split:
 
 def gradient(
     problem: Problem, iteration: int, split: Split
-) -> tuple[Any, dict[str, Any], dict[str, Any], list[tuple[int, Refused]]]:
+) -> tuple[Any, dict[str, Any], dict[str, Any], list[tuple[int, Refused]], dict[str, dict[str, float]] | None]:
     """Accumulate the gradient of the loss into the parameters.
 
     `split` is told of each view's parts. Returns width-1 arrays: the loss, for each parameter the gradient's sum
-    of squares (of its finite entries) and the number of entries that are not finite, and by sensor what was refused.
+    of squares (of its finite entries) and the number of entries that are not finite, by sensor what was refused, and
+    by key and type what regularizers cost, None without any.
     """
     config = problem.config
     total: Any = 0.0
-    refused = []
+    refused, costs = [], None
     for view, scale in problem.drawn(iteration):
         split.start()
         step = gradient_step(
@@ -242,5 +244,8 @@ def gradient(
         total = total + step.loss
         refused.append((view.sensor, step.refused))
     split.end()
+    if problem.regularizers:
+        costs = problem.regularize()
+        gradients = {key: problem.optimizer.gradient(key) for key in gradients}
     squares = {key: finite_square_norm(value) for key, value in gradients.items()}
-    return total, squares, {key: count_nonfinite(value) for key, value in gradients.items()}, refused
+    return total, squares, {key: count_nonfinite(value) for key, value in gradients.items()}, refused, costs

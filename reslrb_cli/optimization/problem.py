@@ -7,9 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.config.parameters import Laplacian, Thickness
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import OnSamples
@@ -18,6 +20,7 @@ from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.optimization.loading import BETWEEN_SPP, render_in_passes
 from reslrb_cli.optimization.optimizers import Optimizer, make_transform
 from reslrb_cli.optimization.precondition import make_smoother
+from reslrb_cli.optimization.regularizers import Cost, Span, make_cost, mesh_cost, spans_of
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, Jsonable, PathsRecord, SequenceRecord
 from reslrb_cli.scene.parameters import Selection
@@ -71,6 +74,8 @@ class Problem:
     guided: GuidedRecord | None = None
     sequence: SequenceRecord | None = None
     memory: MemoryPlan | None = None
+    #: What values cost by themselves, by key and type.
+    regularizers: dict[str, dict[str, Cost]] = field(default_factory=dict)
 
     def decisions(self) -> dict[str, dict[str, Any] | None]:
         """What was measured and planned before the first iteration, as manifests and checkpoints have it, by name."""
@@ -102,6 +107,29 @@ class Problem:
         """The gradient of each parameter that steps have added up since it was last handed over or cleared."""
         self.selection.collect()
         return {key: self.optimizer.gradient(key) for key in self.selection.keys}
+
+    def regularize(self) -> dict[str, dict[str, float]]:
+        """Add what values cost by themselves to the gradients, once a step; return that, by key and type."""
+        told: dict[str, dict[str, float]] = {}
+        for key, costs in self.regularizers.items():
+            value = self.optimizer[key]
+            array = np.array(dr.detach(value), dtype=np.float64)
+            found = {name: cost(array) for name, cost in costs.items()}
+            told[key] = {name: total for name, (total, _) in found.items()}
+            gradient = np.ascontiguousarray(sum(each for _, each in found.values()), dtype=np.float32)
+            # A sum, since NumPy's own memory has an alignment on which kernels depend.
+            dr.accum_grad(value, type(value)(gradient) + dr.opaque(mi.Float, 0))
+        return told
+
+    def held(self) -> dict[str, int]:
+        """How many heights are held at the least thickness, by key, of the heightmaps that have one."""
+        counts = {}
+        for key, costs in self.regularizers.items():
+            if "thickness" in costs:
+                lowest = next(each.lowest for each in self.selection.spec(key).regularizers
+                              if isinstance(each, Thickness))  # fmt: skip
+                counts[key] = int(np.count_nonzero(np.array(dr.detach(self.optimizer[key])) <= np.float32(lowest)))
+        return counts
 
     @property
     def sensors(self) -> list[int]:
@@ -187,3 +215,19 @@ def make_optimizer(config: Config, selection: Selection) -> Optimizer:
             if spec.smoothing is not None
         },
     )
+
+
+def make_regularizers(selection: Selection) -> dict[str, dict[str, Cost]]:
+    """What the values of `selection` cost by themselves, by key and type; empty where nothing does."""
+    found: dict[str, dict[str, Cost]] = {}
+    for key in selection.keys:
+        for each in selection.spec(key).regularizers:
+            if isinstance(each, Laplacian) and selection.kind(key) == "mesh":
+                faces = np.array(selection.params[f"{key.rpartition('.')[0]}.faces"], dtype=np.int64)
+                cost = mesh_cost(each.weight, selection.array(key), faces)
+            else:
+                flat = selection.kind(key) == "bitmap"
+                spans = (Span(), Span()) if flat else spans_of(*selection.deformation.laid_over(key))
+                cost = make_cost(each, spans)
+            found.setdefault(key, {})[each.type] = cost
+    return found

@@ -286,6 +286,7 @@ def _gradient_at(problem: Problem, key: str, v: Any) -> Array:
     optimizer.set_value(key, variable.to_scene(v))
     problem.apply()
     sample_gradient(problem, problem.integrator, 0, _PURPOSE, problem.config.run.spp)
+    problem.regularize()
     row = np.array(variable.chain(v, optimizer.gradient(key)), dtype=np.float64).ravel()
     take_gradient(problem)
     return finite(row)

@@ -74,6 +74,15 @@ class Clamped:
 
 
 @dataclass(frozen=True)
+class Regularized:
+    """What regularizers cost in an iteration, by parameter and type, weights included; no part of the loss. And by
+    parameter how many heights the update left at the least thickness."""
+
+    costs: dict[str, dict[str, Figure]]
+    held: dict[str, int]
+
+
+@dataclass(frozen=True)
 class Record(Line):
     """What one iteration was: its step, and the parameters before its update.
 
@@ -84,7 +93,7 @@ class Record(Line):
     `nonfinite` counts the entries of loss, of its derivative by the image and of gradients that were not finite;
     `grad_norm` leaves them out. `nonfinite_by_parameter` holds those of gradients and updates, of parameters with any.
     `clamped` is None where gradients are not clamped; `grad_norm` is that before. `held_out` is the loss of views that
-    are held out, None without any, and of iterations that did not look.
+    are held out, None without any, and of iterations that did not look. `regularized` is None without regularizers.
     `parameter_errors` are root mean square errors by key, each in its parameter's unit, over the entries that light and
     sensor reach, of the parameters whose true value is known; `parameter_rmse` is that over the entries of all of them,
     None where they have no common unit, or no true value is known.
@@ -109,6 +118,7 @@ class Record(Line):
     nonfinite_by_parameter: dict[str, int] = field(default_factory=dict)
     clamped: Clamped | None = None
     held_out: float | None = None
+    regularized: Regularized | None = None
 
 
 class MetricsWriter:
@@ -262,3 +272,29 @@ class ClampTally(_Tally):
             return ""
         shares = ", ".join(f"{100 * value:.2g} % of that of {key}" for key, value in self.bias.items())
         return f"{self.entries} entries of gradients clamped in {self.iterations} iterations: a bias of {shares}"
+
+
+@dataclass
+class RegularizedTally(_Tally):
+    """What regularizers cost in the last iteration, by parameter and type, and the iterations after which heights were
+    held at the least thickness, and how many heights after the last."""
+
+    iterations: int = 0
+    costs: dict[str, dict[str, float]] = field(default_factory=dict)
+    held_iterations: int = 0
+    held: dict[str, int] = field(default_factory=dict)
+
+    def add(self, record: Record) -> None:
+        """Count one iteration."""
+        if record.regularized is not None:
+            self.iterations += 1
+            self.costs, self.held = record.regularized.costs, record.regularized.held
+            self.held_iterations += any(self.held.values())
+
+    def __str__(self) -> str:
+        """For the last line of a run; empty where nothing is regularized."""
+        told = [f"{name} of {key} {value:.3g}" for key, costs in self.costs.items() for name, value in costs.items()]
+        if self.held_iterations:
+            heights = sum(self.held.values())
+            told.append(f"heights held at the least thickness in {self.held_iterations} iterations ({heights} at last)")
+        return f"beside the loss: {', '.join(told)}" if told else ""

@@ -40,7 +40,7 @@ from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.checkpoint import save_checkpoint
 from reslrb_cli.records.decisions import RivalRecord
 from reslrb_cli.records.manifest import Manifest
-from reslrb_cli.records.metrics import ClampTally, NonFiniteTally, Record
+from reslrb_cli.records.metrics import ClampTally, NonFiniteTally, Record, RegularizedTally
 from reslrb_cli.records.tree import Arrays, Stored, entries, entry, expected
 from reslrb_cli.report.tonemap import exposure_for
 from reslrb_cli.scene.needs import unsupported_part
@@ -235,7 +235,7 @@ class Course:
         self.state, self.results = standing(problem), Results(problem)
         self.certainty = Certainty(problem)
         self.best = Best(any(view.held_out for view in problem.views))
-        self.nonfinite, self.clamped = NonFiniteTally(), ClampTally()
+        self.nonfinite, self.clamped, self.regularized = NonFiniteTally(), ClampTally(), RegularizedTally()
         self.last: Record | None = None
 
     @property
@@ -255,6 +255,7 @@ class Course:
         self.results.add(record)
         self.nonfinite.add(record)
         self.clamped.add(record)
+        self.regularized.add(record)
 
     def best_values(self) -> dict[str, Array]:
         """The best parameters so far, as `problem.values()` has them; nothing where there are none yet."""

@@ -397,6 +397,7 @@ class Recording:
             **({"seen": self.seen} if self.seen else {}),
             "nonfinite": self.course.nonfinite.to_json(),
             "clamped": self.course.clamped.to_json(),
+            **({"regularized": self.course.regularized.to_json()} if self.course.regularized.iterations else {}),
             "best": finite(self.course.best.to_json()),
         }
 

@@ -102,7 +102,10 @@ class Movable:
     def heightmap_obstacle(self) -> str | None:
         """Why no heightmap can displace it; None where one can."""
         if not self.by_vertices:
-            return f"`{self.id}` is a {self.node.class_name()}; a heightmap displaces the vertices of a mesh"
+            why = f"`{self.id}` is a {self.node.class_name()}; a heightmap displaces the vertices of a mesh"
+            return (
+                f"{why}; `grid: 257` in `heightmap` makes one of it" if self.node.class_name() == "Rectangle" else why
+            )
         if not self.node.has_vertex_texcoords():
             return f"`{self.id}` has no texture coordinates, over which a heightmap is laid; give the mesh some"
         return None
@@ -290,6 +293,12 @@ class Deformation:
             moved.texcoords = _opaque(dr.unravel(mi.Point2f, mesh.vertex_texcoords_buffer()))
         self.values[name] = _opaque(dr.zeros(mi.TensorXf, (*resolution[::-1], 1)))
         self.quantities[name] = "length"
+
+    def laid_over(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (N, 3) and texture coordinates (N, 2) of the first mesh that the heightmap `name` displaces, as it
+        began."""
+        moved = next(each for each in self._moved.values() if each.heightmap == name)
+        return np.array(moved.base).T, np.array(moved.texcoords).T
 
     def place(self) -> list[Any]:
         """Give the scene what follows from the values; `params.update()` has to follow. Returns what to evaluate."""

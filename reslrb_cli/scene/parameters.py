@@ -16,9 +16,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.parameters import HEIGHTMAP, WORDS, ParameterSpec, Settings
+from reslrb_cli.config.parameters import HEIGHTMAP, REGULARIZERS, WORDS, ParameterSpec, Settings
 from reslrb_cli.scene.catalog import ParameterInfo, describe, list_parameters
 from reslrb_cli.scene.deformation import Deformation, Movable, find_movable
+from reslrb_cli.scene.load import warn_once
 from reslrb_cli.scene.values import ParameterValue, Place, check_bounds, check_transform, initial_array, settle
 
 
@@ -56,6 +57,29 @@ class Selection:
     def spec(self, key: str) -> Settings:
         """What the configuration says about the selected `key`."""
         return self.specs[key]
+
+    def kind(self, key: str) -> str:
+        """What regularizers take `key` for: `heightmap`, `bitmap`, `mesh`; "" for anything else."""
+        slot = self.slot(key)
+        if key in self.deformation.values:
+            return HEIGHTMAP if key.endswith(f".{HEIGHTMAP}") else ""
+        if key.endswith(".vertex_positions"):
+            return "mesh"
+        return "bitmap" if slot.is_texture and not slot.halo and not slot.is_signed else ""
+
+    def check_regularizers(self, key: str, place: Place) -> None:
+        """Raise ConfigError for what has no meaning for `key`, or cannot be twice."""
+        kind, seen = self.kind(key), set()
+        for number, each in enumerate(self.specs[key].regularizers):
+            at = f"regularizers[{number}].type"
+            if not kind:
+                raise place.fail(at, f"`{key}` has no surface; heightmaps, bitmaps and vertex_positions have one")
+            if each.type not in REGULARIZERS[kind]:
+                would = ", ".join(REGULARIZERS[kind])
+                raise place.fail(at, f"{each.type} has no meaning for `{key}`, a {kind}; {would} would do")
+            if each.type in seen:
+                raise place.fail(at, f"{each.type} stands twice; give it once, with the sum of the weights")
+            seen.add(each.type)
 
     def value(self, key: str) -> Any:
         """The current value of `key`, as Dr.Jit has it."""
@@ -151,10 +175,13 @@ def select_parameters(scene: mi.Scene, specs: Sequence[ParameterSpec], source: o
         slot = selection.slot(key)
         value = initial_array(slot, settings.initial, settings.resolution, place)
         if settings.bounds is not None:
-            check_bounds(slot, value, settings.bounds, place)
+            plate = any(each.type == "thickness" for each in settings.regularizers)
+            held = Place(place.source, place.key, lambda _: "regularizers") if plate else place
+            check_bounds(slot, value, settings.bounds, held)
         check_transform(slot, value, settings, place)
         if settings.smoothing is not None and not (selection.is_map(key) or selection.faces(key) is not None):
             raise place.fail("precondition", f"smooths textures, heightmaps and vertices; `{key}` is none of them")
+        selection.check_regularizers(key, place)
         if settings.initial != "scene" or settings.resolution is not None:
             slot.set(value)
     selection.update()
@@ -205,6 +232,7 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
                 deformation.add_motion(items, spec.motion.pivot, spec.motion.free)
             elif spec.heightmap is not None:
                 deformation.add_heightmap(items, spec.heightmap.resolution)
+                _warn_of_finer(items, spec.heightmap.resolution)
             for name, word in zip(spec.names, spec.motion.free if spec.motion is not None else ("",), strict=True):
                 chosen[name], origin[name] = spec.settings(word), index
             continue
@@ -220,6 +248,16 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
             tied[keys[0]], keys = keys[1:], keys[:1]
         chosen |= dict.fromkeys(keys, spec.settings())
     return Selection(params, chosen, tied, deformation), origin
+
+
+def _warn_of_finer(items: tuple[Movable, ...], resolution: tuple[int, int]) -> None:
+    """Warn, once, of a map with more texels than its meshes have vertices: what lies between these has no effect."""
+    vertices, (width, height) = sum(item.node.vertex_count() for item in items), resolution
+    if width * height > vertices:
+        hint = f"; `grid: [{width}, {height}]` makes one as fine of a rectangle" if vertices == 4 * len(items) else ""
+        ids = " and ".join(f"`{item.id}`" for item in items)
+        warn_once(f"the heightmap of {ids}, {width}x{height}, is finer than the mesh, of {vertices} vertices: "
+                  f"what lies between these has no effect{hint}")  # fmt: skip
 
 
 def _movables(params: mi.SceneParameters, spec: ParameterSpec, place: Place, origin: dict[str, int]

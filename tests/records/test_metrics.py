@@ -24,7 +24,7 @@ from reslrb_cli.records.metrics import Clamped, MetricsWriter, Record, cut_back,
 KEYS = [
     "iteration", "loss", "step_ms", "primal_ms", "adjoint_ms", "codegen_ms", "elapsed_s", "peak_mib", "spp", "lr",
     "grad_norm", "nonfinite", "parameter_rmse", "parameter_errors", "nonfinite_by_parameter",
-    "clamped", "held_out",
+    "clamped", "held_out", "regularized",
 ]  # fmt: skip
 
 

@@ -1,0 +1,257 @@
+"""Regularizers: what the value of a parameter costs by itself, and its gradient, in double precision.
+
+Integrals over the surface, in the scene's unit, so that they hardly change with the resolution. A map h (H, W, C) has
+texels of dx by dy; its mesh reaches from one texture coordinate to another, wherever the texels lie. Differences are
+taken between neighbours, and what they stand for is shared out so that the weights add up to the whole surface:
+
+    curvature        k = Hm + sqrt(Hm² - K) in the inner texels, by central differences; positive in hollows
+                     2 Hm = ((1 + hy²) hxx - 2 hx hy hxy + (1 + hx²) hyy) / w³,  K = (hxx hyy - hxy²) / w⁴,
+                     w² = 1 + hx² + hy²     (do Carmo, Differential Geometry of Curves and Surfaces, 3.3)
+    slope, total     the mean over the four pairs of differences (hx below or above, hy left or right) between four
+     variation       texels, so that no chequerboard is overlooked
+    laplacian        hxx + hyy in the inner texels; of a mesh L p / A by cotangents (Pinkall and Polthier 1993), A a
+                     third of the area about a vertex, L and A those of the mesh as it begins
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix, diags
+
+from reslrb_cli.config.parameters import Curvature, Laplacian, Regularizer, Slope, Thickness, TotalVariation
+
+Array = np.ndarray[Any, Any]
+
+#: A value of a parameter, as an array: what it costs, and the derivative of that, of the array's shape.
+Cost = Callable[[Array], tuple[float, Array]]
+
+
+@dataclass(frozen=True)
+class Span:
+    """One axis of a map: how long a unit of its texture coordinate is, and between which coordinates the surface is."""
+
+    unit: float = 1.0
+    low: float = 0.0
+    high: float = 1.0
+
+    def pitch(self, count: int) -> float:
+        """The distance of two texels of `count`."""
+        return self.unit / count
+
+    def weights(self, count: int, first: float, last: float) -> Array:
+        """What each of the nodes at first, first + 1, ..., last (in texels of `count`) stands for, a length.
+
+        Nodes share the way between them evenly; the outermost have all that lies beyond. The sum is the surface's.
+        """
+        nodes = np.arange(first, last + 0.5) / count
+        middles = (nodes[:-1] + nodes[1:]) / 2
+        ends = np.clip(np.concatenate([[-np.inf], middles, [np.inf]]), self.low, self.high)
+        return np.asarray(np.diff(ends) * self.unit)
+
+
+#: The axes x and y of a map.
+Spans = tuple[Span, Span]
+
+
+def make_cost(regularizer: Regularizer, spans: Spans) -> Cost:
+    """The cost of a map (H, W, C), `weight` times the integral. Raises TypeError for what is none of a map."""
+    if isinstance(regularizer, Curvature):
+        limit = 1 / regularizer.radius
+        function = _inner(lambda d: _hollow(d, limit), spans)
+    elif isinstance(regularizer, Laplacian):
+        function = _inner(_flatness, spans)
+    elif isinstance(regularizer, Slope):
+        steep = float(np.tan(np.radians(regularizer.degrees)))
+        function = _between(lambda norm: _hinge(norm, steep), spans)
+    elif isinstance(regularizer, TotalVariation):
+        function = _between(lambda norm: _rounded(norm, regularizer.epsilon), spans)
+    elif isinstance(regularizer, Thickness):
+        function = _thin(regularizer.least - regularizer.thickness, spans)
+    else:
+        raise TypeError(f"{regularizer.type} is no cost of a map")
+    return _weighed(function, regularizer.weight)
+
+
+def _weighed(cost: Cost, weight: float) -> Cost:
+    def weighed(value: Array) -> tuple[float, Array]:
+        total, gradient = cost(np.asarray(value, np.float64))
+        return weight * total, weight * gradient
+
+    return weighed
+
+
+def _hinge(value: Array, limit: float) -> tuple[Array, Array]:
+    over = np.maximum(value - limit, 0)
+    return over**2, 2 * over
+
+
+def _rounded(norm: Array, epsilon: float) -> tuple[Array, Array]:
+    root = np.sqrt(norm**2 + epsilon**2)
+    return norm**2 / (root + epsilon), norm / root
+
+
+def _thin(lowest: float, spans: Spans) -> Cost:
+    def cost(h: Array) -> tuple[float, Array]:
+        area = _area(spans, h.shape, 0.5)
+        value, slope = _hinge(-h, -lowest)
+        return float(np.sum(area * value)), -area * slope
+
+    return cost
+
+
+def _area(spans: Spans, shape: tuple[int, ...], first: float) -> Array:
+    """What each node of a map of this shape stands for, (h, w, 1); they begin at `first` texels from its edge."""
+    wide, high = (span.weights(n, first, n - first) for span, n in zip(spans, (shape[1], shape[0]), strict=True))
+    return np.asarray(high[:, None, None] * wide[None, :, None])
+
+
+def _between(of_norm: Callable[[Array], tuple[Array, Array]], spans: Spans) -> Cost:
+    """The integral of a function of the gradient's norm, all channels together."""
+
+    def cost(h: Array) -> tuple[float, Array]:
+        dx, dy = spans[0].pitch(h.shape[1]), spans[1].pitch(h.shape[0])
+        area, total, gradient = _area(spans, h.shape, 1.0) / 4, 0.0, np.zeros_like(h)
+        across, along = np.diff(h, axis=1) / dx, np.diff(h, axis=0) / dy
+        for row in (0, 1):
+            for column in (0, 1):
+                rows, columns = slice(row, row + len(along)), slice(column, column + across.shape[1])
+                gx, gy = across[rows], along[:, columns]
+                norm = np.sqrt(np.sum(gx**2 + gy**2, axis=2, keepdims=True))
+                value, slope = of_norm(norm)
+                total += float(np.sum(area * value))
+                share = area * slope / np.maximum(norm, 1e-300)
+                back_x, back_y = share * gx / dx, share * gy / dy
+                gradient[rows, 1:] += back_x
+                gradient[rows, :-1] -= back_x
+                gradient[1:, columns] += back_y
+                gradient[:-1, columns] -= back_y
+        return total, gradient
+
+    return cost
+
+
+#: Central differences about a texel: of which neighbours (row, column), how often, and the powers of dx and dy below.
+_STENCILS: tuple[tuple[dict[tuple[int, int], float], int, int], ...] = (
+    ({(0, 1): 0.5, (0, -1): -0.5}, 1, 0),
+    ({(1, 0): 0.5, (-1, 0): -0.5}, 0, 1),
+    ({(0, 1): 1.0, (0, 0): -2.0, (0, -1): 1.0}, 2, 0),
+    ({(1, 1): 0.25, (-1, -1): 0.25, (1, -1): -0.25, (-1, 1): -0.25}, 1, 1),
+    ({(1, 0): 1.0, (0, 0): -2.0, (-1, 0): 1.0}, 0, 2),
+)
+
+
+def _inner(function: Callable[[list[Array]], tuple[Array, list[Array]]], spans: Spans) -> Cost:
+    """The integral of a function of hx, hy, hxx, hxy and hyy, which returns its derivatives by these besides."""
+
+    def cost(h: Array) -> tuple[float, Array]:
+        gradient = np.zeros_like(h)
+        if min(h.shape[:2]) < 3:
+            return 0.0, gradient
+        dx, dy = spans[0].pitch(h.shape[1]), spans[1].pitch(h.shape[0])
+        area = _area(spans, h.shape, 1.5)
+
+        def at(place: tuple[int, int]) -> tuple[slice, slice]:
+            (y, x), (rows, columns) = place, (h.shape[0] - 2, h.shape[1] - 2)
+            return slice(1 + y, 1 + y + rows), slice(1 + x, 1 + x + columns)
+
+        units = [dx**i * dy**j for _, i, j in _STENCILS]
+        derivatives = [
+            sum(c * h[at(place)] for place, c in stencil.items()) / unit
+            for (stencil, _, _), unit in zip(_STENCILS, units, strict=True)
+        ]
+        value, slopes = function(derivatives)  # type: ignore[arg-type]  # sums of arrays, none of them empty
+        for (stencil, _, _), unit, slope in zip(_STENCILS, units, slopes, strict=True):
+            for place, c in stencil.items():
+                gradient[at(place)] += (c / unit) * area * slope
+        return float(np.sum(area * value)), gradient
+
+    return cost
+
+
+def _flatness(d: list[Array]) -> tuple[Array, list[Array]]:
+    total = d[2] + d[4]
+    none = np.zeros_like(total)
+    return total**2, [none, none, 2 * total, none, 2 * total]
+
+
+def _hollow(d: list[Array], limit: float) -> tuple[Array, list[Array]]:
+    """max(0, k - limit)² and its derivatives."""
+    hx, hy, hxx, hxy, hyy = d
+    w = np.sqrt(1 + hx**2 + hy**2)
+    sum_ = (1 + hy**2) * hxx - 2 * hx * hy * hxy + (1 + hx**2) * hyy
+    det = hxx * hyy - hxy**2
+    mean, gauss = sum_ / (2 * w**3), det / w**4
+    root = np.sqrt(np.maximum(mean**2 - gauss, 0))
+    value, over = _hinge(mean + root, limit)
+    # At an umbilic k has a kink: there its derivative is that of the mean.
+    steep = np.where(root > 1e-12 * np.abs(mean), 1 / np.maximum(root, 1e-300), 0.0)
+    by_mean, by_gauss = over * (1 + mean * steep), -over * steep / 2
+
+    def through(by_sum: Array | float, by_det: Array | float, by_w: Array | float) -> Array:
+        change = by_sum / (2 * w**3) - 3 * mean / w * by_w
+        return np.asarray(by_mean * change + by_gauss * (by_det / w**4 - 4 * gauss / w * by_w))
+
+    return value, [
+        through(2 * (hx * hyy - hy * hxy), 0, hx / w),
+        through(2 * (hy * hxx - hx * hxy), 0, hy / w),
+        through(1 + hy**2, hyy, 0),
+        through(-2 * hx * hy, -2 * hxy, 0),
+        through(1 + hx**2, hxx, 0),
+    ]
+
+
+def mesh_laplacian(positions: Array, faces: Array) -> tuple[csr_matrix, Array]:
+    """L and 1/A of a mesh with these positions (N, 3) and faces (M, 3); 1/A is 0 at its rim, and where it has no area.
+
+    Vertices at one place are one, so that a mesh cut open along its texture's seams has no rim there: rows and columns
+    are those of the first.
+    """
+    _, first, same = np.unique(positions, axis=0, return_index=True, return_inverse=True)
+    joined = first[same.ravel()][faces]
+    count, corners = len(positions), positions[joined]
+    doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    solid = doubled > 0
+    joined, corners, doubled = joined[solid], corners[solid], doubled[solid]
+    areas = np.bincount(joined.ravel(), np.repeat(doubled / 6, 3), minlength=count)
+    rows, columns, cotangents = [], [], []
+    for k in range(3):
+        a, b, c = (corners[:, (k + n) % 3] for n in range(3))
+        rows.append(joined[:, (k + 1) % 3])
+        columns.append(joined[:, (k + 2) % 3])
+        cotangents.append(np.sum((b - a) * (c - a), axis=1) / doubled / 2)
+    i, j, cot = (np.concatenate(part) for part in (rows, columns, cotangents))
+    half = coo_matrix((cot, (i, j)), shape=(count, count)).tocsr()
+    whole = half + half.T
+    laplacian = whole - diags(np.asarray(whole.sum(axis=1)).ravel())
+    edges, times = np.unique(np.sort(np.stack([i, j], axis=1), axis=1), axis=0, return_counts=True)
+    inverse = np.where(areas > 0, 1 / np.maximum(areas, 1e-300), 0.0)
+    inverse[edges[times == 1].ravel()] = 0.0
+    return laplacian.tocsr(), inverse
+
+
+def mesh_cost(weight: float, positions: Array, faces: Array) -> Cost:
+    """The cost of vertex positions, a buffer (3 N,): `weight` times the integral of |L p / A|²."""
+    laplacian, inverse = mesh_laplacian(np.asarray(positions, np.float64).reshape(-1, 3), faces.reshape(-1, 3))
+
+    def cost(value: Array) -> tuple[float, Array]:
+        bent = laplacian @ value.reshape(-1, 3)
+        shared = inverse[:, None] * bent
+        return float(np.sum(bent * shared)), (2 * (laplacian.T @ shared)).reshape(value.shape)
+
+    return _weighed(cost, weight)
+
+
+def spans_of(positions: Array, texcoords: Array) -> Spans:
+    """The axes of a map over a mesh with vertices at these positions (N, 3) and texture coordinates (N, 2).
+
+    Units are those of the plane map from texture coordinates to positions that fits best.
+    """
+    matrix = np.column_stack([texcoords, np.ones(len(texcoords))]).astype(np.float64)
+    slopes = np.linalg.lstsq(matrix, positions.astype(np.float64), rcond=None)[0][:2]
+    low, high = np.clip(texcoords.min(axis=0), 0, 1), np.clip(texcoords.max(axis=0), 0, 1)
+    x, y = (Span(float(np.linalg.norm(slopes[k])), float(low[k]), float(high[k])) for k in range(2))
+    return x, y
