@@ -109,7 +109,11 @@ def _section(name: str, value: dict[str, Any], defs: dict[str, Any], level: int 
         yield from (members[0]["description"], "")
     else:
         default = members[0]["properties"]["type"]["const"]
-        yield from (f"One of these types (`{default}` where `type` is left out):", "")
+        named = all("type" in member.get("required", ()) for member in members)
+        yield from (
+            "One of these types:" if named else f"One of these types (`{default}` where `type` is left out):",
+            "",
+        )
         yield from (f"- `{m['properties']['type']['const']}`: {m['description']}" for m in members)
         yield ""
     yield from _table(members)
@@ -121,7 +125,7 @@ def _section(name: str, value: dict[str, Any], defs: dict[str, Any], level: int 
 
 def _has_own_section(key: str) -> bool:
     """Others are told apart in the text of their key's type; `target.render.integrator` is as `integrator`."""
-    return key in ("render", "heightmap", "motion", "mask", "precondition")
+    return key in ("render", "heightmap", "motion", "mask", "precondition", "regularizers")
 
 
 def _members(value: dict[str, Any], defs: dict[str, Any]) -> list[dict[str, Any]]:

@@ -19,7 +19,7 @@ MARGIN = 0.125
 PIXELS = 256
 ITERATIONS = 100
 #: Vertices of the face per cell of the start, along each side.
-FINER = 2
+FINER = 3
 #: What options are called where a setting of the face goes by another name.
 _OPTIONS = {"picture_size": "--picture-size", "light_distance": "--light-distance"}
 

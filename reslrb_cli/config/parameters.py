@@ -241,7 +241,7 @@ class Regularizer(Choice):
     """Factor of the integral in what is minimised."""
 
 
-class Curvature(Regularizer, json_schema_extra=NEEDS_TYPE):
+class Curvature(Regularizer, json_schema_extra={"required": ["type", "radius"]}):
     """The concave curvature k of a heightmap, seen from outside, beyond a tool's: integral of max(0, k - 1/radius)²."""
 
     type: Literal["curvature"] = "curvature"
@@ -249,14 +249,14 @@ class Curvature(Regularizer, json_schema_extra=NEEDS_TYPE):
     radius: Positive = Field(description="Radius of the tool's ball, in scene units.")
 
 
-class Slope(Regularizer, json_schema_extra=NEEDS_TYPE):
+class Slope(Regularizer, json_schema_extra={"required": ["type", "degrees"]}):
     """The slope of a heightmap beyond an angle: integral of max(0, slope - tan(degrees))²."""
 
     type: Literal["slope"] = Field(default="slope", description="Of a heightmap: integral of max(0, slope - tan)².")
     degrees: float = Field(ge=0, lt=90, description="Angle up to which slopes cost nothing.")
 
 
-class Thickness(Regularizer, json_schema_extra=NEEDS_TYPE):
+class Thickness(Regularizer, json_schema_extra={"required": ["type", "thickness", "least"]}):
     """A plate that is too thin: integral of max(0, least - (thickness + h))²."""
 
     type: Literal["thickness"] = "thickness"
