@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import click
-import numpy as np
 
 from reslrb_cli.cli.options import writing
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.atomic import write_atomically
+
+if TYPE_CHECKING:
+    import numpy as np
 
 #: Of a picture's longer side, what the film sees about it: light that goes beside the picture counts.
 MARGIN = 0.125
@@ -26,6 +28,8 @@ _OPTIONS = {"picture_size": "--picture-size", "light_distance": "--light-distanc
 
 def read_luminance(path: Path) -> np.ndarray:
     """Linear luminance (H, W) of an image file, upright, what is transparent over white. Raises ConfigError."""
+    import numpy as np
+
     from reslrb_cli.scene.images import read_bitmap, read_photo
 
     image = read_photo(path).image.astype(np.float64)
@@ -93,6 +97,8 @@ def command(
     `reslrb optimize FOLDER/lens.yaml` takes it. The face begins where a transport of light has it throw the picture
     already; how deep it is, and how deep at twice the distance, is told before anything is rendered.
     """
+    import numpy as np
+
     from reslrb_cli.backend.variant import set_variant
     from reslrb_cli.lens import experiment
     from reslrb_cli.lens.surface import Setting, shape_surface

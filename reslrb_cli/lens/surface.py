@@ -192,7 +192,7 @@ def shape_surface(
     _check(picture, setting)
     rays = Rays(setting)
     target = on_receiver(np.asarray(picture, np.float64), setting.through)
-    start = _start(rays)
+    start, chosen = _start(rays), floor == "auto"
     if floor == "auto":
         found = transport.least_floor(rays, target, setting.size, setting.picture_size, start)
         if found is None:
@@ -200,10 +200,18 @@ def shape_surface(
                               f"{transport.FLOORS[-1]:g} of its maximum light would have to be torn apart; "
                               "a larger distance, lifted dark parts or a crop may do")  # fmt: skip
         floor = found
-    target = transport.lifted(target, floor)
     longer = max(setting.size)
     shape = (max(8, round(cells * setting.size[1] / longer)), max(8, round(cells * setting.size[0] / longer)))
-    made = transport.solve(rays, target, setting.size, setting.picture_size, shape, start)
+
+    def solved(floor: float) -> transport.Transport:
+        lifted = transport.lifted(target, floor)
+        return transport.solve(rays, lifted, setting.size, setting.picture_size, shape, start)
+
+    made = solved(floor)
+    if chosen and floor < transport.FOR_LINES and made.residual > transport.UNSOLVED:
+        floor = transport.FOR_LINES  # of dark lines that the trials' grid does not see
+        made = solved(floor)
+    target = transport.lifted(target, floor)
     if not made.converged:
         raise ConfigError("", "distance", f"no face was found that throws this picture {setting.distance:g} mm far; "
                           "a larger distance or a higher floor may do")  # fmt: skip

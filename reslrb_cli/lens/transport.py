@@ -491,6 +491,8 @@ def through_tent(picture: Array) -> Array:
 FLOORS, TRIAL = (0.0, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3), 64
 #: How much more than evenly anything may be lengthened before that counts as a tear.
 TORN = 8.0
+#: The residual above which a grid has no solution as sharp as the picture, and the floor for lines finer than `TRIAL`.
+UNSOLVED, FOR_LINES = 0.03, 0.1
 
 
 def lifted(picture: Array, floor: float) -> Array:

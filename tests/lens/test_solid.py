@@ -252,14 +252,14 @@ def test_a_run_s_folder_holds_the_solid_that_its_scene_shows(run: Path, tmp_path
     assert told["warnings"][0] in said
     # Heights: as seen from the receiver's side, y up.
     map = told["faces"]["face"]["heights"]
-    wanted = points[:, 2].reshape(16, 12)[::-1]
+    wanted = points[:, 2].reshape(48, 36)[::-1]  # three vertices per pixel
     numbers = np.array(mi.Bitmap(str(out / "heights.png")))
     assert numbers.dtype == np.uint16
     step = map["png"]["step"]
-    assert np.abs(map["png"]["offset"] + step * numbers.reshape(16, 12) - wanted).max() <= 0.51 * step
+    assert np.abs(map["png"]["offset"] + step * numbers.reshape(48, 36) - wanted).max() <= 0.51 * step
     exact = read_image(out / "heights.exr", "linear", signed=True)[:, :, 0]
     assert np.array_equal(exact, wanted)
-    assert map["pitch"] == pytest.approx([75 / 11, 100 / 15])
+    assert map["pitch"] == pytest.approx([75 / 35, 100 / 47])
 
 
 def test_the_solid_throws_what_the_run_s_scene_shows(run: Path, tmp_path: Path) -> None:
