@@ -3,8 +3,9 @@
 
     scripts/make_figures.py run RUN_FOLDER OUT.png    from a finished run: target, start, recovered and true texture
     scripts/make_figures.py scenes OUT.png            render the scenes in `scenes/`
+    scripts/make_figures.py lens PICTURE RUN OUT.png  a picture, the face that a run found for it, and what it throws
 
-Both need the environment that `scripts/setup` makes: run them with `.venv/bin/python`.
+All need the environment that `scripts/setup` makes: run them with `.venv/bin/python`.
 """
 
 from __future__ import annotations
@@ -49,8 +50,16 @@ def main() -> None:
     run.add_argument("out", type=Path)
     scenes = kinds.add_parser("scenes", help="strip of the shipped scenes")
     scenes.add_argument("out", type=Path)
+    lens = kinds.add_parser("lens", help="strip from the run of a lens")
+    lens.add_argument("picture", type=Path)
+    lens.add_argument("folder", type=Path)
+    lens.add_argument("out", type=Path)
     arguments = parser.parse_args()
-    write_strip(run_panels(arguments.folder) if arguments.kind == "run" else scene_panels(), arguments.out)
+    if arguments.kind == "lens":
+        panels = lens_panels(arguments.picture, arguments.folder)
+    else:
+        panels = run_panels(arguments.folder) if arguments.kind == "run" else scene_panels()
+    write_strip(panels, arguments.out)
 
 
 def run_panels(folder: Path) -> list[tuple[str, Image]]:
@@ -66,6 +75,30 @@ def run_panels(folder: Path) -> list[tuple[str, Image]]:
         "true texture": folder / "parameters" / "true" / texture,
     }
     return [(title, imread(file.with_suffix(".png"))) for title, file in files.items() if file.exists()]
+
+
+def lens_panels(picture: Path, folder: Path) -> list[tuple[str, Image]]:
+    """The picture, the face lit from its upper left (without its mean curvature), and the light it throws."""
+    from reslrb_cli.backend.variant import set_variant
+
+    set_variant("auto")
+    from reslrb_cli.cli.lens import read_luminance
+    from reslrb_cli.scene.images import read_image
+
+    target, final = (read_image(folder / "images" / f"{name}.exr") for name in ("target", "final"))
+    rows, columns = (np.flatnonzero(target[:, :, 1].any(axis=axis)) for axis in (1, 0))
+    thrown = final[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    heights = read_image(folder / "parameters" / "face.heightmap.exr", "linear", signed=True)[::-1, ::-1, 0]
+    y, x = np.mgrid[-1 : 1 : 1j * heights.shape[0], -1 : 1 : 1j * heights.shape[1]]
+    dome = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1).reshape(-1, 6)
+    relief = heights.ravel() - dome @ np.linalg.lstsq(dome, heights.ravel(), rcond=None)[0]
+    slope_y, slope_x = np.gradient(relief.reshape(heights.shape))
+    lit = slope_x + slope_y
+    lit = 0.5 + lit / (6 * lit.std())
+    shown = read_luminance(picture)[:, :, None]
+    panels = [("picture", encode(np.repeat(shown, 3, 2)))]
+    panels += [("face, lit from above", np.repeat(np.clip(lit, 0, 1)[:, :, None], 3, 2))]
+    return [*panels, ("the light that it throws", encode(thrown * shown.mean()))]
 
 
 def scene_panels() -> list[tuple[str, Image]]:

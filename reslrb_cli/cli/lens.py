@@ -20,8 +20,8 @@ MARGIN = 0.125
 #: Texels and pixels along the longer side.
 PIXELS = 256
 ITERATIONS = 100
-#: Vertices of the face per cell of the start, along each side.
-FINER = 3
+#: Vertices of the face per cell of the start, along each side, as long as they are no more than so many.
+FINER, MOST_VERTICES = 3, 1024
 #: What options are called where a setting of the face goes by another name.
 _OPTIONS = {"picture_size": "--picture-size", "light_distance": "--light-distance"}
 
@@ -165,7 +165,8 @@ def command(
     film = target.shape[1], target.shape[0]
     with writing("--output", output):
         output.mkdir(parents=True, exist_ok=True)
-        ny, nx = (FINER * cells for cells in surface.heights.shape)
+        finer = min(FINER, max(1, MOST_VERTICES // pixels))
+        ny, nx = (finer * cells for cells in surface.heights.shape)
         heights = experiment.at_vertices(surface, nx, ny).astype(np.float32)[:, :, None]
         write_file(output / "start.exr", heights, linear=True)
         write_file(output / "target.exr", np.repeat(target.astype(np.float32)[:, :, None], 3, 2), linear=True)

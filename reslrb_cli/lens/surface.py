@@ -194,7 +194,14 @@ def shape_surface(
     target = on_receiver(np.asarray(picture, np.float64), setting.through)
     start, chosen = _start(rays), floor == "auto"
     if floor == "auto":
-        found = transport.least_floor(rays, target, setting.size, setting.picture_size, start)
+        with np.errstate(invalid="ignore", divide="ignore"):  # of trials that send light nowhere
+            found = transport.least_floor(rays, target, setting.size, setting.picture_size, start)
+            even = found or transport.least_floor(rays, target, setting.size, setting.picture_size, start, [0.9])
+        if found is None and even is None:
+            near = np.isfinite(setting.light_distance)
+            key, what = ("light_distance", "a light farther away") if near else ("distance", "a larger distance")
+            raise ConfigError("", key, f"is {getattr(setting, key):g} mm, from where no {setting.kind} was found that "
+                              f"lights the receiver evenly; {what}, or a smaller size, may do")  # fmt: skip
         if found is None:
             raise ConfigError("", "picture", f"has too much contrast for this {setting.kind}: even with a floor of "
                               f"{transport.FLOORS[-1]:g} of its maximum light would have to be torn apart; "
@@ -264,7 +271,7 @@ def _check(picture: Array, setting: Setting) -> None:
         raise ConfigError("", "picture", f"is {' x '.join(map(str, picture.shape))}; it must have 2 x 2 pixels or more")
     if not np.all(np.isfinite(picture)) or picture.min() < 0:
         raise ConfigError("", "picture", "has values that are negative or not finite")
-    if picture.max() - picture.min() <= 1e-6 * picture.max():
+    if picture.max() - picture.min() <= 0.02 * picture.max():  # a level of 8 bits, or dithering between two, is none
         raise ConfigError("", "picture", "is of one colour; there is nothing to throw")
     for key in ("size", "picture_size"):
         if min(getattr(s, key)) <= 0:
@@ -275,7 +282,7 @@ def _check(picture: Array, setting: Setting) -> None:
     if not -80 <= s.incidence <= 80:
         raise ConfigError("", "incidence", f"is {s.incidence:g} degrees; it must be between -80 and 80")
     if max(map(abs, s.tilt)) > 80:
-        raise ConfigError("", "tilt", "must be between -80 and 80 degrees")
+        raise ConfigError("", "tilt", f"is {s.tilt[0]:g} and {s.tilt[1]:g} degrees; both must be between -80 and 80")
     if s.kind == "lens" and not 1 < s.ior <= 5:
         raise ConfigError("", "ior", f"is {s.ior:g}; glass and plastics that bend light have 1.3 to 2.0, at most 5")
     if s.kind == "mirror":

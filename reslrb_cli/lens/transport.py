@@ -13,6 +13,7 @@ from coarse to fine; each Newton step by GMRES, preconditioned by the Laplacian,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -436,7 +437,9 @@ def _told(state: _State, optics: Optics, picture: Array, target: tuple[float, fl
     lit = equation.mu > 2 * DIM * equation.mu.max()
     D = equation.D * np.array([state.size[0] / target[0], state.size[1] / target[1]])[:, None, None, None]
     result.folded = float(np.mean((equation.det <= 0)[lit]))
-    result.stretch = float(np.max(np.linalg.norm(np.moveaxis(D, (0, 1), (-2, -1))[lit], 2, axis=(-2, -1))))
+    ways = np.moveaxis(D, (0, 1), (-2, -1))[lit]
+    seen = bool(np.all(np.isfinite(ways)))  # else light is totally reflected, or misses the receiver
+    result.stretch = float(np.max(np.linalg.norm(ways, 2, axis=(-2, -1)))) if seen else np.inf
     coarse = (min(picture.shape[0], state.h.shape[0]), min(picture.shape[1], state.h.shape[1]))
     picture = resized(picture, coarse)
     result.pushed = pushed(equation.center, equation.mu * lit, coarse, target)
@@ -501,9 +504,10 @@ def lifted(picture: Array, floor: float) -> Array:
 
 
 def least_floor(
-    optics: Optics, picture: Array, size: tuple[float, float], target: tuple[float, float], start: Array
-) -> float | None:
-    """The least of `FLOORS` with which the transport neither folds nor tears; None where the largest does."""
+    optics: Optics, picture: Array, size: tuple[float, float], target: tuple[float, float], start: Array,
+    floors: Sequence[float] = FLOORS,
+) -> float | None:  # fmt: skip
+    """The least of `floors` with which the transport neither folds nor tears; None where the largest does."""
     ratio = size[0] / size[1]
     shape = (round(TRIAL / max(ratio, 1)), round(TRIAL * min(ratio, 1)))
     small = _shrunk(picture, TRIAL / max(picture.shape))
@@ -512,8 +516,8 @@ def least_floor(
         made = solve(optics, lifted(small, floor), size, target, shape, start)
         return made.converged and not made.folded and made.stretch < TORN
 
-    low, high = -1, len(FLOORS)  # the last that is known to be too low, the first that is known to do
+    low, high = -1, len(floors)  # the last that is known to be too low, the first that is known to do
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (low, middle) if good(FLOORS[middle]) else (middle, high)
-    return FLOORS[high] if high < len(FLOORS) else None
+        low, high = (low, middle) if good(floors[middle]) else (middle, high)
+    return floors[high] if high < len(floors) else None

@@ -83,7 +83,14 @@ BAD = {
     "incidence": (["--mirror", "--incidence", "0"], "--incidence: at 0 degrees the receiver stands in the mirror's"),
     "size": (["--size", "nan"], "--size: is nan; it must be above 0"),
     "thickness": (["--thickness", "0.5"], "--thickness: the relief,"),
+    "light": (["--light-distance", "20"], "--light-distance: is 20 mm, from where no lens was found"),
+    "sun": (["--sun", "40"], "--sun: is 40 degrees; it must be from 0 to below 10"),
+    "sun of a point": (["--sun", "0.5", "--light-distance", "300"], "--sun: is of parallel light"),
+    "two faces": (["--mirror", "--both"], "--both: goes with a lens"),
+    "margin": (["--margin", "2"], "--margin: is 2; it must be from 0 to 1"),
+    "round": (["--mirror", "--outline", "round", "--light-distance", "300"], "--outline: round goes with parallel"),
     "one colour": ([], "p.exr: is of one colour"),
+    "dithered": ([], "p.exr: is of one colour"),
     "one pixel": ([], "p.exr: is 1 x 1"),
 }
 
@@ -91,7 +98,9 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_what_cannot_be_is_refused_in_one_line_and_nothing_is_written(name: str, tmp_path: Path) -> None:
     options, line = BAD[name]
-    wanted = {"one colour": np.ones((16, 16)), "one pixel": np.ones((1, 1))}.get(name, picture(16, 16))
+    noise = 1 - 0.01 * np.random.default_rng(0).integers(0, 2, (16, 16))
+    flat = {"one colour": np.ones((16, 16)), "one pixel": np.ones((1, 1)), "dithered": noise}
+    wanted = flat.get(name, picture(16, 16))
     write_file(tmp_path / "p.exr", np.repeat(wanted[:, :, None], 3, 2).astype(np.float32), linear=True)
     args = [str(tmp_path / "p.exr"), "-o", str(tmp_path / "lens"), "--pixels", "16", *options]
     error = CliRunner().invoke(command, args).exception
