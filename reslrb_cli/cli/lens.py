@@ -137,6 +137,9 @@ def command(
         image = resized(image, (max(1, round(image.shape[0] * pixels / longer)),
                                 max(1, round(image.shape[1] * pixels / longer))))  # fmt: skip
     rows, columns = image.shape
+    if outline == "round" and light_distance is not None and (mirror or rows != columns):
+        raise ConfigError("--outline", "", "round goes with parallel light, or with a point light and a lens for a "
+                          "square picture: a lamp's cone meets no other face all round")  # fmt: skip
     share = np.array([columns, rows]) / max(rows, columns)
     setting = Setting(
         kind="mirror" if mirror else "lens",
@@ -158,9 +161,6 @@ def command(
         source = picture if key == "picture" else _OPTIONS.get(key, f"--{key}")
         raise ConfigError(source, "", error.message) from None
     echo(surface.summary())
-    if outline == "round" and light_distance is not None and (mirror or rows != columns):
-        raise ConfigError("--outline", "", "round goes with parallel light, or with a point light and a lens for a "
-                          "square picture: a lamp's cone meets no other face all round")  # fmt: skip
     target, power = experiment.target_image(image, surface, margin)
     film = target.shape[1], target.shape[0]
     with writing("--output", output):
