@@ -189,10 +189,10 @@ def texts() -> dict[str, str]:
 
 
 def main() -> None:
-    """Write the values anew: those of this machine, and what is the same on all; with `--texts` the digests alone."""
+    """Write the values anew: those of this machine, and what is the same on all; with `--texts` what is printed alone."""
     content = json.loads(VALUES.read_text()) if VALUES.exists() else {"machines": {}}
     if "--texts" in sys.argv[1:]:
-        content["texts"] = texts()
+        content["texts"], content["forms"] = texts(), {name: form_of(name) for name in MEASUREMENTS}
         VALUES.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n")
         return
     with ThreadPoolExecutor(2) as pool:
