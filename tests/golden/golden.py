@@ -189,7 +189,7 @@ def texts() -> dict[str, str]:
 
 
 def main() -> None:
-    """Write the values anew: those of this machine, and what is the same on all; with `--texts` what is printed alone."""
+    """Write the values anew: this machine's, and what is the same on all; with `--texts` what is printed alone."""
     content = json.loads(VALUES.read_text()) if VALUES.exists() else {"machines": {}}
     if "--texts" in sys.argv[1:]:
         content["texts"], content["forms"] = texts(), {name: form_of(name) for name in MEASUREMENTS}
