@@ -292,6 +292,7 @@ optimizer: {{type: sgd, momentum: 0.9, scale: curvature, learning_rate: 1, sched
 run:
   iterations: {iterations}
   spp: 64
+  final_spp: 1024  # of the image that is compared: what it has of noise counts against the lens
   certainty: false  # of a design there is no true value
 fabrication:  # mm; what `reslrb export` makes a solid of
   {{kind: {s.kind}, thickness: {s.thickness:.9g}, outline: {s.outline}, ior: {s.ior:g},{also}
