@@ -7,6 +7,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from cli.tiny import done
 from click.testing import CliRunner
 
 from reslrb_cli.cli.lens import command
@@ -107,3 +108,27 @@ def test_what_cannot_be_is_refused_in_one_line_and_nothing_is_written(name: str,
     assert isinstance(error, ConfigError)
     assert line in str(error)
     assert not (tmp_path / "lens").exists()
+
+
+def test_a_run_goes_on_with_its_momentum_and_its_measured_steepness(tmp_path: Path, llvm: str) -> None:
+    """Both are of what the optimiser moves, which is rougher than the heights; a rate that is measured stays."""
+    write_file(tmp_path / "p.exr", np.repeat(picture(16, 16)[:, :, None], 3, 2).astype(np.float32), linear=True)
+    done("lens", tmp_path / "p.exr", "-o", tmp_path / "lens", "--pixels", "16")
+    sets = [f"run.output={tmp_path}/runs", "run.spp=4", "run.final_spp=4", "optimizer.schedule=constant"]
+
+    def words(name: str, iterations: int) -> list[str]:
+        lines = [*sets, f"run.name={name}", f"run.iterations={iterations}"]
+        return [word for line in lines for word in ("--set", line)]
+
+    said = done("optimize", tmp_path / "lens/lens.yaml", *words("part", 2)).output
+    assert "scale curvature: face.heightmap moves by" in said
+    done("optimize", tmp_path / "lens/lens.yaml", *words("whole", 4))
+    done("optimize", "--resume", tmp_path / "runs/part", "--set", "run.iterations=4")
+    start, *ends = (
+        read_image(path, "linear", signed=True)
+        for path in (tmp_path / "lens/start.exr", *(tmp_path / "runs" / name / "parameters/face.heightmap.exr"
+                                                    for name in ("part", "whole")))
+    )  # fmt: skip
+    moved = np.abs(ends[1] - start).max()
+    assert moved > 0
+    assert np.abs(ends[0] - ends[1]).max() < 0.02 * moved
