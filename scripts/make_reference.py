@@ -134,7 +134,8 @@ def _members(value: dict[str, Any], defs: dict[str, Any]) -> list[dict[str, Any]
         return [defs[value["$ref"].rsplit("/", 1)[1]]]
     if value.get("type") == "array":
         return _members(value["items"], defs)
-    return [m for option in (*value.get("oneOf", ()), *value.get("anyOf", ())) for m in _members(option, defs)]
+    found = [m for option in (*value.get("oneOf", ()), *value.get("anyOf", ())) for m in _members(option, defs)]
+    return list({id(member): member for member in found}.values())  # one, or a list of such
 
 
 def _table(members: list[dict[str, Any]]) -> Iterator[str]:
@@ -184,7 +185,8 @@ def _type(value: dict[str, Any]) -> str:
             names = list(dict.fromkeys(_type(option) for option in value[union]))
             if "number" in names and "integer" in names:
                 names.remove("integer")
-            return " or ".join(names) if "section" not in names else "section" + " or null" * ("null" in names)
+            listed = " or list of sections" * ("list of sections" in names)
+            return " or ".join(names) if "section" not in names else f"section{listed}" + " or null" * ("null" in names)
     if "$ref" in value:
         return _IN_A_LINE.get(value["$ref"].rsplit("/", 1)[1], "section")
     if "enum" in value:

@@ -18,6 +18,7 @@ from reslrb_cli.cli.options import (
     Counts,
     Factors,
     Keeper,
+    allow_code_option,
     budget_option,
     exit_code,
     experiment_arguments,
@@ -31,6 +32,7 @@ from reslrb_cli.cli.options import (
     resume_option,
 )
 from reslrb_cli.cli.terminal import echo
+from reslrb_cli.config.optimizers import loss_words
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.report.format import WITHOUT_BORDER, Columns, count
 
@@ -113,7 +115,7 @@ def _runs_conditions(plan: RunsPlan, session: RunsSession) -> str:
     parts = [
         str(plan.config.source),
         f"{count(plan.runs, 'seed')}, {session.limit_s:.3g} s each",
-        f"loss {plan.config.loss.type}",
+        f"loss {loss_words(plan.config.loss)}",
         f"{optimizer.type} at {optimizer.learning_rate:g}" + "".join(f", x {rate:g}" for rate in plan.rates),
         facts.get("pictures", ""),
         facts.get("error_of", ""),
@@ -157,6 +159,7 @@ MOST_RUNS = 100
 @click.option("--reference", metavar="METHOD",
               help="What errors are taken from: the mean of many steps of this one. Default: reslrb:stack with paths "
                    "from both sides, half of each, where CONFIG allows that.")  # fmt: skip
+@allow_code_option
 @resume_option
 @memory_limit_option
 @click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False),
@@ -166,7 +169,7 @@ MOST_RUNS = 100
 def command(
     config_file: Path, overrides: tuple[str, ...], integrators: str | None, objective: str, runs: int | None,
     rates: tuple[float, ...] | None, budget: float, rounds: int | None, spps: tuple[int, ...] | None,
-    reference: str | None, resumed: Path | None, memory_limit: int | None, json_file: Path | None,
+    reference: str | None, allow_code: bool, resumed: Path | None, memory_limit: int | None, json_file: Path | None,
     plot_file: Path | None,
 ) -> int:  # fmt: skip
     """Measure how fast the error of each method falls on CONFIG, at its initial values, seen through its first sensor.
@@ -178,12 +181,14 @@ def command(
     """
     began = time.monotonic()
     from reslrb_cli.backend.installation import load_packages
-    from reslrb_cli.config.loader import load
+    from reslrb_cli.config.loader import check_code, load
 
     load_packages()  # before what follows asks for them
     from reslrb_cli.measure.methods import DEFAULT, DEFAULTS, REFERENCE, Plan, RunsPlan, parse_cases
 
-    config = load(config_file, overrides)
+    config = load(config_file, overrides).with_code(allow_code)
+    if objective == "loss" or runs is not None:
+        check_code(config)
     if runs is not None:
         _refuse_with_runs()
     elif rates is not None:
@@ -309,7 +314,7 @@ def _conditions(plan: Plan, session: Session) -> str:
     config, facts = plan.config, session.facts
     depth, rr_depth = config.integrator.max_depth, config.integrator.rr_depth
     roulette = "no roulette" if 0 <= depth < rr_depth else f"roulette from depth {rr_depth}"
-    what = {"fixed": "dL/dI held", "loss": f"loss {config.loss.type}", "image": "the image"}[plan.objective]
+    what = {"fixed": "dL/dI held", "loss": f"loss {loss_words(config.loss)}", "image": "the image"}[plan.objective]
     spp = ", ".join(str(count) for count in plan.spps or [config.run.spp])
     parts = [str(config.source), f"{spp} spp", roulette, what, facts.get("pictures", "")]
     parts.append(WITHOUT_BORDER if facts.get("masked") else "")

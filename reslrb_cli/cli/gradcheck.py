@@ -19,6 +19,7 @@ from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.cli.options import (
     COUNT,
     Keeper,
+    allow_code_option,
     allowance,
     check_writable,
     is_given,
@@ -30,6 +31,7 @@ from reslrb_cli.cli.options import (
 )
 from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
+from reslrb_cli.config.loader import check_code
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.measure.methods import PATHS_OPTIONS, all_estimators, parse_estimators
 from reslrb_cli.measure.resume_store import Earlier, settings
@@ -186,6 +188,7 @@ logger = logging.getLogger(__name__)
                    "does not suffice for is named, with what it would take.")  # fmt: skip
 @click.option("--seeds", type=click.IntRange(min=3, max=COUNT.max), metavar="N",
               help="Number of seeds, whatever time they take, those of --resume included.")  # fmt: skip
+@allow_code_option
 @resume_option
 @click.option("--spp", type=COUNT,
               help="Samples per pixel of one gradient. Default: 65536 light paths, no more than run.spp.")  # fmt: skip
@@ -203,8 +206,8 @@ logger = logging.getLogger(__name__)
                    "layers of EXR files.")  # fmt: skip
 def command(
     config_file: Path | None, overrides: tuple[str, ...], suite: str | None, cases: tuple[str, ...],
-    estimators: str | None, budget: float, seeds: int | None, resumed: Path | None, spp: int | None, missing: bool,
-    directions: int | None, json_file: Path | None, markdown_file: Path | None, folder: Path | None,
+    estimators: str | None, budget: float, seeds: int | None, allow_code: bool, resumed: Path | None, spp: int | None,
+    missing: bool, directions: int | None, json_file: Path | None, markdown_file: Path | None, folder: Path | None,
 ) -> int:  # fmt: skip
     """Compare the gradients of every parameter of CONFIG with references, at its initial values.
 
@@ -237,8 +240,9 @@ def command(
         return run_suite_command(cases, estimators, seeds, json_file, markdown_file, resumed)
     if cases:
         raise ConfigError("--case", "", "names a case of a suite; take --suite extreme with it")
-    config = read_or_box(config_file, overrides)
+    config = read_or_box(config_file, overrides).with_code(allow_code)
     if missing:
+        check_code(config)
         variant = set_variant(config.variant)
         echo(f"{device_name(variant)}, {variant}")
         return run_missing(config, variant, budget, seeds, spp, directions, json_file, resumed)

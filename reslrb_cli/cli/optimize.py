@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from reslrb_cli.cli.options import optional_experiment_arguments, read_config, start_variant
+from reslrb_cli.cli.options import allow_code_option, optional_experiment_arguments, read_config, start_variant
 from reslrb_cli.cli.terminal import echo, fill
 from reslrb_cli.config.files import in_words, rough_duration
 from reslrb_cli.config.loader import dump
@@ -89,6 +89,7 @@ logger = logging.getLogger(__name__)
     help="Go on with the run in this folder where it was. CONFIG may be left out, else it has to be that of the run; "
     "--set may change iterations, learning rates, and with run.output or run.name the folder.",
 )
+@allow_code_option
 @click.option("--quiet", is_flag=True, help="Print the last line only.")
 @click.option("-v", "--verbose", is_flag=True, help="Say more of what is measured before the first iteration.")
 def command(
@@ -97,6 +98,7 @@ def command(
     force: bool,
     dry_run: bool,
     resumed: Path | None,
+    allow_code: bool,
     quiet: bool,
     verbose: bool,
 ) -> int:
@@ -112,16 +114,18 @@ def command(
             raise click.UsageError("--force replaces a run, --resume goes on with one; give one of the two")
         if dry_run:
             raise click.UsageError("--dry-run is of a run that begins, --resume goes on with one; give one of the two")
-        return _resume(resumed, config_file, overrides, quiet)
+        return _resume(resumed, config_file, overrides, allow_code, quiet)
     if config_file is None:
         raise click.UsageError("Missing argument 'CONFIG'")
-    return _begin(config_file, overrides, force, dry_run, quiet)
+    return _begin(config_file, overrides, force, dry_run, allow_code, quiet)
 
 
-def _begin(config_file: Path, overrides: tuple[str, ...], force: bool, dry_run: bool, quiet: bool) -> int:
+def _begin(
+    config_file: Path, overrides: tuple[str, ...], force: bool, dry_run: bool, allow_code: bool, quiet: bool
+) -> int:
     from reslrb_cli.records.run_folder import RunFolder, check_output
 
-    config = read_config(config_file, overrides)
+    config = read_config(config_file, overrides).with_code(allow_code)
     run = config.run
     check_output(config_file, run.output, run.folder_name, force)
     variant = start_variant(config)
@@ -139,7 +143,7 @@ def _begin(config_file: Path, overrides: tuple[str, ...], force: bool, dry_run: 
     return _run(course, manifest, make, quiet)
 
 
-def _resume(run: Path, config_file: Path | None, overrides: tuple[str, ...], quiet: bool) -> int:
+def _resume(run: Path, config_file: Path | None, overrides: tuple[str, ...], allow_code: bool, quiet: bool) -> int:
     from reslrb_cli.records.run_folder import check_output
     from reslrb_cli.runs.resume import open_earlier
 
@@ -150,7 +154,7 @@ def _resume(run: Path, config_file: Path | None, overrides: tuple[str, ...], qui
                 "--set run.iterations=NUMBER goes on"
             )
             return ExitCode.DONE
-        config = earlier.config
+        earlier.config = config = earlier.config.with_code(allow_code)
         if earlier.elsewhere:
             check_output(config.source, config.run.output, config.run.folder_name, False)
         variant = start_variant(config.model_copy(update={"variant": earlier.variant}))

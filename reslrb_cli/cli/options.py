@@ -244,6 +244,15 @@ def resume_option(function: Callable[..., Any]) -> Callable[..., Any]:
     )(function)
 
 
+def allow_code_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add `--allow-code` (`allow_code`) to a command that calls the loss."""
+    return click.option(
+        "--allow-code",
+        is_flag=True,
+        help="Run the files of Python code that CONFIG names (loss.type: custom), with all your rights.",
+    )(function)
+
+
 def files_of(resumed: Path | None, json_file: Path | None, plot_file: Path | None) -> tuple[Path | None, Path | None]:
     """The files of `--json` and `--plot`, by default that of `--resume` and one beside it. Raises ConfigError."""
     json_file = json_file or resumed

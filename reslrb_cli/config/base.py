@@ -101,7 +101,13 @@ def _path(folder: Path, value: Any) -> Path:
 _PATH_SCHEMA = WithJsonSchema({"type": "string", "format": "path"})
 
 #: A path relative to the folder of the config file.
-ConfigPath = Annotated[Path, BeforeValidator(lambda value, info: _path(_folder(info), value)), _PATH_SCHEMA]
+ConfigPath = Annotated[Path, BeforeValidator(lambda value, info: config_path(value, info)), _PATH_SCHEMA]
+
+
+def config_path(value: Any, info: ValidationInfo) -> Path:
+    """A path relative to the folder of the config file, absolute. Raises an error to be raised in a validator."""
+    return _path(_folder(info), value)
+
 
 #: A path relative to the working directory.
 WorkPath = Annotated[Path, BeforeValidator(lambda value: _path(Path.cwd(), value)), _PATH_SCHEMA]

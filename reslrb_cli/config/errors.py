@@ -111,7 +111,7 @@ def _is_tag(part: int | str) -> bool:
 
 
 def _join(key: str, below: str) -> str:
-    return f"{key}.{below}" if key and below else key or below
+    return f"{key}{'' if below.startswith('[') else '.'}{below}" if key and below else key or below
 
 
 # --- unknown keys -----------------------------------------------------------------------------------------------------

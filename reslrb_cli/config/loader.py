@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from pydantic import ValidationError
 
 from reslrb_cli.config.errors import Problem, problems
 from reslrb_cli.config.files import CONFIG_BYTES, DEPTH, NODES, OVERRIDES, OVERRIDES_LENGTH, read_file
+from reslrb_cli.config.optimizers import Custom
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import UNFIT, Location, count_values, format_location, parse, write
 from reslrb_cli.errors import ConfigError, one_line
@@ -135,6 +136,23 @@ def loads(text: str, path: Path | str, overrides: Sequence[str] = ()) -> Config:
     raise ConfigError(_blame(stages, parsed, found[0], Path(path)), found[0].key, found[0].explain() + more)
 
 
+def told(first: Mapping[str, Any]) -> Config:
+    """The configuration that a process is told of first (`Measurement.first`), by one that had checked it."""
+    return loads(first["config"], first["source"]).with_code(first.get("allow_code") is True)
+
+
+def check_code(config: Config, losses: Mapping[str, Custom] | None = None) -> None:
+    """Raise ConfigError, located by the key, where losses that users have written are not to be run; None for all of
+    the experiment's. Nothing is loaded."""
+    for key, one in (config.code_losses if losses is None else losses).items():
+        if one.file is None and config.own_loss is None:
+            reason = "missing: FILE.py:NAME, or in Python a function that is handed over, as it was when the run began"
+            raise ConfigError(config.source, key, reason)
+        if one.file is not None and not config.allows_code:
+            reason = f"would run the code of {one.path}, with all your rights; --allow-code has it run"
+            raise ConfigError(config.source, key, reason)
+
+
 def _blame(stages: list[dict[str, Any]], overrides: list[Override], problem: Problem, path: Path) -> str:
     """Who made `problem`: an override without which it is not there yet, and with which it is; else the file.
 
@@ -165,7 +183,7 @@ def with_integrator(config: Config, values: dict[str, Any], blame: str, adjoint:
     changed, found = _validate(data, config.source)
     if changed is None:
         raise ConfigError(blame, found[0].key, found[0].explain())
-    return changed
+    return changed.with_code_as(config)
 
 
 def dump(config: Config) -> str:

@@ -2,13 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Discriminator,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationInfo,
+    model_serializer,
+    model_validator,
+)
 from typing_extensions import Self
 
-from reslrb_cli.config.base import NEEDS_TYPE, ByType, Choice, Count, Positive, Section, located
+from reslrb_cli.config.base import (
+    MARK,
+    NEEDS_TYPE,
+    ByType,
+    Choice,
+    Count,
+    Positive,
+    Section,
+    config_path,
+    located,
+    mark,
+    wrong,
+)
 
 
 class Loss(Choice):
@@ -22,14 +45,21 @@ class Loss(Choice):
     scales: Annotated[int, Field(ge=1, le=16)] = 1
     """The loss is the mean over so many levels of a pyramid of image and target, each of half the resolution of the
     level before (means of 2x2 pixels by their weights): 1 compares pixels alone, more also what is seen from afar."""
+    weight: Positive = 1.0
+    """What an entry of a list of losses (`loss: [{type: l2, weight: 1}, {type: ssim, weight: 0.1}]`) is multiplied by
+    before they are added up; only there. In a list, `scale` is the same in all entries."""
 
     @model_serializer(mode="wrap")
     def _without_unasked(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         values: dict[str, Any] = handler(self)
-        for name, usual in (("scale", "none"), ("scales", 1)):
+        for name, usual in (("scale", "none"), ("scales", 1), ("weight", 1.0)):
             if values.get(name) == usual:
                 del values[name]
         return values
+
+    def own_options(self) -> dict[str, Any]:
+        """Options of the function itself (epsilon, ...): those that not all types share."""
+        return {name: value for name, value in self.options().items() if name not in Loss.model_fields}
 
 
 class L2(Loss):
@@ -59,7 +89,104 @@ class LogL2(Loss, json_schema_extra=NEEDS_TYPE):
     epsilon: Positive = Field(default=1e-2, description="Added inside both logarithms, in units of radiance.")
 
 
-AnyLoss = Annotated[L2 | L1 | RelativeL2 | LogL2, ByType("l2")]
+class Smape(Loss, json_schema_extra=NEEDS_TYPE):
+    """Mean of |I - T| / (|I| + |T| + epsilon), the symmetric relative error."""
+
+    type: Literal["smape"] = Field(default="smape", description="Mean of |I - T| / (|I| + |T| + epsilon).")
+    epsilon: Positive = Field(default=1e-2, description="Added to the denominator, in units of radiance.")
+
+
+class SSIM(Loss, json_schema_extra=NEEDS_TYPE):
+    """1 - mean SSIM (Wang et al. 2004) of windows of 11x11 pixels, Gaussian with a standard deviation of 1.5, each
+    channel by itself, of linear radiance; windows lie within the image, which has 11x11 pixels or more. Pixels that are
+    left out are in a window as if they were the target's, and windows about them do not count."""
+
+    type: Literal["ssim"] = Field(default="ssim", description="1 - mean SSIM (Wang et al. 2004).")
+    data_range: Positive | None = None
+    """L of SSIM's constants (0.01 L)² and (0.03 L)², in units of radiance; null: the target's largest value, of each
+    view and level."""
+
+
+#: Bytes of a file of a user's own code.
+CODE_BYTES = 2**20
+
+
+def _code(value: Any, info: ValidationInfo) -> str:
+    """FILE.py:NAME with the path joined to the folder of the configuration."""
+    path, colon, name = str(value).rpartition(":") if isinstance(value, str) else ("", "", "")
+    if not (colon and path.endswith(".py") and name.isidentifier()):
+        raise wrong("must be FILE.py:NAME, a file of Python code and the name of a function in it")
+    return f"{config_path(path, info)}:{name}"
+
+
+class Custom(Loss, json_schema_extra=NEEDS_TYPE):
+    """What a function of one's own returns, `file`; only where the command line has `--allow-code`
+    ([method.md](method.md#a-loss-of-ones-own))."""
+
+    type: Literal["custom"] = Field(default="custom", description="What a function of one's own returns.")
+    file: Annotated[str, BeforeValidator(_code)] | None = None
+    """`FILE.py:NAME`: a file of Python code, relative to the config file, and the function in it:
+    `NAME(image: mi.TensorXf, target: mi.TensorXf) -> mi.Float`, or with a third argument, `weights`. A run keeps a
+    digest of the file's bytes, not of what it imports, and goes on with no other. null: the function that a caller in
+    Python hands over."""
+
+    @property
+    def path(self) -> Path | None:
+        """The file of code."""
+        return None if self.file is None else Path(self.file.rpartition(":")[0])
+
+    @property
+    def name(self) -> str:
+        """The function's name in it."""
+        return "" if self.file is None else self.file.rpartition(":")[2]
+
+
+AnyLoss = Annotated[L2 | L1 | RelativeL2 | LogL2 | Smape | SSIM | Custom, ByType("l2")]
+
+
+def _loss_kind(value: Any) -> str:
+    return MARK + "list" if isinstance(value, list) else MARK + "mapping"
+
+
+def _check_list(losses: list[Loss]) -> list[Loss]:
+    for place, loss in enumerate(losses):
+        if loss.scale != losses[0].scale:
+            raise located(f"[{place}].scale", "must be the same in all entries of a list: all are fitted, or none is")
+    return losses
+
+
+def _check_single(loss: Loss) -> Loss:
+    if "weight" in loss.model_fields_set:
+        raise located("weight", "goes with a list of losses, `loss: [{type: l2, weight: 1}, ...]`; remove it")
+    return loss
+
+
+#: One loss, or the list of those whose sum is the loss.
+Losses = Annotated[
+    Annotated[AnyLoss, AfterValidator(_check_single), mark("mapping")]
+    | Annotated[list[AnyLoss], Field(min_length=1, max_length=16), AfterValidator(_check_list), mark("list")],
+    Discriminator(_loss_kind),
+]
+
+
+def losses_of(given: Loss | Sequence[Loss] | None) -> list[Loss]:
+    """The entries of `loss`, a single one as a list of it."""
+    return [] if given is None else [given] if isinstance(given, Loss) else list(given)
+
+
+def loss_keys(place: str, name: str, given: Loss | Sequence[Loss] | None) -> list[tuple[str, Loss]]:
+    """The entries of the loss that stands at `place`, each with the key of its option `name`."""
+    if given is None or isinstance(given, Loss):
+        return [(f"{place}.{name}", one) for one in losses_of(given)]
+    return [(f"{place}[{number}].{name}", one) for number, one in enumerate(given)]
+
+
+def loss_words(given: Loss | Sequence[Loss]) -> str:
+    """Of what a loss is made, in short: `l2`, or `l2 + 0.1 ssim`."""
+    parts = [f"{loss.type}" if loss.weight == 1 else f"{loss.weight:g} {loss.type}" for loss in losses_of(given)]
+    return " + ".join(parts)
+
+
 _Decay = Annotated[float, Field(ge=0, lt=1)]
 
 

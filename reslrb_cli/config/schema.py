@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -42,7 +43,19 @@ from reslrb_cli.config.base import (
 from reslrb_cli.config.files import NAME_BYTES
 from reslrb_cli.config.integrators import AnyIntegrator, Integrator, largest_pass, passes_obstacle
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
-from reslrb_cli.config.optimizers import AS_CONFIGURED, L2, Adam, AnyLoss, AnyOptimizer, Stage, check_stages
+from reslrb_cli.config.optimizers import (
+    AS_CONFIGURED,
+    L2,
+    Adam,
+    AnyOptimizer,
+    Custom,
+    Loss,
+    Losses,
+    Stage,
+    check_stages,
+    loss_keys,
+    losses_of,
+)
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.views import SensorName, TargetConfig, ViewSpec, check_views
 
@@ -190,8 +203,9 @@ class RunConfig(Section):
     """Samples that the adjoint image dL/dI comes from: the batches before the one that is differentiated (`batched`), a
     second set (`independent`, twice the paths), or those of the gradient (`correlated`). Gradients of `l2` and
     `relative_l2` are unbiased with the first two; with `correlated` the noise that both share pulls parameters, mostly
-    towards darker: a run says by how much, where a measurement before its first iteration can see it. `l1` and `log_l2`
-    are biased with any of them, since noise in the image does not average out of their derivatives; more samples help.
+    towards darker: a run says by how much, where a measurement before its first iteration can see it. `l1`, `log_l2`,
+    `smape` and `ssim` are biased with any of them, since noise in the image does not average out of their derivatives;
+    more samples help. A list of losses is as its entries are, and one of one's own as its formula is.
     `auto`: `batched` where `batches` divides `spp`, else `independent`."""
     batches: Annotated[int, Field(ge=2)] = 4
     """Batches of a step's samples; with `adjoint: batched` it must divide `spp`. Not with `correlated` and
@@ -300,12 +314,14 @@ class Config(Section):
     `target` and `loss` have it."""
     parameters: Annotated[list[ParameterSpec], Field(min_length=1)] = Field(description="What is recovered.")
     integrator: AnyIntegrator = Field(default=ReslrbConfig(), description="How image and gradient are computed.")
-    loss: AnyLoss = Field(default=L2(), description="How image and target are compared.")
+    loss: Losses = Field(default=L2(), description="How image and target are compared.")
     optimizer: AnyOptimizer = Field(default=Adam(), description="How parameters follow their gradient.")
     run: RunConfig = Field(default_factory=lambda: RunConfig(), description="Iterations, samples, seed and output.")
     fabrication: Fabrication | None = Field(default=None, description="The solid that a lens or a mirror is made as.")
 
     _source: Path = PrivateAttr(default=Path("config.yaml"))
+    _allows_code: bool = PrivateAttr(default=False)
+    _own_loss: Callable[..., Any] | None = PrivateAttr(default=None)
 
     @property
     def adjoint(self) -> Literal["correlated", "independent", "batched"]:
@@ -318,9 +334,49 @@ class Config(Section):
         return "batched" if fits else "independent"
 
     @property
-    def losses(self) -> list[AnyLoss]:
-        """The losses of all views, `loss` first."""
-        return [self.loss, *(view.loss for view in self.views or () if view.loss is not None)]
+    def losses(self) -> list[Loss]:
+        """The losses of all views, `loss` first, the entries of lists each by itself."""
+        return [one for given in (self.loss, *(view.loss for view in self.views or ())) for one in losses_of(given)]
+
+    @property
+    def allows_code(self) -> bool:
+        """Whether files of the user's own code are run; no YAML can say so."""
+        return self._allows_code
+
+    @property
+    def own_loss(self) -> Callable[..., Any] | None:
+        """The function that was handed over in place of a file (`loss.type: custom` without one)."""
+        return self._own_loss
+
+    def with_code(self, allowed: bool = True) -> Config:
+        """The same experiment, with the files of code that it names run, or not."""
+        config = self.model_copy()
+        config._allows_code = allowed
+        return config
+
+    def with_code_as(self, other: Config) -> Config:
+        """The same experiment, with what another is handed and allowed."""
+        config = self.with_code(other._allows_code)
+        config._own_loss = other._own_loss
+        return config
+
+    def with_loss(self, loss: Callable[..., Any]) -> Config:
+        """The same experiment with a function for the loss of all views that have none of their own.
+
+        It is called as `loss(image, target)` of two `mi.TensorXf` (H, W, C), with `weights` third where it has room for
+        them, and returns a `mi.Float` of width 1 that Dr.Jit differentiates.
+        """
+        config = self.model_copy(update={"loss": Custom(type="custom")})
+        config._own_loss = loss
+        return config
+
+    @property
+    def code_losses(self) -> dict[str, Custom]:
+        """The losses that users have written, each with the key that names its file."""
+        places: dict[str, Any] = {"loss": self.loss}
+        places |= {f"views[{place}].loss": view.loss for place, view in enumerate(self.views or ())}
+        return {key: one for place, given in places.items() for key, one in loss_keys(place, "file", given)
+                if isinstance(one, Custom)}  # fmt: skip
 
     @property
     def halves(self) -> Literal[1, 2]:
@@ -330,7 +386,9 @@ class Config(Section):
     @property
     def by_pixel(self) -> bool:
         """Whether every loss looks at each pixel by itself."""
-        return all(loss.scale == "none" and loss.scales == 1 for loss in self.losses)
+        return all(
+            loss.scale == "none" and loss.scales == 1 and loss.type not in ("ssim", "custom") for loss in self.losses
+        )
 
     @property
     def set_spp(self) -> int:
@@ -473,13 +531,13 @@ class Config(Section):
         _check_passes(self.integrator, self.set_spp, "integrator", f"run.spp / {2 * sets}, by loss.scale: fitted")
         shared = self.target.exposure if isinstance(self.target.exposure, list) else [self.target.exposure]
         for number, view in enumerate(self.views or [None]):
-            own, key = (self.loss, "loss.scale") if view is None or view.loss is None else (view.loss, "loss.scale")
-            if view is not None and view.loss is not None:
-                key = f"views[{number}].{key}"
+            given, place = (self.loss, "loss") if view is None or view.loss is None else \
+                (view.loss, f"views[{number}].loss")  # fmt: skip
+            key, own = loss_keys(place, "scale", given)[0]
             exposures = shared if view is None or view.exposure is None else [view.exposure]
             if own.scale == "fitted" and any(isinstance(each, str) for each in exposures):
-                place = "target.exposure" if view is None or view.exposure is None else f"views[{number}].exposure"
-                raise located(key, f"cannot be fitted beside {place}, which is recovered: both scale the image")
+                by = "target.exposure" if view is None or view.exposure is None else f"views[{number}].exposure"
+                raise located(key, f"cannot be fitted beside {by}, which is recovered: both scale the image")
 
 
 def _passes_divide(integrator: Integrator, spp: int) -> bool:

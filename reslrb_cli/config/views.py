@@ -21,7 +21,7 @@ from typing_extensions import Self
 from reslrb_cli.config.base import ConfigPath, Count, Positive, Section, Seed, list_of_one, located, must, wrong
 from reslrb_cli.config.files import KEY_LENGTH
 from reslrb_cli.config.integrators import AnyIntegrator
-from reslrb_cli.config.optimizers import AnyLoss
+from reslrb_cli.config.optimizers import Losses
 from reslrb_cli.config.parameters import COLOR_SPACE, ColorSpace, Value
 
 _KINDS = ("specular", "border", "clipped", "alpha", "nonfinite")
@@ -201,7 +201,7 @@ class ViewSpec(Section):
     weight: Positive = Field(default=1.0, description="The view's part of the loss, relative to the other views'.")
     exposure: Exposure | None = None
     """As `target.exposure`, but recovered for this view alone where it is not a number."""
-    loss: AnyLoss | None = Field(default=None, description="How this view is compared; null: as `loss` says.")
+    loss: Losses | None = Field(default=None, description="How this view is compared; null: as `loss` says.")
 
 
 def check_views(views: list[ViewSpec], scene: Any, target: TargetConfig) -> None:

@@ -247,7 +247,7 @@ class Measurement:
     def first(self, config: Config) -> dict[str, Any]:
         """What a process is told first, to measure `config`."""
         return {"config": dump(config), "source": str(config.source), "variant": self.variant,
-                "memory_limit": self.memory_limit}  # fmt: skip
+                "memory_limit": self.memory_limit, "allow_code": config.allows_code}  # fmt: skip
 
     def settings(self) -> dict[str, Any]:
         """What has to be the same in all sessions, as JSON has it; see `resume_store.settings`."""

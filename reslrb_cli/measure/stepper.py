@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.loader import loads
+from reslrb_cli.config.loader import told
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
@@ -182,7 +182,7 @@ class Stepper(Steps):
 
 def begin_steps(first: dict[str, Any]) -> Begun:
     """Begin the process. It says the size of film and textures first; questions and answers are those of a step."""
-    config = loads(first["config"], first["source"])
+    config = told(first)
     stepper = Stepper(config, first["objective"], first.get("film_width"), first.get("texture_width"))
     size = {"width": stepper.size[0], "height": stepper.size[1], "texels": stepper.texels}
     return size, lambda question: stepper.step(question["round"], question["cold"], question["release"])

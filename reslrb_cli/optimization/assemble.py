@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
+from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.parameters import HEIGHTMAP, ParameterSpec
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
@@ -59,6 +60,8 @@ def assemble(
     are checked, and what light and sensor reach is known. With `settled` nothing is measured anew: it is the problem of
     a run that goes on, as it was before its first iteration. Raises ConfigError and UnsupportedScene.
     """
+    if to_run:
+        check_code(config)
     problem = assemble_scene(config)
     if settled is not None:
         begin_as(problem, settled)
@@ -67,6 +70,9 @@ def assemble(
     if line is not None:
         say(line)
     problem = make_targets(problem, say)
+    for view in problem.views if to_run else ():
+        for own in view.codes:
+            own.attempt(view.target, view.weights)
     if settled is not None:
         return reach_as(decide_as(problem, settled, options), settled)
     problem = settle(problem, options, say, cache)

@@ -27,10 +27,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from reslrb_cli.config.optimizers import losses_of
 from reslrb_cli.integrators.step import cross_step
+from reslrb_cli.optimization.losses import QUADRATIC
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import take_gradient, unrecorded
-from reslrb_cli.optimization.views import QUADRATIC
 from reslrb_cli.records.decisions import Jsonable
 from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array, jackknife_variance
@@ -99,7 +100,7 @@ def measure_correlated_bias(problem: Problem) -> CorrelatedBias | None:
         return None
     unit = (problem.samples_per_pass or 1) * problem.config.halves
     fitted = problem.config.halves == 2  # which is not quadratic
-    part = PART if problem.config.loss.type in QUADRATIC and not fitted else 1
+    part = PART if all(loss.type in QUADRATIC for loss in losses_of(problem.config.loss)) and not fitted else 1
     spp = max(run.spp // part // unit * unit, unit)
     rounds = min(ROUNDS, int(SHARE * run.iterations * run.spp / (2 * spp)))
     if rounds < FEWEST_ROUNDS:

@@ -1,10 +1,5 @@
 """A view: one sensor, the image that it is to see, and how the two are compared.
 
-- `Loss`: how an image is compared with its target. Each takes the image I, (H, W, C) and attached to the AD graph, the
-  target T of the same shape, both in linear radiance, and what each entry weighs, of that shape too with a mean of 1
-  (None: all the same). It returns a width-1 array: a mean over pixels and channels, so that it depends neither on the
-  resolution nor on how many pixels are left out. `fitted` and `pyramid` make others of them: the image multiplied by
-  what suits the target best, and the mean over several resolutions.
 - `Exposure`: what a view's image is multiplied by before it is compared: a number, or one that is recovered with the
   rest. The model is  target = exposure * image,  with one exposure E for all channels or one for each. The derivative
   of a loss L(E I) with respect to E is the sum over pixels of dL/dI I / E: it takes the samples that the other
@@ -19,7 +14,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,6 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.backend.memory import own_memory
+from reslrb_cli.config.optimizers import Custom, loss_keys, losses_of
 from reslrb_cli.config.optimizers import Loss as LossConfig
 from reslrb_cli.config.parameters import Settings
 from reslrb_cli.config.schema import Config
@@ -36,149 +32,10 @@ from reslrb_cli.config.views import Mask, ViewSpec
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.protocol import first_channels, halves_of, whole_of
 from reslrb_cli.optimization.loading import choose_sensors
+from reslrb_cli.optimization.losses import SSIM_SIDE, Loss, best_scale, fitted, make_loss, weighted
+from reslrb_cli.optimization.own_code import OwnLoss
 from reslrb_cli.scene.cameras import read_cameras
 from reslrb_cli.scene.parameters import Selection
-
-#: A loss with its options bound, of an image, its target, and weights, if there are any.
-Loss = Callable[..., "mi.Float"]
-
-
-def _mean(values: mi.TensorXf, weights: mi.TensorXf | None) -> mi.Float:
-    return dr.mean(values if weights is None else values * weights, axis=None).array
-
-
-def l1(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float:
-    """mean |I - T|. Its gradient is 0 where I = T."""
-    return _mean(dr.abs(image - target), weights)
-
-
-def l2(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float:
-    """mean (I - T)²."""
-    return _mean(dr.square(image - target), weights)
-
-
-def relative_l2(
-    image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /, epsilon: float = 1e-2
-) -> mi.Float:
-    """mean (I - T)² / (T² + ε), ε in squared units of radiance.
-
-    The denominator holds the target, not the image: a constant, so the gradient is that of the loss itself. With the
-    (detached) noisy image in its place the noise of one pixel would stand in numerator and denominator at once.
-    """
-    return _mean(dr.square(image - target) / (dr.square(target) + epsilon), weights)
-
-
-def log_l2(
-    image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /, epsilon: float = 1e-2
-) -> mi.Float:
-    """mean (log(I + ε) - log(T + ε))², ε in units of radiance.
-
-    Negative values, as filters with negative lobes make them, count as 0.
-    """
-    difference = dr.log(dr.maximum(image, 0.0) + epsilon) - dr.log(dr.maximum(target, 0.0) + epsilon)
-    return _mean(dr.square(difference), weights)
-
-
-LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2, "relative_l2": relative_l2, "log_l2": log_l2}
-
-#: Those whose derivative is linear in the image, so that its noise averages out.
-QUADRATIC = ("l2", "relative_l2")
-
-
-def make_loss(type: str, scales: int = 1, **options: float) -> Loss:
-    """Return the loss of that name with its options bound, of so many `scales`. Raises KeyError for an unknown name."""
-    loss = functools.partial(LOSSES[type], **options)
-    return loss if scales == 1 else functools.partial(pyramid, loss, scales)
-
-
-def pyramid(
-    loss: Loss, scales: int, image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /
-) -> mi.Float:
-    """The mean of a loss over `scales` levels, the first of which are image and target themselves.
-
-    Each pixel of a level is the mean of 2x2 of the level before by their weights, and weighs as much as those together:
-    one along an odd border has fewer, and what is left out is no part of any.
-    """
-    total = loss(image, target, weights)
-    if weights is None:
-        weights = dr.full(mi.TensorXf, 1, image.shape)
-    for _ in range(1, scales):
-        coarse = _sums(weights)
-        image, target = (_sums(weights * each) / dr.maximum(coarse, 1e-30) for each in (image, target))
-        weights = coarse / dr.mean(coarse, axis=None)
-        total = total + loss(image, target, weights)
-    return total / scales
-
-
-def _sums(image: mi.TensorXf) -> mi.TensorXf:
-    """The sums over 2x2 pixels of an image (H, W, C), (ceil(H / 2), ceil(W / 2), C), attached."""
-    height, width, channels = image.shape
-    shape = ((height + 1) // 2, (width + 1) // 2, channels)
-    lane = dr.arange(mi.UInt32, math.prod(shape))
-    channel, column = lane % channels, 2 * (lane // channels % shape[1])
-    row, total = 2 * (lane // (channels * shape[1])), dr.zeros(mi.Float, math.prod(shape))
-    for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        inside = (row + down < height) & (column + right < width)
-        index = ((row + down) * width + column + right) * channels + channel
-        # Each entry has one place to go: the derivative needs no atomics, and is the same every time.
-        total += dr.gather(mi.Float, image.array, index, inside, dr.ReduceMode.Permute)
-    return mi.TensorXf(total, shape)
-
-
-def _product(first: mi.TensorXf, second: mi.TensorXf, weights: mi.TensorXf | None) -> mi.Float:
-    return _mean(first * second, weights)
-
-
-def best_scale(
-    halves: tuple[mi.TensorXf, mi.TensorXf],
-    target: mi.TensorXf,
-    weights: mi.TensorXf | None = None,
-    across: bool = False,
-) -> mi.Float:
-    """s = <I, T> / <I, I>, of width 1, attached, I the mean of two images of one expectation (H, W, C); 1, without a
-    derivative, where not both products are positive, as of black images.
-
-    The value of <I, I> is that of the two, whose noise is independent, times each other; its derivative is 2 <I, dI>,
-    which noise of I leaves unbiased where dI has other samples, or `across`, <I_a, dI_b> + <I_b, dI_a>.
-    """
-    image, square = 0.5 * (halves[0] + halves[1]), _product(*halves, weights)
-    if not across:
-        whole = _product(image, image, weights)
-        square = dr.detach(square) + (whole - dr.detach(whole))
-    along = _product(image, target, weights)
-    there = (square > 0) & (along > 0)
-    return dr.select(there, along / dr.select(there, square, 1), 1)
-
-
-def fitted(
-    loss: Loss,
-    image: mi.TensorXf,
-    target: mi.TensorXf,
-    weights: mi.TensorXf | None = None,
-    /,
-    across: bool = False,
-) -> mi.Float:
-    """The loss of s I, with s = <I, T> / <I, I> (`best_scale`), of an image (H, W, C) or of two halves (2, H, W, C).
-
-    Its derivative is  s l(s I) + L_s ds/dI,  with l the derivative of the loss. L_s = <l(s I), I> has the image twice:
-    it is taken as the mean of <l(s I_a), I_b> and <l(s I_b), I_a>. So every product of noise with itself is gone from
-    the derivative of a loss that is quadratic in the image; that of one image given twice is the exact derivative.
-    `across`: the derivative with respect to I_a has I_b in place of I, and the other way round: no path of a half sees
-    a delta that it helped to make.
-    """
-    first, second = halves_of(image)
-    factor = best_scale((first, second), target, weights, across)
-    fixed, one, other = dr.detach(factor), dr.detach(first), dr.detach(second)
-    value = loss(fixed * (0.5 * (first + second)), target, weights)
-    change = factor - fixed  # 0, with a derivative
-    parts = [loss(fixed * a + change * b, target, weights) for a, b in ((one, other), (other, one))]
-    if across:
-        value = dr.detach(value)
-        parts += [loss(fixed * (b + (a - dr.detach(a))), target, weights) for a, b in ((first, other), (second, one))]
-    for part in parts:
-        value = value + 0.5 * (part - dr.detach(part))
-    return value
-
 
 Array = np.ndarray[Any, Any]
 
@@ -245,7 +102,7 @@ class Wanted:
     exposure: float | str = 1.0
     exposure_key: str = SHARED
     part: float = 1.0
-    loss: LossConfig | None = None
+    loss: LossConfig | Sequence[LossConfig] | None = None
     held_out: bool = False
 
 
@@ -352,7 +209,7 @@ class View:
     `made` is the target (H, W, C), without alpha; None until there is one, which `target` raises LookupError for.
     `weights`, of the same shape with a mean of 1, say what its entries count, 0 of those that `masked` leaves out;
     None where all are the same. `fits`: the image is scaled to suit the target (`fitted`, `across` as there). What is
-    `held_out` is not trained on, and has a loss of its own.
+    `held_out` is not trained on, and has a loss of its own. `codes` are what of the loss users have written.
     """
 
     sensor: int
@@ -366,6 +223,7 @@ class View:
     masked: Masked = field(default_factory=Masked)
     fits: bool = False
     across: bool = False
+    codes: list[OwnLoss] = field(default_factory=list)
 
     @property
     def target(self) -> mi.TensorXf:
@@ -417,8 +275,10 @@ class View:
     def situation(self) -> list[Any]:
         """Share, exposure and weights in short, as plain values: two views that have the same count the same."""
         weights = None if self.weights is None else hashlib.blake2b(np.array(self.weights).tobytes()).hexdigest()
-        loss = self.wanted.loss
-        return [self.share, self.held_out, self.wanted.exposure, loss and loss.model_dump(), weights]
+        losses = [loss.model_dump() for loss in losses_of(self.wanted.loss)]
+        loss = (losses[0] if losses else None) if isinstance(self.wanted.loss, LossConfig | None) else losses
+        digests = [own.digest() for own in self.codes]
+        return [self.share, self.held_out, self.wanted.exposure, loss, weights, *digests]
 
     def objective(self, image: mi.TensorXf) -> mi.Float:
         """What the view adds to the loss of all views."""
@@ -453,22 +313,39 @@ def view_records(views: list[View]) -> list[dict[str, Any]]:
 def make_views(config: Config, scene: mi.Scene) -> list[View]:
     """The views of an experiment, without their targets. Raises ConfigError as `wanted_views`, and for too many
     scales."""
-    wanted, views = wanted_views(config, scene), []
+    wanted = wanted_views(config, scene)
+    views: list[View] = []
     total = sum(one.part for one in wanted if not one.held_out)
     for one in wanted:
-        kind = one.loss or config.loss
+        given: LossConfig | Sequence[LossConfig]
+        place, given = ("loss", config.loss) if one.loss is None else (f"views[{len(views)}].loss", one.loss)
         share = 1.0 if one.held_out else one.part / total
-        options = kind.options()
-        fits = options.pop("scale", "none") == "fitted"
-        loss = make_loss(kind.type, **options)
-        across = config.adjoint == "correlated"
-        views.append(View(one.sensor, loss, share, fits=fits, across=across, held_out=one.held_out, wanted=one))
         width, height = (int(size) for size in scene.sensors()[one.sensor].film().crop_size())
-        if 2 ** (kind.scales - 1) > max(width, height):
-            place = "loss" if one.loss is None else f"views[{len(views) - 1}].loss"
-            reason = f"{kind.scales} levels need an image of at least {2 ** (kind.scales - 1)} pixels, not"
-            raise ConfigError(config.source, f"{place}.scales", f"{reason} {width}x{height}")
+        parts: list[tuple[float, Loss]] = []
+        codes: list[OwnLoss] = []
+        for key, kind in loss_keys(place, "scales", given):
+            _check_size(config, key, kind, width, height)
+            if isinstance(kind, Custom):
+                codes.append(OwnLoss(config, f"{key.removesuffix('scales')}file", kind))
+            own = codes[-1] if isinstance(kind, Custom) else None
+            parts.append((kind.weight, make_loss(kind.type, kind.scales, own, **kind.own_options())))
+        loss = functools.partial(weighted, parts) if not isinstance(given, LossConfig) else parts[0][1]
+        fits, across = losses_of(given)[0].scale == "fitted", config.adjoint == "correlated"
+        views.append(View(one.sensor, loss, share, fits=fits, across=across, held_out=one.held_out, wanted=one,
+                          codes=codes))  # fmt: skip
     return views
+
+
+def _check_size(config: Config, key: str, kind: LossConfig, width: int, height: int) -> None:
+    """Raise ConfigError, located at `key`, where an image has too few pixels for a loss."""
+    coarsest, least = 2 ** (kind.scales - 1), SSIM_SIDE if kind.type == "ssim" else 1
+    if coarsest > max(width, height):
+        reason = f"{kind.scales} levels need an image of at least {coarsest} pixels, not {width}x{height}"
+        raise ConfigError(config.source, key, reason)
+    if least > 1 and min(-(-width // coarsest), -(-height // coarsest)) < least:
+        reason = f"ssim needs {least}x{least} pixels at each level, and there are {-(-width // coarsest)}x"
+        reason += f"{-(-height // coarsest)} at the {'last' if coarsest > 1 else 'only one'}"
+        raise ConfigError(config.source, key, reason)
 
 
 def expose(views: list[View], scene: mi.Scene, selection: Selection) -> None:

@@ -19,7 +19,7 @@ from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators import reslrb
 from reslrb_cli.measure import nonfinite_trace
 from reslrb_cli.measure.nonfinite_trace import Witness
-from reslrb_cli.optimization import views
+from reslrb_cli.optimization import losses
 
 # Planted faults: what a run does about them, and whether the command that it prints finds them.
 
@@ -216,12 +216,12 @@ def root_of_pixel(image, target, weights=None):
 
     index = (3 * 8 + 5) * 3 + 1
     entry = dr.gather(type(image.array), image.array, index, True, dr.ReduceMode.Permute)
-    return views.l2(image, target) + dr.sum(dr.sqrt(entry - dr.detach(entry)))
+    return losses.l2(image, target) + dr.sum(dr.sqrt(entry - dr.detach(entry)))
 
 
 @pytest.mark.parametrize("kind", ["stop", "skip", "zero"])
 def test_a_loss_whose_derivative_is_not_finite(spoilt_experiment, capsys, monkeypatch, kind):
-    monkeypatch.setitem(views.LOSSES, "l2", root_of_pixel)
+    monkeypatch.setitem(losses.LOSSES, "l2", root_of_pixel)
     _, err = optimize(capsys, f"run.on_nonfinite={kind}", code=5 if kind == "stop" else 0)
     assert "dL/dI in 1 entry, the first at pixel (5, 3), channel 1, of sensor 0" in err
     _, [offender], text = inspect(capsys, err)
@@ -240,9 +240,9 @@ def test_what_was_done_is_kept(spoilt_experiment, capsys, monkeypatch):
     def sometimes(image, target, weights=None):
         calls.append(1)
         # The first is that of the saved initial image.
-        return root_of_pixel(image, target) if len(calls) == 3 else views.l2(image, target)
+        return root_of_pixel(image, target) if len(calls) == 3 else losses.l2(image, target)
 
-    monkeypatch.setitem(views.LOSSES, "l2", sometimes)
+    monkeypatch.setitem(losses.LOSSES, "l2", sometimes)
     out, err = optimize(capsys, STOP)
     folder = Path("runs/config")
     result = manifest()
@@ -257,13 +257,13 @@ def test_what_was_done_is_kept(spoilt_experiment, capsys, monkeypatch):
         assert (last[KEY] != 0.5).all()
     assert "1 values were not finite" in (folder / "report.html").read_text()
     calls.clear()
-    monkeypatch.setitem(views.LOSSES, "l2", views.l2)
+    monkeypatch.setitem(losses.LOSSES, "l2", losses.l2)
     code, out, _ = reslrb_nonfinite(capsys, "inspect", "runs/config/config.yaml", "--nonfinite")
     assert (code, out) == (1, "iteration 1: all is finite this time\n")
 
 
 def test_the_last_line_counts(spoilt_experiment, capsys, monkeypatch):
-    monkeypatch.setitem(views.LOSSES, "l2", root_of_pixel)
+    monkeypatch.setitem(losses.LOSSES, "l2", root_of_pixel)
     out, err = optimize(capsys, "run.on_nonfinite=zero", code=0)
     assert "3 values not finite in 3 iterations" in out.splitlines()[-1]
     assert err.count("--nonfinite") == 1, "the first says where to look"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from agreement import compare
 from cli.tiny import KEY, done, read_metrics, reslrb, settings, write_experiment
-from optimization.test_losses import LOSSES, REFERENCES, images, options
+from optimization.test_losses import REFERENCES, images, options
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.integrators.protocol import whole_of
@@ -55,7 +55,7 @@ def view_of(name, target, weights, **more):
 @pytest.mark.parametrize("scales", [1, 3])
 @pytest.mark.parametrize("fits", [True, False, "across"])
 @pytest.mark.parametrize("masked", [True, False])
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", REFERENCES)
 def test_scaled_losses_and_their_gradients_are_those_of_finite_differences(name, masked, fits, scales):
     image, target = images((6, 7, 3))
     image, target = 3 * image + 0.1, target + 0.1
@@ -82,7 +82,7 @@ def test_scaled_losses_and_their_gradients_are_those_of_finite_differences(name,
     np.testing.assert_allclose(found, expected, rtol=5e-3, atol=5e-3 * np.abs(expected).max() * 0.1)
 
 
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", REFERENCES)
 def test_brightness_is_no_part_of_a_fitted_loss(name):
     image, target = images((6, 7, 3))
     view = view_of(name, target, None)

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import functools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from agreement import compare
 from cli.tiny import KEY, write_experiment
+from skimage.metrics import structural_similarity
 
-from reslrb_cli.config.loader import load
+from reslrb_cli.config.loader import dump, load, loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.identifiability import check_exposures, find_ambiguous
 from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.losses import LOSSES, weighted
 from reslrb_cli.optimization.sensitivity import measure_sensitivities, sample_gradient, see_images, take_gradient
-from reslrb_cli.optimization.views import LOSSES, View, make_loss, view_records
+from reslrb_cli.optimization.views import View, make_loss, make_views, view_records
 
 # Losses against NumPy, values and gradients.
 
@@ -28,7 +32,13 @@ REFERENCES = {
         lambda i, t: np.log((i + EPSILON) / (t + EPSILON)) ** 2,
         lambda i, t: 2 * np.log((i + EPSILON) / (t + EPSILON)) / (i + EPSILON),
     ),
+    "smape": (
+        lambda i, t: np.abs(i - t) / (i + t + EPSILON),
+        lambda i, t: np.sign(i - t) * (2 * t + EPSILON) / (i + t + EPSILON) ** 2,
+    ),
 }
+#: Those of each pixel by itself.
+POINTWISE = tuple(REFERENCES)
 
 
 def images(shape=(5, 7, 3)):
@@ -37,14 +47,14 @@ def images(shape=(5, 7, 3)):
 
 
 def options(name):
-    return {"epsilon": EPSILON} if name in ("relative_l2", "log_l2") else {}
+    return {"epsilon": EPSILON} if name in ("relative_l2", "log_l2", "smape") else {}
 
 
 def test_every_loss_has_a_reference():
-    assert set(LOSSES) == set(REFERENCES)
+    assert set(LOSSES) == {*REFERENCES, "ssim"}
 
 
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", POINTWISE)
 def test_values_and_gradients(name):
     image, target = images()
     value, derivative = (function(image, target) for function in REFERENCES[name])
@@ -57,7 +67,7 @@ def test_values_and_gradients(name):
     np.testing.assert_allclose(np.array(attached.grad), derivative / image.size, rtol=1e-4, atol=1e-7)
 
 
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", POINTWISE)
 def test_a_loss_does_not_depend_on_the_resolution(name):
     image, target = images()
     loss = make_loss(name, **options(name))
@@ -66,7 +76,7 @@ def test_a_loss_does_not_depend_on_the_resolution(name):
     assert values[0] == pytest.approx(values[1], rel=1e-5)
 
 
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", POINTWISE)
 def test_black_and_negative_pixels_stay_finite(name):
     image = mi.TensorXf(np.array([[[0.0], [-0.3], [2.0]]], dtype=np.float32))
     dr.enable_grad(image)
@@ -76,10 +86,162 @@ def test_black_and_negative_pixels_stay_finite(name):
     assert np.isfinite(np.array(image.grad)).all()
 
 
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", POINTWISE)
 def test_a_nan_is_not_hidden(name):
     image = mi.TensorXf(np.array([[[np.nan], [1.0]]], dtype=np.float32))
     assert np.isnan(np.array(make_loss(name)(image, mi.TensorXf(np.ones((1, 2, 1), dtype=np.float32)))))
+
+
+# SSIM, and sums of losses.
+
+
+def textured(shape=(17, 14, 3), seed=5):
+    """An image with structure, and one that is like it, float32."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    base = 0.6 + 0.3 * np.sin(rows / 2)[:, :, None] * np.cos(columns[:, :, None] / 3 + np.arange(shape[2]))
+    return (0.8 * base + rng.uniform(0, 0.3, shape)).astype(np.float32), base.astype(np.float32)
+
+
+@pytest.mark.parametrize("data_range", [1.0, 0.3, None])
+def test_ssim_is_that_of_scikit_image(data_range):
+    image, target = textured()
+    expected = structural_similarity(
+        image.astype(np.float64), target.astype(np.float64), channel_axis=2, gaussian_weights=True, sigma=1.5,
+        use_sample_covariance=False, data_range=data_range or float(target.max()),
+    )  # fmt: skip
+    options = {} if data_range is None else {"data_range": data_range}
+    found = make_loss("ssim", **options)(mi.TensorXf(image), mi.TensorXf(target))
+    assert float(found[0]) == pytest.approx(1 - expected, rel=2e-4)
+
+
+@pytest.mark.parametrize("level", [1.0, 1000.0])
+def test_ssim_of_bright_images_keeps_its_digits(level):
+    image, target = (level * each for each in textured())
+    found = make_loss("ssim")(mi.TensorXf(image), mi.TensorXf(target))
+    same = make_loss("ssim")(*(mi.TensorXf(each / level) for each in (image, target)))
+    assert float(found[0]) == pytest.approx(float(same[0]), rel=1e-4)
+    assert float(make_loss("ssim")(mi.TensorXf(target), mi.TensorXf(target))[0]) == pytest.approx(0, abs=1e-5)
+
+
+def differences(loss, image, rng, step):
+    """A derivative along a random direction by Dr.Jit, and by central differences."""
+    direction = rng.uniform(-1, 1, image.shape).astype(np.float32)
+    attached = mi.TensorXf(image)
+    dr.enable_grad(attached)
+    dr.backward(loss(attached))
+    by_drjit = float(np.sum(np.array(attached.grad, dtype=np.float64) * direction))
+    above, below = (float(loss(mi.TensorXf(image + sign * step * direction))[0]) for sign in (1, -1))
+    return by_drjit, (above - below) / (2 * step)
+
+
+LISTS = {
+    "smape": [{"type": "smape"}],
+    "ssim": [{"type": "ssim"}],
+    "ssim of two levels": [{"type": "ssim", "scales": 2}],
+    "list": [{"type": "l2", "weight": 2}, {"type": "ssim", "weight": 0.1}, {"type": "smape", "scales": 2}],
+}
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("name", LISTS)
+def test_gradients_of_new_losses_against_finite_differences(name, masked):
+    rng = np.random.default_rng(3)
+    image, target = textured((25, 23, 3))
+    parts = [(each.get("weight", 1), make_loss(each["type"], each.get("scales", 1))) for each in LISTS[name]]
+    view = View(0, functools.partial(weighted, parts))
+    weights = np.ones(image.shape[:2])
+    if masked:
+        weights = rng.uniform(0.5, 2, image.shape[:2])
+        weights[:4, :9] = weights[12, 12] = 0
+    view.see(target, weights)
+    image = np.where(
+        weights[:, :, None] > 0, target + np.where(image > target, 1, -1) * (0.1 + np.abs(image - target)), 7
+    )
+    pairs = [differences(view.judge, image.astype(np.float32), rng, 2e-3) for _ in range(3)]
+    found, expected = np.transpose(pairs)
+    np.testing.assert_allclose(found, expected, rtol=5e-3, atol=5e-3 * np.abs(expected).max())
+
+
+def test_what_ssim_leaves_out_is_as_the_target_and_windows_about_it_do_not_count():
+    image, target = textured((24, 24, 1))
+    spoilt = image.copy()
+    spoilt[3:6, 3:6] = np.nan
+    weights = np.ones((24, 24))
+    weights[3:6, 3:6] = 0
+    view = View(0, make_loss("ssim", data_range=1.0))
+    view.see(target, weights)
+    filled = np.where(weights[:, :, None] > 0, image, target)
+    _, full = structural_similarity(
+        filled[:, :, 0].astype(np.float64), target[:, :, 0].astype(np.float64), gaussian_weights=True, sigma=1.5,
+        use_sample_covariance=False, data_range=1.0, full=True,
+    )  # fmt: skip
+    inside = np.zeros((24, 24), bool)
+    inside[5:-5, 5:-5] = True
+    expected = 1 - full[inside & (weights > 0)].mean()
+    assert float(view.judge(mi.TensorXf(spoilt))[0]) == pytest.approx(expected, rel=2e-4)
+
+
+def read(tmp_path, loss, **more):
+    write_experiment(tmp_path)
+    sets = [f"{key}={value}" for key, value in more.items()]
+    return load(tmp_path / "tiny.yaml", [f"loss={loss}", *sets])
+
+
+def test_a_list_of_one_is_the_loss_itself_and_weights_multiply(tmp_path):
+    image, target = textured()
+    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective", "film": {
+        "type": "hdrfilm", "width": 14, "height": 17}}})  # fmt: skip
+    found = []
+    for loss in (
+        "{type: l1}",
+        "[{type: l1}]",
+        "[{type: l1, weight: 3}]",
+        "[{type: l1}, {type: l2, weight: 0.5}]",
+        "{}",
+    ):
+        [view] = make_views(read(tmp_path, loss), scene)
+        view.see(target)
+        found.append(float(view.judge(mi.TensorXf(image))[0]))
+    assert found[0] == found[1]
+    assert found[2] == pytest.approx(3 * found[0], rel=1e-6)
+    assert found[3] == pytest.approx(found[0] + 0.5 * found[4], rel=1e-6)
+
+
+def test_a_single_loss_is_written_as_ever_and_a_list_is_read_back(tmp_path):
+    assert read(tmp_path, "{type: l1}").model_dump()["loss"] == {"type": "l1"}
+    listed = read(tmp_path, "[{type: l2}, {type: ssim, weight: 0.1, scales: 2}]")
+    assert listed.model_dump()["loss"] == [
+        {"type": "l2"}, {"type": "ssim", "scales": 2, "weight": 0.1, "data_range": None},
+    ]  # fmt: skip
+    assert loads(dump(listed), tmp_path / "tiny.yaml") == listed
+
+
+@pytest.mark.parametrize(
+    ("loss", "key", "words"),
+    [
+        ("{type: l2, weight: 2}", "loss.weight", "goes with a list of losses"),
+        ("[]", "loss", "at least one entry"),
+        ("[{type: l2, scale: fitted}, {type: l1}]", "loss[1].scale", "all are fitted, or none is"),
+        ("[{type: l2}, {type: l3}]", "loss[1].type", "l1"),
+        ("[{type: l2, weight: 0}]", "loss[0].weight", "above 0"),
+        ("[{type: l2, sigma: 1}]", "loss[0].sigma", "unknown key"),
+        ("l2", "loss", "must be a mapping"),
+    ],
+)
+def test_lists_that_are_none(tmp_path, loss, key, words):
+    with pytest.raises(ConfigError) as error:
+        read(tmp_path, loss)
+    assert error.value.key == key
+    assert words in error.value.message
+
+
+def test_ssim_of_an_image_that_is_too_small(tmp_path):
+    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective", "film": {
+        "type": "hdrfilm", "width": 21, "height": 20}}})  # fmt: skip
+    make_views(read(tmp_path, "{type: ssim}"), scene)
+    with pytest.raises(ConfigError, match="ssim needs 11x11 pixels at each level, and there are 11x10"):
+        make_views(read(tmp_path, "[{type: l2}, {type: ssim, scales: 2}]"), scene)
 
 
 # Exposures that are recovered: their gradient, and where the images cannot tell them from parameters.
@@ -204,7 +366,7 @@ def left_out(problem):
     return [] if view.weights is None else [tuple(at) for at in np.argwhere(np.array(view.weights)[:, :, 0] == 0)]
 
 
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", POINTWISE)
 def test_a_masked_loss_is_that_of_what_is_left(name):
     rng = np.random.default_rng(2)
     image, target = (rng.uniform(0.1, 2, (4, 5, 3)).astype(np.float32) for _ in range(2))

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.loader import dump, loads
+from reslrb_cli.config.loader import dump, told
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.integrators.step import render_image
@@ -183,7 +183,7 @@ _PURPOSE = "convergence, dL/dI"
 
 def begin_survey(first: dict[str, Any]) -> Begun:
     """Begin the process. The one question names the file for arrays, `out`; its answer is `survey`'s facts."""
-    problem = assemble_scene(loads(first["config"], first["source"]).with_exposures_fixed())
+    problem = assemble_scene(told(first).with_exposures_fixed())
 
     def answer(question: dict[str, Any]) -> dict[str, Any]:
         facts, arrays = survey(problem, first["objective"], **question["ask"])
@@ -341,7 +341,7 @@ def begin_sampling(first: dict[str, Any]) -> Begun:
     Its answer has `step_ms` of each and the number of `new_kernels`; the samples (count, P) go to the file `out`. Where
     `cold`, also the peak of Dr.Jit's arrays. Seeds are those of the `purpose`; `image` says which dL/dI.
     """
-    config = loads(first["config"], first["source"])
+    config = told(first)
     with np.load(first["arrays"]) as arrays:
         sampler = Sampler(config, first["mode"], {name: arrays[name] for name in arrays.files})
 

@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.loader import loads
+from reslrb_cli.config.loader import told
 from reslrb_cli.measure.convergence.setup import affordable_paths, find_references, shorten_target
 from reslrb_cli.measure.references import leave_out_border
 from reslrb_cli.measure.stepper import multiple_of
@@ -83,7 +83,7 @@ def begin_judging(first: dict[str, Any]) -> Begun:
     Each other one names a file of `values`; its answer has their `loss` and `error`.
     """
     start = time.perf_counter()
-    problem = assemble_scene(loads(first["config"], first["source"]))
+    problem = assemble_scene(told(first))
     loading_s = time.perf_counter() - start
     judges: list[Judge] = []
 
@@ -228,7 +228,7 @@ def begin_run(first: dict[str, Any]) -> Begun:
     done, and the peak of Dr.Jit's arrays.
     """
     start = time.perf_counter()
-    problem = assemble_scene(loads(first["config"], first["source"]))
+    problem = assemble_scene(told(first))
     options = find_options(problem)
     with np.load(first["targets"]) as targets:
         set_targets(problem.views, targets)

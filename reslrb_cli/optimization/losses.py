@@ -1,0 +1,246 @@
+"""How an image is compared with its target, by functions that Dr.Jit differentiates.
+
+Each takes the image I, (H, W, C) and attached to the AD graph, the target T of the same shape, both in linear radiance,
+and what each entry weighs, of that shape too with a mean of 1 (None: all the same). It returns a width-1 array: a mean
+over pixels and channels, so that it depends neither on the resolution nor on how many pixels are left out.
+
+`weighted`, `pyramid` and `fitted` make others of them: a sum of several, the mean over several resolutions, and the
+loss of the image multiplied by what suits the target best.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.integrators.protocol import halves_of
+
+#: A loss with its options bound, of an image, its target, and weights, if there are any.
+Loss = Callable[..., "mi.Float"]
+
+
+def _mean(values: mi.TensorXf, weights: mi.TensorXf | None) -> mi.Float:
+    return dr.mean(values if weights is None else values * weights, axis=None).array
+
+
+def l1(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float:
+    """mean |I - T|. Its gradient is 0 where I = T."""
+    return _mean(dr.abs(image - target), weights)
+
+
+def l2(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float:
+    """mean (I - T)²."""
+    return _mean(dr.square(image - target), weights)
+
+
+def relative_l2(
+    image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /, epsilon: float = 1e-2
+) -> mi.Float:
+    """mean (I - T)² / (T² + ε), ε in squared units of radiance.
+
+    The denominator holds the target, not the image: a constant, so the gradient is that of the loss itself. With the
+    (detached) noisy image in its place the noise of one pixel would stand in numerator and denominator at once.
+    """
+    return _mean(dr.square(image - target) / (dr.square(target) + epsilon), weights)
+
+
+def log_l2(
+    image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /, epsilon: float = 1e-2
+) -> mi.Float:
+    """mean (log(I + ε) - log(T + ε))², ε in units of radiance.
+
+    Negative values, as filters with negative lobes make them, count as 0.
+    """
+    difference = dr.log(dr.maximum(image, 0.0) + epsilon) - dr.log(dr.maximum(target, 0.0) + epsilon)
+    return _mean(dr.square(difference), weights)
+
+
+def smape(
+    image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /, epsilon: float = 1e-2
+) -> mi.Float:
+    """mean |I - T| / (|I| + |T| + ε), the symmetric relative error (Vogels et al. 2018), ε in units of radiance.
+
+    Its derivative by I is bounded by 1 / (|T| + ε) whatever I is, and 0 where I = T.
+    """
+    return _mean(dr.abs(image - target) / (dr.abs(image) + dr.abs(target) + epsilon), weights)
+
+
+#: Of the Gaussian window of SSIM: standard deviation and side in pixels, and the constants K_1 and K_2 (Wang et al.).
+SSIM_SIGMA, SSIM_SIDE, SSIM_K = 1.5, 11, (0.01, 0.03)
+
+
+def ssim(
+    image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /, data_range: float | None = None
+) -> mi.Float:
+    """1 - mean SSIM (Wang, Bovik, Sheikh and Simoncelli 2004, equation 13), of images of 11x11 pixels or more.
+
+        SSIM = (2 μ_I μ_T + C_1) (2 σ_IT + C_2) / ((μ_I² + μ_T² + C_1) (σ_I² + σ_T² + C_2)),  C_k = (K_k data_range)²
+
+    in each channel and window, of a Gaussian with a standard deviation of 1.5 pixels, 11 pixels wide; the variances are
+    those of the window itself. It is what scikit-image has with `gaussian_weights=True, use_sample_covariance=False`:
+    the mean is over the windows that lie within the image. Each weighs as much as the pixel at its centre; a pixel that
+    is left out has to be the same in both images, as `View.judge` has it. A `data_range` of None is the target's
+    largest value. Raises ValueError for smaller images.
+    """
+    if min(image.shape[:2]) < SSIM_SIDE:
+        raise ValueError(f"SSIM needs images of {SSIM_SIDE}x{SSIM_SIDE} pixels, not {image.shape[1]}x{image.shape[0]}")
+    mean_i, mean_t = _windows(image), _windows(target)
+    extent: mi.Float | float = 0.0 if data_range is None else data_range
+    if data_range is None:
+        most = dr.max(target.array if weights is None else dr.select(weights.array > 0, target.array, 0))
+        extent = dr.select(most > 0, most, 1)
+    first, second = (dr.square(factor * extent) for factor in SSIM_K)
+    # About the means of the images, which the variances do not depend on: squares of bright pixels lose digits.
+    level = dr.detach(dr.mean(target, axis=None).array)
+    i, t = image - level, target - level
+    at_i, at_t = mean_i - level, mean_t - level
+    across = _windows(i * t) - at_i * at_t
+    both = _windows(dr.square(i) + dr.square(t)) - dr.square(at_i) - dr.square(at_t)
+    above = (2 * mean_i * mean_t + first) * (2 * across + second)
+    unlike = 1 - above / ((dr.square(mean_i) + dr.square(mean_t) + first) * (both + second))
+    if weights is None:
+        return _mean(unlike, None)
+    margin = SSIM_SIDE // 2
+    inner = weights[margin : image.shape[0] - margin, margin : image.shape[1] - margin]
+    return dr.sum(unlike * inner, axis=None).array / dr.maximum(dr.sum(inner, axis=None).array, 1e-30)
+
+
+def _windows(image: mi.TensorXf) -> mi.TensorXf:
+    """The means over SSIM's windows of an image (H, W, C), (H - 10, W - 10, C), attached."""
+    margin = SSIM_SIDE // 2
+    raw = [math.exp(-0.5 * (place / SSIM_SIGMA) ** 2) for place in range(-margin, margin + 1)]
+    factors = [each / sum(raw) for each in raw]
+    for axis in (0, 1):
+        shape = list(image.shape)
+        step = math.prod(shape[axis + 1 :])
+        extent = shape[axis]
+        shape[axis] -= 2 * margin
+        lane = dr.arange(mi.UInt32, math.prod(shape))
+        inner = step * shape[axis]
+        start = lane // inner * (step * extent) + lane % inner
+        total = dr.zeros(mi.Float, math.prod(shape))
+        for place, factor in enumerate(factors):
+            # Entries have several places to go, in one kernel: the derivative is added up by atomics.
+            total += factor * dr.gather(mi.Float, image.array, start + place * step)
+        image = mi.TensorXf(total, tuple(shape))
+    return image
+
+
+LOSSES: dict[str, Loss] = {
+    "l1": l1, "l2": l2, "relative_l2": relative_l2, "log_l2": log_l2, "smape": smape, "ssim": ssim,
+}  # fmt: skip
+
+#: Those whose derivative is linear in the image, so that its noise averages out.
+QUADRATIC = ("l2", "relative_l2")
+
+
+def make_loss(type: str, scales: int = 1, own: Loss | None = None, **options: float) -> Loss:
+    """Return the loss of that name with its options bound, or `own`, of so many `scales`. Raises KeyError for an
+    unknown name."""
+    loss = functools.partial(LOSSES[type], **options) if own is None else own
+    return loss if scales == 1 else functools.partial(pyramid, loss, scales)
+
+
+def weighted(
+    losses: Sequence[tuple[float, Loss]],
+    image: mi.TensorXf,
+    target: mi.TensorXf,
+    weights: mi.TensorXf | None = None,
+    /,
+) -> mi.Float:
+    """The sum of losses, each multiplied by the number before it."""
+    first, *others = (factor * loss(image, target, weights) for factor, loss in losses)
+    return sum(others, first)
+
+
+def pyramid(
+    loss: Loss, scales: int, image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /
+) -> mi.Float:
+    """The mean of a loss over `scales` levels, the first of which are image and target themselves.
+
+    Each pixel of a level is the mean of 2x2 of the level before by their weights, and weighs as much as those together:
+    one along an odd border has fewer, and what is left out is no part of any.
+    """
+    total = loss(image, target, weights)
+    if weights is None:
+        weights = dr.full(mi.TensorXf, 1, image.shape)
+    for _ in range(1, scales):
+        coarse = _sums(weights)
+        image, target = (_sums(weights * each) / dr.maximum(coarse, 1e-30) for each in (image, target))
+        weights = coarse / dr.mean(coarse, axis=None)
+        total = total + loss(image, target, weights)
+    return total / scales
+
+
+def _sums(image: mi.TensorXf) -> mi.TensorXf:
+    """The sums over 2x2 pixels of an image (H, W, C), (ceil(H / 2), ceil(W / 2), C), attached."""
+    height, width, channels = image.shape
+    shape = ((height + 1) // 2, (width + 1) // 2, channels)
+    lane = dr.arange(mi.UInt32, math.prod(shape))
+    channel, column = lane % channels, 2 * (lane // channels % shape[1])
+    row, total = 2 * (lane // (channels * shape[1])), dr.zeros(mi.Float, math.prod(shape))
+    for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        inside = (row + down < height) & (column + right < width)
+        index = ((row + down) * width + column + right) * channels + channel
+        # Each entry has one place to go: the derivative needs no atomics, and is the same every time.
+        total += dr.gather(mi.Float, image.array, index, inside, dr.ReduceMode.Permute)
+    return mi.TensorXf(total, shape)
+
+
+def _product(first: mi.TensorXf, second: mi.TensorXf, weights: mi.TensorXf | None) -> mi.Float:
+    return _mean(first * second, weights)
+
+
+def best_scale(
+    halves: tuple[mi.TensorXf, mi.TensorXf],
+    target: mi.TensorXf,
+    weights: mi.TensorXf | None = None,
+    across: bool = False,
+) -> mi.Float:
+    """s = <I, T> / <I, I>, of width 1, attached, I the mean of two images of one expectation (H, W, C); 1, without a
+    derivative, where not both products are positive, as of black images.
+
+    The value of <I, I> is that of the two, whose noise is independent, times each other; its derivative is 2 <I, dI>,
+    which noise of I leaves unbiased where dI has other samples, or `across`, <I_a, dI_b> + <I_b, dI_a>.
+    """
+    image, square = 0.5 * (halves[0] + halves[1]), _product(*halves, weights)
+    if not across:
+        whole = _product(image, image, weights)
+        square = dr.detach(square) + (whole - dr.detach(whole))
+    along = _product(image, target, weights)
+    there = (square > 0) & (along > 0)
+    return dr.select(there, along / dr.select(there, square, 1), 1)
+
+
+def fitted(
+    loss: Loss,
+    image: mi.TensorXf,
+    target: mi.TensorXf,
+    weights: mi.TensorXf | None = None,
+    /,
+    across: bool = False,
+) -> mi.Float:
+    """The loss of s I, with s = <I, T> / <I, I> (`best_scale`), of an image (H, W, C) or of two halves (2, H, W, C).
+
+    Its derivative is  s l(s I) + L_s ds/dI,  with l the derivative of the loss. L_s = <l(s I), I> has the image twice:
+    it is taken as the mean of <l(s I_a), I_b> and <l(s I_b), I_a>. So every product of noise with itself is gone from
+    the derivative of a loss that is quadratic in the image; that of one image given twice is the exact derivative.
+    `across`: the derivative with respect to I_a has I_b in place of I, and the other way round: no path of a half sees
+    a delta that it helped to make.
+    """
+    first, second = halves_of(image)
+    factor = best_scale((first, second), target, weights, across)
+    fixed, one, other = dr.detach(factor), dr.detach(first), dr.detach(second)
+    value = loss(fixed * (0.5 * (first + second)), target, weights)
+    change = factor - fixed  # 0, with a derivative
+    parts = [loss(fixed * a + change * b, target, weights) for a, b in ((one, other), (other, one))]
+    if across:
+        value = dr.detach(value)
+        parts += [loss(fixed * (b + (a - dr.detach(a))), target, weights) for a, b in ((first, other), (second, one))]
+    for part in parts:
+        value = value + 0.5 * (part - dr.detach(part))
+    return value

@@ -1,0 +1,282 @@
+"""Losses that users have written: what is run and when, what comes of it, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from cli.tiny import KEY, lines, read_metrics, reslrb
+from runs.going_on import begin_alone, optimize
+
+from reslrb_cli.config.loader import load, told
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure.methods import Sweep
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.views import View
+
+OWN = """import drjit as dr
+import mitsuba as mi
+
+print("the code was run")
+
+
+def own(image, target):
+    return dr.mean(dr.square(image - target), axis=None)
+
+
+def with_weights(image, target, weights):
+    values = dr.square(image - target)
+    return dr.mean(values if weights is None else values * weights, axis=None).array
+
+
+def nan(image, target):
+    return dr.mean(dr.sqrt(image - image - 1), axis=None)
+
+
+def nan_derivative(image, target):
+    return dr.mean(dr.sqrt(image - image), axis=None)
+
+
+def not_one(image, target):
+    return (image - target).array
+
+
+def number(image, target):
+    return 1.0
+
+
+def constant(image, target):
+    return dr.mean(target, axis=None)
+
+
+def detached(image, target):
+    return dr.detach(own(image, target))
+
+
+def raises(image, target):
+    raise ValueError("no such thing")
+
+
+def ends(image, target):
+    raise SystemExit(0)
+
+
+def needs_two(image):
+    return image
+
+
+text = "no function"
+"""
+SETS = ("run={iterations: 3, spp: 4, measuring: 0, certainty: false, checkpoint_every: {iterations: 1}}",)
+
+
+@pytest.fixture
+def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    begin_alone(tmp_path, monkeypatch)
+    (tmp_path / "own.py").write_text(OWN)
+    return tmp_path
+
+
+def run(loss: str, *more: str, name: str = "a") -> int:
+    sets = [f"loss={loss}", f"run.name={name}", *more]
+    words = [word for each in (*SETS, *sets) for word in (("--set", each) if not each.startswith("--") else (each,))]
+    return optimize("tiny.yaml", "--quiet", *words)
+
+
+def own(name: str) -> str:
+    return f"{{type: custom, file: own.py:{name}}}"
+
+
+def values(name: str) -> dict[str, np.ndarray]:
+    with np.load(f"runs/{name}/parameters/parameters.npz") as found:
+        return {key: found[key] for key in found.files}
+
+
+def test_the_formula_of_l2_gives_what_l2_gives_bit_by_bit(experiment: Path) -> None:
+    assert run("{type: l2}", name="l2") == 0
+    for name in ("own", "with_weights"):
+        assert run(own(name), "--allow-code", name=name) == 0
+        assert run(f"[{own(name)}]", "--allow-code", name=f"{name}-list") == 0
+        for each in (name, f"{name}-list"):
+            for key, value in values("l2").items():
+                np.testing.assert_array_equal(values(each)[key], value)
+            assert [r["loss"] for r in read_metrics(f"runs/{each}")] == [r["loss"] for r in read_metrics("runs/l2")]
+    assert (values("l2")[KEY] != 0.5).any(), "it moved"
+
+
+def test_nothing_is_run_without_being_allowed(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(own("own")) == 2
+    out, err = capsys.readouterr()
+    assert "the code was run" not in out
+    assert len(lines(err)) == 1
+    assert "--set: loss.file: would run the code of" in err or "tiny.yaml: loss.file: would run the code of" in err
+    assert "--allow-code" in err
+    assert not Path("runs").exists()
+
+
+def test_a_run_is_read_without_its_code_and_goes_on_only_with_the_same(
+    experiment: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(own("own"), "--allow-code") == 0
+    assert "the code was run" in capsys.readouterr().out
+    before = set(sys.modules)
+    for call in (("report", "runs/a", "-o", "page.html"), ("inspect", "runs/a/config.yaml"),
+                 ("render", "--run", "runs/a", "-o", "image.exr", "--spp", "4")):  # fmt: skip
+        result = reslrb(*call)
+        assert result.exit_code == 0, (call, result.output)
+        assert "the code was run" not in result.output
+    assert not [name for name in set(sys.modules) - before if name.startswith("reslrb_own_")]
+    more = ("--quiet", "--resume", "runs/a", "--set", "run.iterations=4")
+    assert optimize(*more) == 2
+    assert "--allow-code" in capsys.readouterr().err
+    (experiment / "own.py").write_text(OWN + "# another\n")
+    assert optimize(*more, "--allow-code") == 2
+    err = capsys.readouterr().err
+    assert "loss.file: has changed since runs/a began" in err
+    (experiment / "own.py").write_text(OWN)
+    assert optimize(*more, "--allow-code") == 0
+    assert len(read_metrics("runs/a")) == 4
+
+
+def test_yaml_cannot_allow_it(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for setting in ("allow_code=true", "run.allow_code=true", "loss.allow_code=true"):
+        assert run(own("own"), setting) == 2
+        assert "unknown key" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("nan", "returns nan"),
+        ("nan_derivative", "derivative that is not finite"),
+        ("not_one", "returns 192 numbers, not one"),
+        ("number", "returns float, not mi.Float"),
+        ("constant", "has no derivative by the image"),
+        ("detached", "has no derivative by the image"),
+        ("raises", "raises in line 41 ValueError: no such thing"),
+        ("ends", "raises in line 45 SystemExit: 0"),
+        ("needs_two", "raises"),
+        ("text", "has a str, not a function, of the name `text`"),
+        ("none", "has nothing of the name `none`"),
+    ],
+)
+def test_what_is_no_loss_is_one_located_line(
+    experiment: Path, capsys: pytest.CaptureFixture[str], name: str, words: str
+) -> None:
+    assert run(own(name), "--allow-code") == 2
+    err = capsys.readouterr().err
+    assert len(lines(err)) == 1, err
+    assert "loss.file: " in err
+    assert words in err
+    assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("def own(:", "SyntaxError"),
+        ("import no_such_thing", "raises in line 1 ModuleNotFoundError"),
+        ("1 / 0", "ZeroDivision"),
+    ],
+)
+def test_a_file_that_cannot_be_run(experiment: Path, capsys: pytest.CaptureFixture[str], text: str, words: str) -> None:
+    (experiment / "own.py").write_text(text)
+    assert run(own("own"), "--allow-code") == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [("own.py", "must be FILE.py:NAME"), ("own.txt:own", "must be FILE.py:NAME"),
+     ("'own.py:a b'", "must be FILE.py:NAME"), ("gone.py:own", "no such file"), ("null", "missing: FILE.py:NAME")],
+)  # fmt: skip
+def test_a_name_that_is_none(experiment: Path, capsys: pytest.CaptureFixture[str], file: str, words: str) -> None:
+    assert run(f"{{type: custom, file: {file}}}", "--allow-code") == 2
+    err = capsys.readouterr().err
+    assert "loss.file: " in err
+    assert words in err
+
+
+def test_it_can_import_what_lies_beside_it_and_paths_are_the_files(experiment: Path) -> None:
+    (experiment / "below").mkdir()
+    (experiment / "below/helping_the_loss.py").write_text("from drjit import mean\n")
+    (experiment / "below/far.py").write_text(
+        "from helping_the_loss import mean\n\n\n"
+        "def own(image, target):\n    return mean((image - target) ** 2, axis=None)\n"
+    )
+    assert run("{type: custom, file: below/far.py:own}", "--allow-code") == 0
+    assert f"file: {experiment}/below/far.py:own" in Path("runs/a/config.yaml").read_text()
+
+
+def test_a_later_nan_is_a_run_s_own_affair(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (experiment / "own.py").write_text(
+        "import drjit as dr\ncalls = []\n\n\ndef own(image, target):\n    calls.append(1)\n"
+        "    value = dr.mean(dr.square(image - target), axis=None)\n"
+        "    return value * (float('nan') if len(calls) > 2 else 1)\n"
+    )
+    assert run(own("own"), "run.on_nonfinite=stop", "--allow-code") == 5
+    assert json.loads(Path("runs/a/manifest.json").read_text())["status"] == "failed"
+
+
+def test_a_function_that_is_handed_over(experiment: Path) -> None:
+    seen: list[tuple[int, ...]] = []
+
+    def loss(image: mi.TensorXf, target: mi.TensorXf) -> mi.Float:
+        import drjit as dr
+
+        seen.append(tuple(image.shape))
+        return dr.mean(dr.abs(image - target), axis=None).array
+
+    config = load("tiny.yaml", ["run.measuring=0", "run.spp=4"]).with_loss(loss)
+    problem = assemble(config, to_run=True)
+    assert seen == [(8, 8, 3)], "it is tried once"
+    assert problem.config.model_dump()["loss"] == {"type": "custom", "file": None}
+    view = problem.views[0]
+    by_name = assemble(load("tiny.yaml", ["loss.type=l1", "run.measuring=0", "run.spp=4"])).views[0]
+    image = np.full((8, 8, 3), 0.3, np.float32)
+    assert float(view.compare(mi.TensorXf(image))[0]) == float(by_name.compare(mi.TensorXf(image))[0])
+
+
+def test_weights_are_handed_to_a_function_that_takes_them(experiment: Path) -> None:
+    rng = np.random.default_rng(1)
+    image, target = rng.uniform(0, 1, (2, 8, 8, 3)).astype(np.float32)
+    even, uneven = np.ones((8, 8)), rng.uniform(1, 2, (8, 8))
+    even[:3] = uneven[:3] = 0
+
+    def view(name: str, weights: np.ndarray) -> View:
+        config = load("tiny.yaml", [f"loss={own(name)}", "run.measuring=0"]).with_code()
+        made = assemble(config).views[0]
+        made.see(target, weights)
+        return made
+
+    expected = ((image - target)[3:] ** 2).mean()
+    assert float(view("with_weights", even).judge(mi.TensorXf(image))[0]) == pytest.approx(expected, rel=1e-5)
+    assert float(view("own", even).judge(mi.TensorXf(image))[0]) == pytest.approx(expected * 5 / 8, rel=1e-5)
+    view("with_weights", uneven).judge(mi.TensorXf(image))
+    with pytest.raises(ConfigError, match=r"loss\.file: takes no weights"):
+        view("own", uneven).judge(mi.TensorXf(image))
+
+
+def test_processes_that_measure_are_told_whether_it_is_allowed(experiment: Path) -> None:
+    call = ["--set", f"loss={own('own')}"]
+    result = reslrb("convergence", "tiny.yaml", *call, "--objective", "loss", "--rounds", "2", "--spp", "4,8")
+    assert (result.exit_code, "--allow-code" in result.output) == (2, True)
+    result = reslrb("gradcheck", "tiny.yaml", *call, "--missing")
+    assert (result.exit_code, "--allow-code" in result.output) == (2, True)
+    config = load("tiny.yaml", [f"loss={own('own')}"])
+    for allowed in (False, True):
+        first = Sweep.first(SimpleNamespace(variant="llvm_ad_rgb", memory_limit=None), config.with_code(allowed))
+        assert told(json.loads(json.dumps(first))).allows_code is allowed
+
+
+@pytest.mark.long
+def test_convergence_runs_it_in_its_processes(experiment: Path) -> None:
+    call = ["convergence", "tiny.yaml", "--set", f"loss={own('own')}", "--rounds", "2", "--spp", "4,8"]
+    result = reslrb(*call, "--objective", "loss", "--allow-code", "--integrators", "reslrb")
+    assert "reslrb, 8 spp: first step" in result.output
+    assert "loss.file" not in result.output
