@@ -149,10 +149,9 @@ def _resume(run: Path, config_file: Path | None, overrides: tuple[str, ...], all
 
     with open_earlier(run, config_file, overrides) as earlier:
         if earlier.is_done:
-            echo(
-                f"{run}: is finished, after {earlier.iteration} of {earlier.iteration} iterations; "
-                "--set run.iterations=NUMBER goes on"
-            )
+            iterations, stopped = earlier.config.run.iterations, earlier.has_stopped
+            more = "run.stop=null" if stopped and iterations > earlier.iteration else "run.iterations=NUMBER"
+            echo(f"{run}: is finished, after {earlier.iteration} of {iterations} iterations; --set {more} goes on")
             return ExitCode.DONE
         earlier.config = config = earlier.config.with_code(allow_code)
         if earlier.elsewhere:

@@ -14,6 +14,7 @@ from pydantic import (
     Field,
     SerializerFunctionWrapHandler,
     ValidationInfo,
+    WithJsonSchema,
     model_serializer,
     model_validator,
 )
@@ -190,6 +191,41 @@ def loss_words(given: Loss | Sequence[Loss]) -> str:
 _Decay = Annotated[float, Field(ge=0, lt=1)]
 
 
+class Standing(Section):
+    """When a loss is taken to stand."""
+
+    patience: Annotated[int, Field(ge=5, lt=2**31)] = 20
+    """Iterations of a window; at the end of each its losses are compared with those of the window before. At least 20
+    where views are held out, whose loss is known every 10 iterations."""
+    relative: Annotated[float, Field(ge=0, lt=1)] = 0.01
+    """The loss stands where its mean over a window did not fall by more than this share of that over the window before,
+    or not by more than the standard error of their difference."""
+
+
+class Plateau(Standing):
+    """What `schedule: plateau` does where the loss stands; windows begin anew then."""
+
+    factor: Annotated[float, Field(gt=0, lt=1)] = 0.5
+    """What the learning rate is multiplied by, down to `final_fraction` of the first."""
+
+
+def _average(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise wrong("must be a number of iterations, of 2 or more, or a share of them, above 0 and below 1")
+    if not (2 <= value < 2**31 if isinstance(value, int) else 0 < value < 1):
+        raise wrong("must be a number of iterations, of 2 or more, or a share of them, above 0 and below 1")
+    return value
+
+
+#: The last iterations: so many, or a share of all.
+Last = Annotated[
+    int | float,
+    BeforeValidator(_average),
+    WithJsonSchema({"anyOf": [{"type": "integer", "minimum": 2},
+                              {"type": "number", "exclusiveMinimum": 0, "exclusiveMaximum": 1}]}),
+]  # fmt: skip
+
+
 class Optimizer(Choice):
     """Options that all optimisers share: the learning rate and its schedule."""
 
@@ -204,10 +240,16 @@ class Optimizer(Choice):
     Learning rates are then shares of that length: 0.02 is 2 % a step.
     `curvature`, for `sgd`: measure the largest curvature of the loss by each parameter, and divide gradients by it. A
     learning rate of 1 is then the step that ends at the bottom in the steepest direction; the default is 0.5."""
-    schedule: Literal["constant", "cosine", "exponential"] = "constant"
-    """How the learning rate runs from its first value to its last."""
+    schedule: Literal["constant", "cosine", "exponential", "plateau"] = "constant"
+    """How the learning rate runs from its first value to its last; `plateau`: lower each time that the loss stands."""
     final_fraction: float = Field(default=0.01, gt=0, le=1)
     """Last learning rate over the first; only with a schedule other than `constant`."""
+    plateau: Plateau = Plateau()
+    """When a loss stands, and what becomes of the rate then; only with `schedule: plateau`. {}: its defaults."""
+    average: Last | None = None
+    """The run's result is the mean of the values after the last iterations: of so many, or of a share of all. It has
+    less noise than the last values, which stand beside it in `parameters/last/`, and which the run goes on from. Where
+    values still move, it lags behind. Not with `run.stop`. null: the last values."""
 
     clamp_gradient: Annotated[float, Field(ge=1)] | None = None
     """Clamp each entry of a gradient at so many times its usual size: the larger of the running means of its own
@@ -218,6 +260,8 @@ class Optimizer(Choice):
     def _check_schedule(self) -> Self:
         if self.schedule == "constant" and "final_fraction" in self.model_fields_set:
             raise located("final_fraction", "has no effect on a constant learning rate; set `schedule` or remove it")
+        if self.schedule != "plateau" and "plateau" in self.model_fields_set:
+            raise located("plateau", "goes with schedule: plateau; set that or remove it")
         return self
 
     @model_validator(mode="before")
@@ -238,6 +282,10 @@ class Optimizer(Choice):
         values: dict[str, Any] = handler(self)
         if self.schedule == "constant":
             values.pop("final_fraction", None)
+        if self.schedule != "plateau":
+            values.pop("plateau", None)
+        if self.average is None:
+            values.pop("average", None)
         return values
 
     def own_options(self) -> dict[str, Any]:

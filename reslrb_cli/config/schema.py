@@ -52,6 +52,7 @@ from reslrb_cli.config.optimizers import (
     Loss,
     Losses,
     Stage,
+    Standing,
     check_stages,
     loss_keys,
     losses_of,
@@ -252,11 +253,18 @@ class RunConfig(Section):
     the iterations is done. After the last of them it is as configured. Where resolution or film change, the optimizer
     begins anew, and so does what `optimizer.scale` measures."""
 
+    stop: Standing | None = None
+    """End the run before its last iteration, as finished, once its loss stands: that of held-out views where there are
+    any, else that of the iterations; with `schedule: plateau` not before the rate is at its least. `{}`: the defaults.
+    null: never."""
+
     @model_serializer(mode="wrap")
     def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         values: dict[str, Any] = handler(self)
         if not self.stages:
             del values["stages"]
+        if self.stop is None:
+            del values["stop"]
         if self.adjoint not in ("auto", "batched"):
             del values["batches"], values["first_batch"]
         return values
@@ -478,6 +486,7 @@ class Config(Section):
                         f"parameters[{i}].{at}", f"`{name}` stands in parameters[{places[option, name]}] already"
                     )
         self._check_samples()
+        self._check_standing()
         check_stages(self.run.stages)
         for number in range(len(self.run.stages)):
             try:
@@ -504,6 +513,19 @@ class Config(Section):
             key = "integrator" if own is None else "target.render.integrator"
             _check_passes(own or self.integrator, self.target.render.spp, key, "target.render.spp")
         return self
+
+    def _check_standing(self) -> None:
+        """Raise an error, located, where windows of losses hold too few, or an average's iterations are not known."""
+        stop, optimizer = self.run.stop, self.optimizer
+        asked = {"run.stop": stop, "optimizer.plateau": optimizer.plateau if optimizer.schedule == "plateau" else None}
+        for key, one in asked.items():
+            if one is not None and self.run.held_out and one.patience < 20:
+                reason = f"must be at least 20, not {one.patience}: held-out views are looked at every 10 iterations"
+                raise located(f"{key}.patience", reason)
+        if stop is not None and optimizer.average is not None:
+            raise located(
+                "optimizer.average", "does not go with run.stop, which ends a run nobody knows when; remove one"
+            )
 
     def _check_samples(self) -> None:
         """Raise an error, located, where a step's samples cannot be split as the run's settings have it."""

@@ -31,6 +31,7 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import measure_curvatures, rescale
 from reslrb_cli.optimization.stages import Stages
 from reslrb_cli.optimization.state import State, put, standing
+from reslrb_cli.optimization.stopping import Watch, lowered
 from reslrb_cli.optimization.views import View
 from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record, Regularized
@@ -52,6 +53,8 @@ def learning_rate_factor(
 
     `least` (0 to 1) is how far a run is at least, of which less than all iterations will be made.
     """
+    if schedule == "plateau":  # which goes by losses (`stopping.lowered`)
+        return 1.0
     return SCHEDULES[schedule](max(iteration / max(iterations - 1, 1), least), final_fraction)
 
 
@@ -92,8 +95,12 @@ def step(
         split = Split()
         loss, squares, counts, refused, costs = gradient(problem, iteration, split)
         dr.eval(loss, squares, counts)
-    factor = problem.pace * learning_rate_factor(
-        config.optimizer.schedule, iteration, config.run.iterations, config.optimizer.final_fraction, progress()
+    factor = (
+        problem.pace
+        * lowered(config.optimizer, state.drops)
+        * learning_rate_factor(
+            config.optimizer.schedule, iteration, config.run.iterations, config.optimizer.final_fraction, progress()
+        )
     )
     with clock.counted():
         value = float(loss[0])
@@ -150,13 +157,19 @@ def iterate(
     state: State,
     on_nonfinite: Told = lambda found: None,
     progress: Callable[[], float] = lambda: 0.0,
+    watch: Watch | None = None,
 ) -> Iterator[tuple[State, Record]]:
-    """Make the iterations from `state` to the last of the run, each as `step` does, of the problem of its stage. Raises
-    NonFinite where it ends."""
+    """Make the iterations from `state` to the last of the run, each as `step` does, of the problem of its stage.
+
+    `watch` knows of those until then, and says which is the last; None where there are none. Raises NonFinite where the
+    run fails.
+    """
     reset_peak()
-    while state.iteration < stages.whole.config.run.iterations:
+    watch = Watch(stages.whole.config) if watch is None else watch
+    while state.iteration < stages.whole.config.run.iterations and not state.stopped:
         problem, state = stages.enter(state, progress)
         state, record = step(problem, state, on_nonfinite, progress)
+        problem.optimizer.stands_at = state = watch.after(state, record)
         yield state, record
         if state.end:
             raise NonFinite(state.end)

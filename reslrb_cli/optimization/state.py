@@ -50,7 +50,8 @@ class State:
     emission had by sensor, `learned` its arrays by `<sensor>/<what>`. `values` are the scene's, as the optimiser has
     them; in a file as they are shown, and as `halo` where that is less. `stage` is the number of the stage whose
     problem it is a state of, and `base` the run's values when that began, of one with a problem of its own (`stages`).
-    `end` says why the run ends with it, "" where it does not.
+    `drops` are those of a rate that a plateau has lowered, `since` the iterations before the last of them; `stopped`
+    says why the run ends with it as finished, and `end` why it fails, "" where it does not.
     """
 
     iteration: Count
@@ -62,6 +63,9 @@ class State:
     scaling: list[Scaled] | None = None
     guiding: dict[str, Count] | None = None
     stage: Count = 0
+    drops: Count = 0
+    since: Count = 0
+    stopped: str = ""
     values: Arrays = field(default_factory=dict, metadata=entry("parameter", "finite"))
     halo: Arrays = field(default_factory=dict, metadata=entry("parameter with halo", "finite"))
     moments: Arrays = field(default_factory=dict, metadata=entry("optimizer"))

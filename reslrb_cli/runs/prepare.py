@@ -34,7 +34,8 @@ from reslrb_cli.optimization.moving import warn_of_border
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import WINDOW, Best, Images, Least, Results
 from reslrb_cli.optimization.stages import Stages
-from reslrb_cli.optimization.state import Settled, State, check_bounds, load, on_file, standing
+from reslrb_cli.optimization.state import Settled, State, check_bounds, load, on_file, put, standing
+from reslrb_cli.optimization.stopping import Averaged, Watch, average_begins
 from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
 from reslrb_cli.optimization.views import view_records
 from reslrb_cli.records.cache import PilotCache
@@ -72,7 +73,7 @@ def plan_record(problem: Problem) -> dict[str, Any]:
 
 #: Settings that decide nothing of what the iterations until then were. All others would make it another run.
 MAY_CHANGE = re.compile(
-    r"run\.(iterations|name|output|checkpoint_every|images_every|certainty|on_nonfinite)(\..*)?"
+    r"run\.(iterations|name|output|checkpoint_every|images_every|certainty|on_nonfinite|stop)(\..*)?"
     r"|optimizer\.learning_rate|parameters\[\d+\]\.learning_rate(\..*)?"
 )
 
@@ -240,6 +241,7 @@ class Course:
         self.best = Best(any(view.held_out for view in problem.views))
         self.nonfinite, self.clamped, self.regularized = NonFiniteTally(), ClampTally(), RegularizedTally()
         self.last: Record | None = None
+        self.watch, self.average = Watch(problem.config), Averaged()
 
     @property
     def done(self) -> int:
@@ -253,6 +255,9 @@ class Course:
         self._take(record)
         if self.stages.is_whole(state.stage):
             self.certainty.see(state.iteration)
+        if state.iteration >= average_begins(self.problem.config):
+            shown = {key: np.array(value) for key, value in self.stages.values(state).items()}
+            self.average = self.average.add(self.problem.config, state.iteration, shown)
         self.state = state
 
     def _counts(self, iteration: int) -> bool:
@@ -267,8 +272,37 @@ class Course:
         self.stages.bring(self.state)
         return self.problem
 
+    def bring_last(self) -> Problem:
+        """The run's own problem at its newest values, also where it was brought to an average."""
+        if self.averages:
+            put(self.problem, self.state)
+        return self.bring()
+
+    def bring_result(self) -> Problem:
+        """The run's own problem, at what is the result of a run at its end: the newest values, or the average."""
+        problem = self.bring()
+        if self.averages:
+            problem.selection.set_arrays({key: value.astype(np.float32) for key, value in self.average.average.items()})
+            for key in problem.selection.keys:
+                problem.optimizer.set_value(key, problem.selection.value(key))
+            problem.apply()
+            problem.optimizer.stands_at = None
+        return problem
+
+    @property
+    def averages(self) -> bool:
+        """Whether the run is at its end, and its result an average."""
+        return self.average.average_count > 0 and self.done == self.problem.config.run.iterations
+
+    def go_on(self) -> None:
+        """Take back that the run had stopped: other settings say when."""
+        if self.state.stopped:
+            self.state = replace(self.state, stopped="")
+
     def _take(self, record: Record) -> None:
         self.last = record
+        if self.problem.config.optimizer.schedule == "plateau":
+            self.certainty.rates.append(record.lr / self.problem.config.optimizer.learning_rate)
         self.results.add(record)
         self.nonfinite.add(record)
         self.clamped.add(record)
@@ -290,7 +324,8 @@ class Course:
             self.results.images["initial"], self.certainty.noted, self.best.least, self.last,
             self.best_values(), self.certainty.squares,
         )  # fmt: skip
-        found, values = entries(self._settled, self.state.on_file(self.stages.at(self.state.stage)), met)
+        found, values = entries(self._settled, self.state.on_file(self.stages.at(self.state.stage)), met,
+                                self.average)  # fmt: skip
         save_checkpoint(folder, self.done, {}, found, values)
         return self.done
 
@@ -305,8 +340,13 @@ class Course:
         wanted = {key: expected(problem.selection.array(key).shape) for key in problem.selection.keys if met.best}
         kept = {key: each[0] for key, each in squares.items() if each is not None}
         met = stored.fill(replace(met, best_values=wanted, squares=kept))
+        average = stored.read(Averaged)
+        if average.average_count and average.average_first == average_begins(problem.config):
+            shapes = {key: expected(problem.selection.array(key).shape, np.float64) for key in problem.selection.keys}
+            self.average = stored.fill(replace(average, average=shapes))
         for record in records:
             self._take(record)
+            self.watch.add(record)
         self.best.recent.extend(record.loss for record in records[-WINDOW:] if self._counts(record.iteration))
         for key, array in met.best_values.items():
             check_bounds(problem, stored, f"best/{key}", key, array)

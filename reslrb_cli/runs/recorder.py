@@ -11,7 +11,7 @@ import logging
 import os
 import shlex
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.nonfinite import Findings
 from reslrb_cli.optimization.problem import Problem, saved_spp
 from reslrb_cli.optimization.sensitivity import curvature_line, step_line
+from reslrb_cli.optimization.state import State
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
 from reslrb_cli.optimization.views import Exposure
@@ -215,7 +216,8 @@ class Recording:
             # the state at the end has the best values too, and what the clamp and the optimiser then know
             reserve.hold(2 * size_of(self.folder.checkpoint) + size_of(values) + RESERVE_BYTES)
             self._iterate(show, stop)
-            status = Status.INTERRUPTED if self.done < self.problem.config.run.iterations else Status.FINISHED
+            left = self.done < self.problem.config.run.iterations and not self.course.state.stopped
+            status = Status.INTERRUPTED if left else Status.FINISHED
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
         except NonFinite as error:
@@ -252,7 +254,7 @@ class Recording:
         if stop():
             return
         with MetricsWriter(self.folder.path) as metrics:
-            for state, record in iterate(self.course.stages, self.course.state, self._on_nonfinite):
+            for state, record in self._iterations():
                 if state.scaling is not None and state.scaling is not told:
                     self._tell_scaling(state.scaling)
                 told = state.scaling
@@ -271,6 +273,12 @@ class Recording:
                     self._save_checkpoint()
                     saved, saved_at = self.done, time.monotonic()
                 self.page.refresh()
+
+    def _iterations(self) -> Iterator[tuple[State, Record]]:
+        course = self.course
+        yield from iterate(course.stages, course.state, self._on_nonfinite, watch=course.watch)
+        if course.state.stopped:
+            logger.info(f"stopped after {self.done} iterations: {course.state.stopped}")
 
     def _tell_scaling(self, measured: Sequence[Scaled]) -> None:
         """Note what was measured for `scale`, and say what it makes of a step."""
@@ -326,7 +334,9 @@ class Recording:
 
     def _write_parameters(self) -> None:
         """Write the last values, and beside them the best so far, where there are any."""
-        write_parameters(self.folder.parameters, self.course.bring().values())
+        if self.course.averages:
+            write_parameters(self.folder.parameters / "last", self.course.bring_last().values())
+        write_parameters(self.folder.parameters, self.course.bring_result().values())
         best = self.course.best_values()
         if best:
             write_parameters(self.folder.parameters / "best", best)
@@ -361,6 +371,9 @@ class Recording:
         config = self.problem.config
         if last is None or self.done < LEAST_ITERATIONS or not config.run.certainty:
             return
+        if self.course.averages:
+            logger.info("how certain the values are is not measured of averages")
+            return
         if not config.by_pixel:
             logger.info("how certain the values are is not measured: it takes a loss of each pixel by itself")
             return
@@ -386,9 +399,7 @@ class Recording:
     def _found(self) -> dict[str, Any]:
         """What the run came to, or has come to by now."""
         last = self.course.last
-        self.course.bring()
-        self.course.results.end()
-        found = self.course.results.to_json()
+        found = self._ended()
         if self.certainty is not None:
             found["certainty"] = finite(self.certainty.to_json())
         found["warnings"] = warnings({"iterations": self.done, **found})
@@ -405,6 +416,23 @@ class Recording:
             "best": finite(self.course.best.to_json()),
         }
 
+    def _ended(self) -> dict[str, Any]:
+        """The results with the values of the end, and of an average beside them what the last values were."""
+        course, results, told = self.course, self.course.results, {}
+        if course.averages:
+            course.bring_last()
+            results.end()
+            last, average = results.to_json(), course.average
+            told = {"average": {
+                "first": average.average_first, "iterations": average.average_count,
+                "last": {key: each["final"] for key, each in last["parameters"].items()},
+                "last_rmse": {key: each["final"] for key, each in last["parameter_rmse"].items()},
+            }}  # fmt: skip
+        course.bring_result()
+        results.end()
+        stopped = {"stopped": course.state.stopped} if course.state.stopped else {}
+        return {**results.to_json(), **told, **stopped}
+
     def _kept(self) -> str:
         """What of the run a reader will find."""
         written = "parameters" not in self.manifest.missing
@@ -420,7 +448,7 @@ class Recording:
 
     def _write_images(self, name: str) -> None:
         spp = saved_spp(self.problem, between=name.startswith("iteration"))
-        self.course.bring()
+        self.course.bring_result()
         if name == "final":
             logger.info(f"rendering the final image: {spp} spp")
         for view in self.problem.views:

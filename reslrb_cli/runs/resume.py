@@ -62,7 +62,12 @@ class Earlier:
     def is_done(self) -> bool:
         """Whether nothing is left to do."""
         finished = self.manifest.get("status") == Status.FINISHED
-        return finished and self.config.run.iterations == self.iteration
+        return finished and (self.config.run.iterations == self.iteration or self.has_stopped)
+
+    @property
+    def has_stopped(self) -> bool:
+        """Whether its loss stood (`run.stop`), and what says so is as it was."""
+        return bool(self.stored.read(State).stopped) and not any(key.startswith("run.stop") for key in self.changed)
 
     def prepare(self, variant: str, say: Say) -> tuple[Course, Manifest]:
         """Assemble the problem as it was, and bring it to where it is; a variant must be set.
@@ -73,6 +78,8 @@ class Earlier:
         manifest = self._manifest(manifest_of(problem, variant, self.config.source))
         course = Course(problem, variant)
         course.restore(self.stored, self.records)
+        if not self.has_stopped:
+            course.go_on()
         measured = course.state.scaling
         manifest.scaling = None if measured is None else [row.to_json() for row in measured]
         return course, manifest

@@ -88,7 +88,7 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
     ),
     "several errors": (GOOD + "run: {spp: 0, seed: -1, iterations: x}\n", "run.", "(and 2 more)"),
     "section is text": (GOOD + "run: fast\n", "run: must be a mapping", "'fast'"),
-    "section is a list": (GOOD + "loss: [l1]\n", "loss: must be a mapping such as {type: NAME}"),
+    "section is a list": (GOOD + "loss: [l1]\n", "loss[0]: must be a mapping such as {type: NAME}"),
     "no parameters": (changed(f"\n  - {PARAMETER}", " []"), "parameters: must have at least one entry"),
     "parameters is a mapping": (changed(f"\n  - {PARAMETER}", " {key: a}"), "parameters: must be a list"),
     "parameter twice": (

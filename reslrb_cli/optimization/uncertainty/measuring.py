@@ -61,6 +61,8 @@ class Certainty:
         self.noted, self.squares = Noted(0, []), dict[str, Any]()
         #: The texels (H, W) of each texture that some view shows and light reaches, once that was asked.
         self.shown: dict[str, Array] = {}
+        #: The factors of the learning rate so far, where no formula has them.
+        self.rates: list[float] = []
 
     def see(self, iterations: int) -> None:
         """Take note of a run that has done so many iterations; it costs nothing."""
@@ -179,7 +181,9 @@ class Certainty:
     def _measured(self, gradients: Gradients, iterations: int) -> dict[str, Measured]:
         settings, optimizer, selection = self.problem.config.optimizer, self.problem.optimizer, self.problem.selection
         planned, final = self.problem.config.run.iterations, settings.final_fraction
-        rates = [learning_rate_factor(settings.schedule, each, planned, final) for each in range(iterations)]
+        rates = self.rates or [
+            learning_rate_factor(settings.schedule, each, planned, final) for each in range(iterations)
+        ]
         found = {}
         for key, rows in gradients.items():
             value = row_of(self.problem, key)

@@ -1,0 +1,113 @@
+"""When a loss stands: what ends a run early (`run.stop`), and lowers its rate (`optimizer.schedule: plateau`); and the
+mean of its last values (`optimizer.average`).
+
+A loss is looked at in windows of `patience` iterations, one after another, once at the end of each. It stands where the
+mean of the newest window is not below that of the one before by more than the standard error of their difference and
+by more than `relative` of it: losses of iterations are noise for the most part, of independent samples. Where views are
+held out it is their loss, which has fewer values, always of the same samples. Windows begin once the run is as it is
+configured (`run.stages`), and anew where the rate is lowered. A run with a plateau ends only at its least rate.
+
+The mean of the values of the last iterations has less noise than the last of them (Polyak and Juditsky 1992).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from reslrb_cli.config.optimizers import AnyOptimizer, Standing
+from reslrb_cli.config.schema import Config
+from reslrb_cli.optimization.state import Count, State
+from reslrb_cli.records.metrics import Record
+from reslrb_cli.records.tree import Arrays, entry
+
+Array = np.ndarray[Any, Any]
+
+
+def lowered(optimizer: AnyOptimizer, drops: int) -> float:
+    """What a plateau has made of the rate after so many drops; 1 with other schedules."""
+    if optimizer.schedule != "plateau":
+        return 1.0
+    return max(optimizer.plateau.factor**drops, optimizer.final_fraction)
+
+
+class Watch:
+    """The losses of a run so far, which is told of each iteration in turn; from equal ones equal decisions follow."""
+
+    def __init__(self, config: Config) -> None:
+        self.config, self.held_out = config, bool(config.run.held_out)
+        self._values: dict[int, float] = {}
+
+    def add(self, record: Record) -> None:
+        """Take an iteration, of a run that goes on as well."""
+        loss = record.held_out if self.held_out else record.loss
+        if loss is not None and math.isfinite(loss):
+            self._values[record.iteration] = loss
+
+    def after(self, state: State, record: Record) -> State:
+        """The state that an iteration leaves, with what is decided after it. Takes the record."""
+        self.add(record)
+        stop, optimizer, done = self.config.run.stop, self.config.optimizer, state.iteration
+        began = max(self._first, state.since)
+        if optimizer.schedule == "plateau" and lowered(optimizer, state.drops) > optimizer.final_fraction:
+            if self._stands(optimizer.plateau, began, done):
+                return replace(state, drops=state.drops + 1, since=done)
+        elif stop is not None and (said := self._stands(stop, began, done)):
+            return replace(state, stopped=said)
+        return state
+
+    @property
+    def _first(self) -> int:
+        """The first iteration of the run as it is configured."""
+        stages, iterations = self.config.run.stages, self.config.run.iterations
+        return math.ceil(stages[-1].until * iterations) + 1 if stages else 0
+
+    def _stands(self, asked: Standing, began: int, done: int) -> str:
+        """How the loss stands after `done` iterations, in words; "" where it falls, or no window is at its end."""
+        span = asked.patience
+        if (done - began) % span or done - began < 2 * span:
+            return ""
+        before, now = (
+            np.array([self._values[each] for each in range(end - span, end) if each in self._values])
+            for end in (done - span, done)
+        )
+        if min(len(before), len(now)) < 2:
+            return ""
+        error = [float(np.std(each, ddof=1)) / math.sqrt(len(each)) for each in (before, now)]
+        fall = float(before.mean() - now.mean())
+        if fall > max(math.hypot(*error), asked.relative * abs(float(before.mean()))):
+            return ""
+        means = [f"{each.mean():.4g} +- {wide:.1g}" for each, wide in zip((before, now), error, strict=True)]
+        kind = "loss of held-out views" if self.held_out else "loss"
+        return f"the {kind} stands: {means[0]}, then {means[1]} in {span} iterations"
+
+
+@dataclass(frozen=True)
+class Averaged:
+    """The mean of values after the iterations from `average_first` on, of `average_count` of them (0: none yet)."""
+
+    average_first: Count = 0
+    average_count: Count = 0
+    average: Arrays = field(default_factory=dict, metadata=entry("average", "finite"))
+
+    def add(self, config: Config, done: int, values: dict[str, Array]) -> Averaged:
+        """The same with the values (shapes as they are shown) after `done` iterations, which are in the average."""
+        first, count = average_begins(config), self.average_count
+        if not count or self.average_first != first:
+            first_values = {key: value.astype(np.float64) for key, value in values.items()}
+            return Averaged(first, 1, first_values)
+        mean = {key: self.average[key] + (value - self.average[key]) / (count + 1) for key, value in values.items()}
+        return Averaged(first, count + 1, mean)
+
+
+def average_begins(config: Config) -> int:
+    """After how many iterations the values are in the average, those after the next as well; beyond the last without
+    one."""
+    asked, iterations = config.optimizer.average, config.run.iterations
+    if asked is None:
+        return iterations + 1
+    count = asked if isinstance(asked, int) else math.ceil(asked * iterations)
+    return max(iterations - count, 0) + 1
