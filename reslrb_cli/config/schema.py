@@ -264,7 +264,7 @@ class RunConfig(Section):
         if not self.stages:
             del values["stages"]
         if self.stop is None:
-            del values["stop"]
+            values.pop("stop", None)
         if self.adjoint not in ("auto", "batched"):
             del values["batches"], values["first_batch"]
         return values

@@ -94,12 +94,26 @@ CASES: dict[str, list[str]] = {
         "{until: 0.8, film: 0.5, learning_rate: 0.5}]",
         "optimizer.scale=auto",
     ],
+    "plateau": ["optimizer={type: sgd, schedule: plateau, learning_rate: 0.5, plateau: {patience: 5, relative: 0.9}}"],
+    "average": ["optimizer.average=6"],
+    "held out, plateau, average": [
+        "scene.sensors=all",
+        "run.held_out=[2]",
+        "run.iterations=66",
+        "run.checkpoint_every={iterations: 6}",
+        "optimizer={schedule: plateau, average: 0.5, plateau: {patience: 20, relative: 0.9}}",
+        "run.spp=2",
+    ],
+    "a list of losses, average": [
+        "loss=[{type: smape}, {type: l2, weight: 0.5, scales: 2}]",
+        "optimizer.average=0.3",
+    ],
     "prb": ["integrator={type: prb, max_depth: 3}", "parameters=[{key: poster.reflectance.data, initial: 0.5}]"],
 }
-FEW = ("scale auto, sigmoid, rmsprop", "held out", "stages")
+FEW = ("scale auto, sigmoid, rmsprop", "held out", "stages", "plateau", "average")
 #: After how many iterations a run is killed, and how many its newest state has then; what certainty asks for is noted
 #: at four fifths of the iterations, which has to be before that.
-KILLED: dict[str, tuple[int, int]] = {"certainty": (23, 20)}
+KILLED: dict[str, tuple[int, int]] = {"certainty": (23, 20), "held out, plateau, average": (63, 60)}
 
 
 @pytest.fixture

@@ -1,0 +1,223 @@
+"""When a loss stands: runs that end early, plateaus, and averages of the last values."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli.tiny import KEY, read_metrics
+from optimization.toy import CONFIG
+from runs.going_on import begin_alone, differences, optimize, run_and_kill
+
+from reslrb_cli.config.loader import dump, load, loads
+from reslrb_cli.config.schema import Config
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.optimization.state import State
+from reslrb_cli.optimization.stopping import Averaged, Watch, average_begins, lowered
+from reslrb_cli.records.metrics import Record
+from reslrb_cli.records.run_folder import read_value
+
+# What is decided, of losses that are made up.
+
+
+def config(tmp_path: Path, *sets: str) -> Config:
+    path = tmp_path / "config.yaml"
+    path.write_text(CONFIG)
+    return load(path, ["run.iterations=400", *sets])
+
+
+def follow(given: Config, losses: np.ndarray, held_out: dict[int, float] | None = None) -> list[State]:
+    """The states after each iteration, until the run stops."""
+    watch, state, states = Watch(given), State(0, 0.0, 0.0, 0, {}, {}), []
+    for number, loss in enumerate(losses):
+        seen = None if held_out is None else held_out.get(number)
+        record = Record(number, float(loss), 0, 0, 0, 0, 0, 0, 4, 1, 0, 0, None, held_out=seen)
+        state = watch.after(State(number + 1, 0.0, 0.0, 0, {}, {}, drops=state.drops, since=state.since), record)
+        states.append(state)
+        if state.stopped:
+            break
+    return states
+
+
+STOP = "run.stop={patience: 20, relative: 0.01}"
+
+
+def test_a_loss_that_falls_by_more_than_its_noise_does_not_stop(tmp_path: Path) -> None:
+    rng, given = np.random.default_rng(1), config(tmp_path, STOP)
+    fall = 0.98 ** np.arange(400)
+    assert len(follow(given, fall)) == 400
+    assert all(len(follow(given, fall[:200] + 0.002 * rng.normal(size=200))) == 200 for _ in range(20))
+
+
+def test_a_loss_that_stands_stops_at_the_end_of_the_second_window_mostly(tmp_path: Path) -> None:
+    """Of noise alone the second mean is below the first by more than the standard error in 16 % of the runs."""
+    rng, given = np.random.default_rng(2), config(tmp_path, "run.stop={patience: 20, relative: 0}")
+    lengths = np.array([len(follow(given, 1 + 0.1 * rng.normal(size=400))) for _ in range(400)])
+    share = float(np.mean(lengths == 40))
+    assert abs(share - 0.837) < 4 * np.sqrt(0.837 * 0.163 / 400), share
+    assert set(lengths % 20) == {0}
+    assert lengths.max() < 400
+
+
+def test_a_small_fall_is_none_even_without_noise(tmp_path: Path) -> None:
+    losses = 1 - 1e-4 * np.arange(400)
+    [*_, last] = follow(config(tmp_path, STOP), losses)
+    assert last.iteration == 40
+    assert last.stopped.startswith("the loss stands: 0.9991 +- 0.0001, then 0.9971 +- ")
+    assert len(follow(config(tmp_path, "run.stop={relative: 0}"), losses)) == 400
+
+
+def test_what_is_not_finite_is_left_out(tmp_path: Path) -> None:
+    losses = 0.98 ** np.arange(400)
+    losses[::7] = np.nan
+    assert len(follow(config(tmp_path, STOP), losses)) == 400
+    assert len(follow(config(tmp_path, STOP), np.full(400, np.nan))) == 400
+
+
+def test_held_out_views_decide_where_there_are_any(tmp_path: Path) -> None:
+    given = config(tmp_path, STOP, "run.held_out=[0]")
+    falling = 0.98 ** np.arange(400)
+    standing = {number: 1.0 + 0.001 * (number // 10 % 2) for number in range(0, 400, 10)}
+    assert len(follow(given, falling, standing)) == 40
+    assert len(follow(given, np.ones(400), {number: falling[number] for number in standing})) == 400
+
+
+def test_a_run_in_stages_is_looked_at_once_it_is_as_configured(tmp_path: Path) -> None:
+    given = config(tmp_path, STOP, "run.stages=[{until: 0.25, spp: 2}]")
+    assert len(follow(given, np.ones(400))) == 141
+
+
+def test_a_plateau_lowers_the_rate_and_only_then_a_run_stops(tmp_path: Path) -> None:
+    plateau = "optimizer={schedule: plateau, final_fraction: 0.2, plateau: {patience: 10, factor: 0.5}}"
+    states = follow(config(tmp_path, plateau, STOP), np.ones(400))
+    drops = [state.drops for state in states]
+    assert [drops.index(number) + 1 for number in (1, 2, 3)] == [20, 40, 60]
+    assert [lowered(config(tmp_path, plateau).optimizer, number) for number in range(5)] == [1, 0.5, 0.25, 0.2, 0.2]
+    assert len(states) == 100, "two windows of 20 at the least rate"
+    assert lowered(config(tmp_path).optimizer, 3) == 1
+
+
+def test_an_average_is_that_of_the_last_values(tmp_path: Path) -> None:
+    given = config(tmp_path, "run.iterations=10", "optimizer.average=4")
+    assert average_begins(given) == 7
+    assert average_begins(config(tmp_path, "run.iterations=10", "optimizer.average=0.25")) == 8
+    assert average_begins(config(tmp_path, "run.iterations=10")) == 11
+    values = np.random.default_rng(1).uniform(size=(11, 2, 3))
+    found = Averaged()
+    for done in range(7, 11):
+        found = found.add(given, done, {"a": values[done]})
+    assert (found.average_first, found.average_count) == (7, 4)
+    np.testing.assert_allclose(found.average["a"], values[7:].mean(axis=0), rtol=1e-12)
+    longer = found.add(config(tmp_path, "run.iterations=20", "optimizer.average=4"), 17, {"a": values[0]})
+    assert (longer.average_first, longer.average_count) == (17, 1), "begun anew"
+
+
+@pytest.mark.parametrize(
+    ("setting", "key", "words"),
+    [
+        ("run.stop={patience: 4}", "run.stop.patience", "at least 5"),
+        ("run.stop={relative: 1}", "run.stop.relative", "below 1"),
+        ("optimizer.plateau={patience: 10}", "optimizer.plateau", "goes with schedule: plateau"),
+        ("optimizer.average=1", "optimizer.average", "or a share of them"),
+        ("optimizer.average=1.5", "optimizer.average", "or a share of them"),
+        ("optimizer.average=true", "optimizer.average", "or a share of them"),
+    ],
+)
+def test_settings_that_are_none(tmp_path: Path, setting: str, key: str, words: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        config(tmp_path, setting)
+    assert error.value.key == key
+    assert words in error.value.message
+
+
+def test_settings_that_do_not_go_together(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="does not go with run"):
+        config(tmp_path, "run.stop={}", "optimizer.average=0.5")
+    with pytest.raises(ConfigError, match=r"run\.stop\.patience: must be at least 20, not 10"):
+        config(tmp_path, "run.stop={patience: 10}", "run.held_out=[0]")
+
+
+def test_what_is_not_asked_for_is_not_written(tmp_path: Path) -> None:
+    written = config(tmp_path).model_dump()
+    assert not {"average", "plateau"} & set(written["optimizer"])
+    assert "stop" not in written["run"]
+    asked = config(tmp_path, STOP, "optimizer={schedule: plateau}")
+    assert loads(dump(asked), tmp_path / "config.yaml") == asked
+
+
+# Whole runs.
+
+SETS = ["--set", "run.checkpoint_every={iterations: 3}", "--set", "run.certainty=false", "--set", "run.measuring=0"]
+
+
+@pytest.fixture
+def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    begin_alone(tmp_path, monkeypatch)
+    return tmp_path
+
+
+def manifest(run: str | Path) -> dict:
+    return json.loads((Path(run) / "manifest.json").read_text())
+
+
+@pytest.mark.parametrize("at", [8, 9, 10])
+def test_a_run_that_stops_does_so_after_a_kill_as_well(
+    experiment: Path, monkeypatch: pytest.MonkeyPatch, at: int
+) -> None:
+    """Killed before, and after, the last iteration, when its state is kept already."""
+    stop = ["--set", "run.stop={patience: 5, relative: 0.9}", "--set", "run.iterations=40"]
+    every = ["--set", f"run.checkpoint_every={{iterations: {5 if at == 10 else 3}}}"]
+    whole, left = run_and_kill(monkeypatch, at, *SETS, *every, *stop)
+    assert len(read_metrics(whole)) == 10
+    assert (manifest(whole)["status"], manifest(whole)["results"]["iterations"]) == ("finished", 10)
+    assert manifest(whole)["results"]["stopped"].startswith("the loss stands: ")
+    assert optimize("--resume", str(left), "--quiet") == 0
+    assert differences(whole, left) == []
+
+
+def test_a_run_that_stopped_goes_on_where_it_is_asked_to(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    stop = ["--set", "run.stop={patience: 5, relative: 0.9}", "--set", "run.iterations=14"]
+    assert optimize("tiny.yaml", "--quiet", *SETS, *stop) == 0
+    assert optimize("--resume", "runs/tiny", "--quiet") == 0
+    assert "is finished, after 10 of 14 iterations; --set run.stop=null goes on" in capsys.readouterr().out
+    assert optimize("--resume", "runs/tiny", "--quiet", "--set", "run.stop=null") == 0
+    assert optimize("tiny.yaml", "--quiet", *SETS, "--set", "run.iterations=14", "--set", "run.name=whole") == 0
+    assert len(read_metrics("runs/tiny")) == 14
+    with (
+        np.load("runs/tiny/parameters/parameters.npz") as one,
+        np.load("runs/whole/parameters/parameters.npz") as other,
+    ):
+        assert one[KEY].tobytes() == other[KEY].tobytes()
+
+
+def test_the_result_is_the_average_and_the_last_values_stand_beside_it(experiment: Path) -> None:
+    average = ["--set", "run.iterations=8"]
+    assert optimize("tiny.yaml", "--quiet", *SETS, *average, "--set", "run.name=plain") == 0
+    values = []
+    for iterations in (6, 7, 8):
+        more = ["--set", f"run.iterations={iterations}", "--set", f"run.name=n{iterations}"]
+        assert optimize("tiny.yaml", "--quiet", *SETS, *more) == 0
+        with np.load(f"runs/n{iterations}/parameters/parameters.npz") as found:
+            values.append(found[KEY].astype(np.float64))
+    assert optimize("tiny.yaml", "--quiet", *SETS, *average, "--set", "optimizer.average=3") == 0
+    run = Path("runs/tiny")
+    with np.load(run / "parameters/parameters.npz") as found, np.load(run / "parameters/last/parameters.npz") as last:
+        np.testing.assert_allclose(found[KEY], np.mean(values, axis=0), rtol=1e-6)
+        np.testing.assert_array_equal(last[KEY], values[-1].astype(np.float32))
+        np.testing.assert_array_equal(read_value(run, KEY), found[KEY])
+    results = manifest(run)["results"]
+    assert (results["average"]["first"], results["average"]["iterations"]) == (6, 3)
+    plain = manifest("runs/plain")["results"]
+    assert results["average"]["last_rmse"][KEY] == plain["parameter_rmse"][KEY]["final"]
+    assert results["parameter_rmse"][KEY]["final"] != plain["parameter_rmse"][KEY]["final"]
+    # It goes on from its last values, as one without an average does.
+    shutil.copytree(run, "runs/more")
+    assert optimize("--resume", "runs/more", "--quiet", "--set", "run.iterations=11") == 0
+    assert manifest("runs/more")["results"]["average"]["first"] == 9
+    assert optimize("--resume", "runs/plain", "--quiet", "--set", "run.iterations=11") == 0
+    with np.load("runs/more/parameters/last/parameters.npz") as one, np.load(
+        "runs/plain/parameters/parameters.npz") as other:  # fmt: skip
+        np.testing.assert_array_equal(one[KEY], other[KEY])
