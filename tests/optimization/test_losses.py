@@ -124,6 +124,17 @@ def test_ssim_of_bright_images_keeps_its_digits(level):
     assert float(make_loss("ssim")(mi.TensorXf(target), mi.TensorXf(target))[0]) == pytest.approx(0, abs=1e-5)
 
 
+def test_ssim_of_faint_structure_on_a_bright_ground_keeps_its_digits():
+    """Squares of single precision have none left of it."""
+    image, target = (200 + each for each in textured())
+    expected = structural_similarity(
+        image.astype(np.float64), target.astype(np.float64), channel_axis=2, gaussian_weights=True, sigma=1.5,
+        use_sample_covariance=False, data_range=1.0,
+    )  # fmt: skip
+    found = make_loss("ssim", data_range=1.0)(mi.TensorXf(image), mi.TensorXf(target))
+    assert float(found[0]) == pytest.approx(1 - expected, rel=1e-3)
+
+
 def differences(loss, image, rng, step):
     """A derivative along a random direction by Dr.Jit, and by central differences."""
     direction = rng.uniform(-1, 1, image.shape).astype(np.float32)

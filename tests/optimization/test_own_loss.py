@@ -13,7 +13,7 @@ import pytest
 from cli.tiny import KEY, lines, read_metrics, reslrb
 from runs.going_on import begin_alone, optimize
 
-from reslrb_cli.config.loader import load, told
+from reslrb_cli.config.loader import load, told, with_integrator
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.methods import Sweep
 from reslrb_cli.optimization.assemble import assemble
@@ -272,6 +272,13 @@ def test_processes_that_measure_are_told_whether_it_is_allowed(experiment: Path)
     for allowed in (False, True):
         first = Sweep.first(SimpleNamespace(variant="llvm_ad_rgb", memory_limit=None), config.with_code(allowed))
         assert told(json.loads(json.dumps(first))).allows_code is allowed
+
+
+def test_what_is_handed_over_and_allowed_stays_with_other_integrators(experiment: Path) -> None:
+    handed = load("tiny.yaml").with_loss(np.mean).with_code()
+    other = with_integrator(handed, {"type": "prb"}, "--integrators", {})
+    assert (other.own_loss, other.allows_code) == (np.mean, True)
+    assert handed.with_exposures_fixed().at_stage(0).own_loss is np.mean
 
 
 @pytest.mark.long

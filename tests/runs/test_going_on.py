@@ -95,7 +95,7 @@ CASES: dict[str, list[str]] = {
         "optimizer.scale=auto",
     ],
     "plateau": ["optimizer={type: sgd, schedule: plateau, learning_rate: 0.5, plateau: {patience: 5, relative: 0.9}}"],
-    "average": ["optimizer.average=6"],
+    "average": ["optimizer.average=9"],
     "held out, plateau, average": [
         "scene.sensors=all",
         "run.held_out=[2]",
@@ -106,7 +106,7 @@ CASES: dict[str, list[str]] = {
     ],
     "a list of losses, average": [
         "loss=[{type: smape}, {type: l2, weight: 0.5, scales: 2}]",
-        "optimizer.average=0.3",
+        "optimizer.average=0.5",
     ],
     "prb": ["integrator={type: prb, max_depth: 3}", "parameters=[{key: poster.reflectance.data, initial: 0.5}]"],
 }
