@@ -30,19 +30,23 @@ _SHOWN = 60
 def settings(config: Config, variant: str, device: str, **options: Any) -> dict[str, Any]:
     """What has to be the same in all sessions of a measurement, as JSON has it: `options` are those of the command.
 
-    The scene's file counts by its content, and so does what computes, whose times stand beside each other.
+    The files of scene and code count by their content, and so does what computes, whose times stand beside each other.
     """
-    try:
-        scene = hashlib.sha256(config.scene.file.read_bytes()).hexdigest()
-    except OSError:  # the built-in scene, or one whose loading will say what is wrong
-        scene = ""
+    contents = {"scene.file": config.scene.file}
+    contents |= {key: one.path for key, one in config.code_losses.items() if one.path is not None}
+    found = {}
+    for key, path in contents.items():
+        try:
+            found[f"content of {key}"] = hashlib.sha256(path.read_bytes()).hexdigest()
+        except OSError:  # the built-in scene, or one whose loading will say what is wrong
+            found[f"content of {key}"] = ""
     return {
         "config": parse(dump(config), str(config.source)),
         **options,
         "variant": variant,
         "device": device,
         "versions": versions(),
-        "content of scene.file": scene,
+        **found,
     }
 
 

@@ -19,7 +19,7 @@ from reslrb_cli.optimization.identifiability import check_exposures, find_ambigu
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.losses import LOSSES, weighted
 from reslrb_cli.optimization.sensitivity import measure_sensitivities, sample_gradient, see_images, take_gradient
-from reslrb_cli.optimization.views import View, make_loss, make_views, view_records
+from reslrb_cli.optimization.views import View, make_loss, make_views, slope, view_records
 
 # Losses against NumPy, values and gradients.
 
@@ -172,6 +172,20 @@ def test_gradients_of_new_losses_against_finite_differences(name, masked):
     pairs = [differences(view.judge, image.astype(np.float32), rng, 2e-3) for _ in range(3)]
     found, expected = np.transpose(pairs)
     np.testing.assert_allclose(found, expected, rtol=5e-3, atol=5e-3 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(("name", "biased"), [("l2", False), ("smape", True), ("ssim", True)])
+def test_which_gradients_noise_of_the_image_biases(name, biased):
+    """As with `independent` and `batched`, where dL/dI comes from samples of its own: its mean over noisy images."""
+    rng = np.random.default_rng(11)
+    image, target = textured((16, 16, 1))
+    view = View(0, make_loss(name))
+    view.see(target)
+    along = slope(view.judge, image)
+    at_noise = [slope(view.judge, image + 0.2 * rng.normal(size=image.shape)) for _ in range(200)]
+    shares = np.array([np.sum(each * along) for each in at_noise]) / np.sum(along * along)
+    z = (shares.mean() - 1) / (shares.std(ddof=1) / np.sqrt(len(shares)))
+    assert (abs(z) > 6) if biased else (abs(z) < 3), (z, shares.mean())
 
 
 def test_what_ssim_leaves_out_is_as_the_target_and_windows_about_it_do_not_count():
