@@ -117,15 +117,15 @@ def _section(name: str, value: dict[str, Any], defs: dict[str, Any], level: int 
         yield from (f"- `{m['properties']['type']['const']}`: {m['description']}" for m in members)
         yield ""
     yield from _table(members)
-    if len(members) == 1:
-        for key, child in members[0]["properties"].items():
-            if _has_own_section(key):
-                yield from _section(f"{name}.{key}", child, defs, level + 1)
+    children = {key: child for member in reversed(members) for key, child in member["properties"].items()}
+    for key, child in children.items():
+        if _has_own_section(key):
+            yield from _section(f"{name}.{key}", child, defs, level + 1)
 
 
 def _has_own_section(key: str) -> bool:
     """Others are told apart in the text of their key's type; `target.render.integrator` is as `integrator`."""
-    return key in ("render", "heightmap", "motion", "mask", "precondition", "regularizers", "stages")
+    return key in ("render", "heightmap", "motion", "mask", "precondition", "regularizers", "stages", "stop", "plateau")
 
 
 def _members(value: dict[str, Any], defs: dict[str, Any]) -> list[dict[str, Any]]:
