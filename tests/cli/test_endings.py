@@ -86,7 +86,7 @@ def test_a_run_that_is_ended_at_once_is_interrupted(optimize, during, monkeypatc
 def test_there_is_a_checkpoint_before_the_first_iteration(optimize, monkeypatch):
     seen = []
 
-    def look(problem, begun, on_nonfinite):
+    def look(problem, begun, on_nonfinite, **options):
         with np.load(RUN / "checkpoint" / "state.npz") as state:
             seen.append((int(state["iteration"]), state[f"parameter/{KEY}"].mean()))
         return iter(())
