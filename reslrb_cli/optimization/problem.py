@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -76,6 +76,8 @@ class Problem:
     memory: MemoryPlan | None = None
     #: What values cost by themselves, by key and type.
     regularizers: dict[str, dict[str, Cost]] = field(default_factory=dict)
+    #: What computes the shards of a step (`shards.Engine`); None: this process, one after the other.
+    engine: Callable[..., Any] | None = None
 
     def decisions(self) -> dict[str, dict[str, Any] | None]:
         """What was measured and planned before the first iteration, as manifests and checkpoints have it, by name."""
