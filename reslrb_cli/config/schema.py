@@ -201,7 +201,7 @@ class RunConfig(Section):
     Gradients of `l2` and `relative_l2` are unbiased with all but `correlated`, with which the noise that both share
     pulls parameters, mostly towards darker: a run says by how much, where a measurement before its first iteration can
     see it. `l1` and `log_l2` are biased with any of them, since noise in the image does not average out of their
-    derivatives; more samples help. `auto`: `batched` where `batches` divides `spp`, or a shard's part of it, else
+    derivatives; more samples help. `auto`: `others` where it can be; else `batched` where `batches` divides `spp`, else
     `independent`."""
     batches: Annotated[int, Field(ge=2)] = 4
     """Batches of a step's samples, or of a shard's; with `adjoint: batched` it must divide them. Not with `correlated`
@@ -319,17 +319,13 @@ class Config(Section):
 
     @property
     def adjoint(self) -> Literal["correlated", "independent", "batched"]:
-        """`run.adjoint` of one set of samples, with `auto` settled: batches where they divide the samples, and the
-        passes divide them. `others` is `independent` to who takes a set alone."""
+        """`run.adjoint` of a step, or a shard, by itself, with `auto` settled: batches where they divide the samples,
+        and the passes divide them. `others` is `independent` to who looks at one alone."""
         if self.in_rounds:
             return "independent"
-        return self._adjoint_of(self.share_spp)
-
-    def _adjoint_of(self, spp: int) -> Literal["correlated", "independent", "batched"]:
-        run = self.run
-        if run.adjoint != "auto" and run.adjoint != "others":
-            return run.adjoint
-        return "batched" if self._splits(spp, run.batches) else "independent"
+        if self.run.adjoint != "auto" and self.run.adjoint != "others":
+            return self.run.adjoint
+        return "batched" if self._splits(self.run.spp, self.run.batches) else "independent"
 
     def _splits(self, spp: int, sets: int) -> bool:
         """Whether `spp` samples per pixel can be split into so many sets, their halves, and the passes of these."""
@@ -361,8 +357,7 @@ class Config(Section):
             return 1
         if asked != "auto":
             return max(asked // views, 1)
-        apart = self.run.adjoint == "others" or self._adjoint_of(spp) != "batched"
-        sets = 1 if apart else self.run.batches
+        sets = self.run.batches if self.run.adjoint == "batched" else 1
         counts = [count for count in (16, 8, 4, 2) if count * views <= _AUTO_SHARDS and spp % count == 0]
         return next((count for count in counts if self._splits(spp // count, sets)), 1)
 
@@ -374,7 +369,7 @@ class Config(Section):
     @property
     def in_rounds(self) -> bool:
         """Whether a step is two rounds: the images of all shards, then their gradients."""
-        return self.run.adjoint == "others" and self.shares > 1
+        return self.run.adjoint in ("auto", "others") and self.shares > 1
 
     @property
     def losses(self) -> list[AnyLoss]:
