@@ -60,8 +60,7 @@ class Part(NamedTuple):
 class Task:
     """One shard of a step, of `spp` samples per pixel: whole views, or of one view `weight` of its samples.
 
-    With `images` those of the samples come back beside the gradient. `values` are the parameters' in place of those
-    that the problem has, as its optimiser has them.
+    With `images` those of the samples come back beside the gradient.
     """
 
     iteration: int
@@ -70,7 +69,6 @@ class Task:
     spp: int
     weight: float
     images: bool
-    values: dict[str, Array] | None = None
 
 
 @dataclass(frozen=True)
@@ -118,7 +116,7 @@ def shard_seed(config: Config, iteration: int, sensor: int, shard: int) -> int:
 def shard_image(problem: Problem, task: Task) -> Array:
     """The image of a shard of one view, (H, W, C) or of halves (2, H, W, C), float32."""
     [part] = task.parts
-    with _as_told(problem, task):
+    with _held(problem):
         image = render_image(
             problem.integrator, problem.scene, part.sensor, part.seed, task.spp, problem.config.halves == 2
         )
@@ -132,7 +130,7 @@ def shard_gradient(problem: Problem, task: Task, delta: Array | None = None) -> 
     """
     config = problem.config
     found: list[tuple[float, tuple[int, int, tuple[int, ...]], Array | None]] = []
-    with _as_told(problem, task):
+    with _held(problem):
         _clear(problem)
         views = {view.sensor: view for view in problem.views}
         for part in task.parts:
@@ -170,12 +168,8 @@ def _clear(problem: Problem) -> None:
 
 
 @contextmanager
-def _as_told(problem: Problem, task: Task) -> Iterator[None]:
-    """The problem with the task's values, and with tables that learn nothing."""
-    if task.values is not None:
-        for key, value in task.values.items():
-            problem.optimizer.set_value(key, like(dr.detach(problem.optimizer[key]), value))
-        problem.apply()
+def _held(problem: Problem) -> Iterator[None]:
+    """Have tables learn nothing."""
     guiding = guiding_of(problem)
     before = guiding is not None and guiding.held
     if guiding is not None:
