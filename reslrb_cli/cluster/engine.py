@@ -23,7 +23,8 @@ from typing import Any
 import dask
 import drjit as dr
 import numpy as np
-from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
+from distributed import CancelledError, Client, Future, KilledWorker, LocalCluster, as_completed
+from distributed.comm import CommClosedError
 
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.config.loader import loads
@@ -47,6 +48,9 @@ Array = np.ndarray[Any, Any]
 FUNCTIONS: dict[str, Callable[..., Any]] = {"image": shard_image, "gradient": shard_gradient}
 
 TARGETS_FILE = "targets.npz"
+
+#: How often what is lost with workers is sent, and seconds until one of them has to be there.
+ATTEMPTS, WAIT = 30, 60
 
 #: dask's settings. A task may have been on as many workers that died before it is given up; a worker that is not heard
 #: of for so long is replaced, and has to come to the end of its longest compilation before.
@@ -192,25 +196,48 @@ class Engine:
     def __call__(
         self, problem: Problem, function: Callable[..., Any], work: Sequence[tuple[Any, ...]]
     ) -> Iterator[tuple[int, Any]]:
-        """Yields place and result of each task as they come. Raises MachineError where workers die of one."""
+        """Yields place and result of each task as they come, and raises what a task raised.
+
+        What has died with a worker, and is nowhere else, is sent again. Raises MachineError where that goes on.
+        """
         name = next(name for name, each in FUNCTIONS.items() if each is function)
-        standing = Standing.of(problem)
-        if self._now is None or self._now[0] != standing.digest:
-            self._now = standing.digest, self._client.scatter(standing, broadcast=True, hash=False)
+        standing, left = Standing.of(problem), dict(enumerate(work))
+        for _ in range(ATTEMPTS):
+            futures = self._submit(name, standing, left)
+            for future in as_completed(list(futures)):
+                found, result = _result_of(future)
+                if found:
+                    del left[futures[future]]
+                    yield futures[future], result
+            if not left:
+                return
+            self._now = None
+        raise MachineError(f"--cluster: worker after worker ended; shards without a result: {len(left)}")
+
+    def _submit(self, name: str, standing: Standing, left: Mapping[int, tuple[Any, ...]]) -> dict[Future, int]:
+        """Send the tasks; returns the place of each one's future."""
         futures = {}
-        for place, (task, *given) in enumerate(work):
-            sent = [each if each is None else self._client.scatter(each, hash=False) for each in given]
-            future = self._client.submit(compute, self._experiment, self._now[1], name, task, *sent, pure=False)
-            futures[future] = place
         try:
-            for future, result in as_completed(list(futures), with_results=True):
-                place = futures.pop(future)
-                future.release()
-                yield place, result
-        except KilledWorker as error:
-            raise MachineError(
-                f"--cluster: workers ended, again and again, while they computed a shard: {error}"
-            ) from None
+            self._client.wait_for_workers(1, timeout=WAIT)
+            if self._now is None or self._now[0] != standing.digest:
+                self._now = standing.digest, self._client.scatter(standing, broadcast=True, hash=False)
+            for place, (task, *given) in left.items():
+                sent = [each if each is None else self._client.scatter(each, hash=False) for each in given]
+                now = self._now[1]
+                futures[self._client.submit(compute, self._experiment, now, name, task, *sent, pure=False)] = place
+        except (TimeoutError, OSError) as error:
+            raise MachineError(f"--cluster: no worker answers: {error}") from None
+        return futures
+
+
+def _result_of(future: Future) -> tuple[bool, Any]:
+    """Whether there is a result, and what it is. Raises what the task did."""
+    try:
+        return True, future.result()
+    except (KilledWorker, CancelledError, CommClosedError):
+        return False, None
+    finally:
+        future.release()
 
 
 @contextlib.contextmanager
