@@ -15,6 +15,7 @@ import hashlib
 import logging
 import os
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,6 +60,11 @@ SETTINGS = {
     "distributed.scheduler.worker-ttl": "30 minutes",
     "distributed.comm.timeouts.connect": "60s",
     "distributed.admin.tick.limit": "1h",
+    # No pages, nor anything else that answers to who is not one of them.
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
+    # Ctrl-C goes to all processes of a terminal: the run ends after its iteration, for which it needs its workers.
+    "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
 }
 
 
@@ -202,7 +208,8 @@ class Engine:
         """
         name = next(name for name, each in FUNCTIONS.items() if each is function)
         standing, left = Standing.of(problem), dict(enumerate(work))
-        for _ in range(ATTEMPTS):
+        for attempt in range(ATTEMPTS):
+            time.sleep(min(0.1 * attempt, 2.0))  # until it is noticed which workers have ended
             futures = self._submit(name, standing, left)
             for future in as_completed(list(futures)):
                 found, result = _result_of(future)
@@ -216,17 +223,20 @@ class Engine:
 
     def _submit(self, name: str, standing: Standing, left: Mapping[int, tuple[Any, ...]]) -> dict[Future, int]:
         """Send the tasks; returns the place of each one's future."""
-        futures = {}
+        futures: dict[Future, int] = {}
         try:
             self._client.wait_for_workers(1, timeout=WAIT)
+        except TimeoutError:
+            raise MachineError(f"--cluster: no worker was there for {WAIT} seconds") from None
+        with contextlib.suppress(OSError, TimeoutError):  # a worker ends while it is sent something
             if self._now is None or self._now[0] != standing.digest:
                 self._now = standing.digest, self._client.scatter(standing, broadcast=True, hash=False)
+            arrays = [each for _, *given in left.values() for each in given if each is not None]
+            sent = iter(self._client.scatter(arrays, hash=False) if arrays else [])
             for place, (task, *given) in left.items():
-                sent = [each if each is None else self._client.scatter(each, hash=False) for each in given]
+                more = [None if each is None else next(sent) for each in given]
                 now = self._now[1]
-                futures[self._client.submit(compute, self._experiment, now, name, task, *sent, pure=False)] = place
-        except (TimeoutError, OSError) as error:
-            raise MachineError(f"--cluster: no worker answers: {error}") from None
+                futures[self._client.submit(compute, self._experiment, now, name, task, *more, pure=False)] = place
         return futures
 
 
@@ -254,7 +264,8 @@ def local_engine(course: Course, workers: int, threads: int | None = None) -> It
         try:
             cluster = LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, security=True, protocol="tls://",
-                dashboard_address=None, silence_logs=logging.CRITICAL, local_directory=str(folder),
+                dashboard_address="127.0.0.1:0", scheduler_kwargs={"dashboard": False},
+                silence_logs=logging.CRITICAL, local_directory=str(folder),
             )  # fmt: skip
             stack.enter_context(cluster)
             client = stack.enter_context(Client(cluster))

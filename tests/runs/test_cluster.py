@@ -31,7 +31,7 @@ SETS = ["run.iterations=3", "run.spp=8", "run.measuring=0", "run.certainty=false
 CASES = {
     "guided, scaled": ["run.shards=4", "integrator.guiding=on", "optimizer.scale=auto", "run.views_per_iteration=2"],
     "views": ["run.shards=3", "run.adjoint=batched", "integrator.guiding=on"],
-    "exposure": ["run.shards=4", f"parameters=[{{key: {tiny.KEY}, initial: 0.5}}]", "views.1.exposure=auto"],
+    "exposure": ["run.shards=6", f"parameters=[{{key: {tiny.KEY}, initial: 0.5}}]", "views.1.exposure=auto"],
     "motion": ["run.shards=6", f"parameters[2]={MOTION}"],
     "passes": ["run.shards=2", "integrator.samples_per_pass=1", "run.spp=6"],
     "halves": ["run.shards=6", "loss.scale=fitted"],
@@ -98,13 +98,14 @@ def check(folder: Path, case: str, workers: int) -> None:
     }
 
 
-@pytest.mark.parametrize("workers", a_few(["1", "2"], ["2"]))
-def test_killed_workers_lose_nothing(experiment: Path, workers: str) -> None:
+@pytest.mark.parametrize("killing", a_few(["2 of 2", "6 of 1", "12 of 3"], ["2 of 2"]))
+def test_killed_workers_lose_nothing(experiment: Path, killing: str) -> None:
     """One of them is killed at a random moment of each iteration but the first."""
-    sets = ["run.shards=4", "run.iterations=4", "views=[{sensor: 0}]"]
+    kills, workers = (int(word) for word in killing.split(" of "))
+    sets = ["run.shards=4", f"run.iterations={kills}", "views=[{sensor: 0}]"]
     alone = end(make(experiment, *sets))
     course, rng = make(experiment, *sets), random.Random(workers)
-    with engine.local_engine(course, int(workers), threads=1) as local:
+    with engine.local_engine(course, workers, threads=1) as local:
         course.problem = replace(course.problem, engine=local)
         killed: list[int] = []
 
@@ -119,7 +120,7 @@ def test_killed_workers_lose_nothing(experiment: Path, workers: str) -> None:
 
         together = end(course, strike)
         time.sleep(0.2)
-    assert len(killed) == 4
+    assert len(killed) == kills
     assert {name: array.tobytes() for name, array in alone.items()} == {
         name: array.tobytes() for name, array in together.items()
     }
