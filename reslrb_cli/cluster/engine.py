@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import dask
 import drjit as dr
@@ -44,6 +44,7 @@ from reslrb_cli.runs.prepare import Course
 logger = logging.getLogger(__name__)
 
 Array = np.ndarray[Any, Any]
+T = TypeVar("T")
 
 #: What a worker is asked for, by name: names are sent, and no functions.
 FUNCTIONS: dict[str, Callable[..., Any]] = {"image": shard_image, "gradient": shard_gradient}
@@ -60,6 +61,7 @@ SETTINGS = {
     "distributed.scheduler.worker-ttl": "30 minutes",
     "distributed.comm.timeouts.connect": "60s",
     "distributed.admin.tick.limit": "1h",
+    "distributed.admin.large-graph-warning-threshold": "1TB",  # dL/dI is part of a task
     # No pages, nor anything else that answers to who is not one of them.
     "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
@@ -222,22 +224,32 @@ class Engine:
         raise MachineError(f"--cluster: worker after worker ended; shards without a result: {len(left)}")
 
     def _submit(self, name: str, standing: Standing, left: Mapping[int, tuple[Any, ...]]) -> dict[Future, int]:
-        """Send the tasks; returns the place of each one's future."""
-        futures: dict[Future, int] = {}
+        """Send the tasks; returns the place of each one's future.
+
+        All that they need is part of a task: what is only put on a worker (`Client.scatter`) is gone when that ends,
+        and to put it on one that is just ending may wait for ever.
+        """
         try:
             self._client.wait_for_workers(1, timeout=WAIT)
         except TimeoutError:
             raise MachineError(f"--cluster: no worker was there for {WAIT} seconds") from None
-        with contextlib.suppress(OSError, TimeoutError):  # a worker ends while it is sent something
-            if self._now is None or self._now[0] != standing.digest:
-                self._now = standing.digest, self._client.scatter(standing, broadcast=True, hash=False)
-            arrays = [each for _, *given in left.values() for each in given if each is not None]
-            sent = iter(self._client.scatter(arrays, hash=False) if arrays else [])
-            for place, (task, *given) in left.items():
-                more = [None if each is None else next(sent) for each in given]
-                now = self._now[1]
-                futures[self._client.submit(compute, self._experiment, now, name, task, *more, pure=False)] = place
-        return futures
+        if self._now is None or self._now[0] != standing.digest:
+            self._now = standing.digest, self._client.submit(_given, standing, pure=False)
+        # In turns: by itself dask would send all to the worker that has `standing`.
+        workers = sorted(self._client.nthreads())
+        sent = [self._experiment, self._now[1], name]
+        return {
+            self._client.submit(
+                compute, *sent, *given, pure=False, workers=workers[place % len(workers)] if workers else None,
+                allow_other_workers=bool(workers),
+            ): place
+            for place, given in left.items()
+        }  # fmt: skip
+
+
+def _given(value: T) -> T:
+    """What is sent to one worker, for the others to have it from there, or from whichever is sent it again."""
+    return value
 
 
 def _result_of(future: Future) -> tuple[bool, Any]:
