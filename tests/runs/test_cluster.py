@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 from cli import tiny
 from runs.going_on import MOTION, optimize, write_experiment
-from turns import a_few
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization.loop import iterate
@@ -98,7 +97,8 @@ def check(folder: Path, case: str, workers: int) -> None:
     }
 
 
-@pytest.mark.parametrize("killing", a_few(["2 of 2", "6 of 1", "12 of 3"], ["2 of 2"]))
+@pytest.mark.long
+@pytest.mark.parametrize("killing", ["2 of 2", "6 of 1", "12 of 3"])
 def test_killed_workers_lose_nothing(experiment: Path, killing: str) -> None:
     """One of them is killed at a random moment of each iteration but the first."""
     kills, workers = (int(word) for word in killing.split(" of "))
