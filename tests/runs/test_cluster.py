@@ -98,7 +98,7 @@ def check(folder: Path, case: str, workers: int) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("killing", ["2 of 2", "6 of 1", "12 of 3"])
+@pytest.mark.parametrize("killing", ["2 of 2", "6 of 1", "6 of 3"])
 def test_killed_workers_lose_nothing(experiment: Path, killing: str) -> None:
     """One of them is killed at a random moment of each iteration but the first."""
     kills, workers = (int(word) for word in killing.split(" of "))
