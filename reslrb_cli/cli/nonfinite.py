@@ -18,9 +18,10 @@ from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.integrators import UNDECIDED
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import with_integrator
+from reslrb_cli.config.optimizers import AS_CONFIGURED
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
-from reslrb_cli.optimization.assemble import assemble_scene
+from reslrb_cli.optimization.assemble import assemble_scene, at_stage
 from reslrb_cli.optimization.autotune.sampling import as_decided, with_sides
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.state import guiding_of, restore_tables
@@ -67,10 +68,10 @@ def load_replay(config: Config) -> Replay:
     if not 0 <= iteration < config.run.iterations:
         raise ConfigError(archive, "iteration", f"is {iteration}; the run has {config.run.iterations} iterations")
     config = _settled(config, manifest, written)
-    try:
-        problem = assemble_scene(config, values=values)
-    except ValueError as error:
-        raise ConfigError(archive, "", f"does not fit to {config.source}: {error}") from None
+    number = config.stage_number(iteration / config.run.iterations)
+    coarse = config.stage(number).grain != AS_CONFIGURED.grain
+    with _fitting(archive, config):
+        problem = assemble_scene(config, values=None if coarse else values)
     integrator, size = problem.integrator, problem.samples_per_pass
     if manifest.get("memory"):
         size = _samples_per_pass(manifest["memory"], written)
@@ -79,13 +80,27 @@ def load_replay(config: Config) -> Replay:
         integrator = with_sides(integrator, PathsRecord.from_json(manifest["paths"]))
     integrator = as_decided(integrator, guided, None)
     problem = replace(problem, guided=guided, integrator=integrator, samples_per_pass=size)
-    _teach(problem, saved, archive)
     for view in problem.views:
         suffix = "" if len(problem.views) == 1 else f"-{view.sensor}"
         view.made = _read_image(folder.images / f"target{suffix}.exr", problem, view.sensor)
         weights = folder.images / f"weights{suffix}.exr"
         view.weights = _read_image(weights, problem, view.sensor) if weights.exists() else None
+    if coarse:
+        with _fitting(archive, config):
+            problem = at_stage(problem, number, values)
+    else:
+        problem = replace(problem, config=config.at_stage(number))
+    _teach(problem, saved, archive)
     return Replay(problem, iteration)
+
+
+@contextmanager
+def _fitting(archive: Path, config: Config) -> Iterator[None]:
+    """Raise ConfigError where the values in the archive are not the experiment's."""
+    try:
+        yield
+    except ValueError as error:
+        raise ConfigError(archive, "", f"does not fit to {config.source}: {error}") from None
 
 
 @contextmanager

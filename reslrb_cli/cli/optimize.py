@@ -11,7 +11,6 @@ import logging
 import os
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -151,6 +150,8 @@ def _check_shards(config: Config, workers: int | None) -> None:
     if workers is not None and config.shards == 1:
         reason = "a step is one shard, which --cluster has nothing to share out of; set run.shards to auto, or a number"
         raise ConfigError(config.source, "run.shards", reason)
+    if workers is not None and config.run.stages:
+        raise ConfigError(config.source, "run.stages", "does not go with --cluster yet; leave one of the two out")
 
 
 def _begin(
@@ -212,7 +213,7 @@ def _run(
         from reslrb_cli.cluster.engine import local_engine
 
         with local_engine(course, workers) as engine:
-            course.problem = replace(course.problem, engine=engine)
+            course.compute_with(engine)
             return _run(course, manifest, folder, None, quiet)
     from reslrb_cli.cli.progress import Progress
     from reslrb_cli.cli.terminal import Interrupts

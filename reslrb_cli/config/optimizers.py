@@ -1,13 +1,14 @@
-"""The losses and the optimisers, each with the options that it knows."""
+"""The losses and the optimisers, each with the options that it knows, and the stages in which a run begins."""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 from typing_extensions import Self
 
-from reslrb_cli.config.base import NEEDS_TYPE, ByType, Choice, Positive, located
+from reslrb_cli.config.base import NEEDS_TYPE, ByType, Choice, Count, Positive, Section, located
 
 
 class Loss(Choice):
@@ -154,3 +155,46 @@ class SGD(Optimizer, json_schema_extra=NEEDS_TYPE):
 
 
 AnyOptimizer = Annotated[Adam | AdamW | RMSProp | SGD, ByType("adam")]
+
+
+_Share = Annotated[float, Field(gt=0, le=1)]
+
+
+class Stage(Section):
+    """A part of a run, until a share of its iterations is done; what it leaves out is as the run has it."""
+
+    until: Annotated[float, Field(gt=0, lt=1)]
+    """Share of the run's iterations after which the next stage begins, or, after the last one, the run as it is
+    configured."""
+    resolution: _Share = 1.0
+    """Of heightmaps and textures, width and height, and of a heightmap's mesh that is a flat grid with a vertex for
+    each texel. What several keys share, and textures that only a mesh's file has, keep theirs."""
+    film: _Share = 1.0
+    """Width and height of the films: one over a whole number that divides them. The target's pixels are means of as
+    many, by their weights."""
+    spp: Count | None = Field(default=None, description="Samples per pixel and step; null: `run.spp`.")
+    learning_rate: Positive = Field(default=1.0, description="What every learning rate is multiplied by.")
+    regularizers: Annotated[float, Field(ge=0)] = Field(
+        default=1.0, description="What the weight of every regularizer is multiplied by."
+    )
+
+    @property
+    def grain(self) -> tuple[float, float]:
+        """What makes it another problem than the run's: the resolution and the film."""
+        return self.resolution, self.film
+
+
+#: What a run is when its stages are over.
+AS_CONFIGURED = Stage.model_construct(until=1.0)
+
+
+def check_stages(stages: list[Stage]) -> None:
+    """Raise an error, located, where stages are not in their order, or one is coarser than another before
+    it."""
+    for place, (before, stage) in enumerate(pairwise(stages), 1):
+        if stage.until <= before.until:
+            raise located(f"run.stages[{place}].until", f"must be above {before.until:g}, that of the stage before it")
+        for name in ("resolution", "film"):
+            if getattr(stage, name) < getattr(before, name):
+                reason = f"must be at least {getattr(before, name):g}, that of the stage before it"
+                raise located(f"run.stages[{place}].{name}", reason)

@@ -20,6 +20,7 @@ from pydantic import (
     model_serializer,
     model_validator,
 )
+from pydantic_core import PydanticCustomError
 from typing_extensions import Self
 
 from reslrb_cli.config.base import (
@@ -41,7 +42,7 @@ from reslrb_cli.config.base import (
 from reslrb_cli.config.files import NAME_BYTES
 from reslrb_cli.config.integrators import AnyIntegrator, Integrator, largest_pass, passes_obstacle
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
-from reslrb_cli.config.optimizers import L2, Adam, AnyLoss, AnyOptimizer
+from reslrb_cli.config.optimizers import AS_CONFIGURED, L2, Adam, AnyLoss, AnyOptimizer, Stage, check_stages
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.views import SensorName, TargetConfig, ViewSpec, check_views
 
@@ -249,10 +250,16 @@ class RunConfig(Section):
     """When the state of the run is kept, for `reslrb optimize --resume`: `iterations` or `seconds` between two
     checkpoints. Besides, before the first iteration and at the end, whatever ends it but a kill."""
     reach_spp: Count = Field(default=64, description="Samples for the mask of the texels that light and sensor reach.")
+    stages: list[Stage] = Field(default=[], max_length=16)
+    """How the run begins, in parts, from coarse to fine: resolution, film, samples, rates and weights until a share of
+    the iterations is done. After the last of them it is as configured. Where resolution or film change, the optimizer
+    begins anew, and so does what `optimizer.scale` measures."""
 
     @model_serializer(mode="wrap")
     def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         values: dict[str, Any] = handler(self)
+        if not self.stages:
+            del values["stages"]
         if self.adjoint not in ("auto", "batched", "others"):
             del values["batches"], values["first_batch"]
         return values
@@ -410,6 +417,20 @@ class Config(Section):
         ]
         return self.model_copy(update={"target": target, "views": views})
 
+    def stage(self, number: int) -> Stage:
+        """The stage of that number; after the last one, the run as it is configured."""
+        return self.run.stages[number] if number < len(self.run.stages) else AS_CONFIGURED
+
+    def stage_number(self, progress: float) -> int:
+        """The number of the stage that a run is in when this share (0 to 1) of it is done; of one whose stages are
+        over, or that has none, how many it has."""
+        return sum(progress >= stage.until for stage in self.run.stages)
+
+    def at_stage(self, number: int) -> Config:
+        """The experiment with the samples of a stage, and as if that were all of its run."""
+        spp = self.stage(number).spp or self.run.spp
+        return self.model_copy(update={"run": self.run.model_copy(update={"spp": spp, "stages": []})})
+
     def step_options(self, shard: bool = False) -> dict[str, Any]:
         """What a gradient step is told of its samples, those of an iteration or of a `shard`."""
         options: dict[str, Any] = {"spp": self.share_spp if shard else self.run.spp, "adjoint": self.adjoint}
@@ -459,23 +480,15 @@ class Config(Section):
                     raise located(
                         f"parameters[{i}].{at}", f"`{name}` stands in parameters[{places[option, name]}] already"
                     )
-        _check_passes(self.integrator, self.run.spp, "integrator", "run.spp")
-        self._check_shards()
-        if self.scene.size is not None:
-            obstacle = self.samples_obstacle(self.scene.size[0] * self.scene.size[1])
-            if obstacle is not None:
-                raise located("run.spp", obstacle)
-        for option in sorted({"batches", "first_batch"} & self.run.model_fields_set):
-            if self.run.adjoint not in ("auto", "batched", "others"):
-                raise located(f"run.{option}", f"has no effect with run.adjoint: {self.run.adjoint}, but with batched")
-        if self.run.adjoint == "batched":
-            spp, what = self.share_spp, "run.spp" if self.shares == 1 else "the samples of a shard"
-            if spp % self.run.batches:
-                is_are = "is" if self.shares == 1 else "are"
-                raise located("run.batches", f"{self.run.batches} does not divide {what}, which {is_are} {spp}")
-            _check_passes(self.integrator, spp // self.run.batches, "integrator", f"{what} / run.batches")
-        if self.halves == 2:
-            self._check_halves()
+        self._check_samples()
+        check_stages(self.run.stages)
+        for number in range(len(self.run.stages)):
+            try:
+                self.at_stage(number)._check_samples()
+            except PydanticCustomError as error:
+                about = error.context or {}
+                reason = f"would not do as run.spp: {about.get('key')}: {about.get('message', error)}"
+                raise located(f"run.stages[{number}].spp", reason) from None
         if self.run.adjoint == "correlated" and self.integrator.options().get("weight") == "adjoint":
             raise located(
                 "integrator.weight",
@@ -494,6 +507,26 @@ class Config(Section):
             key = "integrator" if own is None else "target.render.integrator"
             _check_passes(own or self.integrator, self.target.render.spp, key, "target.render.spp")
         return self
+
+    def _check_samples(self) -> None:
+        """Raise an error, located, where a step's samples cannot be split as the run's settings have it."""
+        _check_passes(self.integrator, self.run.spp, "integrator", "run.spp")
+        self._check_shards()
+        if self.scene.size is not None:
+            obstacle = self.samples_obstacle(self.scene.size[0] * self.scene.size[1])
+            if obstacle is not None:
+                raise located("run.spp", obstacle)
+        for option in sorted({"batches", "first_batch"} & self.run.model_fields_set):
+            if self.run.adjoint not in ("auto", "batched", "others"):
+                raise located(f"run.{option}", f"has no effect with run.adjoint: {self.run.adjoint}, but with batched")
+        if self.run.adjoint == "batched":
+            spp, what = self.share_spp, "run.spp" if self.shares == 1 else "the samples of a shard"
+            if spp % self.run.batches:
+                is_are = "is" if self.shares == 1 else "are"
+                raise located("run.batches", f"{self.run.batches} does not divide {what}, which {is_are} {spp}")
+            _check_passes(self.integrator, spp // self.run.batches, "integrator", f"{what} / run.batches")
+        if self.halves == 2:
+            self._check_halves()
 
     def _check_shards(self) -> None:
         """Raise an error, located, where shards are neither whole views nor equal shares of one."""

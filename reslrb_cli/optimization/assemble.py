@@ -1,14 +1,22 @@
-"""From a configuration to the problem that it states: loaded, checked, targets made, what is measured settled."""
+"""From a configuration to the problem that it states: loaded, checked, targets made, what is measured settled; and from
+that to the coarser one of a stage of its run."""
 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from fnmatch import fnmatchcase
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
+from scipy.interpolate import RectBivariateSpline
 
+from reslrb_cli.config.parameters import HEIGHTMAP, ParameterSpec
 from reslrb_cli.config.schema import Config
+from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.optimization.autotune.estimators import find_options
 from reslrb_cli.optimization.autotune.sampling import settle
@@ -28,10 +36,11 @@ from reslrb_cli.optimization.moving import check_moving, moves_anything
 from reslrb_cli.optimization.problem import Problem, make_optimizer, make_regularizers
 from reslrb_cli.optimization.state import begin_as, decide_as, reach_as
 from reslrb_cli.optimization.targets import make_targets
-from reslrb_cli.optimization.views import expose, make_views
+from reslrb_cli.optimization.views import View, expose, make_views
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.tree import Stored
 from reslrb_cli.scene.parameters import Selection, select_parameters
+from reslrb_cli.scene.values import resample
 
 Array = np.ndarray[Any, Any]
 
@@ -121,6 +130,9 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
         problem.integrator.expect(pass_spp(config))
     problem.apply()
     check_moving(problem)
+    for number in range(len(config.run.stages)):
+        _film_at(problem, number)
+        _specs_at(problem, number)
     return problem
 
 
@@ -134,3 +146,154 @@ def _check_values(selection: Selection, values: Mapping[str, Array]) -> None:
             raise ValueError(f"`{key}` is {value.dtype} of shape {value.shape}, not numbers of shape {shape}")
         if not np.isfinite(value).all():
             raise ValueError(f"`{key}` holds a value that is not finite")
+
+
+# --- stages -----------------------------------------------------------------------------------------------------------
+
+
+def at_stage(problem: Problem, number: int, values: Mapping[str, Array] | None = None) -> Problem:
+    """What the run of `problem` works on in a stage that has a resolution or a film of its own: another scene, with
+    coarser maps and targets, drawn from as `problem` is; what was learned of that is forgotten.
+
+    `values` are those of its parameters, in its resolution; None: those that `problem` has now, resampled. Raises
+    ValueError where they are not of its shapes.
+    """
+    config, film = problem.config.at_stage(number), _film_at(problem, number)
+    scene = config.scene if film is None else config.scene.model_copy(update={"size": film})
+    config = config.model_copy(update={"parameters": _specs_at(problem, number), "scene": scene})
+    # What is doubtful in the scene was told of the whole problem's.
+    made = assemble_scene(config, load_configured(config, warn=False), None if values is None else dict(values))
+    if values is None:
+        made.selection.set_arrays({key: bounded(made, key, resized(made, key, value))
+                                   for key, value in problem.values().items()})  # fmt: skip
+        made = replace(made, optimizer=make_optimizer(made.config, made.selection))
+        made.apply()
+    for view, whole in zip(made.views, problem.views, strict=True):
+        _see_coarsely(view, whole, made.scene.sensors()[view.sensor].film())
+    integrator, size = problem.integrator, problem.samples_per_pass
+    if isinstance(integrator, LightTracer):
+        integrator = integrator.afresh()
+        if config.run.memory_budget is not None and integrator.samples_per_pass is not None:
+            size = math.gcd(integrator.samples_per_pass, config.set_spp)
+            integrator = integrator.with_options(samples_per_pass=size, freeze=integrator.freeze)
+        integrator.expect(pass_spp(config))
+    stage = problem.config.stage(number)
+    return replace(
+        made, integrator=integrator, samples_per_pass=size, paths=problem.paths, truth=problem.truth,
+        masks=problem.masks, guided=problem.guided, sequence=problem.sequence, sides=problem.sides,
+        pace=stage.learning_rate, regularizers=make_regularizers(made.selection, stage.regularizers),
+    )  # fmt: skip
+
+
+def _film_at(problem: Problem, number: int) -> tuple[int, int] | None:
+    """The (width, height) of all films in a stage; None where it has the scene's. Raises ConfigError."""
+    config, share, key = problem.config, problem.config.stage(number).film, f"run.stages[{number}].film"
+    if share == 1:
+        return None
+    films = [problem.scene.sensors()[sensor].film() for sensor in problem.sensors]
+    sizes = {tuple(int(n) for n in film.crop_size()) for film in films}
+    if len(sizes) > 1 or sizes != {tuple(int(n) for n in film.size()) for film in films}:
+        raise ConfigError(config.source, key, "goes with films of one size without a crop window; leave it out")
+    (size,) = sizes
+    width, height = (round(n * share) for n in size)
+    if min(width, height) < 1 or (size[0] % width, size[1] % height) != (0, 0) or size[0] * height != size[1] * width \
+            or abs(size[0] / width * share - 1) > 1e-3:  # fmt: skip
+        least = math.gcd(*size)
+        would = [f"1/{n}" for n in range(2, least + 1) if least % n == 0][:4]
+        advice = f"{', '.join(would)} would do" if would else "no smaller one has whole pixels"
+        raise ConfigError(config.source, key, f"{share:g} of {size[0]}x{size[1]} pixels has no whole ones; {advice}")
+    return width, height
+
+
+def _specs_at(problem: Problem, number: int) -> list[ParameterSpec]:
+    """The parameters as a stage has them, a glob as the keys that it selects. Raises ConfigError where it is to make
+    some coarser, and there are none."""
+    config, selection, share = problem.config, problem.selection, problem.config.stage(number).resolution
+    specs: list[ParameterSpec] = []
+    coarser = share == 1
+    for spec in config.parameters:
+        if share == 1 or spec.motion is not None or len(spec.keys) > 1:
+            specs.append(spec)
+            continue
+        for key in selection.keys:
+            if not any(key == name or fnmatchcase(key, name) for name in spec.names):
+                continue
+            changes: dict[str, Any] = {} if spec.heightmap is not None else {"key": key}
+            slot = selection.slot(key)
+            if slot.is_texture:
+                height, width = slot.get().shape[:2]
+                size = max(round(width * share), 3 if slot.halo else 2), max(round(height * share), 2)
+                coarser = True
+                if spec.heightmap is None:
+                    changes["resolution"] = size
+                else:
+                    grid = {"grid": size} if _is_grid(problem, key, spec) else {}
+                    changes["heightmap"] = spec.heightmap.model_copy(update={"resolution": size, **grid})
+            specs.append(spec.model_copy(update=changes))
+    if not coarser:
+        place = f"run.stages[{number}].resolution"
+        raise ConfigError(config.source, place, "makes nothing coarser: no parameter is a texture or a heightmap alone")
+    return specs
+
+
+def _is_grid(problem: Problem, key: str, spec: ParameterSpec) -> bool:
+    """Whether a heightmap's mesh is a flat grid with a vertex at each of its texels, so that both can be coarser."""
+    assert spec.heightmap is not None
+    height, width = problem.selection.array(key).shape[:2]
+    points, uv = problem.selection.deformation.laid_over(key)
+    if len(spec.heightmap.mesh) > 1 or len(points) != width * height:
+        return False
+    place = uv * (width, height) - 0.5
+    nodes = np.rint(place)
+    if np.abs(place - nodes).max() > 1e-2 or len(np.unique(nodes, axis=0)) < len(nodes):
+        return False
+    design = np.column_stack([np.ones(len(nodes)), nodes])
+    away = design @ np.linalg.lstsq(design, points, rcond=None)[0] - points
+    return bool(np.abs(away).max() < 1e-4 * np.ptp(points, axis=0).max())
+
+
+def resized(problem: Problem, key: str, value: Array) -> Array:
+    """Another problem's value of a parameter, or a change of it, in the resolution that `problem` has it in.
+
+    Heights by cubic splines, at the places in space where they are: from edge to edge of a grid that has a vertex for
+    each; textures bilinearly, smoothed first where they shrink.
+    """
+    shape, selection = problem.selection.array(key).shape, problem.selection
+    if value.shape == shape:
+        return value
+    if selection.kind(key) != HEIGHTMAP:
+        return resample(value, (shape[1], shape[0]))
+    spec = next(spec for spec in problem.config.parameters if key in spec.names)
+    whole = _is_grid(problem, key, spec)
+    rows, columns = (_places(new, old, whole) for new, old in zip(shape[:2], value.shape[:2], strict=True))
+    (kx, ky), nodes = (min(3, n - 1) for n in value.shape[:2]), (np.arange(n) for n in value.shape[:2])
+    spline = RectBivariateSpline(*nodes, value[:, :, 0], kx=kx, ky=ky)
+    return np.asarray(spline(rows, columns), np.float32)[:, :, None]
+
+
+def bounded(problem: Problem, key: str, value: Array) -> Array:
+    """A value of a parameter within its bounds."""
+    low, high = problem.selection.spec(key).bounds or (-np.inf, np.inf)
+    return np.clip(value, np.float32(low), np.float32(high))
+
+
+def _places(new: int, old: int, edge_to_edge: bool) -> Array:
+    """Where `new` nodes lie among `old` ones, in steps of these."""
+    if edge_to_edge:
+        return np.linspace(0, old - 1, new)
+    return np.clip((np.arange(new) + 0.5) * old / new - 0.5, 0, old - 1)
+
+
+def _see_coarsely(view: View, whole: View, film: mi.Film) -> None:
+    """Give a view of a smaller film the target of the whole one: means over pixels, by what they weigh."""
+    target = np.array(whole.target, dtype=np.float64)
+    weights = np.ones(target.shape[:2]) if whole.weights is None else np.array(whole.weights, dtype=np.float64)[:, :, 0]
+    width, height = (int(n) for n in film.crop_size())
+    down, across = target.shape[0] // height, target.shape[1] // width
+
+    def summed(image: Array) -> Array:
+        return image.reshape(height, down, width, across, -1).sum(axis=(1, 3))
+
+    total = summed(weights)
+    view.masked = whole.masked
+    view.see(summed(weights[:, :, None] * target) / np.maximum(total, 1e-300), total[:, :, 0] / (down * across))

@@ -27,6 +27,7 @@ from reslrb_cli.optimization.autotune.sampling import lessons
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.memory import plans
 from reslrb_cli.optimization.problem import Problem, saved_spp
+from reslrb_cli.optimization.stages import Stages
 from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
 from reslrb_cli.records.cache import PilotCache
@@ -57,7 +58,23 @@ class Steps:
 
 
 def measure_steps(problem: Problem) -> Steps:
-    """What a step of the run takes, measured or by two smaller ones."""
+    """What a step of the run takes; of one with stages, the mean over its iterations, and all that their first ones
+    take longer."""
+    config, stages = problem.config, Stages(problem)
+    numbers = [config.stage_number(each / config.run.iterations) for each in range(config.run.iterations)]
+    found = {number: _measure_stage(stages.at(number)) for number in sorted({*numbers, stages.last})}
+    parts = [found[number] for number in numbers]
+    return Steps(
+        found[stages.last].spp,
+        statistics.fmean(each.iteration_s for each in parts),
+        sum(each.start_s for each in found.values()),
+        sum(each.compile_s for each in found.values()),
+        max(each.peak for each in found.values()),
+    )
+
+
+def _measure_stage(problem: Problem) -> Steps:
+    """What a step of `problem` takes, measured or by two smaller ones."""
     config = problem.config
     unit, whole = sets_of(config) * (problem.samples_per_pass or 1), config.run.spp
     if unit >= whole:
@@ -84,7 +101,7 @@ def _peak(problem: Problem, spp: int) -> int:
 def _trial(problem: Problem, spp: int) -> Iterator[Problem]:
     """The problem before its first iteration, of `spp` samples per pixel; then the scene is as it was."""
     run = problem.config.run
-    enough = {"spp": spp, "iterations": max(run.iterations, WARM_UP + MOST)}  # of a run of two, too
+    enough = {"spp": spp, "iterations": max(run.iterations, WARM_UP + MOST), "stages": []}  # of a run of two, too
     config = problem.config.model_copy(update={"run": run.model_copy(update=enough)})
     try:
         yield replace(problem.afresh(problem.values()), config=config)

@@ -29,6 +29,7 @@ from reslrb_cli.optimization.optimizers import clamp_gradients
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import measure_curvatures, rescale
 from reslrb_cli.optimization.shards import add_gradient, scaled
+from reslrb_cli.optimization.stages import Stages
 from reslrb_cli.optimization.state import State, put, standing
 from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record, Regularized
@@ -90,7 +91,7 @@ def step(
         split = Split()
         loss, squares, counts, refused, costs = gradient(problem, iteration, split)
         dr.eval(loss, squares, counts)
-    factor = learning_rate_factor(
+    factor = problem.pace * learning_rate_factor(
         config.optimizer.schedule, iteration, config.run.iterations, config.optimizer.final_fraction, progress()
     )
     with clock.counted():
@@ -144,14 +145,16 @@ def step(
 
 
 def iterate(
-    problem: Problem,
+    stages: Stages,
     state: State,
     on_nonfinite: Told = lambda found: None,
     progress: Callable[[], float] = lambda: 0.0,
 ) -> Iterator[tuple[State, Record]]:
-    """Make the iterations from `state` to the last of the run, each as `step` does. Raises NonFinite where it ends."""
+    """Make the iterations from `state` to the last of the run, each as `step` does, of the problem of its stage. Raises
+    NonFinite where it ends."""
     reset_peak()
-    while state.iteration < problem.config.run.iterations:
+    while state.iteration < stages.whole.config.run.iterations:
+        problem, state = stages.enter(state, progress)
         state, record = step(problem, state, on_nonfinite, progress)
         yield state, record
         if state.end:
@@ -163,7 +166,9 @@ def optimize(
 ) -> Iterator[Record]:
     """The records of all iterations of `problem` from where it stands; the parameters are updated when one is
     yielded."""
-    for _, record in iterate(problem, standing(problem), on_nonfinite, progress):
+    stages = Stages(problem)
+    for state, record in iterate(stages, standing(problem), on_nonfinite, progress):
+        stages.bring(state)
         yield record
 
 

@@ -78,6 +78,8 @@ class Problem:
     regularizers: dict[str, dict[str, Cost]] = field(default_factory=dict)
     #: What computes the shards of a step (`shards.Engine`); None: this process, one after the other.
     engine: Callable[..., Any] | None = None
+    #: What learning rates are multiplied by, beside their schedule.
+    pace: float = 1.0
 
     def decisions(self) -> dict[str, dict[str, Any] | None]:
         """What was measured and planned before the first iteration, as manifests and checkpoints have it, by name."""
@@ -219,11 +221,13 @@ def make_optimizer(config: Config, selection: Selection) -> Optimizer:
     )
 
 
-def make_regularizers(selection: Selection) -> dict[str, dict[str, Cost]]:
-    """What the values of `selection` cost by themselves, by key and type; empty where nothing does."""
+def make_regularizers(selection: Selection, times: float = 1.0) -> dict[str, dict[str, Cost]]:
+    """What the values of `selection` cost by themselves, by key and type, their weights multiplied by `times`; empty
+    where nothing does."""
     found: dict[str, dict[str, Cost]] = {}
     for key in selection.keys:
         for each in selection.spec(key).regularizers:
+            each = each.model_copy(update={"weight": times * each.weight})
             if isinstance(each, Laplacian) and selection.kind(key) == "mesh":
                 faces = np.array(selection.params[f"{key.rpartition('.')[0]}.faces"], dtype=np.int64)
                 cost = mesh_cost(each.weight, selection.array(key), faces)

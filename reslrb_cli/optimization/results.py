@@ -207,6 +207,7 @@ class Results:
         self._last: dict[str, float] = {}
         self._values: dict[str, dict[str, Any]] = {key: {} for key in problem.selection.keys}
         self._losses: list[float] = []
+        self._iterations = 0
         self._scales: dict[str, float] = {}
         self.images = {"initial": Images(), "final": Images()}
         self._errors: dict[str, list[float]] = {}
@@ -215,8 +216,12 @@ class Results:
             self._values[key]["true"] = summary(true, problem.masks.get(key))
 
     def add(self, record: Record) -> None:
-        """Take one iteration."""
-        self._losses.append(record.loss)
+        """Take one iteration. The losses that are judged are those of whole films, with all samples."""
+        self._iterations += 1
+        config = self.problem.config
+        stage = config.stage(config.stage_number(record.iteration / config.run.iterations))
+        if stage.film == 1 and stage.spp in (None, config.run.spp):
+            self._losses.append(record.loss)
         for key, error in record.parameter_errors.items():
             self._errors.setdefault(key, []).append(error)
 
@@ -255,7 +260,7 @@ class Results:
         first, last = self._first, self._last
         relative = self.meter.relative(first), self.meter.relative(last)
         worse = [key for key, error in last.items() if got_worse(self._errors.get(key, []), error)]
-        if len(self._losses) < min(run.iterations, LEAST_ITERATIONS):  # of a run that goes on nothing is known yet
+        if self._iterations < min(run.iterations, LEAST_ITERATIONS):  # of a run that goes on nothing is known yet
             worse = []
         found = {
             "rmse": {"initial": self.meter.total(first), "final": self.meter.total(last)},

@@ -48,8 +48,9 @@ class State:
     are length and gain of what is moved in its place (`Variable`), where anything is, `clamp` the iterations that the
     clamp knows; `moments` are the optimiser's and `clamp_sums` the clamp's. `guiding` are the gradients that guided
     emission had by sensor, `learned` its arrays by `<sensor>/<what>`. `values` are the scene's, as the optimiser has
-    them; in a file as they are shown, and as `halo` where that is less. `end` says why the run ends with it, "" where
-    it does not.
+    them; in a file as they are shown, and as `halo` where that is less. `stage` is the number of the stage whose
+    problem it is a state of, and `base` the run's values when that began, of one with a problem of its own (`stages`).
+    `end` says why the run ends with it, "" where it does not.
     """
 
     iteration: Count
@@ -60,11 +61,13 @@ class State:
     clamp: dict[str, FromOne]
     scaling: list[Scaled] | None = None
     guiding: dict[str, Count] | None = None
+    stage: Count = 0
     values: Arrays = field(default_factory=dict, metadata=entry("parameter", "finite"))
     halo: Arrays = field(default_factory=dict, metadata=entry("parameter with halo", "finite"))
     moments: Arrays = field(default_factory=dict, metadata=entry("optimizer"))
     clamp_sums: Arrays = field(default_factory=dict, metadata=entry("clamp"))
     learned: Arrays = field(default_factory=dict, metadata=entry("guiding", "finite"))
+    base: Arrays = field(default_factory=dict, metadata=entry("base", "finite"))
     end: str = field(default="", metadata=PASSING)
 
     def on_file(self, problem: Problem) -> State:
@@ -78,7 +81,7 @@ def standing(problem: Problem, state: State | None = None) -> State:
 
     It costs nothing, since no iteration changes the arrays of one before it.
     """
-    state = State(0, 0.0, 0.0, 0, {}, {}) if state is None else state
+    state = State(0, 0.0, 0.0, 0, {}, {}, stage=len(problem.config.run.stages)) if state is None else state
     optimizer, guiding = problem.optimizer, guiding_of(problem)
     calls, learned = (None, {}) if guiding is None else guiding.state()
     values = {key: dr.detach(optimizer[key]) for key in optimizer.keys()}  # noqa: SIM118 (not a mapping)
@@ -97,8 +100,11 @@ def put(problem: Problem, state: State) -> str | None:
     return wrong
 
 
-def load(problem: Problem, stored: Stored) -> State:
-    """The state that was stored, to which `problem` is brought. Raises ConfigError where it is another experiment's."""
+def load(problem: Problem, stored: Stored, whole: Problem) -> State:
+    """The state that was stored, to which `problem`, that of its stage, is brought; `whole` is the run's own.
+
+    Raises ConfigError where it is another experiment's.
+    """
     told, optimizer, keys = stored.read(State), problem.optimizer, problem.selection.keys
     for name, found in (("units", told.units), ("clamp", told.clamp)):
         for key in found:
@@ -116,7 +122,8 @@ def load(problem: Problem, stored: Stored) -> State:
     learned = dict.fromkeys(f"{number}/{name}" for number in told.guiding or () for name in KNOWN)
     sums = {key: dict.fromkeys(SUMS, dr.detach(optimizer[key])) for key in told.clamp}
     values = _stored_values(problem, stored, "parameter")
-    asked = replace(told, moments=optimizer.moments(), clamp_sums=sums, learned=learned)
+    base = {} if problem.scene is whole.scene else {key: expected(whole.selection.array(key).shape) for key in keys}
+    asked = replace(told, base=base, moments=optimizer.moments(), clamp_sums=sums, learned=learned)
     state = replace(stored.fill(asked), values=values)
     wrong = put(problem, state)
     if wrong is not None:

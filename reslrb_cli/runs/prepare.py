@@ -33,6 +33,7 @@ from reslrb_cli.optimization.loading import paths_of
 from reslrb_cli.optimization.moving import warn_of_border
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import WINDOW, Best, Images, Least, Results
+from reslrb_cli.optimization.stages import Stages
 from reslrb_cli.optimization.state import Settled, State, check_bounds, load, on_file, standing
 from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
 from reslrb_cli.optimization.views import view_records
@@ -231,12 +232,18 @@ class Course:
     """
 
     def __init__(self, problem: Problem, variant: str) -> None:
-        self.problem, self._settled = problem, settled_of(problem, variant)
+        self._settled, self.stages = settled_of(problem, variant), Stages(problem)
+        self.problem = problem = self.stages.whole
         self.state, self.results = standing(problem), Results(problem)
         self.certainty = Certainty(problem)
         self.best = Best(any(view.held_out for view in problem.views))
         self.nonfinite, self.clamped, self.regularized = NonFiniteTally(), ClampTally(), RegularizedTally()
         self.last: Record | None = None
+
+    def compute_with(self, engine: Callable[..., Any]) -> None:
+        """Have the shards of a run without stages computed by `engine` (`shards.Engine`)."""
+        self.problem = replace(self.problem, engine=engine)
+        self.stages = Stages(self.problem)
 
     @property
     def done(self) -> int:
@@ -245,10 +252,24 @@ class Course:
 
     def add(self, state: State, record: Record) -> None:
         """Take one iteration, which leaves `state`."""
-        self.best.see(record, self.state.values)
+        if self._counts(record.iteration):  # losses of other films are not to be compared
+            self.best.see(record, self.state.values)
         self._take(record)
-        self.certainty.see(state.iteration)
+        if self.stages.is_whole(state.stage):
+            self.certainty.see(state.iteration)
         self.state = state
+
+    def _counts(self, iteration: int) -> bool:
+        """Whether the iteration before, which left its values, and this one, whose loss it is, worked on the run's own
+        problem."""
+        config = self.problem.config
+        begun = (max(iteration - 1, 0), iteration)
+        return all(self.stages.is_whole(config.stage_number(each / config.run.iterations)) for each in begun)
+
+    def bring(self) -> Problem:
+        """The run's own problem, at the newest values."""
+        self.stages.bring(self.state)
+        return self.problem
 
     def _take(self, record: Record) -> None:
         self.last = record
@@ -273,7 +294,7 @@ class Course:
             self.results.images["initial"], self.certainty.noted, self.best.least, self.last,
             self.best_values(), self.certainty.squares,
         )  # fmt: skip
-        found, values = entries(self._settled, self.state.on_file(self.problem), met)
+        found, values = entries(self._settled, self.state.on_file(self.stages.at(self.state.stage)), met)
         save_checkpoint(folder, self.done, {}, found, values)
         return self.done
 
@@ -283,14 +304,14 @@ class Course:
         Raises ConfigError, located in the file, where something there is not what this run can have left.
         """
         problem, met = self.problem, stored.read(Met)
-        self.state = load(problem, stored)
+        self.state = load(self.stages.at(stored.read(State).stage), stored, problem)
         squares = {key: problem.optimizer.squares(key) for key in met.certainty.keys if key in problem.selection.keys}
         wanted = {key: expected(problem.selection.array(key).shape) for key in problem.selection.keys if met.best}
         kept = {key: each[0] for key, each in squares.items() if each is not None}
         met = stored.fill(replace(met, best_values=wanted, squares=kept))
         for record in records:
             self._take(record)
-        self.best.recent.extend(record.loss for record in records[-WINDOW:])
+        self.best.recent.extend(record.loss for record in records[-WINDOW:] if self._counts(record.iteration))
         for key, array in met.best_values.items():
             check_bounds(problem, stored, f"best/{key}", key, array)
         self.best.least, self.best.values = met.best, met.best_values

@@ -248,14 +248,14 @@ class Recording:
 
     def _iterate(self, show: Callable[[Record], None], stop: Callable[[], bool]) -> None:
         run, saved, saved_at = self.problem.config.run, self.done, time.monotonic()
-        every, told = run.images_every, self.done > 0
+        every, told = run.images_every, self.course.state.scaling
         if stop():
             return
         with MetricsWriter(self.folder.path) as metrics:
-            for state, record in iterate(self.problem, self.course.state, self._on_nonfinite):
-                if not told and state.scaling is not None:
+            for state, record in iterate(self.course.stages, self.course.state, self._on_nonfinite):
+                if state.scaling is not None and state.scaling is not told:
                     self._tell_scaling(state.scaling)
-                told = True
+                told = state.scaling
                 self.course.add(state, record)
                 metrics.write(record)
                 show(record)
@@ -294,8 +294,10 @@ class Recording:
         """Keep what the first step that met a value that is not finite began with, and say how to look into it."""
         if self._saved_nonfinite:
             return
-        state = self.course.state  # what guided emission knew before this iteration, which may have taught it more
-        step = NonFiniteStep(found.iteration, self.problem.values(), state.guiding, state.learned)
+        stages, state = self.course.stages, self.course.stages.begun
+        assert state is not None, "an iteration is at work"
+        # What guided emission knew before this iteration, which may have taught it more.
+        step = NonFiniteStep(found.iteration, stages.now.values(), state.guiding, state.learned)
         save_nonfinite(self.folder.checkpoint, step)
         self._saved_nonfinite = True
         if self.problem.config.run.on_nonfinite != "stop":  # which says so when it ends
@@ -324,7 +326,7 @@ class Recording:
 
     def _write_parameters(self) -> None:
         """Write the last values, and beside them the best so far, where there are any."""
-        write_parameters(self.folder.parameters, self.problem.values())
+        write_parameters(self.folder.parameters, self.course.bring().values())
         best = self.course.best_values()
         if best:
             write_parameters(self.folder.parameters / "best", best)
@@ -342,7 +344,8 @@ class Recording:
         if self.course.last is None:  # nothing is there to be drawn, so that this takes no time
             write_report(self.folder.path, self.manifest.content(), {})
         else:
-            write_report(self.folder.path, self.manifest.content() | {"results": self._found()}, self.problem.values())
+            found = self._found()
+            write_report(self.folder.path, self.manifest.content() | {"results": found}, self.problem.values())
 
     def _add(self, failed: str, measure: Callable[[], None]) -> None:
         """Add to the results what `measure` finds. The run is what it is without that; `failed` says so."""
@@ -383,6 +386,7 @@ class Recording:
     def _found(self) -> dict[str, Any]:
         """What the run came to, or has come to by now."""
         last = self.course.last
+        self.course.bring()
         self.course.results.end()
         found = self.course.results.to_json()
         if self.certainty is not None:
@@ -416,6 +420,7 @@ class Recording:
 
     def _write_images(self, name: str) -> None:
         spp = saved_spp(self.problem, between=name.startswith("iteration"))
+        self.course.bring()
         if name == "final":
             logger.info(f"rendering the final image: {spp} spp")
         for view in self.problem.views:

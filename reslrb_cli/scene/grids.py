@@ -18,8 +18,8 @@ from reslrb_cli.scene.xml.read import Description, Element
 def make_grid(description: Description, id: str, size: tuple[int, int], place: Place) -> None:
     """Make a mesh with `size` vertices along its edges of the rectangle `id` of a description, before it is built.
 
-    That is a `rectangle`, or a mesh of four vertices that are a parallelogram's; its place and its material stay.
-    Raises ConfigError at `place` for any other shape.
+    That is a `rectangle`, a mesh of four vertices that are a parallelogram's, or one that is a flat grid over one
+    already; its place and its material stay. Raises ConfigError at `place` for any other shape.
     """
     element = description.root.by_id().get(id)
     if element is None or element.tag != "shape":
@@ -30,7 +30,7 @@ def make_grid(description: Description, id: str, size: tuple[int, int], place: P
         if corners is None:
             raise place.fail("heightmap.grid", f"`{id}` is no rectangle, nor a mesh of four vertices that is one; "
                              "remove `grid`, or give it a mesh as fine as the map")  # fmt: skip
-        p, q, d = corners
+        p, q, d, inside_out = corners
         normal = np.cross(q - p, d - p)
         matrix = np.eye(4)
         matrix[:3] = np.stack([(q - p) / 2, (d - p) / 2, normal / np.linalg.norm(normal), (q + d) / 2], axis=1)
@@ -40,24 +40,32 @@ def make_grid(description: Description, id: str, size: tuple[int, int], place: P
             transform = element.new("transform", name="to_world")
             kept.append(transform)
         transform.children.insert(0, first)
+    else:
+        inside_out = False
     element.attributes["type"] = "ply"
-    element.children[:] = [element.new("string", name="filename", value=str(_grid_file(*size))), *kept]
+    element.children[:] = [element.new("string", name="filename", value=str(_grid_file(*size, inside_out))), *kept]
 
 
 #: What a rectangle hands on to a grid of it.
 _KEPT_OF_GRID = ("to_world", "flip_normals", "face_normals")
 
 
-def _corners_of(element: Element, description: Description) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """A corner of a parallelogram of four vertices, in a mesh's file, the next one and the one before, seen from
-    outside; None of anything else. The first is that of the least texture coordinates, where it has some."""
+Corners = tuple[np.ndarray, np.ndarray, np.ndarray, bool]
+
+
+def _corners_of(element: Element, description: Description) -> Corners | None:
+    """A corner of a parallelogram in a mesh's file, the ends of its edges along u and along v, and whether v is to the
+    right of u, seen from outside; None of anything else.
+
+    Of four vertices without texture coordinates u is what has the mesh to its left.
+    """
     name = element.find("filename")
     path = None if name is None else description.find_file(name.value)
     if path is None or element.type not in ("ply", "obj"):
         return None
     mesh = mi.load_dict({"type": element.type, "filename": str(path)})
     if mesh.vertex_count() != 4 or mesh.face_count() != 2:
-        return None
+        return _corners_of_grid(mesh)
     points = np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
     one, other = (list(face) for face in np.array(mesh.faces_buffer()).reshape(2, 3))
     [alone], [apart] = [k for k in one if k not in other] or [-1], [k for k in other if k not in one] or [-1]
@@ -71,14 +79,36 @@ def _corners_of(element: Element, description: Description) -> tuple[np.ndarray,
         least = np.array(mesh.vertex_texcoords_buffer()).reshape(-1, 2).sum(axis=1)
         start = int(np.argmin(least[loop]))
         loop = loop[start:] + loop[:start]
-    return points[loop[0]], points[loop[1]], points[loop[3]]
+    return points[loop[0]], points[loop[1]], points[loop[3]], False
+
+
+def _corners_of_grid(mesh: mi.Mesh) -> Corners | None:
+    """The same of a mesh of more vertices, whose texture coordinates are proportional to their places, and which covers
+    all of a parallelogram."""
+    if mesh.vertex_count() < 4 or not mesh.has_vertex_texcoords():
+        return None
+    points = np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
+    uv = np.array(mesh.vertex_texcoords_buffer(), dtype=np.float64).reshape(-1, 2)
+    low, high = uv.min(axis=0), uv.max(axis=0)
+    if min(high - low) <= 0:
+        return None
+    design = np.column_stack([np.ones(len(uv)), (uv - low) / (high - low)])
+    p, along, up = np.linalg.lstsq(design, points, rcond=None)[0]
+    corner = points[np.array(mesh.faces_buffer()).reshape(-1, 3)]
+    areas = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    whole = np.cross(along, up)
+    flat = np.abs(design @ np.stack([p, along, up]) - points).max() < 1e-4 * np.ptp(points, axis=0).max()
+    covered = np.linalg.norm(areas, axis=1).sum() / 2
+    if not flat or abs(covered - np.linalg.norm(whole)) > 1e-3 * np.linalg.norm(whole):
+        return None
+    return p, p + along, p + up, bool(areas.sum(axis=0) @ whole < 0)
 
 
 @functools.cache
-def _grid_file(width: int, height: int) -> Path:
-    """A file with a grid over [-1, 1] x [-1, 1], which is there as long as this process."""
-    path = Path(_grid_folder().name) / f"grid_{width}x{height}.ply"
-    path.write_bytes(face_ply(Setting(size=(2.0, 2.0)), width, height))
+def _grid_file(width: int, height: int, inside_out: bool) -> Path:
+    """A file with a grid over [-1, 1] x [-1, 1], its outside up, or down; it is there as long as this process."""
+    path = Path(_grid_folder().name) / f"grid_{width}x{height}{'_down' * inside_out}.ply"
+    path.write_bytes(face_ply(Setting(size=(2.0, 2.0), thickness=0.0), width, height, back=inside_out))
     return path
 
 

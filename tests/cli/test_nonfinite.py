@@ -138,6 +138,15 @@ def test_a_texel_that_is_not_a_number(spoilt_experiment, capsys, film):
     assert f"path {at['path']} of 1024" in text
 
 
+def test_a_step_of_a_stage_is_replayed_in_its_film(spoilt_experiment, capsys):
+    stages = "run.stages=[{until: 0.5, film: 0.5, spp: 4}]"
+    _, err = optimize(capsys, STOP, "scene.options={wall: spoilt.exr}", stages)
+    iteration, [offender], text = inspect(capsys, err)
+    assert iteration == 0
+    assert max(offender["pixel"]) < 4
+    assert f"path {offender['where']['path']} of 64" in text
+
+
 def test_a_light_that_overflows(spoilt_experiment, capsys):
     _, err = optimize(capsys, STOP, "scene.options={power: 3e38}")
     _, [offender], _ = inspect(capsys, err)

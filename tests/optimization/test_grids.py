@@ -93,11 +93,26 @@ def test_so_does_a_mesh_of_four_vertices(tmp_path, with_quad):
     assert np.allclose(z, -1)
 
 
-def test_what_is_no_rectangle_is_refused_and_what_lacks_a_grid_told(tmp_path):
+def test_a_flat_grid_may_have_another(tmp_path):
+    """Over the same square, its outside where it was."""
     from reslrb_cli.optimization.assemble import assemble_scene
 
-    with pytest.raises(ConfigError, match=r"parameters\[0\].heightmap.grid: `face` is no rectangle"):
-        assemble_scene(configured(tmp_path, "mesh: face, resolution: [4, 4], grid: 9"))
+    plain = assemble_scene(configured(tmp_path, "mesh: face, resolution: [4, 4]"))
+    problem = assemble_scene(configured(tmp_path, "mesh: face, resolution: [4, 4], grid: 9"))
+    faces = [next(shape for shape in each.scene.shapes() if shape.id() == "face") for each in (plain, problem)]
+    assert faces[1].vertex_count() == 81
+    for name in ("min", "max"):
+        assert np.allclose(*(getattr(face.bbox(), name) for face in faces), atol=1e-6)
+    normals = [np.array(face.vertex_normals_buffer()).reshape(-1, 3).mean(axis=0) for face in faces]
+    assert np.allclose(*normals, atol=1e-5)
+
+
+def test_what_is_no_rectangle_is_refused_and_what_lacks_a_grid_told(tmp_path, with_quad):
+    from reslrb_cli.optimization.assemble import assemble_scene
+
+    (tmp_path / "quad.ply").write_text(QUAD.replace("-1 1 0 0 1", "-1 2 0 0 1"))
+    with pytest.raises(ConfigError, match=r"parameters\[0\].heightmap.grid: `back` is no rectangle"):
+        assemble_scene(configured(tmp_path, "mesh: back, resolution: [4, 4], grid: 9", with_quad))
     with pytest.raises(ConfigError, match=r"`back` is a Rectangle.*`grid: 257`"):
         assemble_scene(configured(tmp_path, "mesh: back, resolution: [4, 4]"))
     with pytest.raises(ConfigError, match=r"heightmap.grid: must be at least 2"):

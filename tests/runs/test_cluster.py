@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -68,7 +67,7 @@ def make(folder: Path, *sets: str) -> Course:
 def end(course: Course, after: Callable[[int], object] = lambda iteration: None) -> dict[str, np.ndarray]:
     """The values after the iterations, and what tables have learned."""
     with one_thread():
-        for state, _ in iterate(course.problem, course.state):
+        for state, _ in iterate(course.stages, course.state):
             after(state.iteration)
         guiding = guiding_of(course.problem)
         return course.problem.values() | ({} if guiding is None else guiding.state()[1])
@@ -90,7 +89,7 @@ def check(folder: Path, case: str, workers: int) -> None:
     alone = end(make(folder, *CASES[case]))
     course = make(folder, *CASES[case])
     with engine.local_engine(course, workers, threads=1) as local:
-        course.problem = replace(course.problem, engine=local)
+        course.compute_with(local)
         together = end(course)
     assert {name: array.tobytes() for name, array in alone.items()} == {
         name: array.tobytes() for name, array in together.items()
@@ -106,7 +105,7 @@ def test_killed_workers_lose_nothing(experiment: Path, killing: str) -> None:
     alone = end(make(experiment, *sets))
     course, rng = make(experiment, *sets), random.Random(workers)
     with engine.local_engine(course, workers, threads=1) as local:
-        course.problem = replace(course.problem, engine=local)
+        course.compute_with(local)
         killed: list[int] = []
 
         def kill(pid: int, wait: float) -> None:

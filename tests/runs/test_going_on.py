@@ -32,7 +32,7 @@ from runs.going_on import (
 )
 from turns import a_few
 
-from reslrb_cli.cli import main
+from reslrb_cli.cli import main, progress
 from reslrb_cli.guiding.tables import Learned
 from reslrb_cli.optimization import loop, optimizers
 from reslrb_cli.records.checkpoint import STATE_FILE, open_state
@@ -91,9 +91,14 @@ CASES: dict[str, list[str]] = {
     "shards of views": [*BATCHED, "scene.sensors=all", "run.shards=2"],
     "passes": [*BATCHED, "integrator.samples_per_pass=1"],
     "budget": [*BATCHED, "run.memory_budget=8"],
+    "stages": [
+        "run.stages=[{until: 0.2, resolution: 0.5, film: 0.5}, {until: 0.3, resolution: 0.5, film: 0.5, spp: 8}, "
+        "{until: 0.8, film: 0.5, learning_rate: 0.5}]",
+        "optimizer.scale=auto",
+    ],
     "prb": ["integrator={type: prb, max_depth: 3}", "parameters=[{key: poster.reflectance.data, initial: 0.5}]"],
 }
-FEW = ("scale auto, sigmoid, rmsprop", "held out", "shards")
+FEW = ("scale auto, sigmoid, rmsprop", "held out", "shards", "stages")
 #: After how many iterations a run is killed, and how many its newest state has then; what certainty asks for is noted
 #: at four fifths of the iterations, which has to be before that.
 KILLED: dict[str, tuple[int, int]] = {"certainty": (23, 20)}
@@ -123,6 +128,36 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(
     assert manifest["status"] == "finished"
     [resumed] = manifest["resumed"]
     assert (resumed["iteration"], resumed["changed"]) == (newest, {})
+
+
+def test_killed_in_each_of_five_stages_it_ends_as_if_nothing_had_been(
+    experiment: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the midst of a stage, and at the moment at which the next one begins; from each state a life goes on."""
+    stages = (
+        "[{until: 0.2, resolution: 0.25, film: 0.25, spp: 16}, {until: 0.4, resolution: 0.5, film: 0.5},"
+        " {until: 0.6, resolution: 0.5, spp: 8}, {until: 0.8, learning_rate: 0.5}]"
+    )
+    settings = ["run.checkpoint_every={iterations: 1}", "run.certainty=false", f"run.stages={stages}"]
+    sets = [word for setting in settings for word in ("--set", setting)]
+    whole, left = run_and_kill(monkeypatch, 2, *ITERATIONS[:2], *sets)
+    show = progress.Progress.show
+    for at in (7, 8, 13, 16):  # the second is the first iteration of the third stage
+        life = Path(shutil.move(left, f"runs/until{at}"))
+
+        def copying(self: progress.Progress, record: Any, at: int = at, life: Path = life) -> None:
+            show(self, record)
+            if record.iteration == at and not left.exists():
+                shutil.copytree(life, left)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(progress.Progress, "show", copying)
+            assert optimize("--resume", str(life), "--quiet") == 0
+        assert differences(whole, life) == []
+    assert optimize("--resume", str(left), "--quiet") == 0
+    assert differences(whole, left) == []
+    spp = [record["spp"] for record in records_of(left)]
+    assert spp == [16] * 4 + [spp[4]] * 4 + [8] * 3 + [spp[4]] * 7
 
 
 def test_a_run_goes_on_whose_tables_were_just_found_wrong(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
