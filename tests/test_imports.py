@@ -32,6 +32,7 @@ ROWS = [
     "measure",
     "report",
     "runs",
+    "cluster",
     "cli",
     "__main__",
 ]

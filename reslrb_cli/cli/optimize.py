@@ -6,6 +6,7 @@ With `--dry-run` it prints the forecast of a run (`show_forecast`, `templates/fo
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import logging
 import os
 import time
@@ -19,7 +20,7 @@ from reslrb_cli.cli.options import allow_code_option, optional_experiment_argume
 from reslrb_cli.cli.terminal import echo, fill
 from reslrb_cli.config.files import in_words, rough_duration
 from reslrb_cli.config.loader import dump
-from reslrb_cli.errors import ExitCode
+from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
@@ -90,6 +91,12 @@ logger = logging.getLogger(__name__)
     "--set may change iterations, learning rates, and with run.output or run.name the folder.",
 )
 @allow_code_option
+@click.option(
+    "--cluster",
+    metavar="local:N",
+    help="Have the shards of each step (run.shards) computed by N processes on this machine; the result is that of "
+    "one. Needs `pip install reslrb[cluster]`.",
+)
 @click.option("--quiet", is_flag=True, help="Print the last line only.")
 @click.option("-v", "--verbose", is_flag=True, help="Say more of what is measured before the first iteration.")
 def command(
@@ -99,6 +106,7 @@ def command(
     dry_run: bool,
     resumed: Path | None,
     allow_code: bool,
+    cluster: str | None,
     quiet: bool,
     verbose: bool,
 ) -> int:
@@ -109,24 +117,59 @@ def command(
     """
     if quiet or verbose:
         logging.getLogger("reslrb_cli").setLevel(logging.WARNING if quiet else logging.DEBUG)
+    workers = None if cluster is None else _workers(cluster)
     if resumed is not None:
         if force:
             raise click.UsageError("--force replaces a run, --resume goes on with one; give one of the two")
         if dry_run:
             raise click.UsageError("--dry-run is of a run that begins, --resume goes on with one; give one of the two")
-        return _resume(resumed, config_file, overrides, allow_code, quiet)
+        return _resume(resumed, config_file, overrides, allow_code, workers, quiet)
     if config_file is None:
         raise click.UsageError("Missing argument 'CONFIG'")
-    return _begin(config_file, overrides, force, dry_run, allow_code, quiet)
+    if dry_run and workers is not None:
+        raise click.UsageError("--dry-run measures this process alone; leave --cluster out")
+    return _begin(config_file, overrides, force, dry_run, allow_code, workers, quiet)
+
+
+#: Processes that one machine may be asked for.
+_MOST_WORKERS = 1024
+
+
+def _workers(cluster: str) -> int:
+    """The number of workers of `local:N`. Raises UsageError where it is none, or dask is not installed."""
+    kind, _, count = cluster.partition(":")
+    if kind != "local" or not count.isdecimal() or not 1 <= int(count) <= _MOST_WORKERS:
+        raise click.UsageError(
+            f"--cluster: must be local:N, N processes on this machine, such as local:2, not {cluster}"
+        )
+    if any(importlib.util.find_spec(name) is None for name in ("distributed", "cryptography")):
+        raise click.UsageError("--cluster: dask.distributed is not installed; `pip install reslrb[cluster]` has it")
+    return int(count)
+
+
+def _check_shards(config: Config, workers: int | None) -> None:
+    """Raise ConfigError where a step has nothing to share out."""
+    if workers is not None and config.shards == 1:
+        reason = "a step is one shard, which --cluster has nothing to share out of; set run.shards to auto, or a number"
+        raise ConfigError(config.source, "run.shards", reason)
+    if workers is not None and config.run.stages:
+        raise ConfigError(config.source, "run.stages", "does not go with --cluster yet; leave one of the two out")
 
 
 def _begin(
-    config_file: Path, overrides: tuple[str, ...], force: bool, dry_run: bool, allow_code: bool, quiet: bool
+    config_file: Path,
+    overrides: tuple[str, ...],
+    force: bool,
+    dry_run: bool,
+    allow_code: bool,
+    workers: int | None,
+    quiet: bool,
 ) -> int:
     from reslrb_cli.records.run_folder import RunFolder, check_output
 
     config = read_config(config_file, overrides).with_code(allow_code)
     run = config.run
+    _check_shards(config, workers)
     check_output(config_file, run.output, run.folder_name, force)
     variant = start_variant(config)
     if dry_run:
@@ -140,10 +183,17 @@ def _begin(
     def make() -> RunFolder:
         return RunFolder.create(config_file, run.output, run.folder_name, force, dump(config), manifest)
 
-    return _run(course, manifest, make, quiet)
+    return _run(course, manifest, make, workers, quiet)
 
 
-def _resume(run: Path, config_file: Path | None, overrides: tuple[str, ...], allow_code: bool, quiet: bool) -> int:
+def _resume(
+    run: Path,
+    config_file: Path | None,
+    overrides: tuple[str, ...],
+    allow_code: bool,
+    workers: int | None,
+    quiet: bool,
+) -> int:
     from reslrb_cli.records.run_folder import check_output
     from reslrb_cli.runs.resume import open_earlier
 
@@ -154,6 +204,7 @@ def _resume(run: Path, config_file: Path | None, overrides: tuple[str, ...], all
             echo(f"{run}: is finished, after {earlier.iteration} of {iterations} iterations; --set {more} goes on")
             return ExitCode.DONE
         earlier.config = config = earlier.config.with_code(allow_code)
+        _check_shards(config, workers)
         if earlier.elsewhere:
             check_output(config.source, config.run.output, config.run.folder_name, False)
         variant = start_variant(config.model_copy(update={"variant": earlier.variant}))
@@ -161,16 +212,23 @@ def _resume(run: Path, config_file: Path | None, overrides: tuple[str, ...], all
         for line in earlier.said:
             logger.warning(line)
         logger.info(f"going on with {run} after {earlier.iteration} of {config.run.iterations} iterations")
-        return _run(course, manifest, lambda: earlier.take_over(manifest), quiet)
+        return _run(course, manifest, lambda: earlier.take_over(manifest), workers, quiet)
 
 
 def _run(
     course: Course,
     manifest: Manifest,
     folder: Callable[[], contextlib.AbstractContextManager[RunFolder]],
+    workers: int | None,
     quiet: bool,
 ) -> int:
     """Run it in the folder, which is not made before signals are watched: from then on it is to say how it ended."""
+    if workers is not None:
+        from reslrb_cli.cluster.engine import local_engine
+
+        with local_engine(course, workers) as engine:
+            course.compute_with(engine)
+            return _run(course, manifest, folder, None, quiet)
     from reslrb_cli.cli.progress import Progress
     from reslrb_cli.cli.terminal import Interrupts
     from reslrb_cli.records.manifest import Status

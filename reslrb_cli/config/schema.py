@@ -187,6 +187,15 @@ def _without_default(schema: dict[str, Any]) -> None:
     del schema["default"]
 
 
+#: Shards of `auto`, at most.
+_AUTO_SHARDS = 16
+
+_Shards = Annotated[
+    Annotated[Count, mark("number")] | Annotated[Literal["auto"], mark("text")],
+    by_kind("a number of shards, or `auto`", "auto"),
+]
+
+
 class RunConfig(Section):
     """How long, with how many samples, and where to."""
 
@@ -200,20 +209,27 @@ class RunConfig(Section):
     iterations: Count = Field(default=200, description="Optimisation steps.")
     spp: Count = Field(default=16, description="Samples per pixel and step.")
     seed: Seed = Field(default=0, description="Seed of the run; every other seed is made from it.")
-    adjoint: Literal["auto", "correlated", "independent", "batched"] = "auto"
+    adjoint: Literal["auto", "correlated", "independent", "batched", "others"] = "auto"
     """Samples that the adjoint image dL/dI comes from: the batches before the one that is differentiated (`batched`), a
-    second set (`independent`, twice the paths), or those of the gradient (`correlated`). Gradients of `l2` and
-    `relative_l2` are unbiased with the first two; with `correlated` the noise that both share pulls parameters, mostly
-    towards darker: a run says by how much, where a measurement before its first iteration can see it. `l1`, `log_l2`,
-    `smape` and `ssim` are biased with any of them, since noise in the image does not average out of their derivatives;
-    more samples help. A list of losses is as its entries are, and one of one's own as its formula is.
-    `auto`: `batched` where `batches` divides `spp`, else `independent`."""
+    second set (`independent`, twice the paths), those of the gradient (`correlated`), or, where the samples of a view
+    are in `shards`, the other shards (`others`, each path traced twice; as `auto` where shards are whole views).
+    Gradients of `l2` and `relative_l2` are unbiased with all but `correlated`, with which the noise that both share
+    pulls parameters, mostly towards darker: a run says by how much, where a measurement before its first iteration can
+    see it. `l1`, `log_l2`, `smape` and `ssim` are biased with any of them, since noise in the image does not average
+    out of their derivatives; more samples help. A list of losses is as its entries are, and one of one's own as its
+    formula is. `auto`: `others` where it can be; else `batched` where `batches` divides `spp`, else `independent`."""
     batches: Annotated[int, Field(ge=2)] = 4
-    """Batches of a step's samples; with `adjoint: batched` it must divide `spp`. Not with `correlated` and
-    `independent`."""
+    """Batches of a step's samples, or of a shard's; with `adjoint: batched` it must divide them. Not with `correlated`
+    and `independent`."""
     first_batch: Literal["image", "again"] = "image"
     """What the first batch is for: an `image` alone, or to be traced `again` for its gradient, with the adjoint image
     of all others. Not with `correlated` and `independent`."""
+    shards: _Shards = 1
+    """Parts that the samples of an iteration are split into, each with a seed of its own, whatever computes them: at
+    most as many as it has views, each is some of these; a multiple of that, each is a share of one view's samples
+    (`adjoint` and `batches` are then of a shard). Their gradients are added up in their order, in double precision.
+    `auto`: 16, or the most below that which these settings allow; where `scene.sensors` is `all`, whole views. 1: none.
+    Not in what measures single steps (`bench`, `gradcheck`, `convergence`, `inspect`, what is `auto`, `certainty`)."""
     memory_budget: Memory | None = None
     """Memory that the iterations may take, with what stands before them: a number of MiB, or text such as 512 MiB or
     2GiB. The samples of a step are split into passes that fit. It covers what the backend's allocator gives out (the
@@ -265,7 +281,7 @@ class RunConfig(Section):
             del values["stages"]
         if self.stop is None:
             values.pop("stop", None)
-        if self.adjoint not in ("auto", "batched"):
+        if self.adjoint not in ("auto", "batched", "others"):
             del values["batches"], values["first_batch"]
         return values
 
@@ -333,13 +349,57 @@ class Config(Section):
 
     @property
     def adjoint(self) -> Literal["correlated", "independent", "batched"]:
-        """`run.adjoint`, with `auto` settled: batches where they divide the samples, and the passes divide them."""
-        run = self.run
-        if run.adjoint != "auto":
-            return run.adjoint
-        parts = run.batches * self.halves
-        fits = run.spp % parts == 0 and _passes_divide(self.integrator, run.spp // parts)
-        return "batched" if fits else "independent"
+        """`run.adjoint` of a step, or a shard, by itself, with `auto` settled: batches where they divide the samples,
+        and the passes divide them. `others` is `independent` to who looks at one alone."""
+        if self.in_rounds:
+            return "independent"
+        if self.run.adjoint != "auto" and self.run.adjoint != "others":
+            return self.run.adjoint
+        return "batched" if self._splits(self.run.spp, self.run.batches) else "independent"
+
+    def _splits(self, spp: int, sets: int) -> bool:
+        """Whether `spp` samples per pixel can be split into so many sets, their halves, and the passes of these."""
+        parts = sets * self.halves
+        return spp % parts == 0 and _passes_divide(self.integrator, spp // parts)
+
+    @property
+    def drawn_views(self) -> int | None:
+        """How many views an iteration has; None where the scene alone says."""
+        named = self.views or self.scene.sensors
+        trained = None if named == "all" else max(len(named) - len(self.run.held_out), 1)
+        asked = self.run.views_per_iteration or trained
+        return asked if trained is None or asked is None else min(asked, trained)
+
+    @property
+    def shards(self) -> int:
+        """`run.shards`, with `auto` settled; of whole views the most that there are."""
+        asked = self.run.shards
+        if asked != "auto":
+            return asked
+        views = self.drawn_views or _AUTO_SHARDS
+        return self.shares * views if self.shares > 1 else min(views, _AUTO_SHARDS)
+
+    @property
+    def shares(self) -> int:
+        """How many shards the samples of each view are in; 1 where shards are whole views."""
+        views, asked, spp = self.drawn_views, self.run.shards, self.run.spp
+        if views is None:
+            return 1
+        if asked != "auto":
+            return max(asked // views, 1)
+        sets = self.run.batches if self.run.adjoint == "batched" else 1
+        counts = [count for count in (16, 8, 4, 2) if count * views <= _AUTO_SHARDS and spp % count == 0]
+        return next((count for count in counts if self._splits(spp // count, sets)), 1)
+
+    @property
+    def share_spp(self) -> int:
+        """Samples per pixel of a view that one shard has."""
+        return self.run.spp // self.shares
+
+    @property
+    def in_rounds(self) -> bool:
+        """Whether a step is two rounds: the images of all shards, then their gradients."""
+        return self.run.adjoint in ("auto", "others") and self.shares > 1
 
     @property
     def losses(self) -> list[Loss]:
@@ -401,7 +461,7 @@ class Config(Section):
     @property
     def set_spp(self) -> int:
         """Samples per pixel of each set of a step's samples."""
-        return self.run.spp // ((self.run.batches if self.adjoint == "batched" else 1) * self.halves)
+        return self.share_spp // ((self.run.batches if self.adjoint == "batched" else 1) * self.halves)
 
     def samples_obstacle(self, pixels: int) -> str | None:
         """Why the samples of a step cannot be traced with films of so many `pixels`, and what would be right."""
@@ -436,9 +496,9 @@ class Config(Section):
         spp = self.stage(number).spp or self.run.spp
         return self.model_copy(update={"run": self.run.model_copy(update={"spp": spp, "stages": []})})
 
-    def step_options(self) -> dict[str, Any]:
-        """What a gradient step is told of its samples."""
-        options: dict[str, Any] = {"spp": self.run.spp, "adjoint": self.adjoint}
+    def step_options(self, shard: bool = False) -> dict[str, Any]:
+        """What a gradient step is told of its samples, those of an iteration or of a `shard`."""
+        options: dict[str, Any] = {"spp": self.share_spp if shard else self.run.spp, "adjoint": self.adjoint}
         if self.adjoint == "batched":
             options |= {"batches": self.run.batches, "first_batch": self.run.first_batch}
         if self.halves == 2:
@@ -530,23 +590,40 @@ class Config(Section):
     def _check_samples(self) -> None:
         """Raise an error, located, where a step's samples cannot be split as the run's settings have it."""
         _check_passes(self.integrator, self.run.spp, "integrator", "run.spp")
+        self._check_shards()
         if self.scene.size is not None:
             obstacle = self.samples_obstacle(self.scene.size[0] * self.scene.size[1])
             if obstacle is not None:
                 raise located("run.spp", obstacle)
         for option in sorted({"batches", "first_batch"} & self.run.model_fields_set):
-            if self.run.adjoint not in ("auto", "batched"):
+            if self.run.adjoint not in ("auto", "batched", "others"):
                 raise located(f"run.{option}", f"has no effect with run.adjoint: {self.run.adjoint}, but with batched")
         if self.run.adjoint == "batched":
-            if self.run.spp % self.run.batches:
-                raise located("run.batches", f"{self.run.batches} does not divide run.spp, which is {self.run.spp}")
-            _check_passes(self.integrator, self.run.spp // self.run.batches, "integrator", "run.spp / run.batches")
+            spp, what = self.share_spp, "run.spp" if self.shares == 1 else "the samples of a shard"
+            if spp % self.run.batches:
+                is_are = "is" if self.shares == 1 else "are"
+                raise located("run.batches", f"{self.run.batches} does not divide {what}, which {is_are} {spp}")
+            _check_passes(self.integrator, spp // self.run.batches, "integrator", f"{what} / run.batches")
         if self.halves == 2:
             self._check_halves()
 
+    def _check_shards(self) -> None:
+        """Raise an error, located, where shards are neither whole views nor equal shares of one."""
+        asked, views, spp = self.run.shards, self.drawn_views, self.run.spp
+        if asked == "auto" or views is None:
+            return
+        if asked > views and asked % views:
+            raise located(
+                "run.shards",
+                f"is {asked}; of the {views} views of an iteration it must be at most {views}, or a multiple of that",
+            )
+        if spp % self.shares:
+            raise located("run.shards", f"{self.shares} for each view, which do not divide run.spp, {spp}")
+        _check_passes(self.integrator, self.share_spp, "integrator", "the samples of a shard")
+
     def _check_halves(self) -> None:
         """Raise an error, located, where samples have no two halves, or a view has its brightness from two places."""
-        sets = self.run.batches if self.adjoint == "batched" else 1
+        sets = (self.run.batches if self.adjoint == "batched" else 1) * self.shares
         if self.run.spp % (2 * sets):
             reason = f"must be a multiple of {2 * sets}, not {self.run.spp}: loss.scale: fitted takes samples in halves"
             raise located("run.spp", reason)

@@ -73,12 +73,14 @@ class Refused:
 class StepResult:
     """What a step yields besides gradients: the image (H, W, C) and the loss (width 1), both detached.
 
-    Entries of dL/dI that are not finite count as 0; `refused` says how many there were, and where the first.
+    Entries of dL/dI that are not finite count as 0; `refused` says how many there were, and where the first. `seen` is
+    the image as the objective had it, (2, H, W, C) of halves.
     """
 
     image: mi.TensorXf
     loss: mi.Float | mi.TensorXf
     refused: Refused = field(default_factory=Refused)
+    seen: mi.TensorXf | None = None
 
 
 def make_integrator(type: str, **options: Any) -> StepIntegrator:
@@ -181,10 +183,11 @@ def _apart(gradient: mi.TensorXf) -> tuple[mi.TensorXf, mi.TensorXf]:
     return parts
 
 
-def render_image(integrator: StepIntegrator, scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int
-                 ) -> mi.TensorXf:  # fmt: skip
-    """The image (H, W, C) without derivatives."""
-    return integrator.image(Job(scene, resolve_sensor(scene, sensor), dr.opaque(mi.UInt32, seed), spp))
+def render_image(integrator: StepIntegrator, scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int,
+                 halves: bool = False) -> mi.TensorXf:  # fmt: skip
+    """The image (H, W, C) without derivatives, or the images (2, H, W, C) of two halves of the samples."""
+    work = Halves(integrator) if halves else integrator
+    return work.image(Job(scene, resolve_sensor(scene, sensor), dr.opaque(mi.UInt32, seed), spp))
 
 
 def gradient_step(
@@ -235,7 +238,7 @@ def gradient_step(
 
     def derivative(image: mi.TensorXf) -> mi.TensorXf:
         together = adjoint == "correlated" and not work.image_apart
-        loss, gradient = _derivative(objective, image, refused, None if together else on_image)
+        loss, gradient = derivative_of(objective, image, refused, None if together else on_image)
         losses.append(loss)
         gradients.append(gradient)
         return gradient
@@ -247,7 +250,7 @@ def gradient_step(
     else:
         image = work.image(job)
         _differentiate(work, replace(job, seed=second_seed(job.seed)), derivative(image), on_samples)
-    return StepResult(whole_of(image), losses[0], refused)
+    return StepResult(whole_of(image), losses[0], refused, image)
 
 
 def known_step(
@@ -278,8 +281,19 @@ def cross_step(
     if halves:
         work = Halves(work)
     image = work.image(replace(job, seed=dr.opaque(mi.UInt32, image_seed)))
-    _, gradient = _derivative(objective, image, Refused())
+    _, gradient = derivative_of(objective, image, Refused())
     _differentiate(work, job, gradient, on_samples)
+
+
+def given_step(
+    integrator: StepIntegrator | mi.Integrator, scene: mi.Scene, sensor: mi.Sensor | int, gradient: mi.TensorXf, *,
+    seed: int, spp: int, params: mi.SceneParameters | None = None, on_samples: OnSamples | None = None,
+    halves: bool = False,
+) -> None:  # fmt: skip
+    """Add the gradient by the samples of `seed`, with dL/dI `gradient`, (H, W, C) or of halves (2, H, W, C), which is
+    from other samples, and finite. The rest is as in `gradient_step`."""
+    work = interface_of(integrator)
+    _differentiate(Halves(work) if halves else work, _job(scene, sensor, seed, spp, params), gradient, on_samples)
 
 
 def _check_number(name: str, value: object, least: int, most: int) -> None:
@@ -320,7 +334,7 @@ def _batched(
     first = integrator.image(parts[0])
     image, refused = first, Refused()
     for b in range(1, batches):
-        _, gradient = _derivative(objective, image, refused)
+        _, gradient = derivative_of(objective, image, refused)
         own = integrator.known(parts[b], gradient * share)
         if on_samples is not None:
             on_samples(own, gradient * share)
@@ -328,12 +342,12 @@ def _batched(
         dr.eval(image)
     if first_batch == "again":
         others = (image * batches - first) / (batches - 1)
-        _, gradient = _derivative(objective, others, refused)
+        _, gradient = derivative_of(objective, others, refused)
         _differentiate(integrator, parts[0], gradient * share, on_samples)
-    return StepResult(whole_of(image), dr.detach(objective(image)), refused)
+    return StepResult(whole_of(image), dr.detach(objective(image)), refused, image)
 
 
-def _derivative(
+def derivative_of(
     objective: Objective, image: mi.TensorXf, refused: Refused, on_image: Callable[[], None] | None = None
 ) -> tuple[mi.Float | mi.TensorXf, mi.TensorXf]:
     """Loss and dL/dI, evaluated in one go; what of the latter is not finite is refused."""

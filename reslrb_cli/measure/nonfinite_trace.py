@@ -23,6 +23,7 @@ from reslrb_cli.integrators.step import gradient_step, sample_sets
 from reslrb_cli.optimization.loading import LIGHT_TRACERS, pass_spp
 from reslrb_cli.optimization.moving import is_attached
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.shards import make_tasks
 from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.views import View
 from reslrb_cli.seeds import seed
@@ -99,11 +100,14 @@ class Witness(Guiding):
 
 
 def purposes(problem: Problem, view: View) -> list[tuple[int, str, Purpose]]:
-    """What a step draws samples for, in order: the place of each among `sample_sets`, a word to its name, what for."""
-    options = problem.config.step_options()
+    """What a step, or a shard, draws samples for, in order: the place of each among `sample_sets`, a word to its name,
+    what for."""
+    options = problem.config.step_options(shard=True)
     gradient = Purpose.GRADIENT if problem.on_samples(view) is None else Purpose.BOTH
     if options["adjoint"] == "correlated":
         found = [(0, "", Purpose.BOTH)]
+    elif problem.config.in_rounds:
+        found = [(0, "", Purpose.IMAGE), (0, ", again", gradient)]
     elif options["adjoint"] == "independent":
         found = [(0, "", Purpose.IMAGE), (1, "", gradient)]
     else:
@@ -394,20 +398,32 @@ def _shape_name(scene: Any, index: int) -> str | None:
 
 def find_offenders(problem: Problem, iteration: int) -> list[Offender]:
     """The first value that is not finite of each view in which there is any; the parameters are those of `problem`."""
-    found = []
-    guided = guiding_of(problem) is not None
-    # What is not drawn in this iteration has taught no table anything.
-    for view in [view for view, _ in problem.drawn(iteration)] if guided else problem.views:
-        offender = _of_view(problem, iteration, view)
+    found: list[Offender] = []
+    apart = problem.config.shards != 1
+    views = {view.sensor: view for view in problem.views}
+    seeds = [(sensor, "", seed(problem.config.run.seed, iteration, sensor, "image")) for sensor in views]
+    if guiding_of(problem) is not None:  # what is not drawn in this iteration has taught no table anything
+        drawn = {view.sensor for view, _ in problem.drawn(iteration)}
+        seeds = [each for each in seeds if each[0] in drawn]
+    if apart:
+        tasks = make_tasks(problem, iteration)
+        seeds = [(part.sensor, f"shard {task.shard + 1}, ", part.seed) for task in tasks for part in task.parts]
+    for sensor, word, step_seed in seeds:
+        offender = None
+        if all(one.sensor != sensor for one in found):
+            offender = _of_view(problem, views[sensor], step_seed, word)
         if offender is not None:
             found.append(offender)
     return found
 
 
-def _of_view(problem: Problem, iteration: int, view: View) -> Offender | None:
-    step_seed = seed(problem.config.run.seed, iteration, view.sensor, "image")
+def _of_view(problem: Problem, view: View, step_seed: int, word: str) -> Offender | None:
+    """The same of one view's samples, or of those of a shard, which its `word` names; of `others` dL/dI is not at the
+    mean image of the others, but at one of samples of its own."""
     guiding = guiding_of(problem)
     witness = None if guiding is None else Witness(guiding)
+    if witness is not None and problem.config.shards != 1:
+        witness.held = True  # as it is while shards are computed
     if witness is not None:
         problem.integrator.preparation.draw_from(witness, problem.scene)
     step = _take_step(problem, view, step_seed)
@@ -416,7 +432,8 @@ def _of_view(problem: Problem, iteration: int, view: View) -> Offender | None:
     if not is_attached(problem):
         _set_tangents(problem)
     pixel = None if step.refused is None else step.refused[:2]
-    found = [search_paths(*part, pixel) for part in _parts(problem, view, step_seed, witness)]
+    parts = _parts(problem, view, step_seed, witness)
+    found = [search_paths(samples, sensor, word + label, pixel) for samples, sensor, label in parts]
     problem.apply()
     offenders = [part.offender for part in sorted(found, key=lambda part: not part.there) if part.offender is not None]
     if offenders:
@@ -434,16 +451,19 @@ def _parts(
     Of a guided one the `witness` knows what it was drawn from.
     """
     scene, sensor = problem.scene, problem.scene.sensors()[view.sensor]
-    options = problem.config.integrator.options()
+    given = problem.config.integrator.options()
     names = ("max_depth", "rr_depth", "hide_emitters", "sequence")
-    shared = {name: options[name] for name in names if name in options}
+    shared = {name: given[name] for name in names if name in given}
     tracer = Reslrb.of(estimator="gather", **shared)
     if isinstance(problem.integrator, Reslrb):
         own = problem.integrator
         tracer.have_paths(own.paths, own.light_share, own.preparation.whole)
     # Of what moves light, contributions alone are looked at: `gather` has no derivatives of it.
     params = None if is_attached(problem) else problem.selection.params
-    sets = sample_sets(step_seed, problem.config.step_options())
+    options = problem.config.step_options(shard=True)
+    if problem.config.in_rounds:
+        options["adjoint"] = "correlated"  # both rounds have the same samples
+    sets = sample_sets(step_seed, options)
     tables: list[Table | None] = [None] * len(sets)
     if witness is not None:
         tracer.expect(pass_spp(problem.config))
@@ -490,7 +510,7 @@ def _take_step(problem: Problem, view: View, step_seed: int) -> Step:
     optimizer, keys = problem.optimizer, problem.selection.keys
     step = gradient_step(
         problem.integrator, problem.scene, view.sensor, view.objective,
-        seed=step_seed, **problem.config.step_options(), params=problem.selection.params,
+        seed=step_seed, **problem.config.step_options(shard=True), params=problem.selection.params,
         on_samples=problem.on_samples(view),
     )  # fmt: skip
     gradients = {key: np.array(gradient) for key, gradient in problem.gradients().items()}

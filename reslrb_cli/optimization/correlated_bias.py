@@ -101,7 +101,8 @@ def measure_correlated_bias(problem: Problem) -> CorrelatedBias | None:
     unit = (problem.samples_per_pass or 1) * problem.config.halves
     fitted = problem.config.halves == 2  # which is not quadratic
     part = PART if all(loss.type in QUADRATIC for loss in losses_of(problem.config.loss)) and not fitted else 1
-    spp = max(run.spp // part // unit * unit, unit)
+    own_spp = problem.config.share_spp
+    spp = max(own_spp // part // unit * unit, unit)
     rounds = min(ROUNDS, int(SHARE * run.iterations * run.spp / (2 * spp)))
     if rounds < FEWEST_ROUNDS:
         return None
@@ -110,7 +111,7 @@ def measure_correlated_bias(problem: Problem) -> CorrelatedBias | None:
     rows, keys = [], problem.selection.keys
     for key in keys:
         differences = [a[key] - b[key] for a, b in zip(own, other, strict=True)]
-        rows.append(find_bias(key, differences, [b[key] for b in other], spp / run.spp, len(keys)))
+        rows.append(find_bias(key, differences, [b[key] for b in other], spp / own_spp, len(keys)))
     return CorrelatedBias(rounds, spp, rows)
 
 

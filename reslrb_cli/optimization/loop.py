@@ -5,7 +5,6 @@ A schedule is the factor of iteration i of n, from 1 at the first to `final_frac
 
 from __future__ import annotations
 
-import functools
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -29,10 +28,10 @@ from reslrb_cli.optimization.nonfinite import (
 from reslrb_cli.optimization.optimizers import clamp_gradients
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import measure_curvatures, rescale
+from reslrb_cli.optimization.shards import add_gradient, scaled
 from reslrb_cli.optimization.stages import Stages
 from reslrb_cli.optimization.state import State, put, standing
 from reslrb_cli.optimization.stopping import Watch, lowered
-from reslrb_cli.optimization.views import View
 from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record, Regularized
 from reslrb_cli.seeds import seed
@@ -200,11 +199,6 @@ def _findings(
     return found
 
 
-def _scaled(view: View, scale: float, image: mi.TensorXf) -> mi.Float:
-    """A view's part of the loss, `scale` times."""
-    return view.objective(image) if scale == 1 else view.objective(image) * scale
-
-
 class Split:
     """Tells the time of a step up to its image and loss, where the integrator has a moment in which both are there."""
 
@@ -242,14 +236,22 @@ def gradient(
     """
     config = problem.config
     total: Any = 0.0
-    refused, costs = [], None
-    for view, scale in problem.drawn(iteration):
+    refused: list[tuple[int, Refused]] = []
+    costs = None
+    apart = config.shards != 1
+    if apart:
+        if not config.in_rounds:
+            split.start()  # no moment in which all images are there
+        loss, refused = add_gradient(problem, iteration, split.start, split.image)
+        total = mi.Float(loss)
+        gradients = {key: problem.optimizer.gradient(key) for key in problem.selection.keys}
+    for view, scale in () if apart else problem.drawn(iteration):
         split.start()
         step = gradient_step(
             problem.integrator,
             problem.scene,
             view.sensor,
-            functools.partial(_scaled, view, scale),
+            scaled(view, scale),
             seed=seed(config.run.seed, iteration, view.sensor, "image"),
             **config.step_options(),
             params=problem.selection.params,

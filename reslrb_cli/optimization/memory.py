@@ -94,7 +94,7 @@ def estimate(problem: Problem, integrator: Reslrb, samples: int, fixed: int) -> 
     pixels = pixels_of(problem.scene, problem.sensors)
     for index, plan, count in zip(problem.sensors, plans(problem, integrator), pixels, strict=True):
         film, width = problem.scene.sensors()[index].film(), samples * count
-        if problem.config.adjoint == "correlated" and samples == problem.config.run.spp:
+        if problem.config.adjoint == "correlated" and samples == problem.config.share_spp:
             # Else dL/dI is known before the paths are traced, and nothing of them outlives the kernel.
             width = round(width * integrator.share_of_light(plan))
             paths = max(paths, sum(allocated(size * width) for size in entry_bytes(integrator.kept(plan))))

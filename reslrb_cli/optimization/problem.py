@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -76,6 +76,8 @@ class Problem:
     memory: MemoryPlan | None = None
     #: What values cost by themselves, by key and type.
     regularizers: dict[str, dict[str, Cost]] = field(default_factory=dict)
+    #: What computes the shards of a step (`shards.Engine`); None: this process, one after the other.
+    engine: Callable[..., Any] | None = None
     #: What learning rates are multiplied by, beside their schedule.
     pace: float = 1.0
 

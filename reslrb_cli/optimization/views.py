@@ -147,6 +147,9 @@ def wanted_views(config: Config, scene: mi.Scene) -> list[Wanted]:
     if asked > trained:
         reason = f"is {asked}; views that are trained on: {trained}"
         raise ConfigError(config.source, "run.views_per_iteration", reason)
+    if config.drawn_views is None and config.run.shards != "auto" and config.shards > trained:
+        reason = f"is {config.shards}, with scene.sensors: all at most the {trained} views that are trained on; name "
+        raise ConfigError(config.source, "run.shards", f"{reason}the sensors, for shards of a view's samples")
     return wanted
 
 

@@ -243,6 +243,11 @@ class Course:
         self.last: Record | None = None
         self.watch, self.average = Watch(problem.config), Averaged()
 
+    def compute_with(self, engine: Callable[..., Any]) -> None:
+        """Have the shards of a run without stages computed by `engine` (`shards.Engine`)."""
+        self.problem = replace(self.problem, engine=engine)
+        self.stages = Stages(self.problem)
+
     @property
     def done(self) -> int:
         """The number of finished iterations."""

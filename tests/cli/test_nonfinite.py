@@ -279,6 +279,13 @@ def test_each_set_of_samples_is_looked_at(spoilt_experiment, capsys, adjoint):
     assert f"the first at pixel ({', '.join(map(str, offender['pixel']))})" in err
 
 
+def test_each_shard_is_looked_at(spoilt_experiment, capsys):
+    _, err = optimize(capsys, STOP, "scene.options={wall: spoilt.exr}", "run.adjoint=others", "run.shards=2")
+    _, [offender], _ = inspect(capsys, err)
+    assert offender["where"]["samples"] in ("shard 1, image and gradient", "shard 2, image and gradient")
+    assert f"the first at pixel ({', '.join(map(str, offender['pixel']))})" in err
+
+
 def test_there_must_be_something_to_show(spoilt_experiment, capsys):
     code, _, err = reslrb_nonfinite(capsys, "inspect", "config.yaml", "--nonfinite")
     assert (code, len(err.splitlines())) == (2, 2)

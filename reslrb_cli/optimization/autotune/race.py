@@ -169,7 +169,7 @@ def is_auto(config: Config, option: str) -> bool:
 
 def sets_of(config: Config) -> int:
     """The sets that a step's samples are traced in: those that have one dL/dI each, or the halves of these."""
-    return (config.run.batches if config.adjoint == "batched" else 1) * config.halves
+    return (config.run.batches if config.adjoint == "batched" else 1) * config.halves * config.shares
 
 
 def situation(problem: Problem) -> dict[str, Any]:

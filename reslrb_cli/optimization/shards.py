@@ -1,0 +1,309 @@
+"""A step in shards: sets of whole views, or shares of the samples of one view, each computed by itself.
+
+A `Task` is all that a shard needs beside the problem; `shard_image` and `shard_gradient` are functions of both to
+NumPy arrays, which leave nothing behind: whatever computes them, in whatever order, the sums are the same.
+
+With S shares of a view, I_s the image of share s and w_s its part of the samples (1 / S),
+
+    I = sum of w_s I_s,    gradient = sum over s of w_s J_s^T dL/dI      J_s: the derivative of I_s by the parameters
+
+In one round each share takes dL/dI from its own samples, as `run.adjoint` says. In two (`others`) it is that at
+
+    (I - w_s I_s) / (1 - w_s),    the mean image of the other shares
+
+so that no path sees a delta that it helped to make; of an L2 loss that is the sum over all pairs of different shares,
+and unbiased. Images and gradients are added up in the order of the shards, in double precision.
+
+Tables of guided emission are held while shards are computed, and learn once a step, where they are due to, from samples
+beside them, with dL/dI at the mean image of all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, NamedTuple, TypeVar
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.config.schema import Config
+from reslrb_cli.guiding.tables import Guiding
+from reslrb_cli.integrators.protocol import Job, whole_of
+from reslrb_cli.integrators.step import NONE, Refused, derivative_of, given_step, gradient_step, render_image
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.state import guiding_of
+from reslrb_cli.optimization.views import View, to_tensor
+from reslrb_cli.records.tree import like, to_array
+from reslrb_cli.seeds import seed
+
+Array = np.ndarray[Any, Any]
+T = TypeVar("T")
+
+#: What computes the shards: of the problem, a function of it and of further arguments, and these arguments, each with a
+#: task first. Yields place and result of each, in any order.
+Engine = Callable[[Problem, Callable[..., Any], Sequence[tuple[Any, ...]]], Iterable[tuple[int, Any]]]
+
+
+class Part(NamedTuple):
+    """One view's samples in a shard: its sensor, what its loss is scaled by, and the samples' seed."""
+
+    sensor: int
+    scale: float
+    seed: int
+
+
+@dataclass(frozen=True)
+class Task:
+    """One shard of a step, of `spp` samples per pixel: whole views, or of one view `weight` of its samples.
+
+    With `images` those of the samples come back beside the gradient.
+    """
+
+    iteration: int
+    shard: int
+    parts: tuple[Part, ...]
+    spp: int
+    weight: float
+    images: bool
+
+
+@dataclass(frozen=True)
+class ShardGradient:
+    """What a shard says: the gradient of each parameter (float32, not finite where it is not), and of each part its
+    loss, what of dL/dI was refused (count, flat index of the first, shape), and the image, (H, W, C) or of halves
+    (2, H, W, C), where it was asked for."""
+
+    gradients: dict[str, Array]
+    losses: tuple[float, ...] = ()
+    refused: tuple[tuple[int, int, tuple[int, ...]], ...] = ()
+    images: tuple[Array, ...] = ()
+
+
+# --- shards -----------------------------------------------------------------------------------------------------------
+
+
+def make_tasks(problem: Problem, iteration: int, images: bool = False) -> list[Task]:
+    """The shards of an iteration, in their order; `images`: of whole views, too, images come back."""
+    config, drawn = problem.config, problem.drawn(iteration)
+    shares, count = config.shares, min(config.shards, len(drawn))
+    if shares > 1:
+        sets = [[one] for one in drawn for _ in range(shares)]
+    else:
+        ends = [len(drawn) * place // count for place in range(count + 1)]
+        sets = [drawn[first:end] for first, end in pairwise(ends)]
+    return [
+        Task(
+            iteration,
+            shard,
+            tuple(Part(view.sensor, scale, shard_seed(config, iteration, view.sensor, shard)) for view, scale in own),
+            config.share_spp,
+            1 / shares,
+            images or shares > 1,
+        )
+        for shard, own in enumerate(sets)
+    ]
+
+
+def shard_seed(config: Config, iteration: int, sensor: int, shard: int) -> int:
+    """The seed of the samples that a shard has of a view."""
+    return seed(config.run.seed, iteration, sensor, f"image, shard {shard}")
+
+
+def shard_image(problem: Problem, task: Task) -> Array:
+    """The image of a shard of one view, (H, W, C) or of halves (2, H, W, C), float32."""
+    [part] = task.parts
+    with _held(problem):
+        image = render_image(
+            problem.integrator, problem.scene, part.sensor, part.seed, task.spp, problem.config.halves == 2
+        )
+        return np.array(image)
+
+
+def shard_gradient(problem: Problem, task: Task, delta: Array | None = None) -> ShardGradient:
+    """The gradient of a shard: by its own dL/dI, or of one view by `delta`, in the shape of `shard_image`.
+
+    Gradients that had been accumulated before are lost.
+    """
+    config = problem.config
+    found: list[tuple[float, tuple[int, int, tuple[int, ...]], Array | None]] = []
+    with _held(problem):
+        _clear(problem)
+        views = {view.sensor: view for view in problem.views}
+        for part in task.parts:
+            view = views[part.sensor]
+            at = problem.integrator, problem.scene, part.sensor
+            own: dict[str, Any] = {"params": problem.selection.params, "on_samples": problem.on_samples(view)}
+            if delta is not None:
+                own |= {"spp": task.spp, "halves": config.halves == 2}
+                given_step(*at, _tensor(delta), seed=part.seed, **own)
+                continue
+            own |= config.step_options(shard=True)
+            step = gradient_step(*at, scaled(view, part.scale), seed=part.seed, **own)
+            # One view's kernels are not to wait for the next one's.
+            dr.eval(step.loss, problem.gradients())
+            refused = int(step.refused.count[0]), int(step.refused.first[0]), tuple(step.refused.shape)
+            found.append((float(step.loss[0]), refused, np.array(step.seen) if task.images else None))
+        gradients = {key: to_array(value) for key, value in problem.gradients().items()}
+        _clear(problem)
+    losses, refused_parts, images = zip(*found, strict=True) if found else ((), (), ())
+    return ShardGradient(gradients, losses, refused_parts, tuple(image for image in images if image is not None))
+
+
+def scaled(view: View, scale: float) -> Callable[[mi.TensorXf], mi.Float]:
+    """A view's part of the loss, `scale` times."""
+    return view.objective if scale == 1 else lambda image: view.objective(image) * scale
+
+
+def _tensor(image: Array) -> mi.TensorXf:
+    return to_tensor(image.astype(np.float32, copy=False))
+
+
+def _clear(problem: Problem) -> None:
+    for key in problem.optimizer.keys():  # noqa: SIM118 (not a mapping)
+        problem.optimizer.clear_gradient(key)
+
+
+@contextmanager
+def _held(problem: Problem) -> Iterator[None]:
+    """Have tables learn nothing."""
+    guiding = guiding_of(problem)
+    before = guiding is not None and guiding.held
+    if guiding is not None:
+        guiding.held = True
+    try:
+        yield
+    finally:
+        if guiding is not None:
+            guiding.held = before
+
+
+# --- and their sums ---------------------------------------------------------------------------------------------------
+
+
+def serially(
+    problem: Problem, function: Callable[..., T], work: Sequence[tuple[Any, ...]]
+) -> Iterator[tuple[int, T]]:  # fmt: skip
+    """Compute one after the other, in this process (`Engine`)."""
+    for place, given in enumerate(work):
+        yield place, function(problem, *given)
+
+
+def in_order(found: Iterable[tuple[int, T]]) -> Iterator[T]:
+    """The results by their places, from 0 on; those that come too early are kept until it is their turn."""
+    early: dict[int, T] = {}
+    place = 0
+    for at, result in found:
+        early[at] = result
+        while place in early:
+            yield early.pop(place)
+            place += 1
+
+
+class Sum:
+    """A weighted sum of arrays, in double precision, in the order in which they are added."""
+
+    def __init__(self) -> None:
+        self.total: Array | None = None
+
+    def add(self, array: Array, weight: float) -> None:
+        """Add `weight` times an array; what is not finite in it is so in the sum."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            own = array.astype(np.float64) * weight
+            self.total = own if self.total is None else self.total + own
+
+    def without(self, array: Array, weight: float) -> Array:
+        """What is left without one of them, whose weight of 1 in all that is, as a mean; float32."""
+        assert self.total is not None
+        with np.errstate(invalid="ignore", over="ignore"):
+            return np.asarray((self.total - array.astype(np.float64) * weight) / (1 - weight), dtype=np.float32)
+
+
+def add_gradient(
+    problem: Problem, iteration: int, on_start: Callable[[], None], on_image: Callable[[], None]
+) -> tuple[float, list[tuple[int, Refused]]]:
+    """Have the gradient of an iteration's shards be that of the parameters; returns the loss, and by sensor what of
+    dL/dI was refused.
+
+    `on_start` is called when a step of two rounds begins, `on_image` when its images and losses are there.
+    """
+    engine, guiding = problem.engine or serially, guiding_of(problem)
+    due = [] if guiding is None else _due(problem, guiding, iteration)
+    tasks = make_tasks(problem, iteration, images=bool(due))
+    total: dict[str, Sum] = {key: Sum() for key in problem.selection.keys}
+    means: dict[int, Sum] = {}
+    refused: dict[int, Refused] = {}
+    loss = 0.0
+    deltas: list[Array | None] = [None] * len(tasks)
+    if problem.config.in_rounds:
+        on_start()
+        images = list(in_order(engine(problem, shard_image, [(task,) for task in tasks])))
+        for task, image in zip(tasks, images, strict=True):
+            means.setdefault(task.parts[0].sensor, Sum()).add(image, task.weight)
+        deltas = [_delta(problem, task, image, means, refused) for task, image in zip(tasks, images, strict=True)]
+        on_image()
+        del images
+    work = [(task, delta) for task, delta in zip(tasks, deltas, strict=True)]
+    for task, found in zip(tasks, in_order(engine(problem, shard_gradient, work)), strict=True):
+        for key, gradient in found.gradients.items():
+            total[key].add(gradient, task.weight)
+        for part, image in zip(task.parts, found.images, strict=False):
+            means.setdefault(part.sensor, Sum()).add(image, task.weight)
+        for part, told in zip(task.parts, found.refused, strict=False):
+            _count(refused.setdefault(part.sensor, Refused()), *told)
+        loss += sum(found.losses) if problem.config.shares == 1 else 0.0
+    scales = {part.sensor: part.scale for task in tasks for part in task.parts}
+    shown = {view.sensor: (view, scales[view.sensor]) for view in problem.views if view.sensor in means}
+    for sensor, (view, scale) in shown.items() if problem.config.shares > 1 else ():
+        loss += float(scaled(view, scale)(_mean(means[sensor]))[0])
+    for key, leaf in ((key, problem.optimizer[key]) for key in problem.selection.keys):
+        with np.errstate(over="ignore", invalid="ignore"):
+            gradient = np.asarray(total[key].total, dtype=np.float32)
+        dr.set_grad(leaf, like(dr.detach(leaf), gradient))
+    for sensor in due:
+        _teach(problem, iteration, shown[sensor][0], means[sensor])
+    return loss, list(refused.items())
+
+
+def _mean(found: Sum) -> mi.TensorXf:
+    assert found.total is not None
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _tensor(found.total)
+
+
+def _delta(problem: Problem, task: Task, image: Array, means: dict[int, Sum], refused: dict[int, Refused]) -> Array:
+    """dL/dI for a share of a view, at the mean image of the others."""
+    [part] = task.parts
+    view = next(view for view in problem.views if view.sensor == part.sensor)
+    others = _tensor(means[part.sensor].without(image, task.weight))
+    _, gradient = derivative_of(scaled(view, part.scale), others, refused.setdefault(part.sensor, Refused()))
+    return np.array(gradient)
+
+
+def _count(refused: Refused, count: int, first: int, shape: tuple[int, ...]) -> None:
+    """Add what a shard refused, of which the first is that of the first shard that has any."""
+    if count and int(refused.first[0]) == NONE:
+        refused.first, refused.shape = dr.opaque(mi.UInt32, first), shape
+    refused.count = dr.opaque(mi.UInt32, int(refused.count[0]) + count)
+
+
+# --- guided emission --------------------------------------------------------------------------------------------------
+
+
+def _due(problem: Problem, guiding: Guiding, iteration: int) -> list[int]:
+    """The sensors whose tables are to learn in this iteration; it is counted."""
+    sensors = [view.sensor for view, _ in problem.drawn(iteration)]
+    problem.integrator.plan(problem.scene, problem.scene.sensors()[sensors[0]])  # makes the grid
+    return [sensor for sensor in sensors if guiding.due(sensor)]
+
+
+def _teach(problem: Problem, iteration: int, view: View, image: Sum) -> None:
+    """Have the tables of a view learn, with dL/dI at its mean image."""
+    config = problem.config
+    _, gradient = derivative_of(view.objective, _mean(image), Refused())
+    sensor, own = problem.scene.sensors()[view.sensor], seed(config.run.seed, iteration, view.sensor, "image")
+    job = Job(problem.scene, sensor, dr.opaque(mi.UInt32, own), config.set_spp, problem.selection.params)
+    problem.integrator.learn_now(job, whole_of(gradient))
