@@ -5,11 +5,9 @@ With `--dry-run` it prints the forecast of a run (`show_forecast`, `templates/fo
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,15 +16,12 @@ import click
 from reslrb_cli.cli.options import optional_experiment_arguments, read_config, start_variant
 from reslrb_cli.cli.terminal import echo, fill
 from reslrb_cli.config.files import in_words, rough_duration
-from reslrb_cli.config.loader import dump
 from reslrb_cli.errors import ExitCode
 
 if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
     from reslrb_cli.optimization.problem import Problem
-    from reslrb_cli.records.manifest import Manifest
-    from reslrb_cli.records.run_folder import RunFolder
-    from reslrb_cli.runs.prepare import Course
+    from reslrb_cli.runs.prepare import Begun
 
 
 def show_forecast(config: Config) -> None:
@@ -119,7 +114,7 @@ def command(
 
 
 def _begin(config_file: Path, overrides: tuple[str, ...], force: bool, dry_run: bool, quiet: bool) -> int:
-    from reslrb_cli.records.run_folder import RunFolder, check_output
+    from reslrb_cli.records.run_folder import check_output
 
     config = read_config(config_file, overrides)
     run = config.run
@@ -129,18 +124,12 @@ def _begin(config_file: Path, overrides: tuple[str, ...], force: bool, dry_run: 
         show_forecast(config)
         return ExitCode.DONE
 
-    from reslrb_cli.runs.prepare import prepare
+    from reslrb_cli.runs.prepare import begin
 
-    course, manifest = prepare(config, variant, logger.info, logger.warning)
-
-    def make() -> RunFolder:
-        return RunFolder.create(config_file, run.output, run.folder_name, force, dump(config), manifest)
-
-    return _run(course, manifest, make, quiet)
+    return _run(begin(config, variant, force, logger.info, logger.warning), quiet)
 
 
 def _resume(run: Path, config_file: Path | None, overrides: tuple[str, ...], quiet: bool) -> int:
-    from reslrb_cli.records.run_folder import check_output
     from reslrb_cli.runs.resume import open_earlier
 
     with open_earlier(run, config_file, overrides) as earlier:
@@ -151,22 +140,13 @@ def _resume(run: Path, config_file: Path | None, overrides: tuple[str, ...], qui
             )
             return ExitCode.DONE
         config = earlier.config
-        if earlier.elsewhere:
-            check_output(config.source, config.run.output, config.run.folder_name, False)
         variant = start_variant(config.model_copy(update={"variant": earlier.variant}))
-        course, manifest = earlier.prepare(variant, logger.info)
-        for line in earlier.said:
-            logger.warning(line)
+        begun = earlier.begin(variant, logger.info, logger.warning)
         logger.info(f"going on with {run} after {earlier.iteration} of {config.run.iterations} iterations")
-        return _run(course, manifest, lambda: earlier.take_over(manifest), quiet)
+        return _run(begun, quiet)
 
 
-def _run(
-    course: Course,
-    manifest: Manifest,
-    folder: Callable[[], contextlib.AbstractContextManager[RunFolder]],
-    quiet: bool,
-) -> int:
+def _run(begun: Begun, quiet: bool) -> int:
     """Run it in the folder, which is not made before signals are watched: from then on it is to say how it ended."""
     from reslrb_cli.cli.progress import Progress
     from reslrb_cli.cli.terminal import Interrupts
@@ -174,8 +154,9 @@ def _run(
     from reslrb_cli.report.run_summary import last_line, parameter_lines, terminal_width
     from reslrb_cli.runs.recorder import Recording
 
+    course, manifest = begun.course, begun.manifest
     iterations = course.problem.config.run.iterations
-    with Interrupts(notice=None if quiet else NOTICE) as interrupts, folder() as place:
+    with Interrupts(notice=None if quiet else NOTICE) as interrupts, begun.place() as place:
         recording = Recording(course, place, manifest)
         interrupts.last_act = recording.abandon
         with Progress(iterations, quiet, course.results.meter, course.done) as progress:

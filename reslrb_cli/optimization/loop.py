@@ -91,6 +91,7 @@ def step(
         split = Split()
         loss, squares, counts, refused, costs = gradient(problem, iteration, split)
         dr.eval(loss, squares, counts)
+    gradients = {key: optimizer.gradient(key) for key in optimizer.keys()}  # noqa: SIM118 (not a mapping)
     factor = learning_rate_factor(
         config.optimizer.schedule, iteration, config.run.iterations, config.optimizer.final_fraction, progress()
     )
@@ -120,6 +121,7 @@ def step(
             clamp=clamp,
             clamp_sums=clamp_sums,
             end=why_end(config.run.on_nonfinite, found, standstill),
+            gradients=gradients,
         ),
     )
     return state, Record(

@@ -49,7 +49,7 @@ class State:
     clamp knows; `moments` are the optimiser's and `clamp_sums` the clamp's. `guiding` are the gradients that guided
     emission had by sensor, `learned` its arrays by `<sensor>/<what>`. `values` are the scene's, as the optimiser has
     them; in a file as they are shown, and as `halo` where that is less. `end` says why the run ends with it, "" where
-    it does not.
+    it does not; `gradients` are those of the step that led to it, as `values` are, for whoever looks at them.
     """
 
     iteration: Count
@@ -66,6 +66,7 @@ class State:
     clamp_sums: Arrays = field(default_factory=dict, metadata=entry("clamp"))
     learned: Arrays = field(default_factory=dict, metadata=entry("guiding", "finite"))
     end: str = field(default="", metadata=PASSING)
+    gradients: dict[str, Any] = field(default_factory=dict, metadata=PASSING)
 
     def on_file(self, problem: Problem) -> State:
         """The same with the values as a file has them."""

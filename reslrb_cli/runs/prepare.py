@@ -4,11 +4,13 @@
 - `changes`, `check_changes`: what of an experiment may change while its run goes on, and what may not.
 - `prepare`, `manifest_of`: from a configuration to a problem that is ready to run, and the manifest that says what was
   settled on the way.
+- `Begun`: a run that is to be made, or gone on with; `begin`: one that is new.
 - `Course`: the course itself.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -33,7 +35,7 @@ from reslrb_cli.optimization.loading import paths_of
 from reslrb_cli.optimization.moving import warn_of_border
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import WINDOW, Best, Images, Least, Results
-from reslrb_cli.optimization.state import Settled, State, check_bounds, load, on_file, standing
+from reslrb_cli.optimization.state import Settled, State, check_bounds, load, on_file, put, standing
 from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
 from reslrb_cli.optimization.views import view_records
 from reslrb_cli.records.cache import PilotCache
@@ -41,6 +43,7 @@ from reslrb_cli.records.checkpoint import save_checkpoint
 from reslrb_cli.records.decisions import RivalRecord
 from reslrb_cli.records.manifest import Manifest
 from reslrb_cli.records.metrics import ClampTally, NonFiniteTally, Record, RegularizedTally
+from reslrb_cli.records.run_folder import RunFolder
 from reslrb_cli.records.tree import Arrays, Stored, entries, entry, expected
 from reslrb_cli.report.tonemap import exposure_for
 from reslrb_cli.scene.needs import unsupported_part
@@ -250,6 +253,11 @@ class Course:
         self.certainty.see(state.iteration)
         self.state = state
 
+    def stand(self) -> None:
+        """Bring the problem back to `state` where an iteration was cut short."""
+        if self.problem.optimizer.stands_at is not self.state:
+            put(self.problem, self.state)
+
     def _take(self, record: Record) -> None:
         self.last = record
         self.results.add(record)
@@ -264,6 +272,10 @@ class Course:
             key: value if isinstance(value, np.ndarray) else shown(key, value)
             for key, value in self.best.values.items()
         }
+
+    def shown(self, values: Mapping[str, Any]) -> dict[str, Array]:
+        """Values by key as the optimiser has them, of a state or its gradients, as `problem.values()` has them."""
+        return {key: self.problem.selection.shown(key, value) for key, value in values.items()}
 
     # --- kept and taken up again --------------------------------------------------------------------------------------
 
@@ -296,3 +308,27 @@ class Course:
         self.best.least, self.best.values = met.best, met.best_values
         self.results.images["initial"] = met.images
         self.certainty.noted, self.certainty.squares = met.certainty, met.squares
+
+
+@dataclass(frozen=True)
+class Begun:
+    """A run that is to be made, or gone on with: its course, its manifest, and `place`, which makes its folder or takes
+    it over, and has it locked while the block works."""
+
+    course: Course
+    manifest: Manifest
+    place: Callable[[], contextlib.AbstractContextManager[RunFolder]]
+
+
+def begin(config: Config, variant: str, force: bool, say: Say, warn: Say) -> Begun:
+    """A new run, prepared as `prepare` does, in a folder of its own; a variant must be set.
+
+    Whether there can be one is asked before (`check_output`). Raises ConfigError and UnsupportedScene.
+    """
+    course, manifest = prepare(config, variant, say, warn)
+    run = config.run
+    return Begun(
+        course,
+        manifest,
+        lambda: RunFolder.create(config.source, run.output, run.folder_name, force, dump(config), manifest),
+    )

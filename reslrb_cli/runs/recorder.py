@@ -11,7 +11,7 @@ import logging
 import os
 import shlex
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -174,6 +174,8 @@ class Recording:
     error_maps: dict[str, Any] = field(default_factory=dict)
     seen: dict[str, Any] = field(default_factory=dict)
     certainty: CertaintyRecord | None = None
+    #: How the run ended, once it has.
+    status: Status = Status.RUNNING
     _saved_nonfinite: bool = field(init=False)
     #: Iterations that the newest checkpoint contains; None before the first one.
     _saved: int | None = None
@@ -194,7 +196,22 @@ class Recording:
         return self.course.done
 
     def run(self, show: Callable[[Record], None], stop: Callable[[], bool]) -> Status:
-        """Iterate until the end or until `stop()`, and complete the folder; return how it ended.
+        """Iterate until the end or until `stop()`, and complete the folder; return how it ended (`records`).
+
+        What `show` fails of is what the run fails of.
+        """
+        records = self.records(stop)
+        for record in records:
+            try:
+                show(record)
+            except BaseException as error:
+                with contextlib.suppress(StopIteration):
+                    records.throw(error)
+        return self.status
+
+    def records(self, stop: Callable[[], bool] = lambda: False) -> Generator[Record, None, None]:
+        """The record of each iteration until the end, until `stop()`, or until nobody asks for more (`close`); then
+        the folder is completed, and `status` says how the run ended.
 
         Whatever ends the run, its folder has a manifest that says so, the parameters, a checkpoint and the report, and
         final images where it did not fail; what could not be written is noted in the manifest. Raises what the run
@@ -214,16 +231,19 @@ class Recording:
                 values = values / "initial"
             # the state at the end has the best values too, and what the clamp and the optimiser then know
             reserve.hold(2 * size_of(self.folder.checkpoint) + size_of(values) + RESERVE_BYTES)
-            self._iterate(show, stop)
+            yield from self._iterate(stop)
+            status = Status.INTERRUPTED if self.done < self.problem.config.run.iterations else Status.FINISHED
+        except GeneratorExit:
             status = Status.INTERRUPTED if self.done < self.problem.config.run.iterations else Status.FINISHED
         except KeyboardInterrupt:
+            self.course.stand()
             status = Status.INTERRUPTED
         except NonFinite as error:
             failure = NonFinite(f"{error}; where: {self._inspection()}") if self._saved_nonfinite else error
         except BaseException as error:
             failure = error
         reserve.release()
-        return self._end(status, failure)
+        self.status = self._end(status, failure)
 
     def abandon(self) -> None:
         """Note in the manifest that the run was interrupted, in a process that is about to end in the midst of it."""
@@ -246,7 +266,7 @@ class Recording:
         for key, mask in problem.masks.items():
             write_mask(parameters, key, mask)
 
-    def _iterate(self, show: Callable[[Record], None], stop: Callable[[], bool]) -> None:
+    def _iterate(self, stop: Callable[[], bool]) -> Iterator[Record]:
         run, saved, saved_at = self.problem.config.run, self.done, time.monotonic()
         every, told = run.images_every, self.done > 0
         if stop():
@@ -258,7 +278,7 @@ class Recording:
                 told = True
                 self.course.add(state, record)
                 metrics.write(record)
-                show(record)
+                yield record
                 self._note_memory(record.peak_mib)
                 if (fault := self.folder.fault) is not None:  # another run's may have taken its name
                     raise fault
