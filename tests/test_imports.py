@@ -32,6 +32,7 @@ ROWS = [
     "measure",
     "report",
     "runs",
+    "api",
     "cli",
     "__main__",
 ]

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.errors import MachineError, NonFinite, describe, is_machine_fault, tell
-from reslrb_cli.integrators.protocol import whole_of
 from reslrb_cli.optimization.decisions import Scaled
 from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.nonfinite import Findings
@@ -27,7 +26,6 @@ from reslrb_cli.optimization.problem import Problem, saved_spp
 from reslrb_cli.optimization.sensitivity import curvature_line, step_line
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
-from reslrb_cli.optimization.views import Exposure
 from reslrb_cli.records.atomic import Reserve, remove_parts, size_of
 from reslrb_cli.records.checkpoint import (
     NONFINITE_FILE_NAME,
@@ -440,10 +438,7 @@ class Recording:
             logger.info(f"rendering the final image: {spp} spp")
         for view in self.problem.views:
             seen = self.problem.see(view, spp, self.done, "saved image")
-            image, scale = np.array(whole_of(seen)), view.scale(seen)
-            exposed = view.exposure.of_array(image)  # as the target is
-            if view.fits:
-                exposed = Exposure(view.exposure.fixed * scale).of_array(image)
+            image, exposed, scale = view.exposed(seen)
             self._write_image(name, view.sensor, exposed)
             self.course.results.see(name, view, np.array(seen), scale)
             if name == "final":
