@@ -58,7 +58,8 @@ class Run:
     # --- iterating ----------------------------------------------------------------------------------------------------
 
     def __iter__(self) -> Generator[Record, None, None]:
-        if self._loop is not None and self._loop() is not None:
+        loop = None if self._loop is None else self._loop()
+        if loop is not None and loop.gi_frame is not None:  # one that has ended may still stand in a traceback
             raise RuntimeError("this run is in a loop already; leave that first")
         loop = self._iterations()
         self._loop = weakref.ref(loop)
