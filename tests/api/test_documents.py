@@ -113,7 +113,7 @@ CELLS = [
     'import reslrb_cli as rl\nconfig = rl.load("configs/cornell_floor.yaml", {"run.iterations": 100000, '
     '"scene.options": {"resx": 16, "resy": 16}, "run.final_spp": 16, "run.measuring": 0})\n'
     'run = rl.optimize(config, folder="runs/stopped")',
-    'import threading, os, signal\nfor record in run.live():\n    if record.iteration == 3:\n'
+    "import threading, os, signal\nfor record in run.live():\n    if record.iteration == 3:\n"
     "        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()",
     'print(run.status, run.iteration > 3, sorted(run.parameters), (run.folder / "report.html").exists())\n'
     "again = iter(run)\nprint(next(again).iteration == run.iteration - 1)\nagain.close()",
