@@ -1,5 +1,5 @@
-"""Writes the references: of the configuration, docs/config.schema.json and docs/config.md, and of Python, from docstrings,
-the end of docs/python.md.
+"""Writes the references: docs/config.schema.json and docs/config.md, of the configuration, and the end of docs/python.md,
+of docstrings.
 
 `python scripts/make_reference.py [FOLDER]`, after every change of the schema or of what is public; a test holds them
 together.

@@ -7,6 +7,7 @@ import logging
 import os
 import weakref
 from collections.abc import Generator, Iterator, Mapping, Sequence
+from inspect import GEN_CLOSED, getgeneratorstate
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeAlias
@@ -59,7 +60,7 @@ class Run:
 
     def __iter__(self) -> Generator[Record, None, None]:
         loop = None if self._loop is None else self._loop()
-        if loop is not None and loop.gi_frame is not None:  # one that has ended may still stand in a traceback
+        if loop is not None and getgeneratorstate(loop) != GEN_CLOSED:  # one that has ended may still stand in a traceback
             raise RuntimeError("this run is in a loop already; leave that first")
         loop = self._iterations()
         self._loop = weakref.ref(loop)
