@@ -60,7 +60,9 @@ class Run:
 
     def __iter__(self) -> Generator[Record, None, None]:
         loop = None if self._loop is None else self._loop()
-        if loop is not None and getgeneratorstate(loop) != GEN_CLOSED:  # one that has ended may still stand in a traceback
+        if (
+            loop is not None and getgeneratorstate(loop) != GEN_CLOSED
+        ):  # one that has ended may still stand in a traceback
             raise RuntimeError("this run is in a loop already; leave that first")
         loop = self._iterations()
         self._loop = weakref.ref(loop)
