@@ -1,4 +1,4 @@
-"""Writes the references: docs/config.schema.json and docs/config.md of the configuration, docs/python.md's of docstrings.
+"""Writes the references: docs/config.schema.json and docs/config.md, of the schema, and the end of docs/python.md.
 
 `python scripts/make_reference.py [FOLDER]`, after every change of the schema or of what is public; a test holds them
 together.
