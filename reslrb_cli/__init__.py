@@ -1,8 +1,10 @@
 """Gradients through light paths: reservoir light replay backpropagation on Mitsuba 3.
 
 `import reslrb_cli` needs no variant and loads no Mitsuba. Import it before Mitsuba: it chooses the libLLVM that Dr.Jit
-will load. `register()` makes the plugins known to Mitsuba, `load_scene(...)` gives a scene whose parameters are named
-as on the command line, `step(...)` is one gradient step.
+will load. `optimize(...)` recovers parameters in a loop of one's own, `render`, `gradient`, `gradcheck`, `convergence`
+and `export` are what the commands do, of an experiment that `load` reads. `register()` makes the plugins known to
+Mitsuba, `load_scene(...)` gives a scene whose parameters are named as on the command line, `step(...)` is one gradient
+step. All that is public stands in `__all__`.
 """
 
 from __future__ import annotations
@@ -22,21 +24,51 @@ from typing import TYPE_CHECKING, Any  # noqa: E402
 from reslrb_cli.backend import llvm as _llvm  # noqa: E402
 
 if TYPE_CHECKING:
+    from reslrb_cli.api.experiment import convergence, export, gradcheck, gradient, load, render
+    from reslrb_cli.api.run import Run, optimize
+    from reslrb_cli.config.schema import Config
+    from reslrb_cli.errors import ConfigError, ReslrbError
     from reslrb_cli.integrators.plugin import register
     from reslrb_cli.integrators.step import gradient_step as step
+    from reslrb_cli.records.metrics import Record
     from reslrb_cli.scene.load import load_for_script as load_scene
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "load_scene", "register", "step"]
+__all__ = [
+    "Config",
+    "ConfigError",
+    "Record",
+    "ReslrbError",
+    "Run",
+    "__version__",
+    "convergence",
+    "export",
+    "gradcheck",
+    "gradient",
+    "load",
+    "load_scene",
+    "optimize",
+    "register",
+    "render",
+    "step",
+]
 
 # Dr.Jit loads libLLVM on a thread of its own while it is being imported: later is too late.
 _llvm.prepare()
 
 _LAZY = {
+    **{name: ("reslrb_cli.api.experiment", name)
+       for name in ("convergence", "export", "gradcheck", "gradient", "load", "render")},
+    "Config": ("reslrb_cli.config.schema", "Config"),
+    "ConfigError": ("reslrb_cli.errors", "ConfigError"),
+    "Record": ("reslrb_cli.records.metrics", "Record"),
+    "ReslrbError": ("reslrb_cli.errors", "ReslrbError"),
+    "Run": ("reslrb_cli.api.run", "Run"),
     "load_scene": ("reslrb_cli.scene.load", "load_for_script"),
+    "optimize": ("reslrb_cli.api.run", "optimize"),
     "register": ("reslrb_cli.integrators.plugin", "register"),
     "step": ("reslrb_cli.integrators.step", "gradient_step"),
-}
+}  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

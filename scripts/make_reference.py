@@ -1,16 +1,20 @@
-"""Writes the reference of the configuration: docs/config.schema.json and docs/config.md.
+"""Writes the references: docs/config.schema.json and docs/config.md, of the schema, and the end of docs/python.md.
 
-`python scripts/make_reference.py [FOLDER]`, after every change of the schema; a test holds the two together.
+`python scripts/make_reference.py [FOLDER]`, after every change of the schema or of what is public; a test holds them
+together.
 """
 
 from __future__ import annotations
 
+import inspect
 import json
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import reslrb_cli
 from reslrb_cli.config.schema import Config
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -221,11 +225,93 @@ def _range(value: dict[str, Any]) -> str:
     return f" {', '.join(bounds)}" if bounds else ""
 
 
+# --- Python -----------------------------------------------------------------------------------------------------------
+
+#: Where in docs/python.md what is written by hand ends.
+_MARK = "## Reference\n"
+
+#: The names in their order; what else is public comes behind them.
+_FIRST = ("load", "optimize", "Run", "Record", "render", "gradient", "gradcheck", "convergence", "export")
+
+#: Of these, what is below them stands elsewhere.
+_ELSEWHERE = {"Config": "Its sections are its attributes: `config.run.iterations` ([config.md](config.md))."}
+
+_PYTHON = f"""\
+{_MARK}
+<!-- From here on written by `python scripts/make_reference.py` from docstrings; edit these. -->
+
+`Experiment` is what `load` takes, `Folder` a path as text or a `Path`, `Array` a NumPy array. `GradcheckRecord` and
+`Line` are records: attributes of the names that a line of `--json` has, and `to_json()`, which is that line.
+"""
+
+
+def python_reference() -> str:
+    """The end of docs/python.md: all public names, their signatures and docstrings."""
+    public = [name for name in reslrb_cli.__all__ if not name.startswith("_")]
+    names = [*_FIRST, *(name for name in public if name not in _FIRST)]
+    return "\n".join([_PYTHON, *("\n".join(_described(name, getattr(reslrb_cli, name))) for name in names)])
+
+
+def _described(name: str, thing: Any) -> Iterator[str]:
+    """The lines of one public name."""
+    yield from (f"### `{name}`", "")
+    if inspect.isclass(thing):
+        yield from (_text(thing), "")
+        if name in _ELSEWHERE:
+            yield from (_ELSEWHERE[name], "")
+            return
+        if issubclass(thing, Exception):
+            return
+        for field, kind in _fields(thing).items():
+            yield f"- `{field}: {kind}`"
+        yield from [""] if _fields(thing) else []
+        for member, value in vars(thing).items():
+            if member.startswith("_") or not (inspect.isfunction(value) or isinstance(value, property)):
+                continue
+            function = value.fget if isinstance(value, property) else value
+            shown = _signature(member, function, method=True)
+            if isinstance(value, property):
+                shown = f"{member}: {function.__annotations__['return']}"
+            yield from (f"**`{name}.{shown}`**", "", _text(function), "")
+    else:
+        yield from ("```text", _signature(name, thing), "```", "", _text(thing), "")
+
+
+def _fields(thing: Any) -> dict[str, str]:
+    """The fields of a dataclass, by name, and their types in words."""
+    found = getattr(thing, "__dataclass_fields__", {})
+    return {name: str(each.type).replace("Figure", "float") for name, each in found.items() if not name.isupper()}
+
+
+def _signature(name: str, function: Any, method: bool = False) -> str:
+    """The signature, in one line or, where it is long, an argument a line."""
+    signature = inspect.signature(function)
+    parameters = []
+    for each in list(signature.parameters.values())[method:]:
+        default = "" if each.default is inspect.Parameter.empty else f" = {each.default!r}"
+        stars = {inspect.Parameter.VAR_POSITIONAL: "*", inspect.Parameter.VAR_KEYWORD: "**"}.get(each.kind, "")
+        parameters.append(f"{stars}{each.name}: {each.annotation}{default}")
+    end = f") -> {signature.return_annotation}"
+    line = f"{name}({', '.join(parameters)}{end}"
+    return line if len(line) <= 100 or method else "\n".join([f"{name}(", *(f"    {p}," for p in parameters), end])
+
+
+def _text(thing: Any) -> str:
+    return re.sub(r"\n{3,}", "\n\n", inspect.getdoc(thing) or "")
+
+
+def python_page(before: str) -> str:
+    """docs/python.md, of which `before` is as it stands: what is written by hand, and the reference anew."""
+    return before.partition(_MARK)[0].rstrip() + "\n\n" + python_reference().rstrip() + "\n"
+
+
 def write(folder: Path = DOCS) -> None:
-    """Writes both files into `folder`."""
+    """Writes the files into `folder`."""
     schema = json.dumps(json_schema(), indent=2, ensure_ascii=False) + "\n"
     (folder / "config.schema.json").write_text(schema, encoding="utf-8")
     (folder / "config.md").write_text(markdown(), encoding="utf-8")
+    before = (DOCS / "python.md").read_text(encoding="utf-8")
+    (folder / "python.md").write_text(python_page(before), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ ROWS = [
     "report",
     "runs",
     "cluster",
+    "api",
     "cli",
     "__main__",
 ]

@@ -6,13 +6,14 @@ import ctypes
 import functools
 import logging
 import os
+import sys
 from importlib import metadata
 from types import ModuleType
 
 from reslrb_cli.backend import llvm
 from reslrb_cli.backend.installation import load_packages, prefer_own_plugins
 from reslrb_cli.backend.probe import probe
-from reslrb_cli.errors import BackendError
+from reslrb_cli.errors import BackendError, ConfigError
 
 logger = logging.getLogger(__name__)
 
@@ -42,6 +43,22 @@ def set_variant(name: str = "auto") -> str:
     prefer_own_plugins()
     logger.info("variant %s%s%s", chosen, f" (libLLVM {library.version})" if library else "", why)
     return chosen
+
+
+def keep_variant(name: str, source: object) -> str:
+    """Sets the variant `name` where none is set, and returns what is set; `auto` is content with any that works.
+
+    Raises ConfigError, located in `source`, where another one is set: what was made under that would be lost.
+    """
+    mi = sys.modules.get("mitsuba")
+    now: str | None = None if mi is None else mi.variant()
+    if now is None:
+        return set_variant(name)
+    if name not in ("auto", now):
+        advice = "leave `variant` out, or take another process"
+        raise ConfigError(source, "variant", f"is {name}, but {now} is set in this process; {advice}")
+    check_variant(now)
+    return set_variant(now)
 
 
 def choose(name: str = "auto") -> tuple[str, str]:

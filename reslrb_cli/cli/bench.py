@@ -18,7 +18,6 @@ from reslrb_cli.cli.options import (
     files_of,
     is_given,
     look_at,
-    machine_of,
     measuring,
     memory_limit_option,
     optional_experiment_arguments,
@@ -83,7 +82,15 @@ def command(
     from reslrb_cli.backend.installation import load_packages
 
     load_packages()  # before what follows asks for them
-    from reslrb_cli.measure.methods import SWEPT, Sweep, choose_baseline, depths, parse_cases, usual_values
+    from reslrb_cli.measure.methods import (
+        SWEPT,
+        Sweep,
+        choose_baseline,
+        depths,
+        machine_of,
+        parse_cases,
+        usual_values,
+    )
     from reslrb_cli.records.measurements import BenchStatus
 
     config = read_or_box(config_file, overrides)

@@ -25,7 +25,6 @@ from reslrb_cli.cli.options import (
     files_of,
     is_given,
     look_at,
-    machine_of,
     measuring,
     memory_limit_option,
     origin_of,
@@ -184,7 +183,7 @@ def command(
     from reslrb_cli.config.loader import check_code, load
 
     load_packages()  # before what follows asks for them
-    from reslrb_cli.measure.methods import DEFAULT, DEFAULTS, REFERENCE, Plan, RunsPlan, parse_cases
+    from reslrb_cli.measure.methods import DEFAULT, DEFAULTS, Plan, RunsPlan, compared, machine_of
 
     config = load(config_file, overrides).with_code(allow_code)
     if objective == "loss" or runs is not None:
@@ -193,22 +192,16 @@ def command(
         _refuse_with_runs()
     elif rates is not None:
         raise ConfigError("--rates", "", "are those of whole optimisations; add --runs N")
-    before = _settings_of(resumed)  # what nobody names is as it was: defaults may have been others
-    usual = ",".join(before.get("integrators", ())) or (DEFAULTS[objective] if runs is None else DEFAULT)
-    cases = parse_cases(integrators or usual, deep=False)
-    stands = parse_cases(reference or before.get("reference") or REFERENCE, "--reference", deep=False)
-    if len(stands) != 1:
-        raise ConfigError("--reference", "", "errors are taken from one method; name one")
+    usual = DEFAULTS[objective] if runs is None else DEFAULT
+    named = compared(integrators, reference, usual, _settings_of(resumed))
     json_file, plot_file = files_of(resumed, json_file, plot_file)
     settings: dict[str, Any] = {
         **machine_of(config, memory_limit),
         "config": config,
-        "cases": cases,
-        "reference": stands[0],
+        **named,
         "objective": objective if runs is None else "loss",
         "budget_s": budget,
         "rounds": rounds,
-        "default": integrators is None,
         "spps": spps or (),
     }
     if runs is not None:
@@ -254,16 +247,17 @@ def _run(plan: Plan, resumed: Path | None, json_file: Path | None, began: float)
     from reslrb_cli.measure.convergence.judgement import Judgement
     from reslrb_cli.measure.convergence.session import Session
     from reslrb_cli.measure.convergence.setup import Role
-    from reslrb_cli.records.measurements import SummaryRecord
-    from reslrb_cli.report.convergence_tables import closing_sentence, method_cells, notes, reference_line
+    from reslrb_cli.report.convergence_tables import (
+        closing_sentence,
+        method_cells,
+        notes,
+        reference_line,
+        result_lines,
+    )
 
     with measuring(Session, plan, resumed, began, "round") as (session, interrupts):
-
-        def lines(now: Results) -> list[Line]:
-            return [*now.points, *now.methods, *now.references, SummaryRecord(closing_sentence(now.methods))]
-
         origin = origin_of(plan.variant)
-        keeper = Keeper(json_file, origin, lambda: [], lambda: lines(Judgement(session).results()), session.kept)
+        keeper = Keeper(json_file, origin, lambda: [], lambda: result_lines(Judgement(session).results()), session.kept)
         table: Columns | None = None
         for rounds in session.run():
             keeper.refresh()
@@ -278,7 +272,7 @@ def _run(plan: Plan, resumed: Path | None, json_file: Path | None, began: float)
                 if judgement.ready and member.refusal is None:
                     echo(table.line(method_cells(judgement.overall(member), f"{rounds} rounds")))
         results = Judgement(session).results()
-        keeper.finish(lines(results))
+        keeper.finish(result_lines(results))
         table = _table(session)
         echo(table.head())
         shown = _shown(results.methods)

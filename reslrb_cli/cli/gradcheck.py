@@ -33,7 +33,7 @@ from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
 from reslrb_cli.config.loader import check_code
 from reslrb_cli.errors import ConfigError, ExitCode
-from reslrb_cli.measure.methods import PATHS_OPTIONS, all_estimators, parse_estimators
+from reslrb_cli.measure.methods import PATHS_OPTIONS, parse_estimators
 from reslrb_cli.measure.resume_store import Earlier, settings
 from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verdict
 
@@ -219,7 +219,7 @@ def command(
     began = time.monotonic()
     load_packages()  # before what follows asks for them
     from reslrb_cli.measure.gradcheck import Gradcheck
-    from reslrb_cli.measure.participants import Settings
+    from reslrb_cli.measure.participants import settings_of
     from reslrb_cli.measure.sampling import KIND
     from reslrb_cli.measure.sampling import settings as settings_to_keep
     from reslrb_cli.report.tables import markdown_table, summary_lines
@@ -246,10 +246,8 @@ def command(
         variant = set_variant(config.variant)
         echo(f"{device_name(variant)}, {variant}")
         return run_missing(config, variant, budget, seeds, spp, directions, json_file, resumed)
-    listed = all_estimators(config) if estimators is None else parse_estimators(estimators)
     _check_folder(folder)
-    checked = Settings(config, listed, budget, seeds, spp, estimators is not None, time.monotonic() - began)
-    checked.configs()  # before anything is loaded
+    checked = settings_of(config, estimators, budget, seeds, spp, time.monotonic() - began)
     variant = set_variant(config.variant)
     to_keep = settings_to_keep(checked, variant, device_name(variant))
     check = Gradcheck(checked, earlier=Earlier.read(KIND, resumed, to_keep))

@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from reslrb_cli.cli.inspect import LISTED_SENSORS
-from reslrb_cli.cli.options import check_writable, writing
+from reslrb_cli.cli.options import check_writable
 from reslrb_cli.cli.terminal import echo, fill
 from reslrb_cli.config.loader import loads, parse_override
 from reslrb_cli.config.yaml_text import write
 from reslrb_cli.errors import ConfigError, UnsupportedScene, printable
-from reslrb_cli.records.atomic import write_atomically
+from reslrb_cli.records.atomic import write_atomically, writing
 
 if TYPE_CHECKING:
     import mitsuba as mi

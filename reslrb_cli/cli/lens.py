@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from reslrb_cli.cli.options import writing
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.records.atomic import write_atomically
+from reslrb_cli.records.atomic import write_atomically, writing
 
 if TYPE_CHECKING:
     import numpy as np

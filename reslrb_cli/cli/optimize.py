@@ -5,12 +5,10 @@ With `--dry-run` it prints the forecast of a run (`show_forecast`, `templates/fo
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
 import logging
 import os
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,15 +17,12 @@ import click
 from reslrb_cli.cli.options import allow_code_option, optional_experiment_arguments, read_config, start_variant
 from reslrb_cli.cli.terminal import echo, fill
 from reslrb_cli.config.files import in_words, rough_duration
-from reslrb_cli.config.loader import dump
 from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
     from reslrb_cli.optimization.problem import Problem
-    from reslrb_cli.records.manifest import Manifest
-    from reslrb_cli.records.run_folder import RunFolder
-    from reslrb_cli.runs.prepare import Course
+    from reslrb_cli.runs.prepare import Begun
 
 
 def show_forecast(config: Config) -> None:
@@ -165,7 +160,7 @@ def _begin(
     workers: int | None,
     quiet: bool,
 ) -> int:
-    from reslrb_cli.records.run_folder import RunFolder, check_output
+    from reslrb_cli.records.run_folder import check_output
 
     config = read_config(config_file, overrides).with_code(allow_code)
     run = config.run
@@ -176,14 +171,9 @@ def _begin(
         show_forecast(config)
         return ExitCode.DONE
 
-    from reslrb_cli.runs.prepare import prepare
+    from reslrb_cli.runs.prepare import begin
 
-    course, manifest = prepare(config, variant, logger.info, logger.warning)
-
-    def make() -> RunFolder:
-        return RunFolder.create(config_file, run.output, run.folder_name, force, dump(config), manifest)
-
-    return _run(course, manifest, make, workers, quiet)
+    return _run(begin(config, variant, force, logger.info, logger.warning), workers, quiet)
 
 
 def _resume(
@@ -194,7 +184,6 @@ def _resume(
     workers: int | None,
     quiet: bool,
 ) -> int:
-    from reslrb_cli.records.run_folder import check_output
     from reslrb_cli.runs.resume import open_earlier
 
     with open_earlier(run, config_file, overrides) as earlier:
@@ -205,38 +194,29 @@ def _resume(
             return ExitCode.DONE
         earlier.config = config = earlier.config.with_code(allow_code)
         _check_shards(config, workers)
-        if earlier.elsewhere:
-            check_output(config.source, config.run.output, config.run.folder_name, False)
         variant = start_variant(config.model_copy(update={"variant": earlier.variant}))
-        course, manifest = earlier.prepare(variant, logger.info)
-        for line in earlier.said:
-            logger.warning(line)
+        begun = earlier.begin(variant, logger.info, logger.warning)
         logger.info(f"going on with {run} after {earlier.iteration} of {config.run.iterations} iterations")
-        return _run(course, manifest, lambda: earlier.take_over(manifest), workers, quiet)
+        return _run(begun, workers, quiet)
 
 
-def _run(
-    course: Course,
-    manifest: Manifest,
-    folder: Callable[[], contextlib.AbstractContextManager[RunFolder]],
-    workers: int | None,
-    quiet: bool,
-) -> int:
+def _run(begun: Begun, workers: int | None, quiet: bool) -> int:
     """Run it in the folder, which is not made before signals are watched: from then on it is to say how it ended."""
     if workers is not None:
         from reslrb_cli.cluster.engine import local_engine
 
-        with local_engine(course, workers) as engine:
-            course.compute_with(engine)
-            return _run(course, manifest, folder, None, quiet)
+        with local_engine(begun.course, workers) as engine:
+            begun.course.compute_with(engine)
+            return _run(begun, None, quiet)
     from reslrb_cli.cli.progress import Progress
     from reslrb_cli.cli.terminal import Interrupts
     from reslrb_cli.records.manifest import Status
     from reslrb_cli.report.run_summary import last_line, parameter_lines, terminal_width
     from reslrb_cli.runs.recorder import Recording
 
+    course, manifest = begun.course, begun.manifest
     iterations = course.problem.config.run.iterations
-    with Interrupts(notice=None if quiet else NOTICE) as interrupts, folder() as place:
+    with Interrupts(notice=None if quiet else NOTICE) as interrupts, begun.place() as place:
         recording = Recording(course, place, manifest)
         interrupts.last_act = recording.abandon
         with Progress(iterations, quiet, course.results.meter, course.done) as progress:

@@ -1,7 +1,6 @@
 """The options and arguments that commands about one experiment share, and the way from a file to a variant.
 
-`read_recovered` makes the experiment of a run with the values to which the run brought its parameters, for what goes on
-from there. Measuring commands keep with `Keeper` what they have measured so far: the file of `--json` says what
+Measuring commands keep with `Keeper` what they have measured so far: the file of `--json` says what
 measured, then has one object a line, and stands on the disk while they go on.
 """
 
@@ -21,12 +20,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from reslrb_cli.backend.doctor import device_name, memory_bytes
+from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.config.loader import load, loads
-from reslrb_cli.config.parameters import RunValue
 from reslrb_cli.config.schema import Config
-from reslrb_cli.errors import ConfigError, ExitCode, is_machine_fault
+from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.records.atomic import remove_parts_of
 from reslrb_cli.records.measurement_files import (
     Kept,
@@ -147,17 +145,10 @@ def exit_code(interrupted: bool, done: bool, states: set[BenchStatus]) -> ExitCo
 
 
 def read_recovered(run: Path, overrides: tuple[str, ...]) -> Config:
-    """The configuration of the run in the folder `run`, its parameters beginning where that run has brought them.
+    """The experiment of a run with what it recovered (`records.run_folder.recovered`). Raises ConfigError."""
+    from reslrb_cli.records.run_folder import recovered
 
-    Raises ConfigError, located in the folder, where it is no run's or holds no values.
-    """
-    from reslrb_cli.records.run_folder import checkpoint_of
-
-    checkpoint_of(run)
-    config = read_config(run / "config.yaml", overrides)
-    start = RunValue(run=run.absolute())
-    specs = [spec.model_copy(update={"initial": start}) for spec in config.parameters]
-    return config.model_copy(update={"parameters": specs})
+    return recovered(run, overrides)
 
 
 #: Type of an option that counts something: samples, depths, seeds. As in a configuration, 31 bits.
@@ -263,18 +254,6 @@ def files_of(resumed: Path | None, json_file: Path | None, plot_file: Path | Non
     return json_file, plot_file
 
 
-def machine_of(config: Config, memory_limit: int | None) -> dict[str, Any]:
-    """What computes, as a `Measurement` has it: variant, memory, and the limit of each process. Raises ConfigError."""
-    from reslrb_cli.backend.variant import choose
-
-    variant, _ = choose(config.variant)
-    on_gpu, memory = variant.startswith("cuda"), memory_bytes(variant)
-    if on_gpu and memory_limit is not None:
-        raise ConfigError("--memory-limit", "", f"bounds address space, which says nothing of {variant}'s memory")
-    limit = memory_limit or (None if on_gpu else memory)
-    return {"variant": variant, "memory": memory, "memory_limit": limit, "device": device_name(variant)}
-
-
 def allowance(budget_s: float, number: int | None, of: str) -> str:
     """What ends a measurement, in words: its budget, or a `number` of what it is made `of`."""
     if number is not None:
@@ -318,18 +297,6 @@ def start_variant(config: Config) -> str:
     from reslrb_cli.backend.variant import set_variant
 
     return set_variant(config.variant)
-
-
-@contextmanager
-def writing(option: str, path: Path) -> Iterator[None]:
-    """Have an error of writing `path` located by the option (ConfigError); one of the machine stays what it is."""
-    try:
-        yield
-    except (OSError, RuntimeError) as error:
-        if is_machine_fault(error):
-            raise
-        place, reason = getattr(error, "filename", None) or path, getattr(error, "strerror", None) or error
-        raise ConfigError(option, "", f"cannot write {place}: {reason}") from None
 
 
 def check_writable(option: str, path: Path | None) -> None:

@@ -13,15 +13,13 @@ from reslrb_cli.config.files import in_words
 from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.report.format import shorten
+from reslrb_cli.report.run_summary import KEY_WIDTH, descriptions
 
 #: Without a terminal a line is written after each tenth of the iterations, and when this many seconds have passed.
 SECONDS_PER_LINE = 10.0
 
 #: What takes less has no bar.
 LEAST_SECONDS = 1.0
-
-#: A key in a line has at most so many characters.
-KEY_WIDTH = 32
 
 #: Cells that the bar has at least; what would leave it fewer is said in fewer words.
 LEAST_BAR = 8
@@ -35,23 +33,6 @@ FRAMES = (
 
 #: Where there is no room for any of them.
 LEAST_FRAME = "{percentage:3.0f}%|{bar}|"
-
-
-def descriptions(record: Record, meter: ErrorMeter) -> list[str]:
-    """The record's loss, and its parameters' error where that is known, in ever fewer words.
-
-    Where the parameters' units differ, the error is the largest relative one.
-    """
-    loss = f"loss {record.loss:.4g}"
-    if record.parameter_rmse is not None:
-        rmse = f"RMSE {record.parameter_rmse:.4g}"
-        return [f"{loss}, parameter {rmse}", f"{loss}, {rmse}", loss]
-    relative = meter.relative(record.parameter_errors)
-    if not relative:
-        return [loss]
-    key = max(relative, key=lambda key: relative[key])
-    error = f"error {relative[key]:.4g}"
-    return [f"{loss}, relative {error} at worst ({shorten(key, KEY_WIDTH)})", f"{loss}, relative {error}", loss]
 
 
 class Progress:

@@ -18,11 +18,11 @@ from reslrb_cli.cli.options import (
     read_config,
     read_recovered,
     start_variant,
-    writing,
 )
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.records.atomic import writing
 
 #: Formats that hold linear values; the others of `FORMATS` are written in 8-bit sRGB.
 FLOAT_FORMATS = (".exr", ".hdr", ".pfm")
@@ -99,7 +99,7 @@ def command(
     check_image_path(output)
     start_variant(config)
 
-    from reslrb_cli.optimization.assemble import load_for_rendering
+    from reslrb_cli.optimization.assemble import check_passes, load_for_rendering
     from reslrb_cli.optimization.loading import render_in_passes
     from reslrb_cli.records.images import write_file
     from reslrb_cli.report.tonemap import exposure_words
@@ -107,9 +107,9 @@ def command(
     if sensor is not None:
         config = _of_sensor(config, sensor)
     scene, sensors, integrator, multiple = load_for_rendering(config, initial)
-    if spp is not None and multiple is not None and spp % min(multiple, spp):
-        raise ConfigError("--spp", "", f"{spp} is not a multiple of integrator.samples_per_pass, which is {multiple}")
     samples = spp or config.run.spp
+    if spp is not None:
+        check_passes("--spp", spp, multiple)
     image = render_in_passes(integrator, scene, sensors[0], samples, config.run.seed, 0, "render", multiple)
     suits = 1.0 if linear else _suiting(image, scene, scene.sensors()[sensors[0]])
     factor = suits if exposure is None else exposure

@@ -1,4 +1,4 @@
-"""The reader of configurations, from a file and from `--set`; it also writes them as resolved.
+"""The reader of configurations, from a file and from `--set`, or from a script; it also writes them as resolved.
 
 `--set a.b=value` is a value, typed as YAML, at a place in the configuration.
 """
@@ -23,6 +23,8 @@ from reslrb_cli.errors import ConfigError, one_line
 
 #: Mappings whose keys are the user's own and may hold dots: what follows their name is one key.
 FREE_MAPPINGS: tuple[Location, ...] = (("scene", "options"), ("target", "render", "parameters"))
+#: Who is to blame for an override that a script gives.
+OVERRIDDEN = "overrides"
 _PART = re.compile(r"\[(\d+)\]|(?:^|\.)([^.\[\]]+)")
 
 
@@ -102,7 +104,7 @@ def _put(at: Any, override: Override, depth: int) -> Any:
     return {**at, part: _put(at.get(part), override, depth + 1)}
 
 
-def load(path: Path | str, overrides: Sequence[str] = ()) -> Config:
+def load(path: Path | str, overrides: Sequence[str | Override] = ()) -> Config:
     """The configuration in the YAML file `path`, with `overrides` such as "run.spp=32" put in, in their order.
 
     Raises ConfigError, located by the file (or the override that is at fault) and the key.
@@ -110,15 +112,57 @@ def load(path: Path | str, overrides: Sequence[str] = ()) -> Config:
     return loads(read_text(Path(path), str(path)), path, overrides)
 
 
-def loads(text: str, path: Path | str, overrides: Sequence[str] = ()) -> Config:
+def loads(text: str, path: Path | str, overrides: Sequence[str | Override] = ()) -> Config:
     """The same from the text of a file; `path` names it, and paths in it are relative to where that is."""
-    source = str(path)
     if len(overrides) > OVERRIDES:
         raise ConfigError("--set", "", f"is given {len(overrides)} times; more than {OVERRIDES} belong in a file")
-    if sum(map(len, overrides)) > OVERRIDES_LENGTH:
+    if sum(len(each) for each in overrides if isinstance(each, str)) > OVERRIDES_LENGTH:
         raise ConfigError("--set", "", f"holds more than {OVERRIDES_LENGTH} characters; so many belong in a file")
-    parsed = [parse_override(override) for override in overrides]
-    data = parse(text, source)
+    parsed = [parse_override(each) if isinstance(each, str) else each for each in overrides]
+    return resolve(parse(text, str(path)), path, parsed)
+
+
+def override(key: str, value: object) -> Override:
+    """The override of a script: `key` as `--set` has it, `value` as YAML would have made it. Raises ConfigError."""
+    return Override(OVERRIDDEN, _parse_location(key, OVERRIDDEN), plain(value, OVERRIDDEN, key))
+
+
+def plain(value: Any, source: object, key: str = "", depth: int = 0) -> Any:
+    """What YAML would have made of a value from a script: paths are text, tuples lists, NumPy's numbers and arrays
+    Python's. Raises ConfigError, located by `source` and `key`, for what YAML does not have."""
+    if depth > DEPTH:
+        raise ConfigError(source, "", f"leads deeper than {DEPTH} levels; no setting lies there")
+    if isinstance(value, Mapping):
+        for name in value:
+            if not isinstance(name, str):
+                raise ConfigError(source, key, f"has the key {one_line(repr(name), 40)}; keys are text")
+        places = {name: f"{key}.{name}" if key else name for name in value}
+        return {name: plain(each, source, places[name], depth + 1) for name, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(each, source, f"{key}[{place}]", depth + 1) for place, each in enumerate(value)]
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "tolist"):  # of NumPy, which is not imported here
+        return plain(value.tolist(), source, key)
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise ConfigError(source, key, f"is {one_line(repr(value), 60)}; YAML has no such value")
+
+
+def changed(config: Config, overrides: Sequence[str | Override]) -> Config:
+    """The same experiment with overrides put in. Raises ConfigError."""
+    if not overrides:
+        return config
+    parsed = [parse_override(each) if isinstance(each, str) else each for each in overrides]
+    return resolve(config.model_dump(mode="json", exclude_none=True), config.source, parsed)
+
+
+def resolve(data: Any, path: Path | str, parsed: Sequence[Override] = ()) -> Config:
+    """The configuration of settings as they were read, with overrides put in; `path` names where they come from.
+
+    Raises ConfigError, located by the file (or the override that is at fault) and the key.
+    """
+    source = str(path)
     if data is None and not parsed:
         raise ConfigError(source, "", "is empty; it needs at least scene, target and parameters")
     if not isinstance(data, dict) and data is not None:
@@ -153,7 +197,7 @@ def check_code(config: Config, losses: Mapping[str, Custom] | None = None) -> No
             raise ConfigError(config.source, key, reason)
 
 
-def _blame(stages: list[dict[str, Any]], overrides: list[Override], problem: Problem, path: Path) -> str:
+def _blame(stages: list[dict[str, Any]], overrides: Sequence[Override], problem: Problem, path: Path) -> str:
     """Who made `problem`: an override without which it is not there yet, and with which it is; else the file.
 
     `stages` hold the file's settings, and those after each override. Found by halving: a check takes time.

@@ -7,10 +7,12 @@ of `convergence --runs`.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
+from reslrb_cli.backend.doctor import device_name, memory_bytes
+from reslrb_cli.backend.variant import choose
 from reslrb_cli.config.base import SEED_END
 from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, UNDECIDED, Prb, Ptracer, Trajectory, WalkAd
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
@@ -417,6 +419,28 @@ class Side:
     case: Case
     spp: int
     rate: float | None = None
+
+
+def compared(integrators: str | None, reference: str | None, usual: str, before: Mapping[str, Any]) -> dict[str, Any]:
+    """What a `Plan` compares, and takes errors from: lists as written, or None for those of `before`, or the `usual`.
+
+    `before` are the settings of what is gone on from, whose defaults may have been others. Raises ConfigError.
+    """
+    cases = parse_cases(integrators or ",".join(before.get("integrators", ())) or usual, deep=False)
+    stands = parse_cases(reference or before.get("reference") or REFERENCE, "--reference", deep=False)
+    if len(stands) != 1:
+        raise ConfigError("--reference", "", "errors are taken from one method; name one")
+    return {"cases": cases, "reference": stands[0], "default": integrators is None}
+
+
+def machine_of(config: Config, memory_limit: int | None) -> dict[str, Any]:
+    """What computes, as a `Measurement` has it: variant, memory, and the limit of each process. Raises ConfigError."""
+    variant, _ = choose(config.variant)
+    on_gpu, memory = variant.startswith("cuda"), memory_bytes(variant)
+    if on_gpu and memory_limit is not None:
+        raise ConfigError("--memory-limit", "", f"bounds address space, which says nothing of {variant}'s memory")
+    limit = memory_limit or (None if on_gpu else memory)
+    return {"variant": variant, "memory": memory, "memory_limit": limit, "device": device_name(variant)}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,6 +16,7 @@ from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import Case, all_directions, choose_step, seeds, smooth_weights
 from reslrb_cli.measure.methods import Case as Listed
+from reslrb_cli.measure.methods import all_estimators, parse_estimators
 from reslrb_cli.measure.references import (
     CAMERA_PATHS,
     Situation,
@@ -88,6 +89,19 @@ class Settings:
         """The experiment with each integrator, by its label. Raises ConfigError where one cannot be."""
         depth = self.config.integrator.max_depth
         return {case.label: case.at(self.config, depth, self.known) for case in self.integrators}
+
+
+def settings_of(
+    config: Config, estimators: str | None, budget_s: float, seeds: int | None, spp: int | None, spent_s: float
+) -> Settings:
+    """What is checked of `config`: the list of `estimators`, as `--estimators` has it, or all of them.
+
+    Raises ConfigError where one cannot be.
+    """
+    listed = all_estimators(config) if estimators is None else parse_estimators(estimators)
+    checked = Settings(config, listed, budget_s, seeds, spp, estimators is not None, spent_s)
+    checked.configs()  # before anything is loaded
+    return checked
 
 
 @dataclass(frozen=True)

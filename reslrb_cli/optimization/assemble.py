@@ -3,6 +3,7 @@ that to the coarser one of a stage of its run."""
 
 from __future__ import annotations
 
+import difflib
 import functools
 import math
 from collections.abc import Callable, Mapping
@@ -82,19 +83,51 @@ def assemble(
     return problem
 
 
-def load_for_rendering(config: Config, initial: bool) -> tuple[Any, list[int], Any, int | None]:
-    """Load the scene (with the parameters' initial values, if `initial`), and make the integrator.
+def load_for_rendering(
+    config: Config, initial: bool, values: Mapping[str, Any] | None = None
+) -> tuple[Any, list[int], Any, int | None]:
+    """Load the scene (with the parameters' initial values, if `initial`, or `values`), and make the integrator.
 
     Returns both, between them the indices of the sensors in use, and the integrator's `samples_per_pass`.
     """
     if initial:
         problem = assemble_scene(config)
+        if values is not None:
+            problem = set_values(problem, values)
         return problem.scene, problem.sensors, problem.integrator, samples_per_pass(config)
     scene = load_configured(config, selects=False)
     sensors = choose_sensors(config, scene)
     check_integrator(config, config.integrator, scene, sensors)
     integrator = make_configured(config.integrator, paths_of(config.integrator, scene, sensors))
     return scene, sensors, integrator, samples_per_pass(config)
+
+
+def check_passes(source: str, spp: int, multiple: int | None) -> None:
+    """Raise ConfigError, located by `source`, where passes of `multiple` samples do not make `spp` of them."""
+    if spp < 1:
+        raise ConfigError(source, "", f"is {spp}; at least 1 is needed")
+    if multiple is not None and spp % min(multiple, spp):
+        raise ConfigError(source, "", f"{spp} is not a multiple of integrator.samples_per_pass, which is {multiple}")
+
+
+def set_values(problem: Problem, values: Mapping[str, Any]) -> Problem:
+    """The same before its first iteration, with `values` of some parameters: arrays of their shape, or what NumPy makes
+    such of. Raises ConfigError, located by `values` and the key."""
+    found = {}
+    for key, value in values.items():
+        if key not in problem.selection.keys:
+            near = difflib.get_close_matches(key, problem.selection.keys, n=1, cutoff=0)
+            raise ConfigError("values", key, f"is no parameter of this experiment; did you mean {near[0]}?")
+        shape = problem.selection.array(key).shape
+        try:
+            array = np.broadcast_to(np.asarray(value, np.float32), shape).copy()
+        except (TypeError, ValueError):
+            has = f"of shape {np.shape(value)}" if isinstance(value, np.ndarray) else "no array"
+            raise ConfigError("values", key, f"is {has}; the parameter's shape is {shape}, of numbers") from None
+        if not np.isfinite(array).all():
+            raise ConfigError("values", key, "holds a value that is not finite")
+        found[key] = array
+    return problem.afresh({**problem.values(), **found})
 
 
 def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array] | None = None) -> Problem:

@@ -94,6 +94,7 @@ def step(
         split = Split()
         loss, squares, counts, refused, costs = gradient(problem, iteration, split)
         dr.eval(loss, squares, counts)
+    gradients = {key: optimizer.gradient(key) for key in optimizer.keys()}  # noqa: SIM118 (not a mapping)
     factor = (
         problem.pace
         * lowered(config.optimizer, state.drops)
@@ -127,6 +128,7 @@ def step(
             clamp=clamp,
             clamp_sums=clamp_sums,
             end=why_end(config.run.on_nonfinite, found, standstill),
+            gradients=gradients,
         ),
     )
     return state, Record(

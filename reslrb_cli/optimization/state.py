@@ -51,7 +51,8 @@ class State:
     them; in a file as they are shown, and as `halo` where that is less. `stage` is the number of the stage whose
     problem it is a state of, and `base` the run's values when that began, of one with a problem of its own (`stages`).
     `drops` are those of a rate that a plateau has lowered, `since` the iterations before the last of them; `stopped`
-    says why the run ends with it as finished, and `end` why it fails, "" where it does not.
+    says why the run ends with it as finished, and `end` why it fails, "" where it does not. `gradients` are those of
+    the step that led to it, as `values` are, for whoever looks at them.
     """
 
     iteration: Count
@@ -73,6 +74,7 @@ class State:
     learned: Arrays = field(default_factory=dict, metadata=entry("guiding", "finite"))
     base: Arrays = field(default_factory=dict, metadata=entry("base", "finite"))
     end: str = field(default="", metadata=PASSING)
+    gradients: dict[str, Any] = field(default_factory=dict, metadata=PASSING)
 
     def on_file(self, problem: Problem) -> State:
         """The same with the values as a file has them."""

@@ -271,6 +271,12 @@ class View:
             exposed = dr.select(self.weights > 0, exposed, self.target)
         return float(best_scale(halves_of(exposed), self.target, self.weights)[0])
 
+    def exposed(self, seen: mi.TensorXf) -> tuple[Array, Array, float]:
+        """An image as in `compare`, itself (H, W, C) and as its target is exposed, and what `scale` says of it."""
+        image, scale = np.array(whole_of(seen)), self.scale(seen)
+        exposure = Exposure(self.exposure.fixed * scale) if self.fits else self.exposure
+        return image, exposure.of_array(image), scale
+
     def kept(self, image: Array) -> Array:
         """An image of the target's shape, 0 where pixels are left out."""
         return image if self.weights is None else np.where(np.array(self.weights) > 0, image, 0)

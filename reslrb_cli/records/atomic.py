@@ -19,6 +19,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
+from reslrb_cli.errors import ConfigError, is_machine_fault
+
 _PART = re.compile(r"\..+\.\d+\.part")
 
 #: How the names of folders that are not finished begin.
@@ -146,3 +148,15 @@ class Reserve:
 def size_of(folder: Path) -> int:
     """Bytes of all files in `folder`."""
     return sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
+
+
+@contextmanager
+def writing(option: str, path: Path) -> Iterator[None]:
+    """Have an error of writing `path` located by the option (ConfigError); one of the machine stays what it is."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        if is_machine_fault(error):
+            raise
+        place, reason = getattr(error, "filename", None) or path, getattr(error, "strerror", None) or error
+        raise ConfigError(option, "", f"cannot write {place}: {reason}") from None

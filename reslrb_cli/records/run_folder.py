@@ -1,8 +1,8 @@
 """The folder of one run: where it is made, what may be replaced, who works in it, and how a run goes on in it.
 
 `read_value` reads the values to which a run brought its parameters, whether it is finished, interrupted or still at
-work. `RunFolder` makes and replaces folders. Those that are gone on with are opened under their lock (`opened`), or
-copied into a new one (`copy_into`).
+work, and `recovered` makes the experiment that begins with them. `RunFolder` makes and replaces folders. Those that are
+gone on with are opened under their lock (`opened`), or copied into a new one (`copy_into`).
 """
 
 from __future__ import annotations
@@ -15,13 +15,16 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from reslrb_cli.config.loader import Override, load
+from reslrb_cli.config.parameters import RunValue
+from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.records import manifest as manifests
 from reslrb_cli.records import metrics
@@ -57,6 +60,18 @@ def read_value(run: Path, key: str) -> Array:
     has = " and ".join(f"`{name}`" for name in near) or "nothing"
     more = f" and {len(known) - len(near)} more" if len(known) > len(near) else ""
     raise ConfigError(run, "", f"did not recover `{key}`; it has {has}{more}")
+
+
+def recovered(run: Path, overrides: Sequence[str | Override]) -> Config:
+    """The configuration of the run in the folder `run`, its parameters beginning where that run has brought them.
+
+    Raises ConfigError, located in the folder, where it is no run's or holds no values.
+    """
+    checkpoint_of(run)
+    config = load(run / "config.yaml", overrides)
+    start = RunValue(run=run.absolute())
+    specs = [spec.model_copy(update={"initial": start}) for spec in config.parameters]
+    return config.model_copy(update={"parameters": specs})
 
 
 def checkpoint_of(run: Path) -> Path:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from reslrb_cli.measure.convergence.judgement import Results
 from reslrb_cli.measure.optimization_benchmark.rank import ALPHA, Verdict
+from reslrb_cli.records.measurement_files import Line
 from reslrb_cli.records.measurements import (
     TARGETS,
     Band,
@@ -16,6 +18,7 @@ from reslrb_cli.records.measurements import (
     RunBestRecord,
     RunMethodRecord,
     RunPointRecord,
+    SummaryRecord,
 )
 from reslrb_cli.report.format import Columns, count, interval, number, shorten
 
@@ -84,6 +87,12 @@ def reference_line(record: ReferenceRecord) -> str:
         z = f"max |z| {abs(record.bias_z):.1f} (limit {record.bias_z_limit:.1f})"
         words += f"; {verdict} {record.bias_reference}: {z}"
     return words
+
+
+def result_lines(results: Results) -> list[Line]:
+    """All that a convergence is written as: its records, and what they come to in a sentence."""
+    summary = SummaryRecord(closing_sentence(results.methods))
+    return [*results.points, *results.methods, *results.references, summary]
 
 
 def closing_sentence(records: Sequence[MethodRecord]) -> str:

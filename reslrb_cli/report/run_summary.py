@@ -12,7 +12,9 @@ from collections.abc import Mapping, Sequence
 from textwrap import wrap
 from typing import Any, NamedTuple
 
+from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.records.decisions import PaidRecord, RivalRecord
+from reslrb_cli.records.metrics import Record
 from reslrb_cli.report.format import count, line, number, shorten, with_error
 
 #: The verdict on a value that can be relied on, as recorded; all others say what keeps it from that.
@@ -42,6 +44,26 @@ MOST_NAMED = 3
 
 #: A key in a line of text has at most so many characters, and beside a verdict.
 PARTNER_WIDTH = 40
+
+#: The same beside a bar.
+KEY_WIDTH = 32
+
+
+def descriptions(record: Record, meter: ErrorMeter) -> list[str]:
+    """The record's loss, and its parameters' error where that is known, in ever fewer words.
+
+    Where the parameters' units differ, the error is the largest relative one.
+    """
+    loss = f"loss {record.loss:.4g}"
+    if record.parameter_rmse is not None:
+        rmse = f"RMSE {record.parameter_rmse:.4g}"
+        return [f"{loss}, parameter {rmse}", f"{loss}, {rmse}", loss]
+    relative = meter.relative(record.parameter_errors)
+    if not relative:
+        return [loss]
+    key = max(relative, key=lambda key: relative[key])
+    error = f"error {relative[key]:.4g}"
+    return [f"{loss}, relative {error} at worst ({shorten(key, KEY_WIDTH)})", f"{loss}, relative {error}", loss]
 
 
 def is_settled(results: Mapping[str, Any], key: str) -> bool:

@@ -4,11 +4,13 @@
 - `changes`, `check_changes`: what of an experiment may change while its run goes on, and what may not.
 - `prepare`, `manifest_of`: from a configuration to a problem that is ready to run, and the manifest that says what was
   settled on the way.
+- `Begun`: a run that is to be made, or gone on with; `begin`: one that is new.
 - `Course`: the course itself.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -43,6 +45,7 @@ from reslrb_cli.records.checkpoint import save_checkpoint
 from reslrb_cli.records.decisions import RivalRecord
 from reslrb_cli.records.manifest import Manifest
 from reslrb_cli.records.metrics import ClampTally, NonFiniteTally, Record, RegularizedTally
+from reslrb_cli.records.run_folder import RunFolder
 from reslrb_cli.records.tree import Arrays, Stored, entries, entry, expected
 from reslrb_cli.report.tonemap import exposure_for
 from reslrb_cli.scene.needs import unsupported_part
@@ -272,6 +275,12 @@ class Course:
         begun = (max(iteration - 1, 0), iteration)
         return all(self.stages.is_whole(config.stage_number(each / config.run.iterations)) for each in begun)
 
+    def values(self) -> dict[str, Array]:
+        """The result as it is now, as `Problem.values` has it: the newest values, or at the end the average."""
+        if self.averages:
+            return {key: value.astype(np.float32) for key, value in self.average.average.items()}
+        return self.stages.values(self.state)
+
     def bring(self) -> Problem:
         """The run's own problem, at the newest values."""
         self.stages.bring(self.state)
@@ -304,6 +313,12 @@ class Course:
         if self.state.stopped:
             self.state = replace(self.state, stopped="")
 
+    def stand(self) -> None:
+        """Bring the problem back to `state` where an iteration was cut short."""
+        now = self.stages.at(self.state.stage)
+        if now.optimizer.stands_at is not self.state:
+            put(now, self.state)
+
     def _take(self, record: Record) -> None:
         self.last = record
         if self.problem.config.optimizer.schedule == "plateau":
@@ -320,6 +335,10 @@ class Course:
             key: value if isinstance(value, np.ndarray) else shown(key, value)
             for key, value in self.best.values.items()
         }
+
+    def shown(self, values: Mapping[str, Any]) -> dict[str, Array]:
+        """Values by key as the optimiser has them, of a state or its gradients, as `problem.values()` has them."""
+        return {key: self.problem.selection.shown(key, value) for key, value in values.items()}
 
     # --- kept and taken up again --------------------------------------------------------------------------------------
 
@@ -358,3 +377,27 @@ class Course:
         self.best.least, self.best.values = met.best, met.best_values
         self.results.images["initial"] = met.images
         self.certainty.noted, self.certainty.squares = met.certainty, met.squares
+
+
+@dataclass(frozen=True)
+class Begun:
+    """A run that is to be made, or gone on with: its course, its manifest, and `place`, which makes its folder or takes
+    it over, and has it locked while the block works."""
+
+    course: Course
+    manifest: Manifest
+    place: Callable[[], contextlib.AbstractContextManager[RunFolder]]
+
+
+def begin(config: Config, variant: str, force: bool, say: Say, warn: Say) -> Begun:
+    """A new run, prepared as `prepare` does, in a folder of its own; a variant must be set.
+
+    Whether there can be one is asked before (`check_output`). Raises ConfigError and UnsupportedScene.
+    """
+    course, manifest = prepare(config, variant, say, warn)
+    run = config.run
+    return Begun(
+        course,
+        manifest,
+        lambda: RunFolder.create(config.source, run.output, run.folder_name, force, dump(config), manifest),
+    )

@@ -11,7 +11,7 @@ import logging
 import os
 import shlex
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.errors import MachineError, NonFinite, describe, is_machine_fault, tell
-from reslrb_cli.integrators.protocol import whole_of
 from reslrb_cli.optimization.decisions import Scaled
 from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.nonfinite import Findings
@@ -28,7 +27,6 @@ from reslrb_cli.optimization.sensitivity import curvature_line, step_line
 from reslrb_cli.optimization.state import State
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
-from reslrb_cli.optimization.views import Exposure
 from reslrb_cli.records.atomic import Reserve, remove_parts, size_of
 from reslrb_cli.records.checkpoint import (
     NONFINITE_FILE_NAME,
@@ -175,6 +173,8 @@ class Recording:
     error_maps: dict[str, Any] = field(default_factory=dict)
     seen: dict[str, Any] = field(default_factory=dict)
     certainty: CertaintyRecord | None = None
+    #: How the run ended, once it has.
+    status: Status = Status.RUNNING
     _saved_nonfinite: bool = field(init=False)
     #: Iterations that the newest checkpoint contains; None before the first one.
     _saved: int | None = None
@@ -195,7 +195,22 @@ class Recording:
         return self.course.done
 
     def run(self, show: Callable[[Record], None], stop: Callable[[], bool]) -> Status:
-        """Iterate until the end or until `stop()`, and complete the folder; return how it ended.
+        """Iterate until the end or until `stop()`, and complete the folder; return how it ended (`records`).
+
+        What `show` fails of is what the run fails of.
+        """
+        records = self.records(stop)
+        for record in records:
+            try:
+                show(record)
+            except BaseException as error:
+                with contextlib.suppress(StopIteration):
+                    records.throw(error)
+        return self.status
+
+    def records(self, stop: Callable[[], bool] = lambda: False) -> Generator[Record, None, None]:
+        """The record of each iteration until the end, until `stop()`, or until nobody asks for more (`close`); then
+        the folder is completed, and `status` says how the run ended.
 
         Whatever ends the run, its folder has a manifest that says so, the parameters, a checkpoint and the report, and
         final images where it did not fail; what could not be written is noted in the manifest. Raises what the run
@@ -215,17 +230,21 @@ class Recording:
                 values = values / "initial"
             # the state at the end has the best values too, and what the clamp and the optimiser then know
             reserve.hold(2 * size_of(self.folder.checkpoint) + size_of(values) + RESERVE_BYTES)
-            self._iterate(show, stop)
+            yield from self._iterate(stop)
+            left = self.done < self.problem.config.run.iterations and not self.course.state.stopped
+            status = Status.INTERRUPTED if left else Status.FINISHED
+        except GeneratorExit:
             left = self.done < self.problem.config.run.iterations and not self.course.state.stopped
             status = Status.INTERRUPTED if left else Status.FINISHED
         except KeyboardInterrupt:
+            self.course.stand()
             status = Status.INTERRUPTED
         except NonFinite as error:
             failure = NonFinite(f"{error}; where: {self._inspection()}") if self._saved_nonfinite else error
         except BaseException as error:
             failure = error
         reserve.release()
-        return self._end(status, failure)
+        self.status = self._end(status, failure)
 
     def abandon(self) -> None:
         """Note in the manifest that the run was interrupted, in a process that is about to end in the midst of it."""
@@ -248,7 +267,7 @@ class Recording:
         for key, mask in problem.masks.items():
             write_mask(parameters, key, mask)
 
-    def _iterate(self, show: Callable[[Record], None], stop: Callable[[], bool]) -> None:
+    def _iterate(self, stop: Callable[[], bool]) -> Iterator[Record]:
         run, saved, saved_at = self.problem.config.run, self.done, time.monotonic()
         every, told = run.images_every, self.course.state.scaling
         if stop():
@@ -260,7 +279,7 @@ class Recording:
                 told = state.scaling
                 self.course.add(state, record)
                 metrics.write(record)
-                show(record)
+                yield record
                 self._note_memory(record.peak_mib)
                 if (fault := self.folder.fault) is not None:  # another run's may have taken its name
                     raise fault
@@ -453,10 +472,7 @@ class Recording:
             logger.info(f"rendering the final image: {spp} spp")
         for view in self.problem.views:
             seen = self.problem.see(view, spp, self.done, "saved image")
-            image, scale = np.array(whole_of(seen)), view.scale(seen)
-            exposed = view.exposure.of_array(image)  # as the target is
-            if view.fits:
-                exposed = Exposure(view.exposure.fixed * scale).of_array(image)
+            image, exposed, scale = view.exposed(seen)
             self._write_image(name, view.sensor, exposed)
             self.course.results.see(name, view, np.array(seen), scale)
             if name == "final":

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
-from reslrb_cli.config.loader import dump, load, loads
+from reslrb_cli.config.loader import OVERRIDDEN, Override, changed, dump, load, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.optimization.assemble import assemble
@@ -16,9 +16,16 @@ from reslrb_cli.optimization.state import Settled, State
 from reslrb_cli.records.checkpoint import PREVIOUS_FILE_NAME, STATE_FILE, open_state
 from reslrb_cli.records.manifest import Manifest, Status, now, versions
 from reslrb_cli.records.metrics import Record, cut_back, read_records
-from reslrb_cli.records.run_folder import RunFolder, check_writable, copy_into, opened, write_beginning
+from reslrb_cli.records.run_folder import (
+    RunFolder,
+    check_output,
+    check_writable,
+    copy_into,
+    opened,
+    write_beginning,
+)
 from reslrb_cli.records.tree import Stored
-from reslrb_cli.runs.prepare import Change, Course, Met, changes, check_changes, digests, manifest_of
+from reslrb_cli.runs.prepare import Begun, Change, Course, Met, changes, check_changes, digests, manifest_of
 
 Say = Callable[[str], None]
 
@@ -69,7 +76,7 @@ class Earlier:
         """Whether its loss stood (`run.stop`), and what says so is as it was."""
         return bool(self.stored.read(State).stopped) and not any(key.startswith("run.stop") for key in self.changed)
 
-    def prepare(self, variant: str, say: Say) -> tuple[Course, Manifest]:
+    def begin(self, variant: str, say: Say, warn: Say) -> Begun:
         """Assemble the problem as it was, and bring it to where it is; a variant must be set.
 
         Raises ConfigError, UnsupportedScene.
@@ -82,7 +89,9 @@ class Earlier:
             course.go_on()
         measured = course.state.scaling
         manifest.scaling = None if measured is None else [row.to_json() for row in measured]
-        return course, manifest
+        for line in self.said:
+            warn(line)
+        return Begun(course, manifest, lambda: self._take_over(manifest))
 
     def _manifest(self, manifest: Manifest) -> Manifest:
         before = self.manifest
@@ -111,7 +120,7 @@ class Earlier:
         return manifest
 
     @contextlib.contextmanager
-    def take_over(self, manifest: Manifest) -> Iterator[RunFolder]:
+    def _take_over(self, manifest: Manifest) -> Iterator[RunFolder]:
         """The folder in which the run goes on, with its metrics as far as its state, and `manifest`; locked.
 
         Raises ConfigError and MachineError where it cannot be written to.
@@ -137,10 +146,10 @@ class Earlier:
 
 
 @contextlib.contextmanager
-def open_earlier(run: Path, config_file: Path | None, overrides: tuple[str, ...]) -> Iterator[Earlier]:
+def open_earlier(run: Path, wanted: Path | Config | None, overrides: Sequence[str | Override]) -> Iterator[Earlier]:
     """The run in the folder `run`, to go on, locked while the block works.
 
-    `config_file` is what it is to agree with, in place of the `config.yaml` in its folder. Raises ConfigError: where it
+    `wanted` is what it is to agree with, in place of the `config.yaml` in its folder. Raises ConfigError: where it
     is no run, or one at work; where its state is damaged, and the one before that too; where the settings differ in
     what cannot change.
     """
@@ -150,19 +159,23 @@ def open_earlier(run: Path, config_file: Path | None, overrides: tuple[str, ...]
         stack.callback(stored.archive.close)
         settled, iteration = stored.read(Settled), stored.read(State).iteration
         began = loads(settled.config, stored.path)
-        config, source = _read_config(run, config_file, overrides, settled.config)
+        config, source = _read_config(run, wanted, overrides, settled.config)
         elsewhere = config.run.output != source.run.output or config.run.name != source.run.name
         found = changes(began, config)
         asked = changes(source, config)
-        changed = check_changes(found, lambda key: "--set" if key in asked else config.source, run)
+        blamed = "--set" if all(isinstance(each, str) for each in overrides) else OVERRIDDEN
+        differing = check_changes(found, lambda key: blamed if key in asked else config.source, run)
         if config.run.iterations < iteration:
             reason = f"is {config.run.iterations}; the run has done {iteration} already"
             raise ConfigError(config.source, "run.iterations", reason)
         _check_files(settled.files, config, run)
         records, size = read_records(folder.path, iteration, stored.read(Met).last)
-        earlier = Earlier(folder, manifest, stored, settled, config, changed, elsewhere, records, size, said)
-        if not (elsewhere or earlier.is_done):
-            check_writable(folder)
+        earlier = Earlier(folder, manifest, stored, settled, config, differing, elsewhere, records, size, said)
+        if not earlier.is_done:
+            if elsewhere:
+                check_output(config.source, config.run.output, config.run.folder_name, False)
+            else:
+                check_writable(folder)
         yield earlier
 
 
@@ -187,13 +200,17 @@ def _read_state(folder: RunFolder, said: list[str]) -> Stored:
     raise ConfigError(folder.path, "", f"has no checkpoint/{STATE_FILE}: the run ended before it kept anything")
 
 
-def _read_config(run: Path, config_file: Path | None, overrides: tuple[str, ...], text: str) -> tuple[Config, Config]:
+def _read_config(
+    run: Path, wanted: Path | Config | None, overrides: Sequence[str | Override], text: str
+) -> tuple[Config, Config]:
     """The configuration that the run is to go on with, and the same without overrides; `text` is what its state has."""
+    if isinstance(wanted, Config):
+        return changed(wanted, overrides), wanted
     own = run / "config.yaml"
-    if config_file is not None or own.exists():
-        path = own if config_file is None else config_file
-        return load(path, list(overrides)), load(path)
-    return loads(text, own, list(overrides)), loads(text, own)
+    if wanted is not None or own.exists():
+        path = own if wanted is None else wanted
+        return load(path, overrides), load(path)
+    return loads(text, own, overrides), loads(text, own)
 
 
 def _check_files(before: Mapping[str, str], config: Config, run: Path) -> None:

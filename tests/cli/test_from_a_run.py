@@ -13,7 +13,6 @@ from cli import tiny
 from click.testing import CliRunner, Result
 
 from reslrb_cli.cli import main
-from reslrb_cli.cli.export import choose_integrator
 from reslrb_cli.cli.options import read_recovered
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.parameters import ParameterSpec, RunValue
@@ -22,6 +21,7 @@ from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.checkpoint import STATE_FILE, save_checkpoint
 from reslrb_cli.records.images import load_image, read_parameters
 from reslrb_cli.records.run_folder import read_value
+from reslrb_cli.runs.export import choose_integrator
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.parameters import select_parameters
 from reslrb_cli.scene.values import resample

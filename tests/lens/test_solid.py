@@ -21,12 +21,12 @@ import trimesh
 from cli.tiny import done, reslrb
 from lens.test_experiment import picture
 
-from reslrb_cli.cli import export
 from reslrb_cli.config.schema import Fabrication
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.lens import solid as solids
 from reslrb_cli.lens.solid import Sheet, as_sheet, make_solid, measured
 from reslrb_cli.records.images import write_file
+from reslrb_cli.runs import export
 from reslrb_cli.scene.images import read_image
 
 SIZE = (60.0, 40.0)

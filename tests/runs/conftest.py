@@ -23,9 +23,7 @@ def interrupted(llvm: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator
         patch.setattr(recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>"))
         patch.setattr(recording, "seen_errors", lambda folder, results: {})
         iterate = recording.Recording._iterate
-        patch.setattr(
-            recording.Recording, "_iterate", lambda self, show, stop: iterate(self, show, lambda: self.done == 4)
-        )
+        patch.setattr(recording.Recording, "_iterate", lambda self, stop: iterate(self, lambda: self.done == 4))
         code = optimize(
             "tiny.yaml", "--quiet", "--set", "run={iterations: 6, checkpoint_every: {iterations: 1}, spp: 4}"
         )

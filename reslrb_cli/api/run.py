@@ -1,0 +1,317 @@
+"""A run of a script: its iterations in the script's own loop, with or without a folder."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+import os
+import weakref
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from inspect import GEN_CLOSED, getgeneratorstate
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from reslrb_cli.api.experiment import Experiment, called, held, load, load_with
+from reslrb_cli.backend.variant import keep_variant
+from reslrb_cli.config.loader import Override, override
+from reslrb_cli.config.schema import Config
+from reslrb_cli.errors import ConfigError, describe
+from reslrb_cli.optimization.loop import iterate
+from reslrb_cli.optimization.problem import saved_spp
+from reslrb_cli.records.manifest import Status
+from reslrb_cli.records.metrics import Record
+from reslrb_cli.records.run_folder import check_output
+from reslrb_cli.runs.prepare import Begun, begin
+from reslrb_cli.runs.recorder import Recording
+from reslrb_cli.runs.resume import open_earlier
+
+Array: TypeAlias = "np.ndarray[Any, Any]"
+Folder: TypeAlias = "str | os.PathLike[str]"
+
+logger = logging.getLogger(__name__)
+
+
+class Run:
+    """An optimisation whose iterations are made as they are asked for; `optimize` makes it.
+
+    Iterating over it makes one iteration after the other and yields the `Record` of each, as `metrics.jsonl` has it.
+    Whoever leaves the loop, by `break` or an error, stops the run; so do the end of a `with` block and `close`. A run
+    folder is then complete, as after Ctrl-C on the command line: manifest, checkpoint, parameters, final images and
+    report, the lock released. A loop that is begun again goes on where the one before was left. What an interrupt
+    (Ctrl-C, a notebook's stop button) cuts short is the loop, after the iteration that is at work.
+
+    Runs of one process share nothing but the device, and may take turns: `zip(run_a, run_b)`.
+    """
+
+    def __init__(self, stack: contextlib.ExitStack, begun: Begun, writes: bool) -> None:
+        self._begun, self._writes, self._stack = begun, writes, stack
+        self._records: list[Record] = []
+        self._folder: Path | None = None
+        done = begun.course.done >= self.config.run.iterations and not writes
+        self._status = Status.FINISHED if done else Status.RUNNING
+        self._stopped = False
+        self._failure: BaseException | None = None
+        self._loop: weakref.ref[Generator[Record, None, None]] | None = None
+
+    # --- iterating ----------------------------------------------------------------------------------------------------
+
+    def __iter__(self) -> Generator[Record, None, None]:
+        loop = None if self._loop is None else self._loop()
+        if (
+            loop is not None and getgeneratorstate(loop) != GEN_CLOSED
+        ):  # one that has ended may still stand in a traceback
+            raise RuntimeError("this run is in a loop already; leave that first")
+        loop = self._iterations()
+        self._loop = weakref.ref(loop)
+        return loop
+
+    def _iterations(self) -> Generator[Record, None, None]:
+        made = self._made()
+        try:
+            while True:
+                with held():
+                    record = next(made, None)
+                if record is None:
+                    return
+                self._records.append(record)
+                yield record
+        except GeneratorExit:
+            # Python drops what is raised while the loop is left: `close` raises it.
+            try:
+                with held():
+                    made.close()
+            except Exception as error:
+                self._failure = error
+                logger.error("%s", describe(error))
+        finally:
+            with held():
+                made.close()
+
+    def _made(self) -> Generator[Record, None, None]:
+        """The records of what is left to do, written down where the run has a folder."""
+        if self._stopped and self._writes and self._folder is not None:
+            with called():
+                self._stack, self._begun, self._writes = _reopened(
+                    self._folder, None, (), self.config.own_loss, self.config.allows_code
+                )
+        self._stopped, self._status, self._failure = True, Status.RUNNING, None
+        course = self._begun.course
+        with self._stack:
+            if not self._writes:
+                yield from self._unwritten()
+                return
+            with self._begun.place() as place:
+                self._folder = place.path
+                recording = Recording(course, place, self._begun.manifest)
+                try:
+                    yield from recording.records()
+                finally:
+                    self._status = Status(self._begun.manifest.status)
+
+    def _unwritten(self) -> Generator[Record, None, None]:
+        course, self._status = self._begun.course, Status.FAILED
+        try:
+            told = functools.partial(logger.warning, "%s")
+            for state, record in iterate(course.stages, course.state, told, watch=course.watch):
+                course.add(state, record)
+                yield record
+        except (GeneratorExit, KeyboardInterrupt):
+            self._status = Status.INTERRUPTED
+            raise
+        finally:
+            course.stand()
+            if course.done >= self.config.run.iterations or course.state.stopped:
+                self._status = Status.FINISHED
+
+    def live(self, figure: bool = True) -> Iterator[Record]:
+        """Iterate, with a progress bar, and in a notebook a live `figure`: loss, errors, and a view beside its target.
+
+        The bar is that of `tqdm.auto`, in a notebook with the extra `reslrb[notebook]` a widget. The figure is drawn
+        anew now and then, in a small share of the time.
+        """
+        from reslrb_cli.api.live import drawn, watched  # brings matplotlib along
+
+        def draw() -> bytes:
+            (sensor, target), *_ = self.targets.items()
+            return drawn(self._records, self.truth, self.images[sensor], target)
+
+        problem = self._begun.course.problem
+        total = problem.config.run.iterations
+        return watched(iter(self), total, self.iteration, problem.meter, draw if figure else None)
+
+    def close(self) -> None:
+        """Stop the run where it is, and complete its folder; nothing is done where it is not in a loop.
+
+        Raises what could not be done, as MachineError where the folder could not be written to; of a loop that was
+        left before, too.
+        """
+        loop = None if self._loop is None else self._loop()
+        if loop is not None:
+            loop.close()
+        self._stack.close()
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
+
+    def __enter__(self) -> Run:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            self.close()
+        except Exception:
+            if error is None:  # else it was logged, and what the block failed of is the better news
+                raise
+
+    # --- looking ------------------------------------------------------------------------------------------------------
+
+    @property
+    def config(self) -> Config:
+        """The experiment, with every default."""
+        return self._begun.course.problem.config
+
+    @property
+    def folder(self) -> Path | None:
+        """The run's folder, which is made as the first loop begins; None before, and of a run that writes nothing."""
+        return self._folder
+
+    @property
+    def status(self) -> str:
+        """`running` until a loop has ended, then `finished`, `interrupted` or `failed`."""
+        return self._status.value
+
+    @property
+    def iteration(self) -> int:
+        """The number of iterations that are done, those before a `resume` included."""
+        return self._begun.course.done
+
+    @property
+    def records(self) -> list[Record]:
+        """The records of the iterations that this process has made, oldest first."""
+        return list(self._records)
+
+    @property
+    def parameters(self) -> dict[str, Array]:
+        """The parameters' values after the last whole iteration, by key, float32 and in the parameters' own units:
+        a texture (height, width, channels), a colour (channels,), a number (), vertices (count, 3). At the end of a run
+        with `optimizer.average` they are the mean."""
+        return self._begun.course.values()
+
+    @property
+    def gradients(self) -> dict[str, Array]:
+        """The gradient of the last iteration's step by key, of its parameter's shape, regularizers included: before
+        clamping, and as it came, finite or not; in a stage of `run.stages`, of that stage's shapes. Empty before the
+        first iteration."""
+        course = self._begun.course
+        return course.shown(course.state.gradients)
+
+    @property
+    def images(self) -> dict[int, Array]:
+        """What each view shows now, by its sensor's index: (height, width, channels) float32, exposed as its target.
+
+        Rendered when it is asked for, with as many samples as images between iterations have (at least 64 per pixel),
+        whose seeds are no iteration's: to look changes nothing. Raises ConfigError and the like as a run does.
+        """
+        course = self._begun.course
+        problem = course.problem
+        with held():
+            course.stand()
+            course.bring()
+            spp = saved_spp(problem, between=True)
+            seen = {view.sensor: view.exposed(problem.see(view, spp, course.done, "saved image"))[1]
+                    for view in problem.views}  # fmt: skip
+        return seen
+
+    @property
+    def targets(self) -> dict[int, Array]:
+        """The target of each view, by its sensor's index: (height, width, channels) float32, without alpha."""
+        return {view.sensor: np.array(view.target) for view in self._begun.course.problem.views}
+
+    @property
+    def truth(self) -> dict[str, Array]:
+        """The true values by key, of the parameters of which they are known: where the target is rendered."""
+        return dict(self._begun.course.problem.truth)
+
+    def __repr__(self) -> str:
+        where = "" if self._folder is None else f", {self._folder}"
+        return f"<Run {self.config.source}: {self.iteration} of {self.config.run.iterations}, {self.status}{where}>"
+
+
+def optimize(
+    experiment: Experiment | None = None,
+    folder: Folder | None = None,
+    resume: Folder | None = None,
+    overrides: Mapping[str, object] | None = None,
+    loss: Callable[..., Any] | None = None,
+    allow_code: bool = False,
+) -> Run:
+    """Recover the parameters of an experiment: a `Run`, to be iterated over, which makes one iteration after the other.
+
+        with rl.optimize("configs/cornell_floor.yaml", folder="runs/carpet") as run:
+            for record in run:
+                print(record.iteration, record.loss)
+        texture = run.parameters["floor.reflectance.data"]
+
+    `experiment` is what `load` takes, or what it returned, and `overrides` are as there. With `folder` the run is
+    written there as `reslrb optimize` does, or where that name is taken to `folder-2` and so on (`Run.folder`); without
+    one nothing is written but the caches of kernels and of what was measured.
+
+    `resume` goes on with the run in that folder exactly where it was, in that folder, or with `folder` in a new one.
+    `experiment` may then be left out, else it has to be that of the run; `overrides` may change iterations and learning
+    rates. A run that is finished has nothing to iterate over.
+
+    `loss` is a function of your own in place of the experiment's: `loss(image, target)` of two `mi.TensorXf` (height,
+    width, channels), the image attached, or `loss(image, target, weights)`; it returns a `mi.Float` of width 1. A
+    `resume` asks for it again. `allow_code` has the files of code run that the experiment names (`loss.file`).
+
+    Sets the Mitsuba variant of the experiment where none is set. Loads and checks all that the experiment names, makes
+    the target, and measures what is left to measurement, before it returns. Raises ConfigError, located by file and
+    key, UnsupportedScene, BackendError, MachineError; iterating raises NonFinite, OutOfMemory and MachineError too.
+    """
+    put_in = [override(key, value) for key, value in (overrides or {}).items()]
+    if folder is not None:
+        path = Path(os.path.abspath(folder))
+        put_in += [Override("folder", ("run", "output"), str(path.parent))]
+        put_in += [Override("folder", ("run", "name"), path.name)]
+    with called():
+        if resume is not None:
+            wanted = None if experiment is None else load(experiment)
+            run = Run(*_reopened(Path(resume), wanted, put_in, loss, allow_code))
+            run._folder = Path(resume)
+            return run
+        if experiment is None:
+            raise ConfigError("experiment", "", "is missing; give a configuration, or resume=RUN")
+        config = _with_own(load_with(experiment, put_in), loss, allow_code)
+        if folder is not None:
+            check_output(config.source, config.run.output, config.run.folder_name, False)
+        variant = keep_variant(config.variant, config.source)
+        begun = begin(config, variant, False, logger.info, logger.warning)
+        return Run(contextlib.ExitStack(), begun, folder is not None)
+
+
+def _with_own(config: Config, loss: Callable[..., Any] | None, allow_code: bool) -> Config:
+    """The same experiment with a loss of the caller's, and with code that it names allowed, or not."""
+    config = config.with_code(allow_code)
+    return config if loss is None else config.with_loss(loss)
+
+
+def _reopened(
+    folder: Path,
+    wanted: Config | None,
+    put_in: Sequence[Override],
+    loss: Callable[..., Any] | None,
+    allow_code: bool,
+) -> tuple[contextlib.ExitStack, Begun, bool]:
+    """What holds the folder of a run that goes on, that run, and whether there is anything left to be written."""
+    with contextlib.ExitStack() as stack:
+        earlier = stack.enter_context(open_earlier(folder, wanted, put_in))
+        earlier.config = _with_own(earlier.config, loss, allow_code)
+        variant = keep_variant(earlier.variant, earlier.config.source)
+        begun = earlier.begin(variant, logger.info, logger.warning)
+        return contextlib.ExitStack() if earlier.is_done else stack.pop_all(), begun, not earlier.is_done

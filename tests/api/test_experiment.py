@@ -1,0 +1,293 @@
+"""`rl.load`, and what looks at an experiment in a single call: as the commands have it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from cli import tiny
+from cli.tiny import KEY, done
+from measure.pretended_steps import Stage
+from runs.going_on import LAMP, work_alone, write_experiment
+
+import reslrb_cli as rl
+from reslrb_cli.config.loader import dump, load
+from reslrb_cli.measure.convergence import session
+from reslrb_cli.measure.convergence.session import Session
+from reslrb_cli.measure.methods import Plan
+
+#: Cheap, and the same every time.
+FAST = {"run.certainty": False, "run.iterations": 3}
+
+
+@pytest.fixture
+def folder(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    write_experiment(tmp_path)
+    work_alone(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
+    return tmp_path
+
+
+def experiment(**run: Any) -> dict[str, Any]:
+    """`tiny.yaml` as a script has it."""
+    return {
+        "variant": "llvm_ad_rgb",
+        "scene": {"file": Path("scene.xml")},
+        "target": {"render": {"spp": np.int64(16)}},
+        "parameters": [
+            {"key": KEY, "initial": 0.5, "bounds": (0, 1)},
+            {"key": LAMP, "initial": np.array([3, 4, 5]), "bounds": np.float32([0, 20])},
+        ],
+        "integrator": {"type": "reslrb", "max_depth": 3, "estimator": "stack"},
+        "run": {"iterations": 5, "spp": 4, "reach_spp": 8, "name": "tiny", **run},
+    }
+
+
+# --- load -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_mapping_is_what_yaml_would_have_been(folder: Path) -> None:
+    expected = load("tiny.yaml", ["run.spp=8", "parameters[0].bounds=[0, 0.9]"])
+    overrides = {"run.spp": 8, "parameters[0].bounds": (0, 0.9)}
+    assert dump(rl.load(experiment(), overrides)) == dump(expected)
+    assert dump(rl.load("tiny.yaml", overrides)) == dump(expected)
+    assert dump(rl.load(rl.load("tiny.yaml"), overrides)) == dump(expected)
+    assert rl.load(experiment(spp=8), {"parameters[0].bounds": [0, 0.9]}) == expected
+    unnamed = experiment()
+    del unnamed["run"]
+    assert rl.load(unnamed).run.name == "run"
+    assert rl.load(experiment()).scene.file == folder / "scene.xml"
+
+
+def test_paths_of_a_mapping_are_relative_to_base(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "elsewhere").mkdir()
+    monkeypatch.chdir(folder / "elsewhere")
+    assert rl.load(experiment(), base=folder).scene.file == folder / "scene.xml"
+    assert rl.load(experiment(), base="..").scene.file.resolve() == folder / "scene.xml"
+
+
+def itself() -> dict[str, Any]:
+    made = experiment()
+    made["scene"]["options"] = made
+    return made
+
+
+@pytest.mark.parametrize(
+    ("call", "line"),
+    [
+        (lambda: rl.load(experiment(iterations=0)), "<dict>: run.iterations: must be at least 1"),
+        (lambda: rl.load(experiment(iteration=3)), "<dict>: run.iteration: unknown key; did you mean `iterations`?"),
+        (lambda: rl.load(experiment(spp=object)), "<dict>: run.spp: is <class 'object'>; YAML has no such value"),
+        (lambda: rl.load(experiment() | {3: 4}), "<dict>: has the key 3; keys are text"),
+        (lambda: rl.load(experiment() | {"run": 3}), "<dict>: run: "),
+        (lambda: rl.load({}), "<dict>: scene: "),
+        (itself, ""),
+        (lambda: rl.load("tiny.yaml", {"run.spq": 3}), "overrides: run.spq: unknown key; did you mean `spp`?"),
+        (lambda: rl.load("tiny.yaml", {"run..spp": 3}), "overrides: `run..spp` is no key"),
+        (lambda: rl.load("tiny.yaml", {"run.spp": {1, 2}}), "overrides: run.spp: is {1, 2}; YAML has no such value"),
+        (lambda: rl.load("none.yaml"), "none.yaml: no such file"),
+        (lambda: rl.load("."), ".: is no run's folder"),
+    ],
+)
+def test_errors_are_located(folder: Path, call: Callable[[], Any], line: str) -> None:
+    if call is itself:
+        call, line = lambda: rl.load(itself()), "<dict>: leads deeper than"
+    with pytest.raises(rl.ConfigError) as error:
+        call()
+    assert str(error.value).startswith(line)
+
+
+# --- looking ----------------------------------------------------------------------------------------------------------
+
+
+def test_an_image_is_that_of_the_command(folder: Path) -> None:
+    done("render", "tiny.yaml", "-o", "command.exr", "--spp", "8")
+    done("render", "tiny.yaml", "-o", "scene.exr", "--scene")
+    images = rl.render("tiny.yaml", spp=8)
+    assert list(images) == [0]
+    assert np.array_equal(images[0], np.array(mi.Bitmap("command.exr")))
+    assert images[0].dtype == np.float32
+    assert np.array_equal(rl.render(experiment(), initial=False)[0], np.array(mi.Bitmap("scene.exr")))
+    views = rl.load("tiny.yaml", {"scene.sensors": "all"})
+    assert [(sensor, image.shape) for sensor, image in rl.render(views).items()] == [(n, (8, 8, 3)) for n in range(3)]
+
+
+def test_values_stand_in_for_initial_ones(folder: Path) -> None:
+    texture = np.random.default_rng(5).uniform(0, 1, (4, 4, 3))
+    given = rl.render("tiny.yaml", values={KEY: texture, LAMP: 6})
+    assert not np.array_equal(given[0], rl.render("tiny.yaml")[0])
+    as_initial = {"parameters[0].initial": 0.25, "parameters[1].initial": 6}
+    expected = rl.render(rl.load("tiny.yaml", as_initial))
+    assert np.array_equal(rl.render("tiny.yaml", values={KEY: 0.25, LAMP: 6})[0], expected[0])
+
+
+def test_the_gradient_is_that_of_the_first_iteration(folder: Path) -> None:
+    run = rl.optimize("tiny.yaml", overrides=FAST)
+    first = next(iter(run))
+    loss, gradient = rl.gradient("tiny.yaml")
+    assert loss == first.loss
+    assert all(value.tobytes() == run.gradients[key].tobytes() for key, value in gradient.items())
+    assert {key: (value.shape, value.dtype.name) for key, value in gradient.items()} == {
+        KEY: ((4, 4, 3), "float32"), LAMP: ((3,), "float32")}  # fmt: skip
+    other, changed = rl.gradient("tiny.yaml", seed=3)
+    assert other != loss
+    assert not np.array_equal(changed[KEY], gradient[KEY])
+    assert rl.gradient("tiny.yaml", spp=4)[0] == loss
+    assert rl.gradient("tiny.yaml", spp=8)[0] != loss
+
+
+def test_the_gradient_is_that_of_the_loss(folder: Path) -> None:
+    """By differences along itself, at equal seeds and many samples: nothing here is discontinuous in the values."""
+    smooth = rl.load("tiny.yaml", {"run.adjoint": "correlated", "run.spp": 256})
+    at = {KEY: np.full((4, 4, 3), 0.4, np.float32), LAMP: np.float32([4, 5, 6])}
+    _, gradient = rl.gradient(smooth, at)
+    for key in at:
+        size = float(np.abs(at[key]).mean())
+        along = gradient[key] / np.linalg.norm(gradient[key]) * size
+        step = 0.02
+        sides = [rl.gradient(smooth, at | {key: at[key] + sign * step * along})[0] for sign in (1, -1)]
+        assert (sides[0] - sides[1]) / (2 * step) == pytest.approx(float((gradient[key] * along).sum()), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("call", "line"),
+    [
+        (lambda: rl.render("tiny.yaml", spp=0), "spp: is 0; at least 1 is needed"),
+        (lambda: rl.render("tiny.yaml", values={"poster": 1}),
+         f"values: poster: is no parameter of this experiment; did you mean {KEY}?"),
+        (lambda: rl.render("tiny.yaml", values={KEY: np.zeros((3, 4, 3))}),
+         f"values: {KEY}: is of shape (3, 4, 3); the parameter's shape is (4, 4, 3), of numbers"),
+        (lambda: rl.render("tiny.yaml", values={KEY: "grey"}), f"values: {KEY}: is no array; the parameter's shape is"),
+        (lambda: rl.gradient("tiny.yaml", values={KEY: np.nan}), f"values: {KEY}: holds a value that is not finite"),
+        (lambda: rl.render("tiny.yaml", values={KEY: 1}, initial=False), "values: are those of parameters; leave out"),
+        (lambda: rl.gradient("tiny.yaml", spp=0), "overrides: run.spp: must be at least 1"),
+        (lambda: rl.gradcheck("tiny.yaml", "stick"), "estimators reslrb:stick: integrator.estimator: must be one of"),
+        (lambda: rl.gradcheck("tiny.yaml", seeds=2), "seeds: is 2; at least 3 are needed"),
+        (lambda: rl.convergence("tiny.yaml", "prb,nothing"), "integrators nothing: integrator.type: must be one of"),
+        (lambda: rl.convergence("tiny.yaml", reference="prb,ptracer"), "reference: errors are taken from one method"),
+        (lambda: rl.convergence("tiny.yaml", objective="mean"), "objective: is 'mean'; there are fixed, loss, image"),
+        (lambda: rl.convergence("tiny.yaml", rounds=0), "rounds: is 0; at least 1 is needed"),
+        (lambda: rl.convergence("tiny.yaml", spps=[4, 0]), "spps: is 0; at least 1 is needed"),
+        (lambda: rl.export("none", "made"), "none: no such folder"),
+    ],
+)  # fmt: skip
+def test_arguments_are_named_in_errors(folder: Path, call: Callable[[], Any], line: str) -> None:
+    with pytest.raises(rl.ConfigError) as error:
+        call()
+    assert str(error.value).startswith(line)
+
+
+# --- measuring --------------------------------------------------------------------------------------------------------
+
+#: Times apart, and what depends on them.
+SIMPLE = {"parameters[1]": {"key": LAMP, "initial": [3, 4, 5]}}
+
+
+def lines_of(file: str) -> list[dict[str, Any]]:
+    """The lines of a file of `--json`, without that which says what measured."""
+    return [json.loads(line) for line in Path(file).read_text().splitlines()][1:]
+
+
+def test_gradcheck_has_the_records_of_the_command(folder: Path) -> None:
+    done("gradcheck", "tiny.yaml", "--estimators", "stack", "--seeds", "3", "--spp", "4", "--json", "g.jsonl")
+    records = rl.gradcheck("tiny.yaml", "stack", seeds=3, spp=4)
+    found = [json.loads(record.to_json()) for record in records]
+    assert [record.parameter for record in records if record.reference.value == "walk_ad"] == [KEY, LAMP]
+    told = lines_of("g.jsonl")
+    assert [{**one, **dict.fromkeys(other)} for one, other in zip(told, found, strict=True)] == [
+        dict.fromkeys(each) for each in found
+    ]
+    names = ("parameter", "reference", "kind", "seeds", "verdict", "holds")
+    assert [[each[name] for name in names] for each in found] == [[each[name] for name in names] for each in told]
+
+
+class Played(Session):
+    """A session whose processes pretend, and whose clock only they move."""
+
+    def __init__(self, plan: Plan, folder: Path, stop: Callable[[], bool], say: Callable[[str], None], **given: Any):
+        stage = Stage()
+        super().__init__(plan, folder, stop, say, stage.start, stage.clock, earlier=given.get("earlier"))
+
+
+def test_convergence_has_the_records_of_the_command(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "Session", Played)
+    given = ["--integrators", "reslrb:stack,ptracer", "--reference", "reslrb:stack", "--rounds", "8", "--spp", "4,8"]
+    done("convergence", "tiny.yaml", *given, "--json", "c.jsonl")
+    records = rl.convergence("tiny.yaml", "reslrb:stack,ptracer", rounds=8, spps=[4, 8], reference="reslrb:stack")
+    found = [json.loads(record.to_json()) for record in records]
+    assert found == lines_of("c.jsonl")
+    assert {"point", "method", "reference", "summary"} <= {each["kind"] for each in found}
+
+
+@pytest.mark.long
+def test_convergence_measures(folder: Path) -> None:
+    records = rl.convergence("tiny.yaml", "reslrb:stack", reference="reslrb:stack", rounds=4)
+    assert [record.to_json() for record in records][-1].startswith('{"kind": "summary"')
+
+
+def test_an_export_is_that_of_the_command(folder: Path) -> None:
+    with rl.optimize("tiny.yaml", folder="runs/mine", overrides=FAST) as run:
+        list(run)
+    assert run.folder is not None
+    done("export", str(run.folder), "-o", "command")
+    scene = rl.export(run.folder, "mine")
+    assert scene == Path("mine/scene.xml")
+    assert scene.read_bytes() == Path("command/scene.xml").read_bytes()
+    assert tiny.files(Path("mine")) == tiny.files(Path("command"))
+    with pytest.raises(rl.ConfigError, match="folder: mine exists; name a folder that does not exist yet"):
+        rl.export(run.folder, "mine")
+    # and a run's folder is an experiment, which begins where that is
+    assert np.array_equal(rl.render(run.folder, spp=8)[0], rl.render("tiny.yaml", 8, run.parameters)[0])
+    assert rl.load(run.folder, {"run.spp": 2}).run.spp == 2
+
+
+# --- the package's face -----------------------------------------------------------------------------------------------
+
+#: A user's script, which mypy is to look at with what is installed.
+TYPED = """
+import numpy
+import reslrb_cli as rl
+
+config: rl.Config = rl.load({"scene": {}}, overrides={"run.iterations": 3}, base="..")
+with rl.optimize(config, folder="x") as run:
+    for record in run:
+        loss: float = record.loss
+        image: numpy.ndarray = run.images[0]
+reveal_type(rl.gradient(config)[0])
+reveal_type(rl.render(config))
+reveal_type(rl.optimize(resume="x").status)
+rl.optimize(config, folders="x")
+"""
+
+
+@pytest.mark.long
+def test_users_type_checkers_see_the_types(tmp_path: Path) -> None:
+    (tmp_path / "script.py").write_text(TYPED)
+    command = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "--cache-dir", str(tmp_path / "c"),
+               "script.py"]  # fmt: skip
+    environment = {**os.environ, "MYPYPATH": str(tiny.ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=300, env=environment)
+    out = done.stdout
+    assert 'Revealed type is "float"' in out or "builtins.float" in out, out + done.stderr
+    assert (tiny.ROOT / "reslrb_cli/py.typed").exists()
+    assert "dict[int, " in out
+    assert 'Unexpected keyword argument "folders"' in out
+    assert "import-untyped" not in out
+    assert len([line for line in out.splitlines() if ": error:" in line]) == 1, out
+
+
+def test_what_is_public_is_there_and_nothing_is_loaded_before() -> None:
+    script = "import sys, reslrb_cli as rl; print({'numpy', 'mitsuba', 'click'} & set(sys.modules), rl.__all__)"
+    out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert out.startswith("set() ")
+    for name in rl.__all__:
+        assert getattr(rl, name).__doc__, name

@@ -1,0 +1,370 @@
+"""`rl.optimize`: what a loop of one's own comes to, with and without a folder, however it ends."""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cli import tiny
+from cli.tiny import KEY, files
+from compilation import search_path
+from runs.going_on import TIMES, begin_alone, differences, optimize, records_of
+
+import reslrb_cli as rl
+from reslrb_cli.errors import MachineError, NonFinite
+from reslrb_cli.records.lock import FolderLock
+from reslrb_cli.runs import recorder as recording
+
+#: The case of tests/runs with two parameters; what certainty needs is compared there.
+SET = {"run.certainty": False, "run.iterations": 6}
+STAYS = {"poster.reflectance.data": (4, 4, 3), "lamp.emitter.radiance.value": (3,)}
+
+
+@pytest.fixture
+def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    begin_alone(tmp_path, monkeypatch)
+    return tmp_path
+
+
+def as_json(record: rl.Record) -> dict[str, Any]:
+    return {key: value for key, value in json.loads(record.to_json()).items() if key not in TIMES}
+
+
+def values_equal(first: dict[str, Any], second: dict[str, Any]) -> bool:
+    return first.keys() == second.keys() and all(first[key].tobytes() == second[key].tobytes() for key in first)
+
+
+def is_free(folder: Path) -> bool:
+    with FolderLock(folder, wait_s=0):
+        return True
+
+
+def status_of(folder: Path) -> str:
+    return str(json.loads((folder / "manifest.json").read_text())["status"])
+
+
+@pytest.mark.parametrize("settings", [{}, {"optimizer.scale": "auto", "optimizer.clamp_gradient": 1.5}])
+def test_a_loop_comes_to_what_the_command_does(experiment: Path, settings: dict[str, Any]) -> None:
+    """Bit by bit: parameters, state and records; without a folder too."""
+    sets = [word for key, value in (SET | settings).items() for word in ("--set", f"{key}={json.dumps(value)}")]
+    assert optimize("tiny.yaml", "--quiet", *sets) == 0
+    run = rl.optimize("tiny.yaml", folder="runs/mine", overrides=SET | settings)
+    records = [as_json(record) for record in run]
+    assert run.folder == experiment / "runs/mine"
+    assert (run.status, run.iteration, status_of(run.folder)) == ("finished", 6, "finished")
+    assert differences(Path("runs/tiny"), run.folder) == []
+    assert records == records_of(Path("runs/tiny")) == [as_json(record) for record in run.records]
+    assert files(run.folder) == files(Path("runs/tiny"))
+
+    alone = rl.optimize("tiny.yaml", overrides=SET | settings)
+    assert [as_json(record) for record in alone] == records
+    assert values_equal(alone.parameters, run.parameters)
+    assert values_equal(alone.parameters, dict(np.load("runs/tiny/parameters/parameters.npz")))
+    assert (alone.folder, alone.status) == (None, "finished")
+    assert files(Path("runs")) == {f"{name}/{file}" for name in ("tiny", "mine") for file in files(run.folder)}
+
+
+def test_between_iterations_all_can_be_looked_at(experiment: Path) -> None:
+    """And that changes nothing."""
+    plain = rl.optimize("tiny.yaml", overrides=SET)
+    expected = [as_json(record) for record in plain]
+    run = rl.optimize("tiny.yaml", overrides=SET)
+    assert run.gradients == {}
+    assert (run.iteration, run.records, run.status) == (0, [], "running")
+    before, seen = run.parameters, []
+    assert {key: value.shape for key, value in before.items()} == STAYS
+    for record in run:
+        seen.append(as_json(record))
+        image, target = run.images[0], run.targets[0]
+        assert image.shape == target.shape == (8, 8, 3)
+        assert image.dtype == np.float32
+        gradients = run.gradients
+        assert {key: value.shape for key, value in gradients.items()} == STAYS
+        norm = np.sqrt(sum(float(np.square(each, dtype=np.float64).sum()) for each in gradients.values()))
+        assert norm == pytest.approx(record.grad_norm, rel=1e-5)
+        assert not values_equal(run.parameters, before)
+    assert seen == expected
+    assert values_equal(run.parameters, plain.parameters)
+    assert (before[KEY] == 0.5).all()
+    assert set(run.truth) <= set(STAYS)
+    assert repr(run) == "<Run tiny.yaml: 6 of 6, finished>"
+
+
+def test_two_experiments_take_turns(experiment: Path) -> None:
+    """Each is, bit by bit, what it is alone."""
+    other = SET | {"run.iterations": 4, "run.seed": 7, "optimizer.type": "rmsprop"}
+    alone = [list(map(as_json, rl.optimize("tiny.yaml", overrides=each))) for each in (SET, other)]
+    runs = [rl.optimize("tiny.yaml", overrides=each) for each in (SET, other)]
+    turns = list(zip_longest(*runs))
+    assert [[as_json(pair[place]) for pair in turns if pair[place]] for place in (0, 1)] == alone
+    assert [run.status for run in runs] == ["finished", "finished"]
+
+
+def leave_by_break(run: rl.Run) -> None:
+    for record in run:
+        if record.iteration == 1:
+            break
+
+
+def leave_by_error(run: rl.Run) -> None:
+    with pytest.raises(ZeroDivisionError):
+        [1 // (1 - record.iteration) for record in run]
+
+
+def leave_by_return_from_live(run: rl.Run) -> None:
+    for record in run.live():
+        if record.iteration == 1:
+            return
+
+
+def leave_a_block(run: rl.Run) -> None:
+    loop = iter(run)
+    with run:
+        assert [next(loop).iteration for _ in range(2)] == [0, 1]
+    assert list(loop) == []
+
+
+def interrupt(at: bool) -> None:
+    if at:
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+def leave_by_an_interrupt(run: rl.Run) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        [interrupt(record.iteration == 1) for record in run]
+
+
+def leave_by_an_interrupt_at_work(run: rl.Run) -> None:
+    """It comes while the second iteration is at work, which is made whole, and is not lost."""
+    write, seen = recording.MetricsWriter.write, list[int]()
+
+    def interrupted(self: Any, record: rl.Record) -> None:
+        interrupt(record.iteration == 1)
+        write(self, record)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recording.MetricsWriter, "write", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            seen.extend(record.iteration for record in run)
+    assert seen == [0]
+
+
+@pytest.mark.parametrize("leave", [leave_by_break, leave_by_error, leave_by_return_from_live, leave_a_block,
+                                   leave_by_an_interrupt, leave_by_an_interrupt_at_work])  # fmt: skip
+def test_a_loop_that_is_left_leaves_a_whole_folder(experiment: Path, leave: Callable[[rl.Run], None]) -> None:
+    run = rl.optimize("tiny.yaml", folder="mine", overrides=SET)
+    leave(run)
+    assert run.folder is not None
+    assert (run.status, run.iteration, status_of(run.folder)) == ("interrupted", 2, "interrupted")
+    assert is_free(run.folder)
+    assert files(run.folder) >= tiny.COMPLETE
+    assert json.loads((run.folder / "manifest.json").read_text())["missing"] == {}
+    assert values_equal(run.parameters, dict(np.load(run.folder / "parameters/parameters.npz")))
+    assert len(records_of(run.folder)) == 2
+
+
+@pytest.mark.parametrize("folder", ["mine", None])
+def test_a_loop_that_is_begun_again_goes_on(experiment: Path, folder: str | None) -> None:
+    whole = rl.optimize("tiny.yaml", folder=folder and "whole", overrides=SET)
+    expected = [as_json(record) for record in whole]
+    run = rl.optimize("tiny.yaml", folder=folder, overrides=SET)
+    for _ in range(2):
+        for record in run:
+            if record.iteration % 3 == 1:
+                break
+    found = [as_json(record) for record in run]
+    assert [record["iteration"] for record in found] == [5]
+    assert [as_json(record) for record in run.records] == expected
+    assert values_equal(run.parameters, whole.parameters)
+    if run.folder is not None and whole.folder is not None:
+        assert differences(whole.folder, run.folder) == []
+    assert list(run) == []
+    assert (run.status, run.iteration) == ("finished", 6)
+
+
+def test_a_run_is_gone_on_with_from_its_folder(experiment: Path) -> None:
+    whole = rl.optimize("tiny.yaml", folder="whole", overrides=SET)
+    assert len(list(whole)) == 6
+    with rl.optimize("tiny.yaml", folder="mine", overrides=SET | {"run.iterations": 3}) as first:
+        assert len(list(first)) == 3
+    again = rl.optimize(resume="mine", overrides={"run.iterations": 6})
+    assert again.iteration == 3
+    assert values_equal(again.parameters, first.parameters)
+    assert [record.iteration for record in again] == [3, 4, 5]
+    assert again.folder == Path("mine")
+    assert differences(Path("whole"), Path("mine")) == []
+
+    done = rl.optimize(resume="mine")
+    assert (done.status, list(done), done.folder) == ("finished", [], Path("mine"))
+    assert values_equal(done.parameters, again.parameters)
+    assert is_free(Path("mine"))
+
+    beside = rl.optimize(rl.load("mine/config.yaml"), folder="beside", resume="mine", overrides={"run.iterations": 7})
+    assert [record.iteration for record in beside] == [6]
+    assert beside.folder == experiment / "beside"
+    assert len(records_of(Path("mine"))) == 6
+
+
+def test_a_folder_whose_name_is_taken_has_a_number(experiment: Path) -> None:
+    for expected in ("mine", "mine-2"):
+        run = rl.optimize("tiny.yaml", folder="mine", overrides=SET | {"run.iterations": 1})
+        assert run.folder is None
+        list(run)
+        assert run.folder == experiment / expected
+
+
+def test_a_run_is_in_one_loop_at_a_time(experiment: Path) -> None:
+    run = rl.optimize("tiny.yaml", overrides=SET)
+    for _ in run:
+        with pytest.raises(RuntimeError, match="in a loop already"):
+            iter(run)
+        break
+    gc.collect()
+    assert next(iter(run)).iteration == 1
+
+
+def test_errors_are_located(experiment: Path) -> None:
+    cases: list[tuple[Callable[[], Any], str]] = [
+        (lambda: rl.optimize(), "experiment: is missing; give a configuration, or resume=RUN"),
+        (lambda: rl.optimize("none.yaml"), "none.yaml: no such file"),
+        (lambda: rl.optimize("tiny.yaml", folder="scene.xml/runs"), "tiny.yaml: run.output:"),
+        (lambda: rl.optimize("tiny.yaml", folder="runs/CON"), "folder: run.name:"),
+        (lambda: rl.optimize("tiny.yaml", overrides={"run.iterations": 0}), "overrides: run.iterations:"),
+        (lambda: rl.optimize("tiny.yaml", overrides={"variant": "cuda_ad_rgb"}), "variant: is cuda_ad_rgb, but llvm"),
+        (lambda: rl.optimize(resume="."), ".: is no run's folder"),
+    ]
+    for call, start in cases:
+        with pytest.raises(rl.ConfigError) as error:
+            call()
+        assert start in str(error.value), error.value
+    with rl.optimize("tiny.yaml", folder="mine", overrides=SET) as run:
+        next(loop := iter(run))
+        with pytest.raises(rl.ConfigError, match="mine: is in use by a run"):
+            rl.optimize(resume="mine")
+        del loop
+    with pytest.raises(rl.ConfigError, match=r"overrides: run.seed: is 5, 0 in the run; mine goes on as it began"):
+        rl.optimize(resume="mine", overrides={"run.seed": 5})
+
+
+def test_what_a_run_fails_of_is_raised(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from reslrb_cli.optimization import loop
+
+    work = loop.step
+
+    def failing(problem: Any, state: Any, *rest: Any) -> Any:
+        if state.iteration == 2:
+            raise NonFinite("the loss of iteration 2 is not finite")
+        return work(problem, state, *rest)
+
+    monkeypatch.setattr(loop, "step", failing)
+    for folder in ("mine", None):
+        run = rl.optimize("tiny.yaml", folder=folder, overrides=SET)
+        with pytest.raises(NonFinite, match="iteration 2"):
+            list(run)
+        assert (run.status, run.iteration) == ("failed", 2)
+        assert {key: value.shape for key, value in run.parameters.items()} == STAYS
+    assert status_of(Path("mine")) == "failed"
+
+
+def test_a_folder_that_could_not_be_completed_is_told(
+    experiment: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = rl.optimize("tiny.yaml", folder="mine", overrides=SET)
+    tiny.failing_last(monkeypatch, "write_parameters", calls=2)
+    leave_by_break(run)
+    assert "No space left on device" in caplog.text
+    with pytest.raises(MachineError, match="No space left on device"):
+        run.close()
+    run.close()
+    assert status_of(Path("mine")) == "failed"
+
+
+INTERRUPTED = """
+import os, signal, sys
+import reslrb_cli as rl
+run = rl.optimize("tiny.yaml", folder="mine", overrides={"run.iterations": 1000000})
+print("begins", flush=True)
+try:
+    for record in run:
+        print(record.iteration, flush=True)
+except KeyboardInterrupt:
+    print("left", run.status, run.iteration, len(run.parameters), run.folder.name, flush=True)
+"""
+
+
+def test_an_interrupt_from_outside_keeps_the_result(experiment: Path) -> None:
+    """SIGINT of a terminal or a notebook, at any moment of any iteration."""
+    environment = {**os.environ, "PYTHONPATH": search_path(), "RESLRB_CACHE": str(experiment / "cache")}
+    process = subprocess.Popen(
+        [sys.executable, "-c", INTERRUPTED], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    )
+    assert process.stdout is not None
+    timer = threading.Timer(100, process.kill)
+    timer.start()
+    try:
+        for line in process.stdout:
+            if line.strip() == "5":
+                break
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate()
+    finally:
+        timer.cancel()
+    assert process.returncode == 0, err
+    assert "Traceback" not in err
+    [status, count, keys, name] = out.splitlines()[-1].removeprefix("left ").split()
+    assert (status, keys, name) == ("interrupted", "2", "mine")
+    assert int(count) == len(records_of(Path("mine"))) >= 6
+    assert status_of(Path("mine")) == "interrupted"
+
+
+def test_threads_beside_the_main_one_iterate_too(experiment: Path) -> None:
+    found: list[int] = []
+
+    def work() -> None:
+        found.extend(record.iteration for record in rl.optimize("tiny.yaml", overrides=SET | {"run.iterations": 2}))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert found == [0, 1]
+
+
+def test_a_run_is_watched(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A bar, and the figure that a notebook shows."""
+    from reslrb_cli.api import live
+
+    run = rl.optimize("tiny.yaml", overrides=SET)
+    assert [record.iteration for record in run.live()] == [0, 1, 2, 3, 4, 5]
+    assert "6/6" in capsys.readouterr().err
+    png = live.drawn(run.records, run.truth, run.images[0], run.targets[0])
+    assert png.startswith(b"\x89PNG")
+
+
+def test_the_figure_is_shown_now_and_then(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At once, and at the end; one that fails ends nothing."""
+    from reslrb_cli.api import live
+
+    shown: list[bytes] = []
+    monkeypatch.setattr(live, "_notebook", lambda: shown.append)
+    list(rl.optimize("tiny.yaml", overrides=SET).live())
+    assert len(shown) == 2
+    list(rl.optimize("tiny.yaml", overrides=SET).live(figure=False))
+    assert len(shown) == 2
+
+    def none() -> Iterator[bytes]:
+        raise OSError("nothing is drawn")
+
+    monkeypatch.setattr(live, "drawn", lambda *_: none())
+    monkeypatch.setattr(live, "_notebook", lambda: lambda png: [*png])
+    assert len(list(rl.optimize("tiny.yaml", overrides=SET).live())) == 6
