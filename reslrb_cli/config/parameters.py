@@ -191,9 +191,9 @@ class TransportStart(Section, json_schema_extra={"required": ["receiver"]}):
 
     receiver: Name
     """Id of a plane shape, a `rectangle`: what the view's target shows of it is what light is brought to."""
-    floor: Annotated[Literal["auto"], mark("text")] | Annotated[
-        Annotated[float, Field(ge=0, lt=1)], mark("number")
-    ] = Field(default="auto", discriminator=Discriminator(lambda value: kind_tag(value, "auto")))
+    floor: Annotated[Literal["auto"], mark("text")] | Annotated[Annotated[float, Field(ge=0, lt=1)], mark("number")] = (
+        Field(default="auto", discriminator=Discriminator(lambda value: kind_tag(value, "auto")))
+    )
     """What is darker than this share of the target's maximum is lifted to it; `auto`: the least share with which light
     is not torn apart."""
     lamp: Name | None = None
@@ -238,7 +238,8 @@ Initial = Annotated[
     Discriminator(
         _initial_tag,
         custom_error_type="wrong",
-        custom_error_message="must be a number, a list of numbers, {file: IMAGE}, {run: RUN}, {transport: ...}, or `scene`",
+        custom_error_message="must be a number, a list of numbers, {file: IMAGE}, {run: RUN}, {transport: ...}, or "
+        "`scene`",
     ),
 ]
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import LightTracer
+from reslrb_cli.optimization import start
 from reslrb_cli.optimization.autotune.estimators import find_options
 from reslrb_cli.optimization.autotune.sampling import settle
 from reslrb_cli.optimization.errors import quantity
@@ -57,7 +58,9 @@ def assemble(
     line = outlook(config, problem.scene, problem.sensors) if to_run else None
     if line is not None:
         say(line)
+    starts = start.prepare(problem) if settled is None else []
     problem = make_targets(problem, say)
+    problem = start.begin(problem, starts, say)
     if settled is not None:
         return reach_as(decide_as(problem, settled, options), settled)
     problem = settle(problem, options, say, cache)
@@ -67,13 +70,18 @@ def assemble(
     return problem
 
 
-def load_for_rendering(config: Config, initial: bool) -> tuple[Any, list[int], Any, int | None]:
+def load_for_rendering(
+    config: Config, initial: bool, say: Callable[[str], None] = lambda line: None
+) -> tuple[Any, list[int], Any, int | None]:
     """Load the scene (with the parameters' initial values, if `initial`), and make the integrator.
 
     Returns both, between them the indices of the sensors in use, and the integrator's `samples_per_pass`.
     """
     if initial:
         problem = assemble_scene(config)
+        starts = start.prepare(problem)
+        if starts:
+            start.begin(make_targets(problem, say), starts, say)
         return problem.scene, problem.sensors, problem.integrator, samples_per_pass(config)
     scene = load_configured(config, selects=False)
     sensors = choose_sensors(config, scene)
