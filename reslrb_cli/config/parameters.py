@@ -191,9 +191,10 @@ class TransportStart(Section, json_schema_extra={"required": ["receiver"]}):
 
     receiver: Name
     """Id of a plane shape, a `rectangle`: what the view's target shows of it is what light is brought to."""
-    floor: Annotated[Literal["auto"], mark("text")] | Annotated[Annotated[float, Field(ge=0, lt=1)], mark("number")] = (
-        Field(default="auto", discriminator=Discriminator(lambda value: kind_tag(value, "auto")))
-    )
+    floor: Annotated[
+        Annotated[float, Field(ge=0, lt=1), mark("number")] | Annotated[Literal["auto"], mark("text")],
+        Discriminator(lambda value: MARK + ("text" if isinstance(value, str) else "number")),
+    ] = "auto"
     """What is darker than this share of the target's maximum is lifted to it; `auto`: the least share with which light
     is not torn apart."""
     lamp: Name | None = None
