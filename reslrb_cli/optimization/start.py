@@ -143,13 +143,17 @@ class Start:
         middle = (centre @ normal) * normal + (low[0] + high[0]) / 2 * across + (low[1] + high[1]) / 2 * up
         pixel = np.sqrt(abs(float(np.linalg.norm(along))) * self._pixel_height(centre_film))
         n = [max(2, min(1024, round(side / pixel))) for side in size]
-        # at the centres of a film's pixels where that stands straight before the receiver
-        s, t = np.meshgrid(
-            ((np.arange(n[0]) + 0.5) / n[0] - 0.5) * size[0], ((np.arange(n[1]) + 0.5) / n[1] - 0.5) * size[1]
-        )
-        film = self._film(middle + s[..., None] * across + t[..., None] * up)
-        picture = scipy.ndimage.map_coordinates(image, [film[1] - 0.5, film[0] - 0.5], order=1, mode="constant")
-        return Receiver(middle, across, up, size), picture
+        s, t = np.meshgrid(*((np.arange(m) + 0.5) / m * side - side / 2 for m, side in zip(n, size, strict=True)))
+        film = self._film(middle + s[..., None] * across + t[..., None] * up) - 0.5
+        picture = scipy.ndimage.map_coordinates(image, film[::-1], order=1, mode="constant")
+        if np.abs(film - np.round(film)).max() < 0.05:  # the film's own pixels
+            return Receiver(middle, across, up, size), picture
+        cut = [_blurred(picture.T), _blurred(picture)]
+        for axis, (low_cut, high_cut) in zip((across, up), cut, strict=True):
+            middle = middle + (low_cut - high_cut) / 2 * pixel * axis
+        (left, right), (bottom, top) = cut
+        size = (size[0] * (1 - (left + right) / n[0]), size[1] * (1 - (bottom + top) / n[1]))
+        return Receiver(middle, across, up, size), picture[bottom : n[1] - top, left : n[0] - right]
 
     def _pixel_height(self, at: tuple[Array, Array]) -> float:
         return float(np.linalg.norm(self._places(at[0], at[1] + 0.5) - self._places(at[0], at[1] - 0.5)))
@@ -177,6 +181,14 @@ class Start:
         low, high = bounds(shape)
         margin = 1e-3 * np.max(high - low)
         return np.asarray(np.all((points >= low - margin) & (points <= high + margin), axis=-1))
+
+
+def _blurred(rows: Array) -> tuple[int, int]:
+    """How many rows at either end are a picture's edge between pixels: less than half as bright as the next."""
+    mean, found = rows.mean(axis=1), []
+    for each in (mean, mean[::-1]):
+        found.append(next((i for i in range(min(3, len(each) // 4)) if each[i] >= 0.5 * each[i + 1]), 0))
+    return found[0], found[1]
 
 
 def prepare(problem: Problem) -> list[Start]:
