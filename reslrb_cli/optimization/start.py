@@ -184,10 +184,15 @@ class Start:
 
 
 def _blurred(rows: Array) -> tuple[int, int]:
-    """How many rows at either end are a picture's edge between pixels: less than half as bright as the next."""
+    """How many rows at either end are none of a picture's: stray light, then its edge between pixels, of which up to
+    three are less than half as bright as the next."""
     mean, found = rows.mean(axis=1), []
+    least = 0.05 * float(np.median(mean))
     for each in (mean, mean[::-1]):
-        found.append(next((i for i in range(min(3, len(each) // 4)) if each[i] >= 0.5 * each[i + 1]), 0))
+        first = min(int(np.argmax(each > least)), len(each) // 4)
+        found.append(
+            next((i for i in range(first, min(first + 3, len(each) // 3)) if each[i] >= 0.5 * each[i + 1]), first)
+        )
     return found[0], found[1]
 
 
