@@ -15,10 +15,13 @@ from reslrb_cli.cli.lens import command
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization import start
-from reslrb_cli.optimization.assemble import assemble_scene
+from reslrb_cli.optimization.assemble import assemble, assemble_scene
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import make_targets
+from reslrb_cli.records.checkpoint import STATE_FILE, open_state
 from reslrb_cli.records.images import write_file
+from reslrb_cli.records.tree import Stored
+from reslrb_cli.runs.prepare import Course
 from reslrb_cli.scene.images import read_image
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -302,3 +305,21 @@ def test_bounds_that_exclude_it_are_refused(written: dict[str, Path]) -> None:
     with pytest.raises(ConfigError) as caught:
         begun(written["lens"], "parameters.0.bounds=[-0.1, 0.1]")
     assert caught.value.key == "parameters[0].bounds"
+
+
+def test_a_run_that_is_gone_on_with_has_the_start_that_it_had(
+    written: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = load(
+        written["round"] / "lens.yaml",
+        [f"parameters.0.initial={START}", "integrator.guiding=off", "integrator.sequence=independent"],
+    )
+    first = assemble(config)
+    Course(first, mi.variant()).save(tmp_path)
+
+    def made_anew(*_: object) -> None:
+        raise AssertionError("the start is made anew")
+
+    monkeypatch.setattr(start, "_read", made_anew)
+    again = assemble(config, settled=Stored(*open_state(tmp_path / STATE_FILE)))
+    assert np.array_equal(heights(again), heights(first))
