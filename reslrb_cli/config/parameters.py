@@ -371,7 +371,9 @@ class ParameterSpec(Section):
     initial: Initial = "scene"
     """Value to start from: a number (all entries), a list of numbers (one per channel), an image file, the value to
     which a run brought the same key, or `scene` (the scene's own value; a heightmap is flat there, and nothing is
-    moved)."""
+    moved). `transport` makes a heightmap that throws the view's target onto the plane shape `receiver`, nothing darker
+    than `floor` (a share of its maximum, or `auto`, the least with which light is not torn apart); `lamp` names the
+    lamp where several have light: docs/lens.md."""
     bounds: _AnyBounds | None = None
     """[low, high], in the parameter's units; values are clamped to them after each step. `-.inf` and `.inf` leave a
     side open."""
