@@ -175,6 +175,7 @@ def _default(value: dict[str, Any]) -> str:
 _IN_A_LINE = {
     "ImageFile": "{file, color_space}",
     "RunValue": "{run}",
+    "TransportValue": "{transport: {receiver, floor, lamp}}",
     "CheckpointEvery": "{iterations} or {seconds}",
     **dict.fromkeys(
         ("MotionInitial", "MotionBounds", "MotionTransform", "MotionRates"), "{translation, rotation, scale}"

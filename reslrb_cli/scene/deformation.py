@@ -300,6 +300,16 @@ class Deformation:
         moved = next(each for each in self._moved.values() if each.heightmap == name)
         return np.array(moved.base).T, np.array(moved.texcoords).T
 
+    def displaced(self, name: str) -> tuple[mi.Mesh, np.ndarray, np.ndarray, np.ndarray]:
+        """The first mesh that the heightmap `name` displaces, its positions now (N, 3) float64, its texture coordinates
+        (N, 2), and directions (N, 3) along which heights go."""
+        moved = next(each for each in self._moved.values() if each.heightmap == name)
+        positions = np.array(self.params[moved.item.key], dtype=np.float64).reshape(-1, 3)
+        texcoords, normals = (np.array(each, dtype=np.float64).T for each in (moved.texcoords, moved.normals))
+        if moved.motion is not None:
+            normals = normals @ np.array(moved.motion.matrix(self.values).matrix).reshape(4, 4)[:3, :3].T
+        return moved.item.node, positions, texcoords, normals
+
     def place(self) -> list[Any]:
         """Give the scene what follows from the values; `params.update()` has to follow. Returns what to evaluate."""
         for key, moved in self._moved.items():
