@@ -24,6 +24,7 @@ from reslrb_cli.errors import LINE_LENGTH, ExitCode, one_line
 _SUMMARIES = {
     "init": "Write a configuration for a scene, to begin with.",
     "optimize": "Recover scene parameters from target images.",
+    "sweep": "Run an experiment at several settings and seeds, and compare.",
     "render": "Render the scene of a configuration.",
     "export": "Write a run's scene, with what it recovered, for Mitsuba alone.",
     "lens": "Write an experiment that shapes a lens which throws a picture.",

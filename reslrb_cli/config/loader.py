@@ -34,17 +34,17 @@ class Override:
     value: Any
 
 
-def parse_override(text: str) -> Override:
-    """An override from `a.b=value`. Raises ConfigError where `text` is none."""
-    label = "--set " + one_line(text, 100)
+def parse_override(text: str, option: str = "--set", example: str = "KEY=VALUE, such as run.spp=32") -> Override:
+    """An override from `a.b=value`, which `option` was given. Raises ConfigError where `text` is none."""
+    label = f"{option} {one_line(text, 100)}"
     path, equals, value = text.partition("=")
     path = path.strip()
     if not equals or not path:
-        raise ConfigError(label, "", "must be KEY=VALUE, such as run.spp=32")
+        raise ConfigError(label, "", f"must be {example}")
     location = _parse_location(path, label)
 
     def in_shell(mended: str) -> str:
-        return f"--set {shlex.quote(f'{path}={mended}')}"
+        return f"{option} {shlex.quote(f'{path}={mended}')}"
 
     return Override(label, location, parse(value, label, name_line=False, example=in_shell))
 
@@ -109,14 +109,17 @@ def load(path: Path | str, overrides: Sequence[str] = ()) -> Config:
     return loads(read_text(Path(path), str(path)), path, overrides)
 
 
-def loads(text: str, path: Path | str, overrides: Sequence[str] = ()) -> Config:
-    """The same from the text of a file; `path` names it, and paths in it are relative to where that is."""
+def loads(text: str, path: Path | str, overrides: Sequence[str] = (), last: Sequence[Override] = ()) -> Config:
+    """The same from the text of a file; `path` names it, and paths in it are relative to where that is.
+
+    Overrides that were parsed before, `last`, come after the others.
+    """
     source = str(path)
     if len(overrides) > OVERRIDES:
         raise ConfigError("--set", "", f"is given {len(overrides)} times; more than {OVERRIDES} belong in a file")
     if sum(map(len, overrides)) > OVERRIDES_LENGTH:
         raise ConfigError("--set", "", f"holds more than {OVERRIDES_LENGTH} characters; so many belong in a file")
-    parsed = [parse_override(override) for override in overrides]
+    parsed = [*(parse_override(override) for override in overrides), *last]
     data = parse(text, source)
     if data is None and not parsed:
         raise ConfigError(source, "", "is empty; it needs at least scene, target and parameters")
