@@ -99,16 +99,15 @@ def _by_iteration(runs: Sequence[Run], name: str) -> tuple[Array, Array]:
 
 
 def _by_time(runs: Sequence[Run], name: str) -> tuple[Array, Array]:
-    """Seconds (N,), and the figure of each run (runs, N) by its newest iteration that was done by then: not a number
-    before its first and after its last."""
+    """Seconds (N,), from where all runs have an iteration, and the figure of each run (runs, N) by its newest iteration
+    that was done by then: one that is over stays where it ended."""
     ends = [np.array(_column(run, "elapsed_s"), dtype=np.float64) for run in runs]
-    points = min(max(len(run.records) for run in runs), MOST_POINTS)
-    times = np.linspace(min(end[0] for end in ends), max(end[-1] for end in ends), max(points, 2))
+    times = np.unique(np.concatenate(ends))
+    times = times[times >= max(end[0] for end in ends)]
+    times = times[:: -(-len(times) // MOST_POINTS)]
     values = np.full((len(runs), len(times)), np.nan)
     for row, run, end in zip(values, runs, ends, strict=True):
-        place = np.searchsorted(end, times, side="right") - 1
-        known = (place >= 0) & (times <= end[-1])
-        row[known] = np.array(_column(run, name), dtype=np.float64)[place[known]]
+        row[:] = np.array(_column(run, name), dtype=np.float64)[np.searchsorted(end, times, side="right") - 1]
     return times, values
 
 
