@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from reslrb_cli.cli.options import overrides_option, read_recovered, start_variant, writing
+from reslrb_cli.cli.options import FOLDER, overrides_option, read_recovered, start_variant, writing
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.atomic import write_atomically
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @click.command("export")
-@click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
+@click.argument("run", metavar="RUN", type=FOLDER)
 @overrides_option
 @click.option(
     "-o", "--output", required=True, type=click.Path(path_type=Path),

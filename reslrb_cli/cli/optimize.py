@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from reslrb_cli.cli.options import optional_experiment_arguments, read_config, start_variant
+from reslrb_cli.cli.options import FOLDER, optional_experiment_arguments, read_config, start_variant
 from reslrb_cli.cli.terminal import echo, fill
 from reslrb_cli.config.files import in_words, rough_duration
 from reslrb_cli.config.loader import dump
@@ -92,7 +92,7 @@ logger = logging.getLogger(__name__)
 @click.option(
     "--resume",
     "resumed",
-    type=click.Path(path_type=Path),
+    type=FOLDER,
     metavar="RUN",
     help="Go on with the run in this folder where it was. CONFIG may be left out, else it has to be that of the run; "
     "--set may change iterations, learning rates, and with run.output or run.name the folder.",

@@ -24,9 +24,9 @@ def command(paths: tuple[Path, ...], output: Path | None) -> int:
     """Write one page about runs and measurements, complete in itself, to be looked at or sent around.
 
     RUN is the folder of a run of `optimize`, or of a `sweep`; a file that `bench`, `gradcheck` or `convergence` wrote
-    with --json; or a folder of maps that `gradcheck` wrote with --images. Several runs have their losses and errors in one picture, and
-    their images, times and memory beside each other. A run that is still at work, or was killed, is shown as far as it
-    came.
+    with --json; or a folder of maps that `gradcheck` wrote with --images. Several runs have their losses and errors in
+    one picture, and their images, times and memory beside each other. A run that is still at work, or was killed, is
+    shown as far as it came.
     """
     from reslrb_cli.backend.installation import load_packages
 

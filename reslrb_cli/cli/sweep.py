@@ -22,7 +22,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from reslrb_cli.backend.installation import python_command
-from reslrb_cli.cli.options import COUNT, check_writable, is_given, optional_experiment_arguments, start_variant
+from reslrb_cli.cli.options import (
+    COUNT,
+    FOLDER,
+    check_writable,
+    complete_setting,
+    is_given,
+    optional_experiment_arguments,
+    start_variant,
+)
 from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.errors import BackendError, ConfigError, ExitCode, MachineError, UnsupportedScene, one_line
 
@@ -51,6 +59,7 @@ _PROGRAM = "sys.argv[0] = 'reslrb'; from reslrb_cli.cli.sweep import follow; fol
     "--vary",
     multiple=True,
     metavar="KEY=[VALUE, ...]",
+    shell_complete=complete_setting,
     help="A setting, as of --set, and its values, a list in YAML. May be repeated: all combinations are run.",
 )
 @click.option(
@@ -63,14 +72,14 @@ _PROGRAM = "sys.argv[0] = 'reslrb'; from reslrb_cli.cli.sweep import follow; fol
     "-o",
     "--output",
     "folder",
-    type=click.Path(path_type=Path),
+    type=FOLDER,
     metavar="FOLDER",
     help="The folder of the sweep. Default: that of a run, with -sweep behind its name.",
 )
 @click.option(
     "--resume",
     "resumed",
-    type=click.Path(path_type=Path),
+    type=FOLDER,
     metavar="FOLDER",
     help="Go on with the sweep in this folder, in place of CONFIG; so does the same command again.",
 )
