@@ -10,11 +10,14 @@ import contextlib
 import ctypes
 import logging
 import os
+import re
 import selectors
+import shutil
 import signal
 import subprocess
 import sys
 import threading
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,6 +36,8 @@ from reslrb_cli.cli.options import (
 )
 from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.errors import BackendError, ConfigError, ExitCode, MachineError, UnsupportedScene, one_line
+from reslrb_cli.measure.processes import last_words
+from reslrb_cli.report.format import shorten
 
 if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
@@ -48,6 +53,9 @@ NOTICE = "stopping after this iteration of the run at work; once more, and it en
 END_SECONDS = 5.0
 
 _POLL_SECONDS = 0.1
+
+#: Lines of a run that are looked at for what it ended by; and how those of its progress begin.
+MOST_LINES, _PROGRESS = 200, re.compile(r"\d+/\d+: ")
 
 #: The program, in a process that does not outlive the one of this number.
 _PROGRAM = "sys.argv[0] = 'reslrb'; from reslrb_cli.cli.sweep import follow; follow(int(sys.argv.pop(1)))"
@@ -147,7 +155,7 @@ def _run(folder: Path, sweep: Sweep, json_file: Path | None, quiet: bool, verbos
     from reslrb_cli.backend.installation import load_packages
 
     load_packages()  # images are read by Mitsuba
-    from reslrb_cli.records.measurement_files import LivePage
+    from reslrb_cli.records.measurement_files import LineFile, LivePage
     from reslrb_cli.records.sweeps import PAGE_FILE, Failure, label, run_name
     from reslrb_cli.report.page import write_page
     from reslrb_cli.report.sources import read_sweep_runs
@@ -155,11 +163,13 @@ def _run(folder: Path, sweep: Sweep, json_file: Path | None, quiet: bool, verbos
     from reslrb_cli.runs.sweep import command as command_of
     from reslrb_cli.runs.sweep import is_left
 
+    file = None if json_file is None else LineFile(json_file)
+
     def refresh() -> None:
         source = read_sweep_runs(folder)
         write_page([source], folder / PAGE_FILE, live=True)
-        if json_file is not None:
-            _write_json(json_file, source)
+        if file is not None and not file.is_stream:
+            file.write(_json_lines(source))
 
     page = LivePage(refresh, "the sweep's page")
     runs, interrupted = list(sweep.runs), False
@@ -189,8 +199,9 @@ def _run(folder: Path, sweep: Sweep, json_file: Path | None, quiet: bool, verbos
         source = read_sweep_runs(folder)
         write_page([source], folder / PAGE_FILE)
     records = run_records(source)
-    if json_file is not None:
-        _write_json(json_file, source)
+    if file is not None:
+        file.write(_json_lines(source))
+        file.close()
     for line in lines(sweep, records):
         echo(line)
     done, failed = sum(run.is_done for run in records), sum(run.status == "failed" for run in records)
@@ -203,18 +214,15 @@ def _run(folder: Path, sweep: Sweep, json_file: Path | None, quiet: bool, verbos
     return ExitCode.CHECK_FAILED if failed else ExitCode.DONE
 
 
-def _write_json(path: Path, source: SweepRuns) -> None:
-    """Write what each run and each combination came to, and which is the best, behind what measured them."""
-    from reslrb_cli.records.measurement_files import LineFile, Origin
+def _json_lines(source: SweepRuns) -> list[Line]:
+    """What each run and each combination came to, and which is the best, behind what measured them."""
+    from reslrb_cli.records.measurement_files import Origin
     from reslrb_cli.report.sweep import best_records, row_records, run_records
 
     manifest: dict[str, Any] = dict(next(iter(source.runs.values())).manifest) if source.runs else {}
     origin = Origin(str(manifest.get("device", "")), str(manifest.get("variant", "")))
     runs = run_records(source)
-    found: list[Line] = [origin, *runs, *row_records(source.sweep, runs), *best_records(source.sweep, runs)]
-    file = LineFile(path)
-    file.write(found)
-    file.close()
+    return [origin, *runs, *row_records(source.sweep, runs), *best_records(source.sweep, runs)]
 
 
 # --- one run, in a process of its own ---------------------------------------------------------------------------------
@@ -233,7 +241,7 @@ def call(arguments: Sequence[str], interrupts: Interrupts, verbose: bool = False
     assert process.stdout is not None
     assert process.stdin is not None
     interrupts.last_act = lambda: _end(process)
-    told, said, rest = False, "", b""
+    told, said, rest = False, deque[str](maxlen=MOST_LINES), b""
     try:
         with selectors.DefaultSelector() as selector:
             selector.register(process.stdout, selectors.EVENT_READ)
@@ -248,12 +256,15 @@ def call(arguments: Sequence[str], interrupts: Interrupts, verbose: bool = False
                     break
                 *lines, rest = (rest + chunk).split(b"\n")
                 for line in (line.decode(errors="replace") for line in lines if line.strip()):
-                    said = line
+                    said.append(line)
                     if verbose:
                         echo(f"  {line}")
+                    elif _PROGRESS.match(line):
+                        _show(line)
         code = process.wait()
     finally:
         interrupts.last_act = lambda: None
+        _show("")
         if process.poll() is None:
             process.kill()
             process.wait()
@@ -262,9 +273,16 @@ def call(arguments: Sequence[str], interrupts: Interrupts, verbose: bool = False
                 stream.close()
     if code < 0:
         name = signal.Signals(-code).name
-        memory = ": the system ends so what takes too much memory" if -code == signal.SIGKILL else ""
-        return (ExitCode.INTERRUPTED if told else code), f"ended by {name}{memory}"
-    return code, said
+        memory = " (the system ends so what takes too much memory)" if -code == signal.SIGKILL else ""
+        return (ExitCode.INTERRUPTED if told else code), f"ended by {name}{memory}: {last_words(chr(10).join(said))}"
+    return code, said[-1] if said else f"ended with exit code {code}, and said nothing"
+
+
+def _show(line: str) -> None:
+    """Show the progress of a run in the last line of the terminal, if there is one, in place of what stood there."""
+    if sys.stderr.isatty():
+        text = shorten(f"  {line}" if line else "", shutil.get_terminal_size().columns - 1)
+        click.echo(f"\r\x1b[K{text}", err=True, nl=False)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
@@ -304,7 +322,7 @@ def _forecast(plan: Plan) -> int:
     from reslrb_cli.cli.optimize import forecast_run
     from reslrb_cli.config.files import in_words, rough_duration
     from reslrb_cli.records.sweeps import label
-    from reslrb_cli.report.format import count, shorten, table
+    from reslrb_cli.report.format import count, table
 
     sweep, seeds = plan.sweep, len(plan.sweep.seeds)
     whole = f"{count(len(sweep.combinations), 'combination')} with {count(seeds, 'seed')}"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -39,6 +40,9 @@ from reslrb_cli.runs.prepare import changes
 
 #: Runs of a sweep, at most: each has a folder, and a line of its page.
 MOST_RUNS = 1000
+
+#: How long the end of a process is waited for that was killed: a GPU's memory takes its time to be given back.
+RELEASE_SECONDS, _POLL_SECONDS = 15.0, 0.05
 
 #: Bytes of a run's name that say its seed.
 _SEED_BYTES = len(f"-seed={SEED_END}")
@@ -277,9 +281,17 @@ def is_left(folder: Path, sweep: Sweep, name: str) -> bool:
 
 
 def command(folder: Path, combination: Combination, seed: int) -> list[str]:
-    """What `reslrb` is to be called with for one run: it begins, or goes on from where it was cut off."""
+    """What `reslrb` is to be called with for one run: it begins, or goes on from where it was cut off.
+
+    A process that was killed and still has the run's folder is waited for. Raises ConfigError, located in that, where
+    one goes on working there.
+    """
     folder, name = folder.absolute(), run_name(combination, seed)
-    run = folder / name
+    run, end = folder / name, time.monotonic() + RELEASE_SECONDS
+    while (read_manifest(run) or {}).get("status") == Status.RUNNING:
+        if time.monotonic() > end:
+            raise ConfigError(run, "", "is in use by a run of its own; end that first")
+        time.sleep(_POLL_SECONDS)
     if newest_checkpoint(run / "checkpoint") is not None and read_manifest(run) is not None:
         return ["optimize", "--resume", str(run)]
     words = ["optimize", str(config_file(folder, combination))]

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,12 +21,15 @@ from click.testing import CliRunner
 from compilation import search_path
 
 from reslrb_cli.cli import main, progress, sweep
+from reslrb_cli.cli.terminal import Interrupts
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.optimization_benchmark.rank import find_best
-from reslrb_cli.records.sweeps import in_words, read_sweep, run_name, short_keys
+from reslrb_cli.records.lock import FolderLock
+from reslrb_cli.records.sweeps import Combination, Sweep, SweepRunRecord, in_words, read_sweep, run_name, short_keys
 from reslrb_cli.report.sources import read_sweep_runs
-from reslrb_cli.report.sweep import lines, run_records
+from reslrb_cli.report.sweep import best_records, lines, row_records, run_records
 from reslrb_cli.runs import recorder as recording
+from reslrb_cli.runs import sweep as plans
 from reslrb_cli.runs.sweep import make_plan
 
 #: Settings by which a run takes a moment, and what two that are equal differ in all the same.
@@ -300,6 +304,33 @@ def wait_for(happened, seconds=60.0):
         time.sleep(0.02)
 
 
+def test_a_process_that_crashes_is_told_by_its_last_words(monkeypatch):
+    for end, code, said in (
+        ("print('>>> no room'); print('x'); sys.stdout.flush(); os.kill(os.getpid(), 9)", -9,
+         "ended by SIGKILL (the system ends so what takes too much memory): no room"),
+        ("print('a.yaml: wrong'); sys.exit(2)", 2, "a.yaml: wrong"),
+        ("sys.exit(4)", 4, "ended with exit code 4, and said nothing"),
+        ("time.sleep(60)", 130, "ended by SIGTERM: "),
+    ):  # fmt: skip
+        monkeypatch.setattr(sweep, "_PROGRAM", f"import os, sys, time; {end}")
+        interrupts = Interrupts()
+        interrupts.requested = code == 130  # a run that does not heed signals yet
+        assert sweep.call(["optimize"], interrupts) == (code, said)
+
+
+def test_a_run_that_another_goes_on_with_is_waited_for(folder, monkeypatch):
+    words = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "-o", "s"]
+    tiny.done(*words)
+    manifest = json.loads(Path("s/seed=0/manifest.json").read_text())
+    Path("s/seed=0/manifest.json").write_text(json.dumps(manifest | {"status": "running"}))
+    monkeypatch.setattr(plans, "RELEASE_SECONDS", 0.1)
+    with FolderLock(Path("s/seed=0")):
+        result = reslrb(*words)
+    assert (result.exit_code, result.output.splitlines()[-1]) == (
+        2, f"{Path('s/seed=0').absolute()}: is in use by a run of its own; end that first")  # fmt: skip
+    assert "finished, 1 of 1 runs done" in tiny.done(*words).output
+
+
 def test_a_run_does_not_outlive_a_sweep_that_is_killed(llvm, tmp_path):
     tiny.write_experiment(tmp_path)
     settings = tiny.settings(*QUICK, "run.iterations=100000")
@@ -376,6 +407,38 @@ def test_pairs_tell_what_the_spread_over_seeds_hides():
     few = find_best({name: each[:5] for name, each in values.items()}, paired=True)
     assert (few.too_few, few.enough) == (True, 7)
     assert find_best({"a": [1.0, 2.0], "b": [1.0, 2.0]}, paired=True).tied == ["b"]
+
+
+def pretended(losses, key="run.spp", **about):
+    """A sweep of so many settings and seeds (settings, seeds), and its finished runs of these losses."""
+    combinations = [Combination(f"spp={k}", {key: k}) for k in range(len(losses))]
+    sweep = Sweep("a.yaml", [], combinations, list(range(len(losses[0]))))
+    done = {"status": "finished", "error": 0.5, "elapsed_s": 2.0, "peak_mib": 3.0}
+    runs = [SweepRunRecord(run_name(each, seed), each.settings, seed, **done | {"loss": float(losses[k][seed])} | about)
+            for seed in sweep.seeds for k, each in enumerate(combinations)]  # fmt: skip
+    return sweep, runs
+
+
+def test_the_best_is_told_in_pairs_of_seeds_that_all_have():
+    noise = np.exp(np.random.default_rng(4).normal(0, 1, 10))
+    sweep, runs = pretended([1.1 * noise, noise])
+    (best, equal) = best_records(sweep, runs)
+    assert (best.of, best.best, best.second, best.beats, best.seeds) == ("loss", "spp=1", "spp=0", ["spp=0"], 10)
+    assert [best.ratio.value, best.ratio.low, best.ratio.high] == pytest.approx([1 / 1.1] * 3)
+    assert "spp=1; surely lower than all others (in pairs of 10 seeds" in best.line
+    assert (equal.of, equal.tied) == ("error", ["spp=1"])
+    # of a seed that only one has nothing is compared, nor of what failed, nor of what is something else
+    runs[-1] = replace(runs[-1], status="waiting")
+    assert best_records(sweep, runs)[0].seeds == 9
+    runs[-1] = replace(runs[-1], status="failed", message="no room")
+    assert best_records(sweep, runs) == []
+    row = row_records(sweep, runs)[1]
+    assert (row.runs, row.of, row.failed, row.message) == (9, 10, 1, "seed 9: no room")
+    assert (row.loss.median, row.loss.low, row.loss.high) == (
+        np.median(noise[:9]), noise[:9].min(), noise[:9].max())  # fmt: skip
+    for key, compared in (("loss", ["error"]), ("loss.type", ["error"]), ("scene.size", []), ("target", ["error"]),
+                          ("parameters[0].bounds", []), ("lossy", ["loss", "error"])):  # fmt: skip
+        assert [each.of for each in best_records(*pretended([noise, noise], key))] == compared, key
 
 
 def test_equal_settings_are_rarely_told_apart():
