@@ -26,7 +26,8 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.optimization_benchmark.rank import find_best
 from reslrb_cli.records.lock import FolderLock
 from reslrb_cli.records.sweeps import Combination, Sweep, SweepRunRecord, in_words, read_sweep, run_name, short_keys
-from reslrb_cli.report.sources import read_sweep_runs
+from reslrb_cli.report.page import sweep as curves
+from reslrb_cli.report.sources import Run, read_sweep_runs
 from reslrb_cli.report.sweep import best_records, lines, row_records, run_records
 from reslrb_cli.runs import recorder as recording
 from reslrb_cli.runs import sweep as plans
@@ -77,6 +78,7 @@ def test_all_combinations_with_all_seeds(folder):
     assert len(names) == len(set(names)) == 2 * 3 * 4
     assert names[0] == "optimizer=adam-learning_rate=0.1-spp=4-seed=0"
     assert names[6] == "optimizer=adam-learning_rate=0.1-spp=4-seed=1"  # all combinations of one seed come first
+    assert make_plan(Path("tiny.yaml"), ["run.spp=[4, 8]"], 3, ["run.seed=5"]).sweep.seeds == [5, 6, 7]
     found = {(type(each.optimizer).__name__, each.run.spp) for each in plan.configs.values()}
     assert found == {(kind, spp) for kind in ("Adam", "SGD") for spp in (4, 8, 12)}
 
@@ -450,6 +452,22 @@ def test_equal_settings_are_rarely_told_apart():
         wrong += bool(find_best({str(k): list(each) for k, each in enumerate(values)}, paired=True).beats)
     # the best of four is chosen by the same values: more than 5 % would be 20 of 400, its standard deviation 4.4
     assert wrong <= 20 + 3 * 4.4
+
+
+def test_curves_are_medians_with_the_least_and_the_greatest():
+    """Of runs of 1, 2 and 4 iterations; by time from where all have one, and where each ended from then on."""
+    runs = []
+    for number, (times, losses) in enumerate(
+        [([1.0], [9.0]), ([2.0, 3.0], [7.0, 5.0]), ([0.5, 1.5, 4.0, 5.0], range(4))]
+    ):
+        records = [{"elapsed_s": at, "loss": float(loss)} for at, loss in zip(times, losses, strict=True)]
+        runs.append(Run(Path(), str(number), {}, records))
+    curve = curves._median("", 0, *curves._by_iteration(runs, "loss"))
+    assert (curve.xs, curve.ys, [end.tolist() for end in curve.band]) == ([0], [7.0], [[0.0], [9.0]])
+    curve = curves._median("", 0, *curves._by_time(runs, "loss"))
+    assert curve.xs == [2.0, 3.0, 4.0, 5.0]
+    assert curve.ys == [7.0, 5.0, 5.0, 5.0]
+    assert [end.tolist() for end in curve.band] == [[1.0, 1.0, 2.0, 3.0], [9.0] * 4]
 
 
 def test_the_page_has_table_curves_and_pictures(folder):
