@@ -54,6 +54,9 @@ END_SECONDS = 5.0
 
 _POLL_SECONDS = 0.1
 
+#: The times as long as the last page took that pass until the next one, at least: a run waits for it.
+PAGE_SHARE = 5.0
+
 #: Lines of a run that are looked at for what it ended by; and how those of its progress begin.
 MOST_LINES, _PROGRESS = 200, re.compile(r"\d+/\d+: ")
 
@@ -171,7 +174,7 @@ def _run(folder: Path, sweep: Sweep, json_file: Path | None, quiet: bool, verbos
         if file is not None and not file.is_stream:
             file.write(_json_lines(source))
 
-    page = LivePage(refresh, "the sweep's page")
+    page = LivePage(refresh, "the sweep's page", PAGE_SHARE)
     runs, interrupted = list(sweep.runs), False
     go_on = f"`reslrb sweep --resume {os.path.relpath(folder)}` goes on"
     with Interrupts(notice=None if quiet else NOTICE) as interrupts:
