@@ -22,7 +22,7 @@ from reslrb_cli.records.sweeps import (
     run_name,
     short_keys,
 )
-from reslrb_cli.report.format import duration, interval, number, shorten, table
+from reslrb_cli.report.format import count, duration, interval, number, shorten, table
 from reslrb_cli.report.run_summary import units_differ
 from reslrb_cli.report.sources import Run, SweepRuns, is_number
 
@@ -134,7 +134,7 @@ def _best(of: str, verdict: Verdict, values: dict[str, list[float]], labels: dic
     seeds = len(values[verdict.best])
     apart = ratio([values[verdict.best]], [values[second]])
     what = f"lowest median {FIGURES[of]}: {shorten(labels[verdict.best], LABEL_WIDTH)}"
-    pairs = f"in pairs of {seeds} seed{'' if seeds == 1 else 's'}"
+    pairs = f"in pairs of {count(seeds, 'seed')}"
     tied = ", ".join(shorten(labels[name], LABEL_WIDTH) for name in verdict.tied[:MOST_NAMED])
     more = len(verdict.tied) - MOST_NAMED
     tied += f" and {more} more" if more > 0 else ""
@@ -144,9 +144,10 @@ def _best(of: str, verdict: Verdict, values: dict[str, list[float]], labels: dic
         says = f"not told from {tied} ({pairs}, by Wilcoxon's signed ranks, 5 % over all)"
     else:
         says = f"surely lower than all others ({pairs}, by Wilcoxon's signed ranks, 5 % over all)"
+    lower = sum(one < other for one, other in zip(values[verdict.best], values[second], strict=True))
+    says += f"; lower than the next, {shorten(labels[second], LABEL_WIDTH)}, with {lower} of {count(seeds, 'seed')}"
     if apart is not None:
-        times = interval(apart.value, apart.low, apart.high, 3)
-        says += f"; {times} times the next, {shorten(labels[second], LABEL_WIDTH)} (95 %, bootstrap over the seeds)"
+        says += f", {interval(apart.value, apart.low, apart.high, 3)} times that (95 %, bootstrap over the seeds)"
     return SweepBestRecord(of, verdict.best, second, verdict.tied, verdict.beats, seeds, apart, f"{what}; {says}")
 
 

@@ -428,6 +428,7 @@ def test_the_best_is_told_in_pairs_of_seeds_that_all_have():
     assert (best.of, best.best, best.second, best.beats, best.seeds) == ("loss", "spp=1", "spp=0", ["spp=0"], 10)
     assert [best.ratio.value, best.ratio.low, best.ratio.high] == pytest.approx([1 / 1.1] * 3)
     assert "spp=1; surely lower than all others (in pairs of 10 seeds" in best.line
+    assert "; lower than the next, spp=0, with 10 of 10 seeds, 0.909 [0.909, 0.909] times that" in best.line
     assert (equal.of, equal.tied) == ("error", ["spp=1"])
     # of a seed that only one has nothing is compared, nor of what failed, nor of what is something else
     runs[-1] = replace(runs[-1], status="waiting")
