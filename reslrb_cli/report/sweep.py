@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from reslrb_cli.measure.optimization_benchmark.rank import Verdict, find_best, ratio
+from reslrb_cli.records.manifest import Status, is_complete
 from reslrb_cli.records.measurements import Band
 from reslrb_cli.records.sweeps import (
     Combination,
@@ -53,8 +54,11 @@ def _run_record(source: SweepRuns, combination: Combination, seed: int) -> Sweep
         done = 0 if run is None else len(run.records)
         return SweepRunRecord(name, combination.settings, seed, status, done, message=line)
     results, relative = run.results, units_differ(run.results)
+    status = str(run.manifest.get("status", ""))
+    if status == Status.FINISHED and not is_complete(run.manifest):  # it was killed over its final images
+        status = Status.INTERRUPTED.value
     return SweepRunRecord(
-        name, combination.settings, seed, str(run.manifest.get("status", "")), len(run.records),
+        name, combination.settings, seed, status, len(run.records),
         _number((results.get("image_loss") or {}).get("final")), _error(run, relative), relative,
         _number(results.get("elapsed_s")), max((record["peak_mib"] for record in run.records), default=None),
         str(run.manifest.get("error") or ""),

@@ -173,9 +173,10 @@ def test_what_is_damaged_is_located(folder):
 
 
 def test_a_sweep_that_was_killed_ends_with_the_table_of_one_that_was_not(folder, monkeypatch):
-    """At three moments what a kill would have left is copied: in the midst of a run, before one has kept anything, and
-    between two runs."""
+    """At four moments what a kill would have left is copied: in the midst of a run, before one has kept anything, over
+    its final images, and between two runs."""
     show, begin, calls, moments = progress.Progress.show, recording.Recording._begin, [], []
+    end = recording.Recording._write_final_images
 
     def copy(moment):
         moments.append(f"killed-{moment}")
@@ -193,6 +194,11 @@ def test_a_sweep_that_was_killed_ends_with_the_table_of_one_that_was_not(folder,
             copy("before-a-checkpoint")
         begin(self)
 
+    def ending(self):
+        if len(calls) == 3:
+            copy("over-final-images")
+        end(self)
+
     def calling(arguments, interrupts, verbose=False):
         calls.append(arguments)
         if len(calls) == 4:
@@ -201,20 +207,29 @@ def test_a_sweep_that_was_killed_ends_with_the_table_of_one_that_was_not(folder,
 
     monkeypatch.setattr(progress.Progress, "show", showing)
     monkeypatch.setattr(recording.Recording, "_begin", beginning)
+    monkeypatch.setattr(recording.Recording, "_write_final_images", ending)
     monkeypatch.setattr(sweep, "call", calling)
     words = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", RATES, "--seeds", "2"]
     tiny.done(*words, "-o", "whole")
     whole = table("whole")
     assert [run["status"] for run in whole[0]] == ["finished"] * 4
-    assert len(moments) == 3
+    assert len(moments) == 4
     for place, left in enumerate(moments):
         calls[:] = [None] * 10  # nothing is copied any more
         # the same command again, or --resume
         tiny.done(*words, "-o", left) if place % 2 else tiny.done("sweep", "--resume", left)
         assert table(left) == whole, left
-        assert [words[1] == "--resume" for words in calls[10:]].count(True) == (left == "killed-in-a-run"), left
+        assert [words[1] == "--resume" for words in calls[10:]].count(True) == (
+            left in ("killed-in-a-run", "killed-over-final-images")
+        ), left
         assert (
-            len(calls) - 10 == {"killed-in-a-run": 3, "killed-before-a-checkpoint": 2, "killed-between-runs": 1}[left]
+            len(calls) - 10
+            == {
+                "killed-in-a-run": 3,
+                "killed-before-a-checkpoint": 2,
+                "killed-between-runs": 1,
+                "killed-over-final-images": 2,
+            }[left]
         )
     calls[:] = [None] * 10
     tiny.done("sweep", "--resume", "whole")
@@ -298,6 +313,15 @@ def start(folder, *arguments):
                             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)  # fmt: skip
 
 
+def count_lines(run):
+    """How many iterations the metrics of a run have."""
+    path = run / "metrics.jsonl"
+    try:
+        return len(path.read_text().splitlines())
+    except OSError:  # there are none yet, or they are about to be cut back
+        return 0
+
+
 def wait_for(happened, seconds=60.0):
     """Wait until something has happened."""
     end = time.monotonic() + seconds
@@ -338,7 +362,7 @@ def test_a_run_does_not_outlive_a_sweep_that_is_killed(llvm, tmp_path):
     settings = tiny.settings(*QUICK, "run.iterations=100000")
     process = start(tmp_path, "tiny.yaml", *settings, "-o", "s")
     run = tmp_path / "s/seed=0"
-    wait_for(lambda: (run / "metrics.jsonl").exists() and (run / "checkpoint/previous.npz").exists())
+    wait_for(lambda: count_lines(run) > 6)
     worker = json.loads((run / "manifest.json").read_text())["process"]["pid"]
     process.kill()
     process.wait()
@@ -352,11 +376,13 @@ def test_a_run_does_not_outlive_a_sweep_that_is_killed(llvm, tmp_path):
 
     wait_for(is_gone, 5.0)
     # another goes on from there, and is told to end by a signal to it alone
-    before = len((run / "metrics.jsonl").read_text().splitlines())
+    before = count_lines(run)
 
     def stop():
-        wait_for(lambda: len((run / "metrics.jsonl").read_text().splitlines()) > before + 2)
-        os.kill(os.getpid(), signal.SIGTERM)
+        try:
+            wait_for(lambda: count_lines(run) > before + 2)
+        finally:
+            os.kill(os.getpid(), signal.SIGTERM)
 
     stopping = threading.Thread(target=stop)
     stopping.start()
