@@ -22,8 +22,10 @@ from reslrb_cli.errors import LINE_LENGTH, ExitCode, one_line
 
 # What `reslrb --help` says of each command, so that it need not load them; in the order of a user's work.
 _SUMMARIES = {
+    "example": "Copy an experiment that comes with the program.",
     "init": "Write a configuration for a scene, to begin with.",
     "optimize": "Recover scene parameters from target images.",
+    "sweep": "Run an experiment at several settings and seeds, and compare.",
     "render": "Render the scene of a configuration.",
     "export": "Write a run's scene, with what it recovered, for Mitsuba alone.",
     "lens": "Write an experiment that shapes a lens which throws a picture.",
@@ -32,8 +34,12 @@ _SUMMARIES = {
     "gradcheck": "Compare gradients with references.",
     "convergence": "Measure error against run time.",
     "report": "Write one page about runs and measurements.",
+    "completion": "Print what has a shell complete commands, options and settings.",
     "doctor": "Say which backend is in use, and what is missing.",
 }
+
+#: The variable by which a shell asks what a line may go on with, as click makes it of the program's name.
+COMPLETE_VARIABLE = "_RESLRB_COMPLETE"
 
 
 class _Main(click.Group):
@@ -63,7 +69,7 @@ class _Main(click.Group):
         **extra: Any,
     ) -> Any:
         """Runs the command line `args` and exits with its code; `standalone_mode=False` hands errors through."""
-        if not standalone_mode:
+        if not standalone_mode or os.environ.get(COMPLETE_VARIABLE):  # by which a shell asks: the answer is in bytes
             return super().main(args, prog_name, complete_var, standalone_mode=False, **extra)
         self.debug = os.environ.get("RESLRB_DEBUG", "0") not in ("", "0")
         with forgiving_output():

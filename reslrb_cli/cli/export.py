@@ -6,12 +6,12 @@ from pathlib import Path
 
 import click
 
-from reslrb_cli.cli.options import overrides_option, read_recovered, start_variant
+from reslrb_cli.cli.options import FOLDER, overrides_option, read_recovered, start_variant
 from reslrb_cli.cli.terminal import echo
 
 
 @click.command("export")
-@click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
+@click.argument("run", metavar="RUN", type=FOLDER)
 @overrides_option
 @click.option(
     "-o", "--output", required=True, type=click.Path(path_type=Path),

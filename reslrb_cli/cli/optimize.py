@@ -14,21 +14,28 @@ from typing import TYPE_CHECKING
 
 import click
 
-from reslrb_cli.cli.options import allow_code_option, optional_experiment_arguments, read_config, start_variant
+from reslrb_cli.cli.options import (
+    FOLDER,
+    allow_code_option,
+    optional_experiment_arguments,
+    read_config,
+    start_variant,
+)
 from reslrb_cli.cli.terminal import echo, fill
 from reslrb_cli.config.files import in_words, rough_duration
 from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
+    from reslrb_cli.optimization.forecast import Forecast
     from reslrb_cli.optimization.problem import Problem
     from reslrb_cli.runs.prepare import Begun
 
 
-def show_forecast(config: Config) -> None:
-    """Measure what a run of `config` will take, and print it; a variant must be set, and nothing is written but the
-    caches of kernels and pilots."""
-    from reslrb_cli.backend.memory import resident_bytes
+def forecast_run(config: Config) -> tuple[Forecast, list[tuple[str, float, bool]], float]:
+    """What a run of `config` will take, measured: its forecast; what comes before its first iteration, with the seconds
+    that it took now (0: nothing was to be measured) and whether a run finds that where it is kept; and the seconds of
+    the whole run. A variant must be set, and nothing is written but the caches of kernels and pilots."""
     from reslrb_cli.measure.prb_comparison import RIVAL, measure_rival
     from reslrb_cli.optimization.correlated_bias import measure_correlated_bias
     from reslrb_cli.optimization.forecast import make_forecast
@@ -47,8 +54,15 @@ def show_forecast(config: Config) -> None:
         measured.append((f"{RIVAL} beside it", rival_s, cache.keeps))
 
     forecast = make_forecast(config, say, cache, measure_before)
-    # What took so many seconds now (0: nothing was to be measured), and a run finds where it is kept.
     before = [("pilot", forecast.pilot_s, cache.keeps), *measured]
+    return forecast, before, forecast.whole_s + sum(seconds for _, seconds, kept in before if not kept)
+
+
+def show_forecast(config: Config) -> None:
+    """Print what a run of `config` will take, as `forecast_run` measures it."""
+    from reslrb_cli.backend.memory import resident_bytes
+
+    forecast, before, whole_s = forecast_run(config)
     sums = f"{forecast.iterations} x {1e3 * forecast.iteration_s:.3g} ms"
     sums += f" + {rough_duration(forecast.start_s)}" if forecast.start_s > 0.01 * forecast.elapsed_s else ""
     text = fill(
@@ -60,7 +74,7 @@ def show_forecast(config: Config) -> None:
         resident=resident_bytes(),
         sums=sums,
         before=before,
-        whole_s=forecast.whole_s + sum(seconds for _, seconds, kept in before if not kept),
+        whole_s=whole_s,
     )
     click.echo(text, nl=False)
 
@@ -80,7 +94,7 @@ logger = logging.getLogger(__name__)
 @click.option(
     "--resume",
     "resumed",
-    type=click.Path(path_type=Path),
+    type=FOLDER,
     metavar="RUN",
     help="Go on with the run in this folder where it was. CONFIG may be left out, else it has to be that of the run; "
     "--set may change iterations, learning rates, and with run.output or run.name the folder.",

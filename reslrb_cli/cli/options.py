@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.shell_completion import CompletionItem
 
 from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.cli.terminal import Interrupts, echo
@@ -151,6 +152,24 @@ def read_recovered(run: Path, overrides: tuple[str, ...]) -> Config:
     return recovered(run, overrides)
 
 
+class FolderPath(click.Path):
+    """A path of which a shell completes folders; what it is in truth, who opens it says."""
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        return [CompletionItem(incomplete, type="dir")]
+
+
+#: Type of an argument or an option that names the folder of a run, or of a sweep.
+FOLDER = FolderPath(path_type=Path)
+
+
+def complete_setting(context: click.Context, parameter: click.Parameter, begun: str) -> list[CompletionItem]:
+    """What the key of a setting may go on with, for `--set` and `--vary`."""
+    from reslrb_cli.cli import completion
+
+    return completion.complete_setting(context, parameter, begun)
+
+
 #: Type of an option that counts something: samples, depths, seeds. As in a configuration, 31 bits.
 COUNT = click.IntRange(min=1, max=2**31 - 1)
 
@@ -219,6 +238,7 @@ def overrides_option(function: Callable[..., Any]) -> Callable[..., Any]:
         "overrides",
         multiple=True,
         metavar="KEY=VALUE",
+        shell_complete=complete_setting,
         help="Override a setting, e.g. --set run.spp=32; the value is YAML. May be repeated.",
     )(function)
 

@@ -12,6 +12,7 @@ import click
 
 from reslrb_cli.cli.options import (
     COUNT,
+    FOLDER,
     check_writable,
     is_given,
     optional_experiment_arguments,
@@ -61,7 +62,7 @@ class Exposure(click.ParamType):
 @click.option(
     "--run",
     metavar="RUN",
-    type=click.Path(path_type=Path),
+    type=FOLDER,
     help="Render the scene of the run in this folder with the values that it recovered, in place of CONFIG.",
 )
 @click.option("--spp", type=COUNT, help="Samples per pixel; default: run.spp.")

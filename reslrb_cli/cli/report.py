@@ -19,22 +19,23 @@ MOST_SOURCES = 100
 @click.command("report")
 @click.argument("paths", metavar="RUN...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("-o", "--output", type=click.Path(path_type=Path), metavar="PAGE",
-              help="The page to write, an HTML file. Default, of one run: its own report.html.")  # fmt: skip
+              help="The page to write, an HTML file. Default, of one run or sweep: its own page.")  # fmt: skip
 def command(paths: tuple[Path, ...], output: Path | None) -> int:
     """Write one page about runs and measurements, complete in itself, to be looked at or sent around.
 
-    RUN is the folder of a run of `optimize`; a file that `bench`, `gradcheck` or `convergence` wrote with --json; or a
-    folder of maps that `gradcheck` wrote with --images. Several runs have their losses and errors in one picture, and
-    their images, times and memory beside each other. A run that is still at work, or was killed, is shown as far as it
-    came.
+    RUN is the folder of a run of `optimize`, or of a `sweep`; a file that `bench`, `gradcheck` or `convergence` wrote
+    with --json; or a folder of maps that `gradcheck` wrote with --images. Several runs have their losses and errors in
+    one picture, and their images, times and memory beside each other. A run that is still at work, or was killed, is
+    shown as far as it came.
     """
     from reslrb_cli.backend.installation import load_packages
 
     load_packages()  # images are read by Mitsuba
     from reslrb_cli.cli.progress import Reading
+    from reslrb_cli.records.sweeps import PAGE_FILE
     from reslrb_cli.report.page import write_page
     from reslrb_cli.report.perceptual import with_seen_errors
-    from reslrb_cli.report.sources import Run, read_sources
+    from reslrb_cli.report.sources import Run, SweepRuns, read_sources
 
     if len(paths) > MOST_SOURCES:
         raise ConfigError("RUN", "", f"{len(paths)} are given; a page shows at most {MOST_SOURCES}")
@@ -42,9 +43,9 @@ def command(paths: tuple[Path, ...], output: Path | None) -> int:
         sources = read_sources(paths, tell)
     gc.freeze()  # Python's search for cycles would go through millions of numbers while it draws
     if output is None:
-        if len(sources) != 1 or not isinstance(sources[0], Run):
+        if len(sources) != 1 or not isinstance(sources[0], Run | SweepRuns):
             raise ConfigError("--output", "", "is missing; give the page to write, as in -o page.html")
-        output = sources[0].path / "report.html"
+        output = sources[0].path / ("report.html" if isinstance(sources[0], Run) else PAGE_FILE)
     check_writable("--output", output)
     write_page([with_seen_errors(source) for source in sources], output)
     echo(f"look at {os.path.relpath(output)}")

@@ -37,17 +37,17 @@ class Override:
     value: Any
 
 
-def parse_override(text: str) -> Override:
-    """An override from `a.b=value`. Raises ConfigError where `text` is none."""
-    label = "--set " + one_line(text, 100)
+def parse_override(text: str, option: str = "--set", example: str = "KEY=VALUE, such as run.spp=32") -> Override:
+    """An override from `a.b=value`, which `option` was given. Raises ConfigError where `text` is none."""
+    label = f"{option} {one_line(text, 100)}"
     path, equals, value = text.partition("=")
     path = path.strip()
     if not equals or not path:
-        raise ConfigError(label, "", "must be KEY=VALUE, such as run.spp=32")
+        raise ConfigError(label, "", f"must be {example}")
     location = _parse_location(path, label)
 
     def in_shell(mended: str) -> str:
-        return f"--set {shlex.quote(f'{path}={mended}')}"
+        return f"{option} {shlex.quote(f'{path}={mended}')}"
 
     return Override(label, location, parse(value, label, name_line=False, example=in_shell))
 

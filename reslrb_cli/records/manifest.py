@@ -53,6 +53,17 @@ class Status(str, enum.Enum):
     FAILED = "failed"
 
 
+#: Why a part is missing from a folder whose process ended before it came to that part.
+NOT_YET = "not written yet"
+
+
+def is_complete(content: Mapping[str, Any]) -> bool:
+    """Whether a manifest is that of a run that is finished, and came to the end of writing what it found."""
+    missing = content.get("missing")
+    cut_off = isinstance(missing, dict) and NOT_YET in missing.values()
+    return content.get("status") == Status.FINISHED and not cut_off
+
+
 @dataclass
 class Manifest:
     """Provenance and outcome of one run.

@@ -220,7 +220,8 @@ def read_samples(path: Path) -> Kept:
         raise ConfigError(path, "", f"is damaged, cut off, or not written beside --json ({reason})") from None
 
 
-#: Seconds between two pages, at least; and the times as long as the last page took: pages take a twentieth of a run.
+#: Seconds between two pages, at least; and the times as long as the last page took: pages take a twentieth of a run,
+#: where nothing else is said.
 PAGE_SECONDS, PAGE_SHARE = 5.0, 20.0
 
 
@@ -230,8 +231,10 @@ class LivePage:
     A page that cannot be written ends no run, and is not tried again: the last one, at the run's end, says why.
     """
 
-    def __init__(self, write: Callable[[], object], what: str = "the page of the run") -> None:
-        self._write, self._what = write, what
+    def __init__(
+        self, write: Callable[[], object], what: str = "the page of the run", share: float = PAGE_SHARE
+    ) -> None:
+        self._write, self._what, self._share = write, what, share
         self._next: float | None = 0.0
 
     def refresh(self) -> None:
@@ -246,4 +249,4 @@ class LivePage:
             self._next = None
         else:
             end = time.monotonic()
-            self._next = end + max(PAGE_SECONDS, PAGE_SHARE * (end - start))
+            self._next = end + max(PAGE_SECONDS, self._share * (end - start))

@@ -1,4 +1,4 @@
-"""What a page is made of: run folders, and the files that measuring commands write, told apart by what is in them."""
+"""What a page is made of: folders of runs and sweeps, files of measuring commands, told apart by what is in them."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from reslrb_cli.errors import ConfigError, one_line
 from reslrb_cli.records import metrics
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.measurement_files import Origin, Tell, read_lines, read_origin
+from reslrb_cli.records.sweeps import Sweep, is_sweep, read_sweep, run_name
 
 Array = np.ndarray[Any, Any]
 
@@ -100,7 +101,18 @@ class Maps:
     kind = "maps"
 
 
-Source = Run | Measurements | Maps
+@dataclass(frozen=True)
+class SweepRuns:
+    """A sweep, and those of its runs that have a folder, by their names."""
+
+    path: Path
+    name: str
+    sweep: Sweep
+    runs: Mapping[str, Run]
+    kind = "sweep"
+
+
+Source = Run | Measurements | Maps | SweepRuns
 
 
 def read_sources(paths: Sequence[Path], tell: Tell | None = None) -> list[Source]:
@@ -129,9 +141,19 @@ def read_run(folder: Path, name: str | None = None, tell: Tell | None = None) ->
     return Run(folder, name or folder.absolute().name, read_manifest(folder) or {}, records, damaged=damaged)
 
 
+def read_sweep_runs(folder: Path, name: str | None = None, tell: Tell | None = None) -> SweepRuns:
+    """The sweep in `folder`, and its runs as far as they can be read. Raises ConfigError, located in its plan."""
+    sweep = read_sweep(folder)
+    names = [run_name(*run) for run in sweep.runs]
+    runs = {name: read_run(folder / name, name, tell) for name in names if read_manifest(folder / name) is not None}
+    return SweepRuns(folder, name or folder.absolute().name, sweep, runs)
+
+
 def _read_folder(path: Path, name: str, tell: Tell | None) -> Source:
     if read_manifest(path) is not None:
         return read_run(path, name, tell)
+    if is_sweep(path):
+        return read_sweep_runs(path, name, tell)
     from reslrb_cli.records.images import read_layer_names
 
     try:
@@ -140,7 +162,7 @@ def _read_folder(path: Path, name: str, tell: Tell | None) -> Source:
         raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
     if maps:
         return Maps(path, name, maps)
-    reason = "is no run folder, and no folder of maps; give the folder of a run, or a file that --json wrote"
+    reason = "is no run folder, no sweep and no folder of maps; give the folder of a run, or a file that --json wrote"
     raise ConfigError(path, "", reason)
 
 

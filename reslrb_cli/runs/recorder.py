@@ -37,7 +37,7 @@ from reslrb_cli.records.checkpoint import (
 )
 from reslrb_cli.records.images import PARAMETERS_FILE as PARAMETERS_FILE_NAME
 from reslrb_cli.records.images import write_image, write_mask, write_parameters
-from reslrb_cli.records.manifest import Manifest, Status
+from reslrb_cli.records.manifest import NOT_YET, Manifest, Status
 from reslrb_cli.records.measurement_files import LivePage
 from reslrb_cli.records.metrics import MetricsWriter, Record, finite
 from reslrb_cli.records.run_folder import RunFolder
@@ -48,9 +48,6 @@ from reslrb_cli.report.tonemap import shown_exposures, write_error_map
 from reslrb_cli.runs.prepare import Course
 
 logger = logging.getLogger(__name__)
-
-#: Why a part is missing from a folder whose process ended before it came to that part.
-NOT_YET = "not written yet"
 
 
 class Ending:

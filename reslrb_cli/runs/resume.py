@@ -14,7 +14,7 @@ from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.state import Settled, State
 from reslrb_cli.records.checkpoint import PREVIOUS_FILE_NAME, STATE_FILE, open_state
-from reslrb_cli.records.manifest import Manifest, Status, now, versions
+from reslrb_cli.records.manifest import Manifest, is_complete, now, versions
 from reslrb_cli.records.metrics import Record, cut_back, read_records
 from reslrb_cli.records.run_folder import (
     RunFolder,
@@ -68,8 +68,7 @@ class Earlier:
     @property
     def is_done(self) -> bool:
         """Whether nothing is left to do."""
-        finished = self.manifest.get("status") == Status.FINISHED
-        return finished and (self.config.run.iterations == self.iteration or self.has_stopped)
+        return is_complete(self.manifest) and (self.config.run.iterations == self.iteration or self.has_stopped)
 
     @property
     def has_stopped(self) -> bool:

@@ -254,7 +254,7 @@ def test_what_is_nothing_of_the_kind_is_one_located_line(tmp_path, content, line
 
 def test_a_folder_that_is_nothing_of_the_kind(tmp_path):
     (tmp_path / "picture.exr").write_bytes(b"no image")
-    with pytest.raises(ConfigError, match="is no run folder, and no folder of maps"):
+    with pytest.raises(ConfigError, match="is no run folder, no sweep and no folder of maps"):
         read_sources([tmp_path])
 
 

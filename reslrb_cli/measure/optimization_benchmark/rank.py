@@ -169,27 +169,46 @@ def finals(runs: Sequence[Run], limit_s: float, of: str) -> dict[str, list[float
     return found
 
 
-def find_best(values: dict[str, list[float]]) -> Verdict | None:
+def find_best(values: Mapping[str, Sequence[float]], paired: bool = False) -> Verdict | None:
     """Which method has the lowest median, and who is tied with it; None where there is nothing to compare.
 
     Those are tied with it whose values the Mann-Whitney test does not tell from its own: two-sided, exact for few
-    values of which no two are equal, at ALPHA over the number of the others.
+    values of which no two are equal, at ALPHA over the number of the others. `paired`: values at the same place are of
+    the same seed, and Wilcoxon's test of the signed ranks of their differences is taken, which are finite.
     """
     if not values:
         return None
     order = sorted(values, key=lambda label: float(np.median(values[label])))
     best, others = order[0], order[1:]
     level = ALPHA / max(len(others), 1)
-    apart = [label for label in others if stats.mannwhitneyu(values[best], values[label]).pvalue < level]
-    enough = next(count for count in range(2, 1000) if _least_p(count, count) < level)
-    can_tell = any(_least_p(len(values[best]), len(values[label])) < level for label in others)
+    test, least_p = (_signed_ranks, _least_paired_p) if paired else (_ranks, _least_p)
+    apart = [label for label in others if test(values[best], values[label]) < level]
+    enough = next(count for count in range(2, 1000) if least_p(count, count) < level)
+    can_tell = any(least_p(len(values[best]), len(values[label])) < level for label in others)
     tied = [label for label in others if label not in apart]
     return Verdict(best, tied, apart, bool(others) and not can_tell, enough)
+
+
+def _ranks(one: Sequence[float], other: Sequence[float]) -> float:
+    return float(stats.mannwhitneyu(one, other).pvalue)
+
+
+def _signed_ranks(one: Sequence[float], other: Sequence[float]) -> float:
+    """Two-sided, but where the pairs have the other one lower, whatever the medians: then 1."""
+    differences = np.subtract(one, other, dtype=np.float64)
+    if not differences.any():
+        return 1.0
+    return min(2.0 * float(stats.wilcoxon(differences, alternative="less").pvalue), 1.0)
 
 
 def _least_p(one: int, other: int) -> float:
     """The least probability that the test can find between so many values and so many others."""
     return 2.0 / math.comb(one + other, one)
+
+
+def _least_paired_p(one: int, other: int) -> float:
+    """The same of so many pairs."""
+    return 2.0 ** (1 - min(one, other))
 
 
 @dataclass(frozen=True)

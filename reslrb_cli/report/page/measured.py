@@ -15,10 +15,11 @@ from reslrb_cli.report.format import count, number
 from reslrb_cli.report.page.images import gradient_maps, image_rows, seen_tables
 from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
 from reslrb_cli.report.page.run import StepParts, bars, guarded, problems, record_parts
+from reslrb_cli.report.page.sweep import sweep_parts
 from reslrb_cli.report.page.values import convergence_of_all, parameter_table, texture_pictures
 from reslrb_cli.report.plots import Curve
 from reslrb_cli.report.run_summary import worst
-from reslrb_cli.report.sources import Maps, Measurements, Run, Source, is_number
+from reslrb_cli.report.sources import Maps, Measurements, Run, Source, SweepRuns, is_number
 from reslrb_cli.report.tables import HEAD, cells, failure_line, summary_lines
 
 Entry = Mapping[str, Any]
@@ -165,7 +166,10 @@ def several_parts(sources: Sequence[Source]) -> tuple[str, Markup, Parts]:
     runs = [source for source in sources if isinstance(source, Run)]
     parts = run_comparison(runs) if runs else []
     for source in sources:
-        if not isinstance(source, Run):
+        if isinstance(source, SweepRuns):
+            title_of = (lambda part, name=source.name: f"{part}: {name}") if len(sources) > 1 else str
+            parts += [(title_of(part), markup) for part, markup in sweep_parts(source).items()]
+        elif not isinstance(source, Run):
             parts.append((f"{HEADINGS[source.kind]}: {source.name}", guarded(partial(measured, source))))
     for run in runs:
         own = record_parts(run)

@@ -64,7 +64,7 @@ def texture_pictures(run: Run) -> Markup:
         arrays = {moment: array for moment, array in found.items() if array.ndim == 3 and array.size}
         if not arrays:
             continue
-        arrays, words = _visible(arrays, about.get("quantity") in PLACES)
+        arrays, words = visible(arrays, about.get("quantity") in PLACES)
         shown = []
         for moment, array in arrays.items():
             value = [lay_out("run.value", about[moment])] if about.get(moment) else []
@@ -78,7 +78,7 @@ def texture_pictures(run: Run) -> Markup:
     return parts
 
 
-def _visible(arrays: Mapping[str, Array], heights: bool) -> tuple[dict[str, Array], str]:
+def visible(arrays: Mapping[str, Array], heights: bool) -> tuple[dict[str, Array], str]:
     """The same so that they can be seen, at all moments alike, and words that say how.
 
     Heights, which may be negative, go from black to white; what is emitted may be far beyond 1, and has the exposure

@@ -1,0 +1,354 @@
+"""`reslrb sweep`: runs of one experiment at several settings and seeds, one after the other, and a table of them.
+
+Each run is `reslrb optimize` in a process of its own, so that none has the memory, the kernels or the end of another.
+It does not outlive this one (`follow`), so that a sweep that was killed can be gone on with at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import logging
+import os
+import re
+import selectors
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from reslrb_cli.backend.installation import python_command
+from reslrb_cli.cli.options import (
+    COUNT,
+    FOLDER,
+    check_writable,
+    complete_setting,
+    is_given,
+    optional_experiment_arguments,
+    start_variant,
+)
+from reslrb_cli.cli.terminal import Interrupts, echo
+from reslrb_cli.errors import BackendError, ConfigError, ExitCode, MachineError, UnsupportedScene, one_line
+from reslrb_cli.measure.processes import last_words
+from reslrb_cli.report.format import shorten
+
+if TYPE_CHECKING:
+    from reslrb_cli.config.schema import Config
+    from reslrb_cli.records.metrics import Line
+    from reslrb_cli.records.sweeps import Sweep
+    from reslrb_cli.report.sources import SweepRuns
+    from reslrb_cli.runs.sweep import Plan
+
+logger = logging.getLogger(__name__)
+NOTICE = "stopping after this iteration of the run at work; once more, and it ends at once"
+
+#: How long a run is waited for that was told to end at once.
+END_SECONDS = 5.0
+
+_POLL_SECONDS = 0.1
+
+#: The times as long as the last page took that pass until the next one, at least: a run waits for it.
+PAGE_SHARE = 5.0
+
+#: Lines of a run that are looked at for what it ended by; and how those of its progress begin.
+MOST_LINES, _PROGRESS = 200, re.compile(r"\d+/\d+: ")
+
+#: The program, in a process that does not outlive the one of this number.
+_PROGRAM = "sys.argv[0] = 'reslrb'; from reslrb_cli.cli.sweep import follow; follow(int(sys.argv.pop(1)))"
+
+
+@click.command("sweep")
+@optional_experiment_arguments
+@click.option(
+    "--vary",
+    multiple=True,
+    metavar="KEY=[VALUE, ...]",
+    shell_complete=complete_setting,
+    help="A setting, as of --set, and its values, a list in YAML. May be repeated: all combinations are run.",
+)
+@click.option(
+    "--seeds",
+    type=COUNT,
+    metavar="N",
+    help="Runs of each combination, of seeds from run.seed on. Default: 1, or what the sweep has.",
+)
+@click.option(
+    "-o",
+    "--output",
+    "folder",
+    type=FOLDER,
+    metavar="FOLDER",
+    help="The folder of the sweep. Default: that of a run, with -sweep behind its name.",
+)
+@click.option(
+    "--resume",
+    "resumed",
+    type=FOLDER,
+    metavar="FOLDER",
+    help="Go on with the sweep in this folder, in place of CONFIG; so does the same command again.",
+)
+@click.option("--retry", is_flag=True, help="Try the runs again that failed.")
+@click.option(
+    "--dry-run",
+    is_flag=True,
+    help="Print how many runs there are and what they will take, by a few small steps of each combination.",
+)
+@click.option(
+    "--json",
+    "json_file",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Write what every run and combination came to, one object a line.",
+)
+@click.option("--quiet", is_flag=True, help="Print the table and the last line only.")
+@click.option("-v", "--verbose", is_flag=True, help="Show what each run says.")
+def command(
+    config_file: Path | None,
+    overrides: tuple[str, ...],
+    vary: tuple[str, ...],
+    seeds: int | None,
+    folder: Path | None,
+    resumed: Path | None,
+    retry: bool,
+    dry_run: bool,
+    json_file: Path | None,
+    quiet: bool,
+    verbose: bool,
+) -> int:
+    """Run the experiment of CONFIG at every combination of settings, with several seeds, one run after the other.
+
+    Each run has its folder in FOLDER, named by its settings; sweep.html there has the table, curves and pictures. All
+    combinations are checked before the first run begins. A run that fails is told in its row, and the others go on.
+    Ctrl-C ends the sweep after the current iteration; the same command again, or --resume FOLDER, goes on with it,
+    also after a kill.
+    """
+    from reslrb_cli.runs.sweep import make_plan, opened
+
+    if quiet or verbose:
+        logging.getLogger("reslrb_cli").setLevel(logging.WARNING if quiet else logging.DEBUG)
+    plan = None
+    if resumed is not None:
+        given = [name for name in ("config_file", "overrides", "vary", "folder", "dry_run") if is_given(name)]
+        if given:
+            raise click.UsageError("--resume goes on with a sweep as it began; of others it takes --seeds, --retry "
+                                   "and --json alone")  # fmt: skip
+        folder = resumed
+    elif config_file is None:
+        raise click.UsageError("Missing argument 'CONFIG'")
+    else:
+        plan = make_plan(config_file, vary, seeds or 1, overrides)
+        run = next(iter(plan.configs.values())).run
+        folder = folder or run.output / f"{run.folder_name}-sweep"
+        if dry_run:
+            return _forecast(plan)
+    check_writable("--json", json_file)
+    with opened(folder, plan, seeds, retry) as sweep:
+        return _run(folder, sweep, json_file, quiet, verbose)
+
+
+def _run(folder: Path, sweep: Sweep, json_file: Path | None, quiet: bool, verbose: bool) -> int:
+    """Do what is left of the sweep, keep its page, and say what it came to."""
+    from reslrb_cli.backend.installation import load_packages
+
+    load_packages()  # images are read by Mitsuba
+    from reslrb_cli.records.measurement_files import LineFile, LivePage
+    from reslrb_cli.records.sweeps import PAGE_FILE, Failure, label, run_name
+    from reslrb_cli.report.page import write_page
+    from reslrb_cli.report.sources import read_sweep_runs
+    from reslrb_cli.report.sweep import lines, run_records
+    from reslrb_cli.runs.sweep import command as command_of
+    from reslrb_cli.runs.sweep import is_left
+
+    file = None if json_file is None else LineFile(json_file)
+
+    def refresh() -> None:
+        source = read_sweep_runs(folder)
+        write_page([source], folder / PAGE_FILE, live=True)
+        if file is not None and not file.is_stream:
+            file.write(_json_lines(source))
+
+    page = LivePage(refresh, "the sweep's page", PAGE_SHARE)
+    runs, interrupted = list(sweep.runs), False
+    go_on = f"`reslrb sweep --resume {os.path.relpath(folder)}` goes on"
+    with Interrupts(notice=None if quiet else NOTICE) as interrupts:
+        for number, (combination, seed) in enumerate(runs, 1):
+            name = run_name(combination, seed)
+            if not is_left(folder, sweep, name):
+                continue
+            page.refresh()
+            if interrupted := interrupts.requested:
+                break
+            if not quiet:
+                echo(f"run {number} of {len(runs)}: {label(combination.settings)}, seed {seed}")
+            code, line = call(command_of(folder, combination, seed), interrupts, verbose)
+            if interrupted := code == ExitCode.INTERRUPTED or (interrupts.requested and code != ExitCode.DONE):
+                break
+            if code == ExitCode.MACHINE:
+                raise MachineError(f"{line}; {go_on}")
+            if code == ExitCode.BACKEND:
+                raise BackendError(line)
+            if not quiet or code != ExitCode.DONE:
+                echo(f"  {line}")
+            if code != ExitCode.DONE:
+                sweep = sweep.with_failure(name, Failure(code, one_line(line)))
+                sweep.write(folder)
+        source = read_sweep_runs(folder)
+        write_page([source], folder / PAGE_FILE)
+    records = run_records(source)
+    if file is not None:
+        file.write(_json_lines(source))
+        file.close()
+    for line in lines(sweep, records):
+        echo(line)
+    done, failed = sum(run.is_done for run in records), sum(run.status == "failed" for run in records)
+    ended = "interrupted" if interrupted else "finished"
+    more = f"; {go_on}" if interrupted else "; --retry tries those that failed again" if failed else ""
+    which = f"{done} of {len(records)} runs done" + (f", {failed} failed" if failed else "")
+    echo(f"{ended}, {which}; look at {os.path.relpath(folder / PAGE_FILE)}{more}")
+    if interrupted:
+        return ExitCode.INTERRUPTED
+    return ExitCode.CHECK_FAILED if failed else ExitCode.DONE
+
+
+def _json_lines(source: SweepRuns) -> list[Line]:
+    """What each run and each combination came to, and which is the best, behind what measured them."""
+    from reslrb_cli.records.measurement_files import Origin
+    from reslrb_cli.report.sweep import best_records, row_records, run_records
+
+    manifest: dict[str, Any] = dict(next(iter(source.runs.values())).manifest) if source.runs else {}
+    origin = Origin(str(manifest.get("device", "")), str(manifest.get("variant", "")))
+    runs = run_records(source)
+    return [origin, *runs, *row_records(source.sweep, runs), *best_records(source.sweep, runs)]
+
+
+# --- one run, in a process of its own ---------------------------------------------------------------------------------
+
+
+def call(arguments: Sequence[str], interrupts: Interrupts, verbose: bool = False) -> tuple[int, str]:
+    """Call `reslrb` with these arguments in a process of its own; its exit code, and the line that says how it ended.
+
+    The first signal that `interrupts` notes is passed on to it; one more, and it ends with this process. What it says
+    is shown with `verbose`, and else its warnings are in its folder.
+    """
+    program = [*python_command(_PROGRAM), str(os.getpid()), *arguments]
+    process = subprocess.Popen(
+        program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True
+    )
+    assert process.stdout is not None
+    assert process.stdin is not None
+    interrupts.last_act = lambda: _end(process)
+    told, said, rest = False, deque[str](maxlen=MOST_LINES), b""
+    try:
+        with selectors.DefaultSelector() as selector:
+            selector.register(process.stdout, selectors.EVENT_READ)
+            while True:
+                if interrupts.requested and not told:
+                    process.send_signal(signal.SIGTERM)
+                    told = True
+                if not selector.select(_POLL_SECONDS):
+                    continue
+                chunk = os.read(process.stdout.fileno(), 1 << 16)
+                if not chunk:
+                    break
+                *lines, rest = (rest + chunk).split(b"\n")
+                for line in (line.decode(errors="replace") for line in lines if line.strip()):
+                    said.append(line)
+                    if verbose:
+                        echo(f"  {line}")
+                    elif _PROGRESS.match(line):
+                        _show(line)
+        code = process.wait()
+    finally:
+        interrupts.last_act = lambda: None
+        _show("")
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+        for stream in (process.stdout, process.stdin):
+            with contextlib.suppress(OSError):
+                stream.close()
+    if code < 0:
+        name = signal.Signals(-code).name
+        memory = " (the system ends so what takes too much memory)" if -code == signal.SIGKILL else ""
+        return (ExitCode.INTERRUPTED if told else code), f"ended by {name}{memory}: {last_words(chr(10).join(said))}"
+    return code, said[-1] if said else f"ended with exit code {code}, and said nothing"
+
+
+def _show(line: str) -> None:
+    """Show the progress of a run in the last line of the terminal, if there is one, in place of what stood there."""
+    if sys.stderr.isatty():
+        text = shorten(f"  {line}" if line else "", shutil.get_terminal_size().columns - 1)
+        click.echo(f"\r\x1b[K{text}", err=True, nl=False)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End the process of a run at once, by a second signal, which has its manifest say so."""
+    with contextlib.suppress(OSError, subprocess.TimeoutExpired):
+        process.send_signal(signal.SIGTERM)
+        process.send_signal(signal.SIGTERM)
+        process.wait(END_SECONDS)
+    with contextlib.suppress(OSError):
+        process.kill()
+
+
+def follow(parent: int) -> None:
+    """The program `reslrb` in a process that ends with the process `parent`, however that ends."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, int(signal.SIGKILL))  # PR_SET_PDEATHSIG
+        if os.getppid() != parent:  # it ended before
+            os._exit(ExitCode.INTERRUPTED)
+    else:
+        threading.Thread(target=_end_with_input, daemon=True).start()
+    from reslrb_cli.cli import run
+
+    run()
+
+
+def _end_with_input() -> None:
+    """Where the system does not see to it: the other end of standard input is closed as its process ends."""
+    os.read(0, 1)
+    os._exit(ExitCode.INTERRUPTED)
+
+
+# --- what it will take ------------------------------------------------------------------------------------------------
+
+
+def _forecast(plan: Plan) -> int:
+    """Print how many runs there are, and what those of each combination will take; nothing is written."""
+    from reslrb_cli.cli.optimize import forecast_run
+    from reslrb_cli.config.files import in_words, rough_duration
+    from reslrb_cli.records.sweeps import label
+    from reslrb_cli.report.format import count, table
+
+    sweep, seeds = plan.sweep, len(plan.sweep.seeds)
+    whole = f"{count(len(sweep.combinations), 'combination')} with {count(seeds, 'seed')}"
+    echo(f"{whole}: {count(len(sweep.combinations) * seeds, 'run')}, one after the other; nothing was written")
+    rows: list[tuple[str, ...]] = [("settings", "memory", "an iteration", "a run", f"{seeds} of them")]
+    total_s = 0.0
+    with Interrupts() as interrupts:
+        for combination in sweep.combinations:
+            if interrupts.requested:
+                raise KeyboardInterrupt
+            config: Config = plan.configs[combination.name]
+            start_variant(config)
+            try:
+                forecast, _, whole_s = forecast_run(config)
+            except (ConfigError, UnsupportedScene) as error:
+                rows.append((shorten(label(combination.settings), 60), f"will fail: {error}"))
+                continue
+            total_s += seeds * whole_s
+            rows.append((
+                shorten(label(combination.settings), 60), in_words(forecast.peak),
+                f"{1e3 * forecast.iteration_s:.3g} ms", rough_duration(whole_s), rough_duration(seeds * whole_s),
+            ))  # fmt: skip
+    for line in table(rows):
+        echo(line)
+    echo(f"time of the whole sweep: about {rough_duration(total_s)}")
+    return ExitCode.DONE

@@ -1,0 +1,196 @@
+"""Parts of a page on a sweep: its table, curves of the medians with bands, and what was recovered side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from reslrb_cli.records.images import load_image, read_parameters
+from reslrb_cli.records.manifest import is_complete
+from reslrb_cli.records.sweeps import Combination, in_words, label, run_name, short_keys
+from reslrb_cli.report.format import count, number, shorten
+from reslrb_cli.report.page.images import Picture, show
+from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
+from reslrb_cli.report.page.run import guarded
+from reslrb_cli.report.page.values import visible
+from reslrb_cli.report.perceptual import PLACES
+from reslrb_cli.report.plots import COLORS, MOST_POINTS, Curve
+from reslrb_cli.report.run_summary import units_differ
+from reslrb_cli.report.sources import Run, SweepRuns
+from reslrb_cli.report.sweep import best_records, figures_of, notes, row_records, run_records
+from reslrb_cli.report.tonemap import exposure_for, exposure_words, shown_exposures
+
+Array = np.ndarray[Any, Any]
+
+#: Combinations that have curves, at most, and that have pictures; parameters that have pictures.
+MOST_CURVES, MOST_PICTURES, MOST_TEXTURES = 2 * len(COLORS), 24, 6
+
+#: Characters of a combination below a picture, and of a setting's value in the table.
+CAPTION_WIDTH, VALUE_WIDTH = 80, 60
+
+
+def sweep_parts(source: SweepRuns) -> dict[str, Markup]:
+    """By title, what there is to show of a sweep, in order; what it does not have is empty."""
+    sweep, runs = source.sweep, run_records(source)
+    figures, short = figures_of(runs), short_keys(sweep.keys)
+    drawn = sweep.combinations[:MOST_CURVES]
+
+    def settings() -> Markup:
+        rows = [
+            {"place": place if place < len(drawn) else None, "record": record,
+             "values": [shorten(in_words(value), VALUE_WIDTH) for value in record.settings.values()]
+             or [label(record.settings)]}
+            for place, record in enumerate(row_records(sweep, runs))
+        ]  # fmt: skip
+        done = sum(run.is_done for run in runs)
+        told = f"{count(len(sweep.combinations), 'combination')} with {count(len(sweep.seeds), 'seed')}: "
+        told += f"{done} of {count(len(runs), 'run')} finished"
+        lines = [f"{told}.", *(f"{best.line}." for best in best_records(sweep, runs))]
+        return lay_out("sweep.rows", rows, [short[name] for name in sweep.keys], figures, lines, notes(sweep, runs))
+
+    parts: dict[str, Callable[[], Markup]] = {
+        "Settings": settings,
+        "Convergence": lambda: _curves(source, drawn),
+        "Images": lambda: _images(source),
+        "Textures": lambda: _textures(source),
+        "Runs of the sweep": lambda: lay_out("sweep.runs", runs, figures),
+    }
+    return {title: guarded(make) for title, make in parts.items()}
+
+
+# --- curves -----------------------------------------------------------------------------------------------------------
+
+
+def _curves(source: SweepRuns, drawn: Sequence[Combination]) -> Markup:
+    """Loss, and the error of all parameters where it is known, against iteration and time: medians with bands."""
+    own = [_runs(source, combination) for combination in drawn]
+    if not any(run.records for runs in own for run in runs):
+        return Markup()
+    parts = lay_out("legend", [label(each.settings) if runs else "" for each, runs in zip(drawn, own, strict=True)])
+    kinds = {"loss": "loss"}
+    if not any(units_differ(run.results) for runs in own for run in runs):
+        kinds["parameter_rmse"] = "parameter RMSE"
+    for name, title in kinds.items():
+        both = []
+        for against, caption in ((_by_iteration, "iteration"), (_by_time, "time in steps and updates (s)")):
+            curves = [_median(label(each.settings), place, *against(runs, name))
+                      for place, (each, runs) in enumerate(zip(drawn, own, strict=True)) if runs]  # fmt: skip
+            both.append(("", diagram(curves, caption, title)))
+        parts += lay_out("diagrams", both)
+    more = len(source.sweep.combinations) - len(drawn)
+    return parts + soft(f"{more} more combinations are not drawn." if more else "")
+
+
+def _runs(source: SweepRuns, combination: Combination) -> list[Run]:
+    """The runs of a combination that have an iteration."""
+    names = [run_name(combination, seed) for seed in source.sweep.seeds]
+    return [run for name in names if (run := source.runs.get(name)) is not None and run.records]
+
+
+def _by_iteration(runs: Sequence[Run], name: str) -> tuple[Array, Array]:
+    """The iterations (N,) and the figure of each run (runs, N) at those, not a number where it is not known."""
+    most = max(len(run.records) for run in runs)
+    values = np.full((len(runs), most), np.nan)
+    for row, run in zip(values, runs, strict=True):
+        row[: len(run.records)] = _column(run, name)
+    return np.arange(most), values
+
+
+def _by_time(runs: Sequence[Run], name: str) -> tuple[Array, Array]:
+    """Seconds (N,), from where all runs have an iteration, and the figure of each run (runs, N) by its newest iteration
+    that was done by then: one that is over stays where it ended."""
+    ends = [np.array(_column(run, "elapsed_s"), dtype=np.float64) for run in runs]
+    times = np.unique(np.concatenate(ends))
+    times = times[times >= max(end[0] for end in ends)]
+    times = times[:: -(-len(times) // MOST_POINTS)]
+    values = np.full((len(runs), len(times)), np.nan)
+    for row, run, end in zip(values, runs, ends, strict=True):
+        row[:] = np.array(_column(run, name), dtype=np.float64)[np.searchsorted(end, times, side="right") - 1]
+    return times, values
+
+
+def _column(run: Run, name: str) -> list[float | None]:
+    return [record[name] for record in run.records]
+
+
+def _median(title: str, place: int, xs: Array, values: Array) -> Curve:
+    """Medians over the runs where all of them have a figure, with the least and the greatest as a band."""
+    known = np.isfinite(values).all(axis=0)
+    xs, values = xs[known], values[:, known]
+    if not len(xs):
+        return Curve(title, [], [], place)
+    band = (values.min(axis=0), values.max(axis=0)) if len(values) > 1 else None
+    return Curve(title, xs.tolist(), np.median(values, axis=0).tolist(), place, band)
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
+
+
+def _shown(source: SweepRuns) -> tuple[list[tuple[Combination, Run]], Markup]:
+    """Of each combination the first run that is finished, and a line that says which they are."""
+    found = []
+    for combination in source.sweep.combinations:
+        done = [run for run in _runs(source, combination) if is_complete(run.manifest)]
+        found += [(combination, done[0])] if done else []
+    more = len(found) - MOST_PICTURES
+    line = "Of each combination the first seed that is finished." if found else ""
+    return found[:MOST_PICTURES], soft(line + (f" {more} more combinations are not shown." if more > 0 else ""))
+
+
+def _images(source: SweepRuns) -> Markup:
+    """The target, and each combination's final image of the first sensor, all with one exposure."""
+    shown, line = _shown(source)
+    names = ("", "-0")  # of several sensors the first
+    first = next((run for _, run in shown), None)
+    if first is None:
+        return Markup()
+    suffix = next((end for end in names if (first.path / "images" / f"target{end}.exr").exists()), "")
+    target = load_image(first.path / "images" / f"target{suffix}.exr")
+    exposure = shown_exposures(first.manifest.get("views")).get(suffix) or exposure_for(target)
+    pictures = [] if target is None else [show(target * exposure, "target", lay_out("titled", "target", ""))]
+    for combination, run in shown:
+        image, loss = load_image(run.path / "images" / f"final{suffix}.exr"), run.results.get("image_loss") or {}
+        if image is not None:
+            said = "" if loss.get("final") is None else f"loss {number(loss['final'])}"
+            pictures.append(_picture(image * exposure, combination, said))
+    return line + lay_out("gallery", pictures, "", exposure_words(exposure, target))
+
+
+def _textures(source: SweepRuns) -> Markup:
+    """Each texture as it is in truth, where that is known, and as each combination recovered it."""
+    shown, line = _shown(source)
+    if not shown:
+        return Markup()
+    archives = [read_parameters(run.path / "parameters") for _, run in shown]
+    true = read_parameters(shown[0][1].path / "parameters" / "true")
+    parts = Markup()
+    for name in [name for name, array in archives[0].items() if array.ndim == 3 and array.size][:MOST_TEXTURES]:
+        about = (shown[0][1].results.get("parameters") or {}).get(name) or {}
+        found: dict[str, Array] = {"true": true[name]} if name in true else {}
+        places = [place for place, each in enumerate(archives) if name in each]
+        found |= {_moment(place): archives[place][name] for place in places}
+        arrays, words = visible(found, about.get("quantity") in PLACES)
+        pictures = [show(arrays["true"], f"true: {name}", lay_out("titled", "true", ""))] if name in true else []
+        pictures += [
+            _picture(arrays[_moment(place)], shown[place][0], _error(shown[place][1], name)) for place in places
+        ]
+        parts += lay_out("gallery", pictures, key(name), words)
+    return line + parts if parts else parts
+
+
+def _moment(place: int) -> str:
+    """What a combination's texture is called where it is made visible: the first one decides how."""
+    return f"final {place}" if place else "final"
+
+
+def _picture(values: Array, combination: Combination, said: str) -> Picture:
+    title = shorten(label(combination.settings), CAPTION_WIDTH)
+    return show(values, title, lay_out("titled", title, ""), said)
+
+
+def _error(run: Run, name: str) -> str:
+    pair: Mapping[str, Any] = (run.results.get("parameter_rmse") or {}).get(name) or {}
+    return "" if pair.get("final") is None else f"RMSE {number(pair['final'], 3)}"

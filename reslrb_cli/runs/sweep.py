@@ -1,0 +1,301 @@
+"""A sweep: every combination of settings, planned and checked before anything runs; and what is left to be done of it.
+
+Runs are processes of their own, which whoever calls begins: `commands` says what `reslrb` is to be called with.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import IO, Any
+
+from reslrb_cli.config.base import SEED_END
+from reslrb_cli.config.files import NAME_BYTES
+from reslrb_cli.config.loader import Override, dump, loads, parse_override, read_text
+from reslrb_cli.config.schema import Config, folder_name
+from reslrb_cli.config.yaml_text import Location, format_location
+from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault, one_line
+from reslrb_cli.records.atomic import remove_parts_of, write_atomically
+from reslrb_cli.records.checkpoint import newest_checkpoint
+from reslrb_cli.records.lock import FolderLock, InUse
+from reslrb_cli.records.manifest import Status, is_complete, read_manifest
+from reslrb_cli.records.sweeps import (
+    SWEEP_FILE,
+    Combination,
+    Sweep,
+    config_file,
+    in_words,
+    is_sweep,
+    read_sweep,
+    run_name,
+    short_keys,
+)
+from reslrb_cli.runs.prepare import changes
+
+#: Runs of a sweep, at most: each has a folder, and a line of its page.
+MOST_RUNS = 1000
+
+#: How long the end of a process is waited for that was killed: a GPU's memory takes its time to be given back.
+RELEASE_SECONDS, _POLL_SECONDS = 15.0, 0.05
+
+#: Bytes of a run's name that say its seed.
+_SEED_BYTES = len(f"-seed={SEED_END}")
+
+#: Settings that a sweep makes itself.
+OWN: dict[Location, str] = {
+    ("run", "seed"): "--seeds N has N of them",
+    ("run", "name"): "runs are named by their settings",
+    ("run", "output"): "-o FOLDER says it",
+}
+
+
+@dataclass(frozen=True)
+class Varied:
+    """A setting and its values, each as an override of its own."""
+
+    key: str
+    location: Location
+    overrides: tuple[Override, ...]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A sweep that is checked: `configs` are those of its combinations by name, with the first seed."""
+
+    sweep: Sweep
+    configs: dict[str, Config]
+
+
+def parse_vary(text: str) -> Varied:
+    """What is varied, from `a.b=[1, 2]`. Raises ConfigError where `text` is none of that."""
+    given = parse_override(text, "--vary", "KEY=[VALUE, ...], such as run.spp=[16, 32]")
+    key = format_location(given.location)
+    if not isinstance(given.value, list) or not given.value:
+        raise ConfigError(given.label, "", f"must be a list of values, such as {key}=[16, 32]")
+    if reason := OWN.get(given.location[:2]):
+        raise ConfigError(given.label, "", f"is not varied: {reason}")
+    overrides = [
+        Override(f"--vary {one_line(f'{key}={in_words(value)}', 100)}", given.location, value) for value in given.value
+    ]
+    seen: list[str] = []
+    for value in given.value:
+        if (kept := json.dumps(value, sort_keys=True)) in seen:
+            raise ConfigError(given.label, "", f"names {one_line(in_words(value), 100)} twice")
+        seen.append(kept)
+    return Varied(key, given.location, tuple(overrides))
+
+
+def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[str]) -> Plan:
+    """Every combination of what is varied, checked as a configuration, with `seeds` seeds from its own on.
+
+    Raises ConfigError, located by the first setting that is wrong.
+    """
+    varied = [parse_vary(text) for text in vary]
+    for place, each in enumerate(varied):
+        for earlier in varied[:place]:
+            if earlier.location[: len(each.location)] == each.location:
+                reason = f"replaces what --vary {earlier.key} sets; give it first, or leave one of them out"
+                raise ConfigError(f"--vary {each.key}", "", reason)
+    sizes = [len(each.overrides) for each in varied]
+    count = seeds
+    for size in sizes:
+        count *= size
+    if count > MOST_RUNS:
+        product = " x ".join(map(str, [*sizes, f"{seeds} seeds"]))
+        raise ConfigError("--vary", "", f"{product} are {count} runs; a sweep has at most {MOST_RUNS}")
+    text = read_text(path, str(path))
+    first = loads(text, path, [*overrides, *(each.overrides[0] for each in varied)]).run.seed
+    if first + seeds > SEED_END:
+        raise ConfigError("--seeds", "", f"leads beyond {SEED_END - 1}, from run.seed: {first} on")
+    combinations, configs = [], {}
+    names = _names(varied)
+    for name, chosen in zip(names, itertools.product(*(each.overrides for each in varied)), strict=True):
+        config = loads(text, path, [*overrides, *chosen])
+        if config.run.seed != first:
+            reason = f"is {config.run.seed}, and {first} in the first combination; {OWN['run', 'seed']}"
+            raise ConfigError("--vary", "run.seed", reason)
+        settings = {each.key: override.value for each, override in zip(varied, chosen, strict=True)}
+        combinations.append(Combination(name, settings))
+        configs[name] = config
+    sweep = Sweep(str(path), list(overrides), combinations, list(range(first, first + seeds)))
+    return Plan(sweep, configs)
+
+
+def _names(varied: Sequence[Varied]) -> list[str]:
+    """The name of each combination, in the order of their product: no two are equal, not even by their case."""
+    short = short_keys([each.key for each in varied])
+    names: list[str] = []
+    taken: set[str] = set()
+    for chosen in itertools.product(*(each.overrides for each in varied)):
+        parts = [f"{short[each.key]}={_named(override.value)}" for each, override in zip(varied, chosen, strict=True)]
+        name = wanted = _bounded("-".join(parts))
+        for number in itertools.count(2):
+            if name.casefold() not in taken:
+                break
+            name = f"{wanted}-{number}"
+        taken.add(name.casefold())
+        names.append(name)
+    return names
+
+
+def _named(value: Any) -> str:
+    """A value in the name of a folder; of a section its `type` first, without the word."""
+    if isinstance(value, Mapping):
+        first = [str(value["type"])] if "type" in value else []
+        return "-".join(first + [f"{key}={_named(each)}" for key, each in value.items() if key != "type"])
+    if isinstance(value, list):
+        return "-".join(map(_named, value))
+    return in_words(value)
+
+
+def _bounded(name: str) -> str:
+    """A name that leaves room for a seed and a number behind it, in the letters that a run's folder may have."""
+    most = NAME_BYTES - _SEED_BYTES - len(f"-{MOST_RUNS}")
+    return folder_name(name).encode()[:most].decode(errors="ignore")
+
+
+# --- the folder -------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def opened(folder: Path, plan: Plan | None, seeds: int | None = None, retry: bool = False) -> Iterator[Sweep]:
+    """The sweep in `folder`, which is locked while the block works: that of `plan`, begun where there is none yet.
+
+    Without a plan it is the one that is there, with so many `seeds`, if these are more. With `retry` runs that failed
+    count as not done. Raises ConfigError, also where the folder has another sweep, or anything else.
+    """
+    if plan is not None:
+        _make(folder)
+    elif not folder.is_dir():
+        raise ConfigError(folder, "", "no such folder; a sweep makes its own: `reslrb sweep CONFIG --vary ...`")
+    try:
+        lock = FolderLock(folder.resolve())
+    except InUse:
+        raise ConfigError(folder, "", "is in use by another `reslrb sweep`; end that first") from None
+    except OSError as error:
+        raise ConfigError(folder, "", f"cannot be opened: {error.strerror}") from None
+    with lock:
+        if is_sweep(folder) or plan is None:
+            kept = read_sweep(folder)
+            if plan is not None:
+                _check_same(folder, kept, plan)
+            sweep = _grown(kept, plan.sweep.seeds if plan else None, seeds)
+        else:
+            _begin(folder, plan)
+            sweep = plan.sweep
+        if retry:
+            sweep = replace(sweep, failures={})
+        try:
+            remove_parts_of(folder / SWEEP_FILE)
+            sweep.write(folder)
+        except OSError as error:
+            raise _unwritable(folder, error) from None
+        yield sweep
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise ConfigError("-o", "", f"{folder} is a file, not the folder of a sweep") from None
+    except OSError as error:
+        raise _unwritable(folder, error) from None
+
+
+def _unwritable(folder: Path, error: OSError) -> ConfigError | MachineError:
+    if is_machine_fault(error):
+        return MachineError(f"{folder}: {error.strerror}; the sweep did not go on")
+    return ConfigError("-o", "", f"cannot write to {folder} ({error.strerror}); give a folder that can be written to")
+
+
+def _begin(folder: Path, plan: Plan) -> None:
+    """Write the configurations; the plan, which comes last, says that all of them are there."""
+    # a sweep that was killed while it began has written nothing but configurations
+    if others := sorted(path.name for path in folder.iterdir() if path.name != "configs"):
+        reason = f"{folder} has {one_line(others[0], 60)!r} in it, and no sweep; give a folder that is new, or empty"
+        raise ConfigError("-o", "", reason)
+    try:
+        for combination in plan.sweep.combinations:
+            path, text = config_file(folder, combination), dump(plan.configs[combination.name]).encode()
+            path.parent.mkdir(exist_ok=True)
+            write_atomically(path, partial(_put, text))
+    except OSError as error:
+        raise _unwritable(folder, error) from None
+
+
+def _put(text: bytes, file: IO[bytes]) -> None:
+    file.write(text)
+
+
+def _check_same(folder: Path, kept: Sweep, plan: Plan) -> None:
+    """Raise ConfigError, which names the first difference, where the sweep in `folder` is not that of the plan."""
+    advice = "give another folder with -o, or go on with that one: --resume"
+    there = [(each.name, each.settings) for each in kept.combinations]
+    here = [(each.name, each.settings) for each in plan.sweep.combinations]
+    if there != here:
+        what = ", ".join(dict.fromkeys([*kept.keys, *plan.sweep.keys])) or "nothing"
+        raise ConfigError(folder, "", f"has a sweep of other settings or values ({what}); {advice}")
+    if kept.seeds[0] != plan.sweep.seeds[0]:
+        reason = f"is {plan.sweep.seeds[0]}, and {kept.seeds[0]} in the sweep in {folder}; {advice}"
+        raise ConfigError(plan.sweep.config, "run.seed", reason)
+    for combination in kept.combinations:
+        path = config_file(folder, combination)
+        then = loads(read_text(path, str(path)), path)
+        found = {
+            key: change
+            for key, change in changes(then, plan.configs[combination.name]).items()
+            if key not in ("run.name", "run.output")
+        }
+        if found:
+            key, (was, is_) = next(iter(found.items()))
+            shown = [one_line("not set" if value is None else value, 60) for value in (is_, was)]
+            reason = f"is {shown[0]}, and {shown[1]} in the sweep in {folder}; {advice}"
+            raise ConfigError(plan.sweep.config, key, reason)
+
+
+def _grown(kept: Sweep, planned: Sequence[int] | None, seeds: int | None) -> Sweep:
+    """With more seeds, where more are asked for; fewer than there are would leave out what was done."""
+    wanted = len(planned) if planned is not None else seeds
+    if wanted is None or wanted == len(kept.seeds):
+        return kept
+    if wanted < len(kept.seeds):
+        raise ConfigError("--seeds", "", f"is {wanted}; the sweep has {len(kept.seeds)} seeds already")
+    if wanted * len(kept.combinations) > MOST_RUNS or kept.seeds[0] + wanted > SEED_END:
+        reason = f"{len(kept.combinations)} x {wanted} seeds: a sweep has at most {MOST_RUNS} runs"
+        raise ConfigError("--seeds", "", reason)
+    return replace(kept, seeds=list(range(kept.seeds[0], kept.seeds[0] + wanted)))
+
+
+# --- what is left to be done ------------------------------------------------------------------------------------------
+
+
+def is_left(folder: Path, sweep: Sweep, name: str) -> bool:
+    """Whether a run of the sweep is still to be done, or to be gone on with."""
+    return name not in sweep.failures and not is_complete(read_manifest(folder / name) or {})
+
+
+def command(folder: Path, combination: Combination, seed: int) -> list[str]:
+    """What `reslrb` is to be called with for one run: it begins, or goes on from where it was cut off.
+
+    A process that was killed and still has the run's folder is waited for. Raises ConfigError, located in that, where
+    one goes on working there.
+    """
+    folder, name = folder.absolute(), run_name(combination, seed)
+    run, end = folder / name, time.monotonic() + RELEASE_SECONDS
+    while (read_manifest(run) or {}).get("status") == Status.RUNNING:
+        if time.monotonic() > end:
+            raise ConfigError(run, "", "is in use by a run of its own; end that first")
+        time.sleep(_POLL_SECONDS)
+    if newest_checkpoint(run / "checkpoint") is not None and read_manifest(run) is not None:
+        return ["optimize", "--resume", str(run)]
+    words = ["optimize", str(config_file(folder, combination))]
+    for key, value in (("run.seed", seed), ("run.output", str(folder)), ("run.name", name)):
+        words += ["--set", f"{key}={json.dumps(value)}"]
+    # one that was killed before it kept anything is replaced
+    return [*words, "--force"]

@@ -1,0 +1,109 @@
+"""What shells are offered, by click's own classes and by a bash, and that offering it loads nothing heavy."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+from cli.tiny import ROOT, done
+from click.shell_completion import BashComplete, FishComplete, ShellComplete, ZshComplete
+
+from reslrb_cli.cli import main
+from reslrb_cli.cli.completion import SHELLS, Bash, setting_keys
+from reslrb_cli.cli.example import examples
+from reslrb_cli.config.loader import parse_override
+from reslrb_cli.config.yaml_text import format_location
+
+
+def offered(kind: type[ShellComplete], *words: str) -> list[tuple[str, str]]:
+    """Type and text of what a shell is offered for the last of the words, which is begun."""
+    shell = kind(main, {}, "reslrb", "_RESLRB_COMPLETE")
+    return [(item.type, item.value) for item in shell.get_completions(list(words[:-1]), words[-1])]
+
+
+@pytest.mark.parametrize("kind", [BashComplete, ZshComplete, FishComplete, Bash])
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["swe"], [("plain", "sweep")]),
+        (["optimize", "--res"], [("plain", "--resume")]),
+        (["optimize", ""], [("file", "")]),
+        (["optimize", "--resume", "ru"], [("dir", "ru")]),
+        (["sweep", "--resume", "ru"], [("dir", "ru")]),
+        (["export", "ru"], [("dir", "ru")]),
+        (["render", "--run", "ru"], [("dir", "ru")]),
+        (["optimize", "a.yaml", "--set", "run.sp"], [("plain", "run.spp=")]),
+        (["optimize", "a.yaml", "--set", "ru"], [("plain", "run="), ("plain", "run.")]),
+        (["sweep", "a.yaml", "--vary", "optimizer.learn"], [("plain", "optimizer.learning_rate=")]),
+        (["bench", "--set", "parameters[3].learning_"],
+         [("plain", "parameters[3].learning_rate="), ("plain", "parameters[3].learning_rate.")]),
+        (["optimize", "a.yaml", "--set", "run.nothing"], []),
+        (["example", "cornell"], [("plain", "cornell_floor")]),
+        (["completion", ""], [("plain", shell) for shell in SHELLS]),
+    ],
+)  # fmt: skip
+def test_what_is_offered(kind, words, found):
+    assert offered(kind, *words) == found
+
+
+def test_every_command_is_offered():
+    assert {text for _, text in offered(BashComplete, "")} == set(main.list_commands(None))
+    assert {text for _, text in offered(BashComplete, "example", "")} == set(examples())
+
+
+def test_keys_are_those_of_overrides():
+    keys = setting_keys()
+    assert {"run.spp", "optimizer.learning_rate", "integrator.estimator", "target.render.integrator.max_depth",
+            "parameters[0].regularizers[0].weight", "run.checkpoint_every.seconds"} <= set(keys)  # fmt: skip
+    assert all(format_location(parse_override(f"{key}=1").location) == key for key in keys)
+    # from the first letter on every key can be come to by what is offered
+    for key in ("parameters[0].initial.run", "run.spp"):
+        begun = ""
+        while begun != f"{key}=":
+            texts = [text for _, text in offered(Bash, "optimize", "a.yaml", "--set", begun)]
+            begun = max((text for text in texts if f"{key}=".startswith(text)), key=len)
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_scripts(shell):
+    script = done("completion", shell).stdout
+    assert f"_RESLRB_COMPLETE={shell}_complete" in script
+    if shell == "bash":
+        assert subprocess.run(["bash", "-n"], input=script, text=True, check=False).returncode == 0
+
+
+def test_a_bash_completes():
+    """By the script itself, as a shell calls it: no space comes behind a key that goes on."""
+    script = done("completion", "bash").stdout
+    program = "compopt() { echo option $*; }\n" + script + (
+        "COMP_WORDS=(reslrb optimize a.yaml --set run.sp) COMP_CWORD=4\n"
+        "_reslrb_completion reslrb\necho ${COMPREPLY[*]}\n"
+        "COMPREPLY=() COMP_WORDS=(reslrb swe) COMP_CWORD=1\n_reslrb_completion reslrb\necho ${COMPREPLY[*]}\n"
+    )  # fmt: skip
+    path = os.pathsep.join([os.path.dirname(sys.executable), os.environ["PATH"]])
+    told = subprocess.run(["bash", "--norc", "-c", program], capture_output=True, text=True, check=False, cwd=ROOT,
+                          env={**os.environ, "PATH": path})  # fmt: skip
+    assert told.stdout.splitlines() == ["option -o nospace", "run.spp=", "sweep"], told.stderr
+
+
+@pytest.mark.parametrize("words", ["optimize a.yaml --set run.sp", "swe", "example c"])
+def test_completing_loads_nothing_heavy(words):
+    script = (
+        "import sys; sys.argv[0] = 'reslrb'\n"
+        "from reslrb_cli.cli import run\n"
+        "try:\n    run()\n"
+        "finally:\n    print(sorted({'mitsuba', 'drjit', 'numpy', 'scipy', 'matplotlib'} & set(sys.modules)))\n"
+    )
+    asked = {
+        "COMP_WORDS": f"reslrb {words}",
+        "COMP_CWORD": str(len(words.split())),
+        "_RESLRB_COMPLETE": "bash_complete",
+    }
+    told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd=ROOT,
+                          env={**os.environ, **asked, "PYTHONPATH": str(ROOT)})  # fmt: skip
+    *offered, heavy = told.stdout.splitlines()
+    assert offered
+    assert heavy == "[]"
+    assert told.stderr == ""

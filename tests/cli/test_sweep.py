@@ -1,0 +1,532 @@
+"""`reslrb sweep`: what it plans and refuses, what it goes on with after a kill, its table, and who is told apart."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli import tiny
+from cli.tiny import ROOT, reslrb
+from click.testing import CliRunner
+from compilation import search_path
+
+from reslrb_cli.cli import main, progress, sweep
+from reslrb_cli.cli.terminal import Interrupts
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure.optimization_benchmark.rank import find_best
+from reslrb_cli.records.lock import FolderLock
+from reslrb_cli.records.sweeps import Combination, Sweep, SweepRunRecord, in_words, read_sweep, run_name, short_keys
+from reslrb_cli.report.page import sweep as curves
+from reslrb_cli.report.sources import Run, read_sweep_runs
+from reslrb_cli.report.sweep import best_records, lines, row_records, run_records
+from reslrb_cli.runs import recorder as recording
+from reslrb_cli.runs import sweep as plans
+from reslrb_cli.runs.sweep import make_plan
+
+#: Settings by which a run takes a moment, and what two that are equal differ in all the same.
+QUICK = ("run.measuring=0", "run.certainty=false", "run.final_spp=4", "run.checkpoint_every={iterations: 2}")
+TIMES = ("elapsed_s", "peak_mib")
+RATES = "optimizer.learning_rate=[0.02, 0.2]"
+
+
+@pytest.fixture
+def folder(llvm, tmp_path, monkeypatch):
+    """The working directory, with `tiny.yaml`; runs are called in this process, and draw no pages."""
+    tiny.write_experiment(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>"))
+    monkeypatch.setattr(recording, "seen_errors", lambda *about: {})
+    monkeypatch.setattr(sweep, "call", call)
+    return tmp_path
+
+
+def call(arguments, interrupts, verbose=False):
+    """What `sweep.call` does, in this process."""
+    result = CliRunner().invoke(main, list(arguments))
+    return result.exit_code, result.output.strip().splitlines()[-1]
+
+
+def made(*arguments, seeds=2):
+    """The plan of `tiny.yaml`, each argument varied."""
+    return make_plan(Path("tiny.yaml"), arguments, seeds, [])
+
+
+def table(folder):
+    """What is in the table, but for times and memory, and what is said of it."""
+    source = read_sweep_runs(Path(folder))
+    runs = [json.loads(run.to_json()) for run in run_records(source)]
+    said = [line for line in lines(source.sweep, run_records(source)) if line.startswith("lowest")]
+    return [{key: value for key, value in run.items() if key not in TIMES} for run in runs], said
+
+
+# --- the plan ---------------------------------------------------------------------------------------------------------
+
+
+def test_all_combinations_with_all_seeds(folder):
+    plan = made("optimizer=[{type: adam, learning_rate: 0.1}, {type: sgd}]", "run.spp=[4, 8, 12]", seeds=4)
+    names = [run_name(*run) for run in plan.sweep.runs]
+    assert len(names) == len(set(names)) == 2 * 3 * 4
+    assert names[0] == "optimizer=adam-learning_rate=0.1-spp=4-seed=0"
+    assert names[6] == "optimizer=adam-learning_rate=0.1-spp=4-seed=1"  # all combinations of one seed come first
+    assert make_plan(Path("tiny.yaml"), ["run.spp=[4, 8]"], 3, ["run.seed=5"]).sweep.seeds == [5, 6, 7]
+    found = {(type(each.optimizer).__name__, each.run.spp) for each in plan.configs.values()}
+    assert found == {(kind, spp) for kind in ("Adam", "SGD") for spp in (4, 8, 12)}
+
+
+def test_names_are_short_safe_and_different(folder):
+    keys = ["run.spp", "target.render.spp", "parameters[0].bounds"]
+    assert short_keys(keys) == dict(zip(keys, ["run.spp", "render.spp", "bounds"], strict=True))
+    assert [in_words(each) for each in (0.1, 1e-05, True, None, "a, b", [1, 2.5], {"type": "sgd"})] == [
+        "0.1", "1e-05", "true", "null", "'a, b'", "[1, 2.5]", "{type: sgd}",
+    ]  # fmt: skip
+    values = ["0.1, 0.2", "0.1-0.2", "../x", "A", "a", "x" * 500, "x" * 499 + "y", "ä\u202e"]
+    text = json.dumps([{"a": value} for value in values], ensure_ascii=False).replace("\u202e", "\\u202e")
+    plan = made(f"scene.options={text}")
+    names = [each.name for each in plan.sweep.combinations]
+    assert len({name.casefold() for name in names}) == len(values)
+    for name in (run_name(*run) for run in plan.sweep.runs):
+        assert len(name.encode()) <= 200
+        assert name == Path(name).name
+        assert not name.startswith(".")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["--vary", "run.spp"], "--vary run.spp: must be KEY=[VALUE, ...], such as run.spp=[16, 32]"),
+        (["--vary", "run.spp=4"], "--vary run.spp=4: must be a list of values, such as run.spp=[16, 32]"),
+        (["--vary", "run.spp=[]"], "--vary run.spp=[]: must be a list of values"),
+        (["--vary", "run.spp=[4, 4]"], "--vary run.spp=[4, 4]: names 4 twice"),
+        (["--vary", "run.spq=[4, 8]"], "--vary run.spq=4: run.spq: unknown key; did you mean `spp`"),
+        (["--vary", "run.spp=[4, eight]"], "--vary run.spp=eight: run.spp: must be"),
+        (["--vary", "run.spp=[4, {}]"], "--vary run.spp={}: run.spp: must be"),
+        (["--vary", "run.spp=[4", "--seeds", "2"], "--vary run.spp=[4: not valid YAML"),
+        (["--vary", "run.seed=[1, 2]"], "--vary run.seed=[1, 2]: is not varied: --seeds N has N of them"),
+        (["--vary", "run=[{spp: 4}, {seed: 3}]"], "--vary: run.seed: is 3, and 0 in the first combination"),
+        (["--vary", "run.spp=[4]", "--vary", "run=[{spp: 4}]"], "--vary run: replaces what --vary run.spp sets"),
+        (["--vary", "run.spp=[4]", "--vary", "run.spp=[8]"], "--vary run.spp: replaces what --vary run.spp sets"),
+        (["--vary", "run.spp=[4, 8]", "--seeds", "501"], "2 x 501 seeds are 1002 runs; a sweep has at most 1000"),
+        (["--set", f"run.seed={2**32 - 1}", "--seeds", "2"], "--seeds: leads beyond 4294967295, from run.seed"),
+        (["--set", "run.spq=3"], "--set run.spq=3: run.spq: unknown key"),
+        # two values of which each is right with the others
+        (["--vary", "run.spp=[4, 6]", "--vary", "run.adjoint=[independent, batched]"], "run.adjoint"),
+        (["--resume", "gone"], "gone: no such folder"),
+        (["--resume", "."], ".: is no sweep's folder: it has no sweep.json"),
+        (["-o", "tiny.yaml"], "-o: tiny.yaml is a file, not the folder of a sweep"),
+        (["-o", "."], "in it, and no sweep; give a folder that is new, or empty"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said_before_anything_runs(folder, arguments, line):
+    before = tiny.files(folder)
+    config = [] if "--resume" in arguments else ["tiny.yaml"]
+    result = reslrb("sweep", *config, *arguments)
+    assert result.exit_code == 2
+    assert line in result.output
+    assert len(result.output.strip().splitlines()) == 1
+    assert tiny.files(folder) == before
+
+
+def test_a_folder_has_one_sweep(folder):
+    arguments = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", "run.iterations=[1]", "-o", "s"]
+    Path("s/configs").mkdir(parents=True)
+    Path("s/configs/of a sweep that was killed before its plan was whole.yaml").touch()
+    tiny.done(*arguments)
+    assert "settings or values" in reslrb(*arguments, "--vary", "run.spp=[4, 8]").output
+    assert (
+        "optimizer.learning_rate: is 0.3, and 0.02" in reslrb(*arguments, "--set", "optimizer.learning_rate=0.3").output
+    )
+    assert "run.seed: is 7, and 0 in the sweep in s" in reslrb(*arguments, "--set", "run.seed=7").output
+    more = tiny.done("sweep", "--resume", "s", "--seeds", 2)
+    assert "2 of 2 runs done" in more.output
+    assert "--seeds: is 1; the sweep has 2 seeds already" in reslrb("sweep", "--resume", "s", "--seeds", 1).output
+    assert "takes --seeds, --retry" in reslrb("sweep", "--resume", "s", "--vary", "run.spp=[4]").output
+
+
+def test_what_is_damaged_is_located(folder):
+    Path("s").mkdir()
+    for text in ("{", "[]", '{"seeds": [0]}', "\0"):
+        Path("s/sweep.json").write_text(text)
+        result = reslrb("sweep", "--resume", "s")
+        assert (result.exit_code, result.output[:13]) == (2, "s/sweep.json:"), result.output
+    plan = made("run.spp=[4, 8]").sweep
+    plan.write(Path("s"))
+    content = json.loads(Path("s/sweep.json").read_text())
+    for name in ("../elsewhere", "/tmp", "", plan.combinations[1].name):
+        content["combinations"][0]["name"] = name
+        Path("s/sweep.json").write_text(json.dumps(content))
+        if name:
+            with pytest.raises(ConfigError, match="no names of folders"):
+                read_sweep(Path("s"))
+
+
+# --- runs, kills and what is left -------------------------------------------------------------------------------------
+
+
+def test_a_sweep_that_was_killed_ends_with_the_table_of_one_that_was_not(folder, monkeypatch):
+    """At four moments what a kill would have left is copied: in the midst of a run, before one has kept anything, over
+    its final images, and between two runs."""
+    show, begin, calls, moments = progress.Progress.show, recording.Recording._begin, [], []
+    end = recording.Recording._write_final_images
+
+    def copy(moment):
+        moments.append(f"killed-{moment}")
+        shutil.copytree("whole", moments[-1])
+
+    def showing(self, record):
+        show(self, record)
+        if (len(calls), record.iteration) == (2, 2):
+            copy("in-a-run")
+
+    def beginning(self):
+        if len(calls) == 3:
+            shutil.rmtree(self.folder.checkpoint)
+            self.folder.checkpoint.mkdir()
+            copy("before-a-checkpoint")
+        begin(self)
+
+    def ending(self):
+        if len(calls) == 3:
+            copy("over-final-images")
+        end(self)
+
+    def calling(arguments, interrupts, verbose=False):
+        calls.append(arguments)
+        if len(calls) == 4:
+            copy("between-runs")
+        return call(arguments, interrupts)
+
+    monkeypatch.setattr(progress.Progress, "show", showing)
+    monkeypatch.setattr(recording.Recording, "_begin", beginning)
+    monkeypatch.setattr(recording.Recording, "_write_final_images", ending)
+    monkeypatch.setattr(sweep, "call", calling)
+    words = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", RATES, "--seeds", "2"]
+    tiny.done(*words, "-o", "whole")
+    whole = table("whole")
+    assert [run["status"] for run in whole[0]] == ["finished"] * 4
+    assert len(moments) == 4
+    for place, left in enumerate(moments):
+        calls[:] = [None] * 10  # nothing is copied any more
+        # the same command again, or --resume
+        tiny.done(*words, "-o", left) if place % 2 else tiny.done("sweep", "--resume", left)
+        assert table(left) == whole, left
+        assert [words[1] == "--resume" for words in calls[10:]].count(True) == (
+            left in ("killed-in-a-run", "killed-over-final-images")
+        ), left
+        assert (
+            len(calls) - 10
+            == {
+                "killed-in-a-run": 3,
+                "killed-before-a-checkpoint": 2,
+                "killed-between-runs": 1,
+                "killed-over-final-images": 2,
+            }[left]
+        )
+    calls[:] = [None] * 10
+    tiny.done("sweep", "--resume", "whole")
+    assert len(calls) == 10  # nothing is done twice
+
+
+def test_a_run_that_fails_is_told_in_its_row(folder, monkeypatch):
+    ends = {"learning_rate=0.02-seed=1": (5, "the loss is not finite"), "learning_rate=0.2-seed=0": (-9, "killed")}
+    called = []
+
+    def failing(arguments, interrupts, verbose=False):
+        called.append(arguments)
+        name = next(word for word in ends if any(word in each for each in arguments)) if any(
+            word in each for word in ends for each in arguments) else None  # fmt: skip
+        return ends[name] if name else call(arguments, interrupts)
+
+    monkeypatch.setattr(sweep, "call", failing)
+    words = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", RATES, "--seeds", "2", "-o", "s"]
+    result = reslrb(*words, "--json", "s.jsonl")
+    assert result.exit_code == 1
+    for line in ("1 of 2, 1 failed", "learning_rate=0.02-seed=1 failed: the loss is not finite",
+                 "finished, 2 of 4 runs done, 2 failed; look at s/sweep.html; --retry tries"):  # fmt: skip
+        assert line in result.output
+    assert "lowest median" not in result.output  # what is left of those that failed are the lucky ones
+    kinds = [json.loads(line)["kind"] for line in Path("s.jsonl").read_text().splitlines()]
+    assert kinds == ["origin", *["sweep_run"] * 4, *["sweep_row"] * 2]
+    called.clear()
+    assert reslrb(*words).exit_code == 1
+    assert called == []
+    ends = {}
+    result = reslrb(*words, "--retry")
+    assert (result.exit_code, len(called)) == (0, 2)
+    assert "lowest median parameter RMSE: learning_rate=0.02" in result.output
+
+
+@pytest.mark.parametrize(("code", "end"), [(6, 6), (3, 3), (130, 130)])
+def test_what_is_no_fault_of_a_run_ends_the_sweep(folder, monkeypatch, code, end):
+    monkeypatch.setattr(sweep, "call", lambda *given, **options: (code, "the disk is full"))
+    result = reslrb("sweep", "tiny.yaml", "--vary", RATES, "-o", "s")
+    assert result.exit_code == end
+    assert "--resume s" in result.output or code == 3
+    assert read_sweep(Path("s")).failures == {}
+
+
+def test_ctrl_c_ends_it_after_the_iteration_with_folders_complete(folder, monkeypatch):
+    show = progress.Progress.show
+
+    def interrupting(self, record):
+        show(self, record)
+        if record.iteration == 1 and not Path("sent").exists():
+            Path("sent").touch()
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(progress.Progress, "show", interrupting)
+    words = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", RATES, "-o", "s"]
+    result = reslrb(*words)
+    assert result.exit_code == 130
+    assert "interrupted, 0 of 2 runs done; look at s/sweep.html; `reslrb sweep --resume s` goes on" in result.output
+    run = Path("s/learning_rate=0.02-seed=0")
+    assert tiny.faults(run, 130, "") == []
+    assert "finished, 2 of 2 runs done" in tiny.done(*words).output
+
+
+def test_a_sweep_has_its_folder_to_itself(folder, monkeypatch):
+    said = []
+
+    def another(arguments, interrupts, verbose=False):
+        said.append(reslrb("sweep", "--resume", "s").output)
+        return 130, ""
+
+    monkeypatch.setattr(sweep, "call", another)
+    reslrb("sweep", "tiny.yaml", "-o", "s")
+    assert said == ["s: is in use by another `reslrb sweep`; end that first\n"]
+
+
+def start(folder, *arguments):
+    """`reslrb sweep` in a process of its own, whose runs have processes of theirs."""
+    script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
+    environment = {**os.environ, "PYTHONPATH": search_path(ROOT), "RESLRB_CACHE": str(folder / "cache")}
+    return subprocess.Popen([sys.executable, "-c", script, "sweep", *arguments], cwd=folder, env=environment,
+                            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)  # fmt: skip
+
+
+def count_lines(run):
+    """How many iterations the metrics of a run have."""
+    path = run / "metrics.jsonl"
+    try:
+        return len(path.read_text().splitlines())
+    except OSError:  # there are none yet, or they are about to be cut back
+        return 0
+
+
+def wait_for(happened, seconds=60.0):
+    """Wait until something has happened."""
+    end = time.monotonic() + seconds
+    while not happened():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_a_process_that_crashes_is_told_by_its_last_words(monkeypatch):
+    for end, code, said in (
+        ("print('>>> no room'); print('x'); sys.stdout.flush(); os.kill(os.getpid(), 9)", -9,
+         "ended by SIGKILL (the system ends so what takes too much memory): no room"),
+        ("print('a.yaml: wrong'); sys.exit(2)", 2, "a.yaml: wrong"),
+        ("sys.exit(4)", 4, "ended with exit code 4, and said nothing"),
+        ("time.sleep(60)", 130, "ended by SIGTERM: "),
+    ):  # fmt: skip
+        monkeypatch.setattr(sweep, "_PROGRAM", f"import os, sys, time; {end}")
+        interrupts = Interrupts()
+        interrupts.requested = code == 130  # a run that does not heed signals yet
+        assert sweep.call(["optimize"], interrupts) == (code, said)
+
+
+def test_a_run_that_another_goes_on_with_is_waited_for(folder, monkeypatch):
+    words = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "-o", "s"]
+    tiny.done(*words)
+    manifest = json.loads(Path("s/seed=0/manifest.json").read_text())
+    Path("s/seed=0/manifest.json").write_text(json.dumps(manifest | {"status": "running"}))
+    monkeypatch.setattr(plans, "RELEASE_SECONDS", 0.1)
+    with FolderLock(Path("s/seed=0")):
+        result = reslrb(*words)
+    assert (result.exit_code, result.output.splitlines()[-1]) == (
+        2, f"{Path('s/seed=0').absolute()}: is in use by a run of its own; end that first")  # fmt: skip
+    assert "finished, 1 of 1 runs done" in tiny.done(*words).output
+
+
+def test_a_run_does_not_outlive_a_sweep_that_is_killed(llvm, tmp_path):
+    tiny.write_experiment(tmp_path)
+    settings = tiny.settings(*QUICK, "run.iterations=100000")
+    process = start(tmp_path, "tiny.yaml", *settings, "-o", "s")
+    run = tmp_path / "s/seed=0"
+    wait_for(lambda: count_lines(run) > 6)
+    worker = json.loads((run / "manifest.json").read_text())["process"]["pid"]
+    process.kill()
+    process.wait()
+    process.stdout.close()
+
+    def is_gone():
+        try:
+            return Path(f"/proc/{worker}/stat").read_text().split()[2] == "Z"
+        except OSError:
+            return True
+
+    wait_for(is_gone, 5.0)
+    # another goes on from there, and is told to end by a signal to it alone
+    before = count_lines(run)
+
+    def stop():
+        try:
+            wait_for(lambda: count_lines(run) > before + 2)
+        finally:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    stopping = threading.Thread(target=stop)
+    stopping.start()
+    result = reslrb("sweep", "--resume", tmp_path / "s")
+    stopping.join()
+    assert result.exit_code == 130, result.output
+    assert tiny.faults(run, 130, result.output) == []
+    assert json.loads((run / "manifest.json").read_text())["resumed"][0]["iteration"] > 0
+
+
+@pytest.mark.long
+def test_killed_five_times(llvm, tmp_path):
+    """2 x 3 settings and 4 seeds, in processes of their own, which have all threads: equal but for rounding."""
+    tiny.write_experiment(tmp_path)
+    words = ["tiny.yaml", *tiny.settings(*QUICK, "run.iterations=20"), "--vary", "optimizer.learning_rate=[0.01, 0.1]",
+             "--vary", "run.spp=[4, 8, 16]", "--seeds", "4"]  # fmt: skip
+    whole = start(tmp_path, *words, "-o", "whole")
+    rng, kills = np.random.default_rng(5), []
+    while True:
+        process = start(tmp_path, *words, "-o", "killed")
+        try:
+            said, _ = process.communicate(timeout=None if len(kills) == 5 else float(rng.uniform(6, 25)))
+            break
+        except subprocess.TimeoutExpired:
+            process.kill()
+            kills.append(process.communicate()[0])
+    assert len(kills) == 5, said
+    assert process.returncode == 0, said
+    assert whole.wait(900) == 0
+    whole.stdout.close()
+    one, other = table(tmp_path / "whole")[0], table(tmp_path / "killed")[0]
+    assert [run["status"] for run in one] == ["finished"] * 24
+    for first, second in zip(one, other, strict=True):
+        for name in ("loss", "error"):
+            assert first.pop(name) == pytest.approx(second.pop(name), rel=1e-4)
+        assert first == second
+
+
+# --- what it comes to -------------------------------------------------------------------------------------------------
+
+
+def test_pairs_tell_what_the_spread_over_seeds_hides():
+    rng = np.random.default_rng(4)
+    noise = np.exp(rng.normal(0, 1, 10))
+    values = {"a": 1.0 * noise, "b": 1.1 * noise * np.exp(rng.normal(0, 0.01, 10)), "c": 3.0 * noise}
+    values = {name: list(each) for name, each in values.items()}
+    paired, unpaired = find_best(values, paired=True), find_best(values)
+    assert (paired.best, paired.tied, paired.beats) == ("a", [], ["b", "c"])
+    assert unpaired.tied == ["b", "c"]
+    few = find_best({name: each[:5] for name, each in values.items()}, paired=True)
+    assert (few.too_few, few.enough) == (True, 7)
+    assert find_best({"a": [1.0, 2.0], "b": [1.0, 2.0]}, paired=True).tied == ["b"]
+
+
+def pretended(losses, key="run.spp", **about):
+    """A sweep of so many settings and seeds (settings, seeds), and its finished runs of these losses."""
+    combinations = [Combination(f"spp={k}", {key: k}) for k in range(len(losses))]
+    sweep = Sweep("a.yaml", [], combinations, list(range(len(losses[0]))))
+    done = {"status": "finished", "error": 0.5, "elapsed_s": 2.0, "peak_mib": 3.0}
+    runs = [SweepRunRecord(run_name(each, seed), each.settings, seed, **done | {"loss": float(losses[k][seed])} | about)
+            for seed in sweep.seeds for k, each in enumerate(combinations)]  # fmt: skip
+    return sweep, runs
+
+
+def test_the_best_is_told_in_pairs_of_seeds_that_all_have():
+    noise = np.exp(np.random.default_rng(4).normal(0, 1, 10))
+    sweep, runs = pretended([1.1 * noise, noise])
+    (best, equal) = best_records(sweep, runs)
+    assert (best.of, best.best, best.second, best.beats, best.seeds) == ("loss", "spp=1", "spp=0", ["spp=0"], 10)
+    assert [best.ratio.value, best.ratio.low, best.ratio.high] == pytest.approx([1 / 1.1] * 3)
+    assert "spp=1; surely lower than all others (in pairs of 10 seeds" in best.line
+    assert "; lower than the next, spp=0, with 10 of 10 seeds, 0.909 [0.909, 0.909] times that" in best.line
+    assert (equal.of, equal.tied) == ("error", ["spp=1"])
+    # of a seed that only one has nothing is compared, nor of what failed, nor of what is something else
+    runs[-1] = replace(runs[-1], status="waiting")
+    assert best_records(sweep, runs)[0].seeds == 9
+    runs[-1] = replace(runs[-1], status="failed", message="no room")
+    assert best_records(sweep, runs) == []
+    row = row_records(sweep, runs)[1]
+    assert (row.runs, row.of, row.failed, row.message) == (9, 10, 1, "seed 9: no room")
+    assert (row.loss.median, row.loss.low, row.loss.high) == (
+        np.median(noise[:9]), noise[:9].min(), noise[:9].max())  # fmt: skip
+    for key, compared in (("loss", ["error"]), ("loss.type", ["error"]), ("scene.size", []), ("target", ["error"]),
+                          ("parameters[0].bounds", []), ("lossy", ["loss", "error"])):  # fmt: skip
+        assert [each.of for each in best_records(*pretended([noise, noise], key))] == compared, key
+
+
+def test_equal_settings_are_rarely_told_apart():
+    """Of four equal ones any is told from the best with a probability of at most 5 %."""
+    rng = np.random.default_rng(9)
+    wrong = 0
+    for _ in range(400):
+        values = rng.normal(size=(4, 12))
+        wrong += bool(find_best({str(k): list(each) for k, each in enumerate(values)}, paired=True).beats)
+    # the best of four is chosen by the same values: more than 5 % would be 20 of 400, its standard deviation 4.4
+    assert wrong <= 20 + 3 * 4.4
+
+
+def test_curves_are_medians_with_the_least_and_the_greatest():
+    """Of runs of 1, 2 and 4 iterations; by time from where all have one, and where each ended from then on."""
+    runs = []
+    for number, (times, losses) in enumerate(
+        [([1.0], [9.0]), ([2.0, 3.0], [7.0, 5.0]), ([0.5, 1.5, 4.0, 5.0], range(4))]
+    ):
+        records = [{"elapsed_s": at, "loss": float(loss)} for at, loss in zip(times, losses, strict=True)]
+        runs.append(Run(Path(), str(number), {}, records))
+    curve = curves._median("", 0, *curves._by_iteration(runs, "loss"))
+    assert (curve.xs, curve.ys, [end.tolist() for end in curve.band]) == ([0], [7.0], [[0.0], [9.0]])
+    curve = curves._median("", 0, *curves._by_time(runs, "loss"))
+    assert curve.xs == [2.0, 3.0, 4.0, 5.0]
+    assert curve.ys == [7.0, 5.0, 5.0, 5.0]
+    assert [end.tolist() for end in curve.band] == [[1.0, 1.0, 2.0, 3.0], [9.0] * 4]
+
+
+def test_the_page_has_table_curves_and_pictures(folder):
+    words = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", "target.render.spp=[8, 16]", "--seeds", "2"]
+    tiny.done(*words, "-o", "s")
+    tiny.done("report", "s")
+    content = json.loads(Path("s/sweep.json").read_text())
+    tiny.done("report", "s", "-o", "page.html")
+    for page in ("s/sweep.html", "page.html"):
+        text = Path(page).read_text()
+        assert "2 combinations with 2 seeds: 4 of 4 runs finished." in text
+        assert text.count("<svg") == 4  # loss and error, by iteration and by time
+        assert text.count("data:image/png") == 3 + 3  # the target, and the truth, beside what was recovered
+        assert "losses of different `target.render.spp` are not of the same, and not compared" in text
+        assert "lowest median parameter RMSE" in text
+        assert "cannot be shown" not in text
+    for place, value in enumerate(("<b>x</b>", "$y$")):
+        content["combinations"][place]["settings"] = {"<i>k</i>": value}
+    Path("s/sweep.json").write_text(json.dumps(content))
+    shutil.rmtree("s/spp=8-seed=1/images")
+    tiny.done("report", "s", "s/spp=8-seed=0", "-o", "both.html")
+    text = Path("both.html").read_text()
+    assert "Settings: s" in text
+    assert "&lt;b&gt;x" in text
+    assert "<b>x" not in text
+    assert "<i>k" not in text
+
+
+def test_a_dry_run_says_how_many_runs_and_what_they_take(folder):
+    before = tiny.files(folder)
+    result = tiny.done("sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", RATES, "--seeds", "3", "--dry-run")
+    assert "2 combinations with 3 seeds: 6 runs, one after the other; nothing was written" in result.output
+    assert "learning_rate=0.02" in result.output
+    assert "time of the whole sweep: about" in result.output
+    assert tiny.files(folder) == before

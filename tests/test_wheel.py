@@ -1,0 +1,148 @@
+"""What a wheel has in it, and that it works where nothing of this repository is: an example is copied, and run."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from pathlib import Path
+
+import pytest
+import setuptools
+from cli.tiny import reslrb
+from compilation import search_path
+
+from reslrb_cli.cli.example import examples
+from reslrb_cli.config.loader import load
+from reslrb_cli.runs.prepare import flat
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "reslrb_cli"
+
+#: What a wheel is made of.
+LEAST_SETUPTOOLS = 77  # as pyproject.toml says
+SOURCES = ("pyproject.toml", "README.md", "LICENSE", "reslrb_cli", "configs", "scenes")
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A wheel of this repository, made of a copy without the network."""
+    if int(setuptools.__version__.partition(".")[0]) < LEAST_SETUPTOOLS:
+        pytest.skip(
+            f"setuptools {setuptools.__version__} makes none of this project; scripts/setup --test has a newer one"
+        )
+    folder = tmp_path_factory.mktemp("wheel")
+    for name in SOURCES:
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, folder / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(ROOT / name, folder / name)
+    script = "import sys; from setuptools import build_meta; print(build_meta.build_wheel(sys.argv[1]))"
+    made = subprocess.run(
+        [sys.executable, "-c", script, "out"], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert made.returncode == 0, made.stderr[-2000:]
+    return folder / "out" / made.stdout.splitlines()[-1]
+
+
+def installed(wheel: Path, folder: Path) -> Path:
+    """A Python that has the wheel, and what that needs from this environment, but not this repository."""
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
+    (site,) = folder.glob("lib/python*/site-packages")
+    install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index", "--target", site, wheel]
+    subprocess.run(install, check=True)
+    needed = Path(sysconfig.get_path("purelib"))
+    # as this environment would, but for what leads to the repository: `.pth` files in such a folder are not read
+    (site / "needed.pth").write_text(f"{needed}\n")
+    return folder / "bin/python"
+
+
+def test_the_wheel_has_all_that_is_no_module(wheel: Path) -> None:
+    names = set(zipfile.ZipFile(wheel).namelist())
+    wanted = {path.relative_to(ROOT).as_posix() for path in PACKAGE.rglob("*.j2")}
+    wanted |= {path.relative_to(ROOT).as_posix() for path in PACKAGE.rglob("*.py")}
+    for name in ("configs", "scenes"):
+        wanted |= {f"reslrb_cli/examples/{path.relative_to(ROOT).as_posix()}"
+                   for path in (ROOT / name).rglob("*") if path.is_file()}  # fmt: skip
+    assert wanted <= names
+    others = {name for name in names - wanted if ".dist-info/" not in name}
+    assert others == set()
+    assert wheel.stat().st_size < 3e6
+
+
+def test_examples_are_as_they_are_shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each can be copied, and loads as the same experiment, all of its files its own."""
+    monkeypatch.chdir(tmp_path)
+    assert {ROOT / "configs" / f"{name}.yaml" for name in examples()} == set((ROOT / "configs").rglob("*.yaml"))
+    listed = reslrb("example").stdout.splitlines()
+    assert [line.split()[0] for line in listed] == list(examples())
+    for name, path in examples().items():
+        result = reslrb("example", name, "-o", f"of {name.replace('/', ' ')}")
+        assert result.exit_code == 0, result.output
+        copied = Path(f"of {name.replace('/', ' ')}") / path.name
+        own, shipped = flat(load(copied)), flat(load(path))
+        assert own.keys() == shipped.keys()
+        for key, value in shipped.items():
+            for mine, theirs in [] if own[key] == value else zip(*map(paths, (own[key], value)), strict=True):
+                assert mine.read_bytes() == theirs.read_bytes()
+                assert mine.resolve().is_relative_to(tmp_path.resolve())
+
+
+def paths(value: str | list[str]) -> list[Path]:
+    """Those of a setting that names a file, or several."""
+    return [Path(each) for each in (value if isinstance(value, list) else [value])]
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["cornel_floor"], "NAME: no example is called `cornel_floor`; did you mean `cornell_floor`?"),
+        (["zzz"], "NAME: no example is called `zzz`; there are caustic_heightmap, "),
+        (["furnace", "-o", "taken"], "taken/furnace.yaml: exists; give another folder with -o, or remove it"),
+        (["stiff/lamp", "-o", "taken"], "taken/scenes/stiff/wall.xml: exists; give another folder"),
+        (["furnace", "-o", "file/below"], "-o: cannot write to file/below: Not a directory"),
+    ],
+)
+def test_what_is_there_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], line: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    for name in ("furnace.yaml", "scenes/stiff/wall.xml"):
+        (Path("taken") / name).parent.mkdir(parents=True, exist_ok=True)
+        (Path("taken") / name).write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
+    result = reslrb("example", *words)
+    assert (result.exit_code, result.output[: len(line)]) == (2, line)
+    assert len(result.output.strip().splitlines()) == 1
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_an_example_runs_from_another_folder(wheel: Path, tmp_path: Path, llvm: str) -> None:
+    """Also its page, whose templates lie in the package, and a second command by `reslrb` itself."""
+    python = installed(wheel, tmp_path / "environment")
+    program, elsewhere = python.with_name("reslrb"), tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    # the script that pip puts beside the packages, where `--target` has it
+    (script,) = (tmp_path / "environment").rglob("bin/reslrb")
+    if script != program:
+        program.write_text(f"#!{python}\n" + script.read_text().partition("\n")[2])
+        program.chmod(0o755)
+    environment = {**os.environ, "PYTHONPATH": search_path(), "RESLRB_CACHE": str(tmp_path / "cache")}
+
+    def call(*words: str) -> str:
+        told = subprocess.run([program, *words], cwd=elsewhere, env=environment, capture_output=True, text=True,
+                              check=False)  # fmt: skip
+        assert told.returncode == 0, told.stderr
+        return told.stdout
+
+    where = subprocess.run([python, "-c", "import reslrb_cli; print(reslrb_cli.__file__)"], cwd=elsewhere,
+                           env=environment, capture_output=True, text=True, check=True).stdout  # fmt: skip
+    assert Path(where.strip()).is_relative_to(tmp_path / "environment")
+    assert "furnace/furnace.yaml" in call("example", "furnace")
+    settings = ("scene.size=[8, 8]", "run.iterations=2", "run.spp=4", "run.measuring=0", "run.final_spp=4",
+                "target.render.spp=16", "integrator.estimator=stack")  # fmt: skip
+    said = call("optimize", "furnace/furnace.yaml", *(word for each in settings for word in ("--set", each)))
+    assert "finished after 2 iterations" in said
+    assert "</html>" in (elsewhere / "runs/furnace/report.html").read_text()
