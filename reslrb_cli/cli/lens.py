@@ -122,8 +122,8 @@ def command(
         raise ConfigError("--incidence", "", "goes with --mirror: light comes to a lens straight")
     if output.exists() and not output.is_dir():
         raise ConfigError("--output", "", f"{output} is a file; name a folder")
-    taken = next((p for n in ("lens.yaml", "scene.xml", "face.ply", "back.ply", "target.exr", "start.exr")
-                  if (p := output / n).exists()), None)  # fmt: skip
+    names = ("lens.yaml", "scene.xml", "face.ply", "back.ply", "target.exr", "picture.exr", "start.exr")
+    taken = next((path for name in names if (path := output / name).exists()), None)
     if taken is not None and not force:
         raise ConfigError("--output", "", f"{taken} exists; --force replaces it")
     set_variant("auto")
@@ -168,7 +168,8 @@ def command(
         ny, nx = (finer * cells for cells in surface.heights.shape)
         heights = experiment.at_vertices(surface, nx, ny).astype(np.float32)[:, :, None]
         write_file(output / "start.exr", heights, linear=True)
-        write_file(output / "target.exr", np.repeat(target.astype(np.float32)[:, :, None], 3, 2), linear=True)
+        for name, seen in (("target.exr", target), ("picture.exr", experiment.on_film(image, surface, margin))):
+            write_file(output / name, np.repeat(seen.astype(np.float32)[:, :, None], 3, 2), linear=True)
         texts = {
             "face.ply": experiment.face_ply(setting, nx, ny),
             "scene.xml": experiment.scene_xml(surface, film, columns, power, sun, both).encode(),

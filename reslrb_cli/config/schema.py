@@ -324,6 +324,9 @@ class Fabrication(Section):
     receiver: Annotated[str, Field(min_length=1)] = Field(
         default="screen", description="Id of what the light falls on."
     )
+    picture: ConfigPath | None = None
+    """The picture as it was before its dark parts were lifted, as the film sees it: what is thrown is compared with
+    that, too. null: with the target alone."""
 
 
 class Config(Section):

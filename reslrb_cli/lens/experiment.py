@@ -103,14 +103,18 @@ def target_image(picture: Array, surface: Surface, margin: float) -> tuple[Array
     (H, W), of the picture (luminance, row 0 at the top) with its dark parts lifted to the floor. No light is lost.
     """
     setting = surface.setting
-    lifted = np.maximum(picture, surface.floor * picture.max())
-    lifted = lifted / lifted.mean()
-    width, height = film_size((picture.shape[0], picture.shape[1]), margin)
-    target = np.zeros((height, width))
-    top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
-    seen = lifted[:, ::-1] if setting.through else lifted
-    target[top : top + picture.shape[0], left : left + picture.shape[1]] = seen
+    target = on_film(np.maximum(picture, surface.floor * picture.max()), surface, margin)
     return target, float(np.pi / ALBEDO * np.prod(setting.picture_size) / leaving(surface))
+
+
+def on_film(picture: Array, surface: Surface, margin: float) -> Array:
+    """A picture (rows, columns) as the film (H, W) sees it, its mean 1, with black about it."""
+    width, height = film_size((picture.shape[0], picture.shape[1]), margin)
+    film = np.zeros((height, width))
+    top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
+    seen = picture[:, ::-1] if surface.setting.through else picture
+    film[top : top + picture.shape[0], left : left + picture.shape[1]] = seen / seen.mean()
+    return film
 
 
 def lamps(surface: Surface, power: float, sun: float) -> str:
@@ -296,6 +300,7 @@ run:
   certainty: false  # of a design there is no true value
 fabrication:  # mm; what `reslrb export` makes a solid of
   {{kind: {s.kind}, thickness: {s.thickness:.9g}, outline: {s.outline}, ior: {s.ior:g},{also}
+   picture: picture.exr,  # as it was, without a floor
    size: [{s.size[0]:.9g}, {s.size[1]:.9g}]}}
 """
 

@@ -43,8 +43,15 @@ def closed_by_ball(heights: Array, pitch: Sequence[float], radius: float) -> Arr
     return np.asarray(closed[reach[1] : -reach[1], reach[0] : -reach[0]])
 
 
+def luminance(image: Array) -> Array:
+    """That of an image (H, W, C), (H, W)."""
+    wide = image[:, :, :3].astype(np.float64)
+    return np.asarray(wide @ [0.2126, 0.7152, 0.0722] if wide.shape[2] == 3 else wide[:, :, 0])
+
+
 def figures(image: Array, target: Array) -> dict[str, float]:
-    """Of luminances (H, W): SSIM and L1 within the picture, and the part of the light on the film that goes there.
+    """Of luminances (H, W): SSIM, L1 and contrast (standard deviation over mean) within the picture, the `contrast` of
+    the target there, and the part of the light on the film that goes there.
 
     The picture is the rectangle about what of the target is not black. Each image is divided by its mean there; SSIM is
     scikit-image's, data_range the target's maximum.
@@ -59,6 +66,8 @@ def figures(image: Array, target: Array) -> dict[str, float]:
         "ssim": float(structural_similarity(seen, wanted, data_range=float(wanted.max()))),
         "l1": float(np.abs(seen - wanted).mean()),
         "inside": float(image[inside].sum() / max(float(image.sum()), 1e-30)),
+        "contrast": float(seen.std()),
+        "target_contrast": float(wanted.std()),
     }
 
 
@@ -85,9 +94,7 @@ class Bench:
     def render(self, spp: int, seed: int = 0) -> Array:
         """Luminance (H, W)."""
         image = np.array(mi.render(self.scene, integrator=self._integrator, sensor=self.sensor, spp=spp, seed=seed))
-        if image.ndim == 2 or image.shape[2] == 1:
-            return image.reshape(image.shape[:2]).astype(np.float64)
-        return np.asarray(image[:, :, :3].astype(np.float64) @ [0.2126, 0.7152, 0.0722])
+        return luminance(image.reshape(*image.shape[:2], -1))
 
     @contextmanager
     def _changed(self, values: dict[str, Any]) -> Iterator[None]:
@@ -189,7 +196,7 @@ def tolerances(
         if turned:
             rows, columns = (float(value) for value in shift_between(image, planned))
             image = scipy.ndimage.shift(image, (-rows, -columns), order=1)
-            entry["shift"] = [columns, rows]
+            entry["shift"] = [columns + 0.0, rows + 0.0]  # no -0
         found[name] = figures(image, target) | entry
         moved = f", shifted by {np.hypot(*entry['shift']):.2g} pixels" if turned else ""
         say(f"{name}: SSIM {found[name]['ssim']:.3f}, {100 * found[name]['inside']:.3g} % of the light inside{moved}")

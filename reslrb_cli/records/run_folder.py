@@ -38,6 +38,9 @@ Array = np.ndarray[Any, Any]
 #: Keys that an error names.
 _SHOWN = 3
 
+#: What a maker wants to know of the solid that a run shapes, and below `images` a picture of it.
+FABRICATION_FILE, SOLID_PICTURE = "fabrication.json", "solid"
+
 
 def read_value(run: Path, key: str) -> Array:
     """The value of `key` in the newest checkpoint of the run folder `run`; where its result is an average, that.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,17 +28,21 @@ from reslrb_cli.lens.solid import (
     within,
 )
 from reslrb_cli.measure.references import DEEPEST, Situation, ptracer_image
-from reslrb_cli.measure.tolerance import Bench
+from reslrb_cli.measure.tolerance import Bench, figures, luminance
 from reslrb_cli.measure.tolerance import tolerances as measure
 from reslrb_cli.optimization.loading import check_integrator, choose_sensors, load_configured, paths_of
 from reslrb_cli.optimization.moving import moves_anything
 from reslrb_cli.records.atomic import write_atomically, writing
-from reslrb_cli.records.images import write_bitmap, write_file
+from reslrb_cli.records.images import write_bitmap, write_file, write_image
+from reslrb_cli.records.metrics import finite
+from reslrb_cli.records.run_folder import FABRICATION_FILE, SOLID_PICTURE
 from reslrb_cli.scene.export import export_scene
 from reslrb_cli.scene.graph import interpolates_normals
-from reslrb_cli.scene.images import read_photo
+from reslrb_cli.scene.images import read_image, read_photo
 from reslrb_cli.scene.parameters import select_parameters
 from reslrb_cli.scene.xml.read import Description
+
+Array = np.ndarray[Any, Any]
 
 #: Told of what was written.
 Say = Callable[[str], None]
@@ -57,7 +62,7 @@ def check_export(config: Config, output: Path, tolerances: bool) -> None:
 def write_export(config: Config, run: Path, output: Path, tolerances: bool, say: Say) -> None:
     """Write into the folder `output`, or the file of a solid, what `config`, the experiment of `run` with what it
     recovered, comes to; a variant must be set. `say` is told what was written. Raises ConfigError, UnsupportedScene."""
-    plan, writer = config.fabrication, WRITERS.get(output.suffix.lower())
+    plan, writer, off = config.fabrication, WRITERS.get(output.suffix.lower()), dict[str, dict[str, Any]]()
     described: list[Description] = []
     scene = load_configured(config, described.append)
     selection, sensors = select_parameters(scene, config.parameters, config.source), choose_sensors(config, scene)
@@ -76,7 +81,8 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
     paths = paths_of(config.integrator, scene, sensors, moves)
     integrator, why = choose_integrator(config, scene, selection.params, paths)
     if plan is not None:
-        off = measure_tolerances(config, scene, selection.params, sheets, integrator, say) if tolerances else {}
+        if tolerances:
+            off = measure_tolerances(config, scene, selection.params, sheets, integrator, say)
         beside = solid_files(plan, sheets, solid, off)
     with writing("--output", output):
         export_scene(described[0], selection.params, selection.scene_keys, integrator, output, run, beside)
@@ -85,6 +91,74 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
         tell_solid(output / f"{plan.kind}.stl", plan, sheets, solid, say)
         if f"{plan.kind}.3mf" not in beside:
             say(f"{plan.kind}.3mf is left out, since lib3mf is missing: pip install 'reslrb[fabrication]'")
+    if off:
+        keep_tolerances(run, off, say)
+
+
+# --- what the run's own folder has of its solid -----------------------------------------------------------------------
+
+
+def keep_solid(config: Config, params: mi.SceneParameters, run: Path, image: Array, target: Array) -> None:
+    """Write into the folder of a run what a maker wants to know of its solid (`fabrication.json`), and a picture of it.
+
+    `params` are those of the scene as it stands, `image` and `target` (H, W, C) what is thrown and what is wanted.
+    Raises ConfigError where there is no solid between the faces.
+    """
+    assert config.fabrication is not None
+    sheets, solid = read_solid(config, config.fabrication, params)
+    numbers, wanted = measured(solid, sheets, config.fabrication), luminance(target)
+    thrown = luminance(image)
+    numbers["thrown"] = figures(thrown, wanted)
+    if config.fabrication.picture is not None:
+        picture = luminance(read_image(config.fabrication.picture))
+        if picture.shape == wanted.shape:
+            kept = np.where(wanted > 0, np.maximum(picture, 1e-9), 0)  # its rectangle is the target's
+            numbers["thrown"]["ssim_of_picture"] = figures(thrown, kept)["ssim"]
+    write_image(run / "images" / SOLID_PICTURE, picture_of(solid))
+    _write_numbers(run, numbers)
+
+
+def keep_tolerances(run: Path, off: dict[str, dict[str, Any]], say: Say) -> None:
+    """Add what was measured of tolerances to the folder of the run, and draw its page anew, where that can be."""
+    from reslrb_cli.report.page import write_report
+
+    try:
+        numbers = json.loads((run / FABRICATION_FILE).read_text())
+        _write_numbers(run, numbers | {"tolerances": off})
+        write_report(run)
+    except (OSError, ValueError) as error:
+        say(f"{run}: the page does not show the tolerances: {error}")
+    else:
+        say(f"{run / 'report.html'}: has them, too")
+
+
+def _write_numbers(run: Path, numbers: dict[str, Any]) -> None:
+    content = json.dumps(finite(numbers), indent=2).encode() + b"\n"
+    write_atomically(run / FABRICATION_FILE, lambda file: file.write(content))
+
+
+def picture_of(solid: Solid) -> Array:
+    """The solid in grazing light, (H, W, 3): its first face seen from a corner, as if it were of plaster."""
+    with tempfile.TemporaryDirectory(prefix="reslrb-") as folder:
+        file = Path(folder) / "solid.ply"
+        file.write_bytes(WRITERS[".ply"](solid))
+        low, high = solid.points.min(axis=0), solid.points.max(axis=0)
+        middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+        away = np.array([-0.5, -1.1, 1.5])
+        origin = middle + 4.2 * radius * away / np.linalg.norm(away)
+        scene = mi.load_dict({
+            "type": "scene",
+            "solid": {"type": "ply", "filename": str(file), "face_normals": True,
+                      "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.7}}},
+            "lamp": {"type": "directional", "direction": [0.92, -0.3, -0.2], "irradiance": 6},
+            "sky": {"type": "constant", "radiance": 0.15},
+            "camera": {"type": "perspective", "fov": 29,
+                       "to_world": mi.ScalarTransform4f().look_at(origin.tolist(), middle.tolist(), [0, 0, 1]),
+                       "film": {"type": "hdrfilm", "width": 480, "height": 360, "pixel_format": "rgba",
+                                "rfilter": {"type": "box"}}},
+        })  # fmt: skip
+        image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "direct", "hide_emitters": True}), spp=32))
+    return np.asarray(image[:, :, :3] + (1 - image[:, :, 3:4]) * 0.9, dtype=np.float32)
 
 
 def check_folder(path: Path) -> None:
@@ -142,7 +216,7 @@ def measure_tolerances(
     files = config.target.file
     if files is None or len(files) != 1:
         raise ConfigError("--tolerances", "", "what is thrown is compared with target.file, which has to be one image")
-    target = read_photo(files[0]).image.astype(np.float64) @ np.array([0.2126, 0.7152, 0.0722])
+    target = luminance(read_photo(files[0]).image)
     width, height = (int(n) for n in scene.sensors()[sensor].film().crop_size())
     if target.shape != (height, width):
         raise ConfigError("--tolerances", "", f"target.file has {target.shape[1]}x{target.shape[0]} pixels, the film "

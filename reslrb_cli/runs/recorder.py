@@ -36,7 +36,7 @@ from reslrb_cli.records.checkpoint import (
     save_nonfinite,
 )
 from reslrb_cli.records.images import PARAMETERS_FILE as PARAMETERS_FILE_NAME
-from reslrb_cli.records.images import write_image, write_mask, write_parameters
+from reslrb_cli.records.images import load_image, write_image, write_mask, write_parameters
 from reslrb_cli.records.manifest import NOT_YET, Manifest, Status
 from reslrb_cli.records.measurement_files import LivePage
 from reslrb_cli.records.metrics import MetricsWriter, Record, finite
@@ -344,6 +344,8 @@ class Recording:
             if status is Status.FINISHED:  # who interrupts does not want to wait; `reslrb report` finds them as well
                 self._add("how certain the values are was", self._measure_certainty)
                 self._add("errors as people see them were", self._measure_seen_errors)
+                if self.problem.config.fabrication is not None:
+                    self._add("what a maker has to know of the solid was", self._measure_solid)
         else:
             self.manifest.missing["final images"] = "the run failed"
         return ending.finish(self._write_page)
@@ -404,6 +406,17 @@ class Recording:
         if pixels > MANY_PIXELS:
             logger.info(f"comparing images of {pixels / 1e6:.2g} million pixels as people see them")
         self.seen = finite(seen_errors(self.folder.path, self.manifest.results, self.manifest.views))
+
+    def _measure_solid(self) -> None:
+        from reslrb_cli.runs.export import keep_solid
+
+        view = self.problem.views[0]
+        shown = load_image(self.folder.images / f"{self._image_name('final', view.sensor)}.exr")
+        if shown is not None:
+            logger.info("making the solid")
+            keep_solid(
+                self.problem.config, self.problem.selection.params, self.folder.path, shown, np.array(view.target)
+            )
 
     def _write_final_images(self) -> None:
         self._write_images("final")

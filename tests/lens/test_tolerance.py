@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from cli.tiny import done, reslrb
+from cli.tiny import done, reslrb, settings
 from lens.test_experiment import picture
+from skimage.metrics import structural_similarity
 
 from reslrb_cli.config.schema import Fabrication
 from reslrb_cli.lens.solid import as_sheet
@@ -42,7 +44,10 @@ def test_shift_and_figures_are_those_of_what_was_done_to_a_picture() -> None:
     target[8:40, 8:40] = picture(32, 32)
     moved = np.roll(target, (2, -3), axis=(0, 1))
     assert shift_between(moved, target) == pytest.approx([2, -3], abs=0.11)
-    assert figures(3 * target, target) == pytest.approx({"ssim": 1, "l1": 0, "inside": 1})
+    inner = picture(32, 32)
+    contrast = inner.std() / inner.mean()
+    right = {"ssim": 1, "l1": 0, "inside": 1, "contrast": contrast, "target_contrast": contrast}
+    assert figures(3 * target, target) == pytest.approx(right)
     worse = figures(moved + 0.1, target)
     assert worse["ssim"] < 0.9
     assert worse["inside"] < 0.9
@@ -179,3 +184,42 @@ def test_the_command_tells_all_of_them(folder: Path) -> None:
         assert np.hypot(*shift) == pytest.approx(200 * np.tan(np.radians(1)) / (100 / 32), abs=0.15)
     result = reslrb("export", folder / "runs/lens", "-o", folder / "a.stl", "--tolerances")
     assert "goes with a folder" in f"{result.output}{result.exception}"
+
+
+def test_the_page_of_a_run_has_what_a_maker_wants_to_know(tmp_path: Path, llvm: str) -> None:
+    """At its end, and what `export --tolerances` finds afterwards, with what was found at the end still there."""
+    tones = np.kron(np.random.default_rng(2).uniform(0, 1, (4, 4)), np.ones((4, 4)))
+    write_file(tmp_path / "p.exr", np.repeat(tones[:, :, None], 3, 2).astype(np.float32), linear=True)
+    done("lens", tmp_path / "p.exr", "--pixels", 16, "--floor", 0.2, "-o", tmp_path / "l")
+    small = settings("run.iterations=2", "run.spp=8", "run.final_spp=32", "run.measuring=1000")
+    done("optimize", tmp_path / "l/lens.yaml", *small, *settings(f"run.output={tmp_path}"))
+    run = tmp_path / "lens"
+    numbers = json.loads((run / "fabrication.json").read_text())
+    final, target = (np.array(mi.Bitmap(str(run / f"images/{name}.exr")))[:, :, :3] for name in ("final", "target"))
+    weights = np.array([0.2126, 0.7152, 0.0722])
+    inside = slice(2, 18), slice(2, 18)  # an eighth of 16 pixels is beside the picture
+    seen, wanted = (image @ weights for image in (final, target))
+    divided = [image[inside] / image[inside].mean() for image in (seen, wanted)]
+    thrown = numbers["thrown"]
+    assert thrown["ssim"] == pytest.approx(structural_similarity(*divided, data_range=divided[1].max()), abs=1e-6)
+    assert thrown["inside"] == pytest.approx(seen[inside].sum() / seen.sum(), rel=1e-6)
+    assert thrown["contrast"] == pytest.approx(divided[0].std(), rel=1e-6)
+    picture = tones / tones.mean()  # as it was, darker than the floor
+    with_it = structural_similarity(divided[0], picture, data_range=picture.max())
+    assert thrown["ssim_of_picture"] == pytest.approx(with_it, abs=1e-5)
+    assert abs(thrown["ssim_of_picture"] - thrown["ssim"]) > 1e-3
+    assert numbers["volume_mm3"] == pytest.approx(2.5e5, rel=0.5)
+    page = (run / "report.html").read_text()
+    assert "<h2>Fabrication</h2>" in page
+    assert "the solid of the lens" in page
+    assert "where it is off" not in page
+    result = done("export", run, "-o", tmp_path / "made", "--tolerances", *settings("run.final_spp=8"))
+    assert "has them, too" in result.output
+    found = json.loads((run / "fabrication.json").read_text())
+    assert found.pop("tolerances").keys() >= {"as planned", "distance +2 %", "index -0.005"}
+    assert found == numbers
+    assert "distance +2 %" in (run / "report.html").read_text()
+    shutil.rmtree(run / "images")
+    (run / "fabrication.json").unlink()  # a run of before
+    result = done("export", run, "-o", tmp_path / "again", "--tolerances", *settings("run.final_spp=8"))
+    assert "the page does not show the tolerances" in result.output

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,8 +15,10 @@ from markupsafe import Markup
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.correlated_bias import CorrelatedBias, share_words
 from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, PathsRecord, RivalRecord, SequenceRecord
+from reslrb_cli.records.images import load_image
+from reslrb_cli.records.run_folder import FABRICATION_FILE, SOLID_PICTURE
 from reslrb_cli.report.format import count, duration, number
-from reslrb_cli.report.page.images import image_rows, seen_tables, view_table
+from reslrb_cli.report.page.images import image_rows, seen_tables, show, view_table
 from reslrb_cli.report.page.layout import lay_out, soft
 from reslrb_cli.report.page.values import convergence, parameter_table, texture_pictures
 from reslrb_cli.report.run_summary import error_line, measured_line, warnings
@@ -118,6 +121,24 @@ MOST_CONFIG = 2**20
 DAMAGED = "This part cannot be shown: what was recorded of it is damaged."
 
 
+def fabrication(run: Run) -> Markup:
+    """The solid that a run shapes: what it throws, its measures, what was found where things are off, and a picture;
+    nothing where there is none."""
+    text = _read(run.path / FABRICATION_FILE)
+    if not text:
+        return Markup()
+    numbers = json.loads(text)
+    image = load_image(run.path / "images" / f"{SOLID_PICTURE}.exr")
+    caption = lay_out("titled", f"the {numbers['kind']}", ", its first face in grazing light")
+    shown = [] if image is None else [show(image, f"the solid of the {numbers['kind']}", caption)]
+    return (
+        lay_out("gallery", shown)
+        + lay_out("run.fabrication", numbers)
+        + lay_out("run.tolerances", numbers.get("tolerances") or {})
+        + lay_out("note", numbers.get("warnings") or [])
+    )
+
+
 def header(run: Run) -> Markup:
     """The run's name, how it ended, what it came to, and what went wrong."""
     seconds, loss = run.last("elapsed_s"), run.results.get("loss")
@@ -148,6 +169,7 @@ def run_parts(run: Run) -> dict[str, Markup]:
             + lay_out("run.certainty", results.get("certainty") or {})
         ),
         "Images": lambda: image_rows(run),
+        "Fabrication": lambda: fabrication(run),
         "Views": lambda: view_table(run.manifest.get("views"), results),
         "Errors as people see them": lambda: seen_tables([run]),
         "Textures": lambda: texture_pictures(run),
