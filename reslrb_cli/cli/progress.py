@@ -13,7 +13,7 @@ from reslrb_cli.config.files import in_words
 from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.report.format import shorten
-from reslrb_cli.report.run_summary import KEY_WIDTH, descriptions
+from reslrb_cli.report.run_summary import BESIDE_A_BAR, descriptions
 
 #: Without a terminal a line is written after each tenth of the iterations, and when this many seconds have passed.
 SECONDS_PER_LINE = 10.0
@@ -116,7 +116,7 @@ class Reading:
 
     def __call__(self, path: Path, done: int, size: int) -> None:
         """Show that `done` of the `size` bytes of `path` are read."""
-        now, name = time.monotonic(), shorten(str(path), KEY_WIDTH)
+        now, name = time.monotonic(), shorten(str(path), BESIDE_A_BAR)
         if not self._stream.isatty():
             if now - self._said >= SECONDS_PER_LINE:
                 self._said = now

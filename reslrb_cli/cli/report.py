@@ -39,6 +39,7 @@ def command(paths: tuple[Path, ...], output: Path | None) -> int:
 
     if len(paths) > MOST_SOURCES:
         raise ConfigError("RUN", "", f"{len(paths)} are given; a page shows at most {MOST_SOURCES}")
+    gc.collect()  # what has been done with, as a scene, is not to be frozen with the rest
     with Reading() as tell:
         sources = read_sources(paths, tell)
     gc.freeze()  # Python's search for cycles would go through millions of numbers while it draws

@@ -197,7 +197,7 @@ def tolerances(
             rows, columns = (float(value) for value in shift_between(image, planned))
             image = scipy.ndimage.shift(image, (-rows, -columns), order=1)
             entry["shift"] = [columns + 0.0, rows + 0.0]  # no -0
-        found[name] = figures(image, target) | entry
+        found[name] = figures(image, target) | {"spp": spp} | entry
         moved = f", shifted by {np.hypot(*entry['shift']):.2g} pixels" if turned else ""
         say(f"{name}: SSIM {found[name]['ssim']:.3f}, {100 * found[name]['inside']:.3g} % of the light inside{moved}")
 

@@ -232,7 +232,7 @@ class LivePage:
     """
 
     def __init__(
-        self, write: Callable[[], object], what: str = "the page of the run", share: float = PAGE_SHARE
+        self, write: Callable[[], object], what: str = "the page of the run", share: float | None = None
     ) -> None:
         self._write, self._what, self._share = write, what, share
         self._next: float | None = 0.0
@@ -249,4 +249,5 @@ class LivePage:
             self._next = None
         else:
             end = time.monotonic()
-            self._next = end + max(PAGE_SECONDS, self._share * (end - start))
+            share = PAGE_SHARE if self._share is None else self._share
+            self._next = end + max(PAGE_SECONDS, share * (end - start))

@@ -98,7 +98,9 @@ def _manifest_of(run: Path) -> dict[str, Any]:
 
 
 SUBFOLDERS = ("images", "parameters", "checkpoint")
-OWN_ENTRIES = ("config.yaml", manifests.MANIFEST_FILE, metrics.METRICS_FILE, "report.html", *SUBFOLDERS)
+OWN_ENTRIES = (
+    "config.yaml", manifests.MANIFEST_FILE, metrics.METRICS_FILE, "report.html", FABRICATION_FILE, *SUBFOLDERS
+)  # fmt: skip
 
 #: 56 KiB, which are tried to be written first: for a configuration, a manifest, and what it is to say of the run's end.
 _ROOM = "is there room?" * 4096

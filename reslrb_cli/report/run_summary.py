@@ -46,7 +46,7 @@ MOST_NAMED = 3
 PARTNER_WIDTH = 40
 
 #: The same beside a bar.
-KEY_WIDTH = 32
+BESIDE_A_BAR = 32
 
 
 def descriptions(record: Record, meter: ErrorMeter) -> list[str]:
@@ -63,7 +63,7 @@ def descriptions(record: Record, meter: ErrorMeter) -> list[str]:
         return [loss]
     key = max(relative, key=lambda key: relative[key])
     error = f"error {relative[key]:.4g}"
-    return [f"{loss}, relative {error} at worst ({shorten(key, KEY_WIDTH)})", f"{loss}, relative {error}", loss]
+    return [f"{loss}, relative {error} at worst ({shorten(key, BESIDE_A_BAR)})", f"{loss}, relative {error}", loss]
 
 
 def is_settled(results: Mapping[str, Any], key: str) -> bool:

@@ -13,6 +13,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config, Fabrication
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.lens.solid import (
@@ -92,7 +93,7 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
         if f"{plan.kind}.3mf" not in beside:
             say(f"{plan.kind}.3mf is left out, since lib3mf is missing: pip install 'reslrb[fabrication]'")
     if off:
-        keep_tolerances(run, off, say)
+        keep_tolerances(config, run, off, say)
 
 
 # --- what the run's own folder has of its solid -----------------------------------------------------------------------
@@ -118,11 +119,13 @@ def keep_solid(config: Config, params: mi.SceneParameters, run: Path, image: Arr
     _write_numbers(run, numbers)
 
 
-def keep_tolerances(run: Path, off: dict[str, dict[str, Any]], say: Say) -> None:
+def keep_tolerances(config: Config, run: Path, off: dict[str, dict[str, Any]], say: Say) -> None:
     """Add what was measured of tolerances to the folder of the run, and draw its page anew, where that can be."""
     from reslrb_cli.report.page import write_report
 
     try:
+        if load(run / "config.yaml").fabrication != config.fabrication:
+            raise ValueError("they are of other settings than the run's `fabrication`")
         numbers = json.loads((run / FABRICATION_FILE).read_text())
         _write_numbers(run, numbers | {"tolerances": off})
         write_report(run)
@@ -152,12 +155,12 @@ def picture_of(solid: Solid) -> Array:
                       "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.7}}},
             "lamp": {"type": "directional", "direction": [0.92, -0.3, -0.2], "irradiance": 6},
             "sky": {"type": "constant", "radiance": 0.15},
-            "camera": {"type": "perspective", "fov": 29,
+            "camera": {"type": "perspective", "fov": 28, "fov_axis": "smaller",
                        "to_world": mi.ScalarTransform4f().look_at(origin.tolist(), middle.tolist(), [0, 0, 1]),
                        "film": {"type": "hdrfilm", "width": 480, "height": 360, "pixel_format": "rgba",
                                 "rfilter": {"type": "box"}}},
         })  # fmt: skip
-        image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "direct", "hide_emitters": True}), spp=32))
+        image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "direct", "hide_emitters": True}), spp=128))
     return np.asarray(image[:, :, :3] + (1 - image[:, :, 3:4]) * 0.9, dtype=np.float32)
 
 

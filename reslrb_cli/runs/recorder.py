@@ -40,7 +40,7 @@ from reslrb_cli.records.images import load_image, write_image, write_mask, write
 from reslrb_cli.records.manifest import NOT_YET, Manifest, Status
 from reslrb_cli.records.measurement_files import LivePage
 from reslrb_cli.records.metrics import MetricsWriter, Record, finite
-from reslrb_cli.records.run_folder import RunFolder
+from reslrb_cli.records.run_folder import FABRICATION_FILE, RunFolder
 from reslrb_cli.report.page import write_report
 from reslrb_cli.report.perceptual import seen_errors
 from reslrb_cli.report.run_summary import warnings
@@ -227,6 +227,7 @@ class Recording:
                 values = values / "initial"
             # the state at the end has the best values too, and what the clamp and the optimiser then know
             reserve.hold(2 * size_of(self.folder.checkpoint) + size_of(values) + RESERVE_BYTES)
+            (self.folder.path / FABRICATION_FILE).unlink(missing_ok=True)  # of where it was before it went on
             yield from self._iterate(stop)
             left = self.done < self.problem.config.run.iterations and not self.course.state.stopped
             status = Status.INTERRUPTED if left else Status.FINISHED
