@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import os
 import signal
@@ -208,6 +209,7 @@ def gradcheck(
         from reslrb_cli.measure.gradcheck import Gradcheck
         from reslrb_cli.measure.participants import settings_of
 
+        gc.collect()  # scenes that are done with would take part, and their parameters' gradients be in the way
         checked = settings_of(config, estimators, budget, seeds, spp, time.monotonic() - began)
         return [result.record for result in Gradcheck(checked).run(lambda: False, logger.info)]
 

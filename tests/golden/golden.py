@@ -63,7 +63,8 @@ for _type in ("ptracer", "prb", "walk_ad", "trajectory"):
     _run(f"floor_{_type}", "cornell_floor", f"integrator={{type: {_type}, max_depth: 4}}|run.adjoint=independent")
 #: Commands whose help is compared.
 COMMANDS = (
-    *("", "inspect", "init", "optimize", "render", "export", "gradcheck", "bench", "convergence", "report", "doctor"),
+    *("", "inspect", "init", "lens", "optimize", "sweep", "example", "render", "export", "gradcheck", "bench"),
+    *("convergence", "report", "completion", "doctor"),
 )
 #: Tiny measurements, of whose JSON lines the form is compared: names and types, at all depths.
 _TINY = ("--set", "scene.options.size=8", "--set", "run.spp=4")
