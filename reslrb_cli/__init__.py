@@ -22,6 +22,7 @@ import importlib  # noqa: E402
 from typing import TYPE_CHECKING, Any  # noqa: E402
 
 from reslrb_cli.backend import llvm as _llvm  # noqa: E402
+from reslrb_cli.version import __version__  # noqa: E402
 
 if TYPE_CHECKING:
     from reslrb_cli.api.experiment import convergence, export, gradcheck, gradient, load, render
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from reslrb_cli.records.metrics import Record
     from reslrb_cli.scene.load import load_for_script as load_scene
 
-__version__ = "0.1.0"
 __all__ = [
     "Config",
     "ConfigError",

@@ -16,6 +16,7 @@ import reslrb_cli
 ROOT = Path(reslrb_cli.__file__).parent
 # A module may import from its own row and from the rows above it.
 ROWS = [
+    "version",
     "errors",
     "seeds",
     "statistics",

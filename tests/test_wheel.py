@@ -64,6 +64,7 @@ def test_the_wheel_has_all_that_is_no_module(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     wanted = {path.relative_to(ROOT).as_posix() for path in PACKAGE.rglob("*.j2")}
     wanted |= {path.relative_to(ROOT).as_posix() for path in PACKAGE.rglob("*.py")}
+    wanted.add("reslrb_cli/py.typed")  # without it a user's type checker takes every public name for Any
     for name in ("configs", "scenes"):
         wanted |= {f"reslrb_cli/examples/{path.relative_to(ROOT).as_posix()}"
                    for path in (ROOT / name).rglob("*") if path.is_file()}  # fmt: skip

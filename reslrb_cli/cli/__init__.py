@@ -16,9 +16,9 @@ from typing import Any
 
 import click
 
-from reslrb_cli import __version__
 from reslrb_cli.cli.terminal import Interrupts, LogLines, forgiving_output, tell
 from reslrb_cli.errors import LINE_LENGTH, ExitCode, one_line
+from reslrb_cli.version import __version__
 
 # What `reslrb --help` says of each command, so that it need not load them; in the order of a user's work.
 _SUMMARIES = {

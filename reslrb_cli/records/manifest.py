@@ -19,13 +19,13 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from reslrb_cli import __version__
 from reslrb_cli.backend.variant import package_version
 from reslrb_cli.config.files import read_file
 from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.records import metrics
 from reslrb_cli.records.atomic import remove_parts, write_atomically
 from reslrb_cli.records.lock import READER_WAIT_SECONDS, FolderLock, Holder, InUse
+from reslrb_cli.version import __version__
 
 PACKAGES = ("mitsuba", "drjit", "numpy")
 

@@ -17,12 +17,12 @@ from typing import Any, ClassVar
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
-from reslrb_cli import __version__
 from reslrb_cli.config.files import read_file
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.atomic import write_atomically
 from reslrb_cli.records.measurements import Band, Range
 from reslrb_cli.records.metrics import Line
+from reslrb_cli.version import __version__
 
 SWEEP_FILE, PAGE_FILE, CONFIGS = "sweep.json", "sweep.html", "configs"
 

@@ -18,7 +18,8 @@ from typing import IO, Any
 from reslrb_cli.config.base import SEED_END
 from reslrb_cli.config.files import NAME_BYTES
 from reslrb_cli.config.loader import Override, dump, loads, parse_override, read_text
-from reslrb_cli.config.schema import Config, folder_name
+from reslrb_cli.config.run import folder_name
+from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import Location, format_location
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault, one_line
 from reslrb_cli.records.atomic import remove_parts_of, write_atomically

@@ -17,7 +17,8 @@ from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, Prb, Reslrb
 from reslrb_cli.config.loader import FREE_MAPPINGS, dump, load
 from reslrb_cli.config.optimizers import Adam, RMSProp
 from reslrb_cli.config.parameters import ImageFile, ParameterSpec
-from reslrb_cli.config.schema import Config, memory_bytes
+from reslrb_cli.config.run import memory_bytes
+from reslrb_cli.config.schema import Config
 from reslrb_cli.estimators import ESTIMATORS
 
 # Values that a configuration may hold, its defaults, its paths, and the way back to YAML.

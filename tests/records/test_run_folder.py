@@ -15,7 +15,7 @@ import pytest
 from compilation import search_path
 
 from reslrb_cli.config.files import NAME_BYTES
-from reslrb_cli.config.schema import check_name
+from reslrb_cli.config.run import check_name
 from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.records import manifest as manifests
 from reslrb_cli.records.cache import MOST, PilotCache, cache_folder, key_of
