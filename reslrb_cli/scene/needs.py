@@ -208,8 +208,10 @@ def camera_finds_nothing(scene: Any) -> bool:
 def check_supported(scene: Any, sensor: Any, hide_emitters: bool = False) -> None:
     """Raise UnsupportedScene, with the reason and the way out, where light tracing cannot render `scene`."""
     if (obstacle := light_obstacle(scene, sensor, hide_emitters)) is not None:
-        other = camera_obstacle(scene, sensor)
-        raise UnsupportedScene(_advised(obstacle, other, "take integrator.type: prb"))
+        kinds = (kind for kind in ("both", "camera") if paths_obstacle(scene, sensor, kind) is None)
+        kind = next(kinds, None)
+        other = camera_obstacle(scene, sensor) if kind is None else None
+        raise UnsupportedScene(_advised(obstacle, other, f"take integrator: {{type: reslrb, paths: {kind}}}"))
 
 
 def check_camera_paths(scene: Any, sensor: Any) -> None:

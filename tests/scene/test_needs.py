@@ -247,9 +247,12 @@ def test_a_medium_that_rays_cannot_meet_is_nobodys(make_scene):
 @pytest.mark.parametrize(
     ("changes", "way"),
     [
-        ({"camera": {"type": "orthographic"}}, "sensors; take integrator.type: prb"),
-        ({"plane": {"type": "rectangle", "bsdf": {"type": "hair"}}}, "another material; take integrator.type: prb"),
-        ({"plane": {"type": "rectangle", "bsdf": GLASS}}, "rough surface, or take integrator.type: prb"),
+        ({"camera": {"type": "orthographic"}}, "sensors; take integrator: {type: reslrb, paths: camera}"),
+        (
+            {"plane": {"type": "rectangle", "bsdf": {"type": "hair"}}},
+            "material; take integrator: {type: reslrb, paths: camera}",
+        ),
+        ({"plane": {"type": "rectangle", "bsdf": GLASS}}, "surface, or take integrator: {type: reslrb, paths: both}"),
         (
             {"camera": {"type": "orthographic"}, "lamp": BEAM},
             "sensors; nor can paths the other way round.*`prb` cannot",
