@@ -198,8 +198,7 @@ class Reslrb(AttachingTracer):
                 f"`{self.estimator}` chooses among the connections of light paths, of which paths: camera has none; "
                 "leave it out, or take stack",
             )
-        if self.light_share not in ("auto", UNDECIDED["light_share"]) and self.paths in ("light", "camera"):
-            raise located("light_share", f"has no effect with paths: {self.paths}, but with both; remove it")
+        _check_share(self.paths, self.light_share)
         for option in sorted(self._foreign() & self.model_fields_set):
             owners = " or ".join(f"`{name}`" for name, options in ESTIMATOR_OPTIONS.items() if option in options)
             raise located(option, f"has no effect with estimator `{self.estimator}`, but with {owners}; remove it")
@@ -241,6 +240,15 @@ class WalkAd(AttachingTracer, json_schema_extra=NEEDS_TYPE):
     """The light-path walk of `reslrb` under naive reverse-mode differentiation, for comparisons at equal seeds."""
 
     type: Literal["walk_ad"] = Field(default="walk_ad", description="The walk of `reslrb`, naively differentiated.")
+    paths: Literal["light", "camera", "both"] = "light"
+    """Where paths begin, as with `reslrb`."""
+    light_share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = 0.5
+    """Which share of the samples are light paths where `paths` are `both`."""
+
+    @model_validator(mode="after")
+    def _check_options(self) -> Self:
+        _check_share(self.paths, self.light_share)
+        return self
 
 
 class Trajectory(LightTracerOptions, json_schema_extra=NEEDS_TYPE):
@@ -252,6 +260,11 @@ class Trajectory(LightTracerOptions, json_schema_extra=NEEDS_TYPE):
 
 
 AnyIntegrator = Annotated[Reslrb | Ptracer | Prb | WalkAd | Trajectory, ByType("reslrb")]
+
+
+def _check_share(paths: str, light_share: float | str) -> None:
+    if light_share not in ("auto", UNDECIDED["light_share"]) and paths in ("light", "camera"):
+        raise located("light_share", f"has no effect with paths: {paths}, but with both; remove it")
 
 
 def passes_obstacle(spp: int, per_pass: int | None, pixels: int, splits: bool = True) -> str | None:

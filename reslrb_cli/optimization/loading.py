@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.integrators import Integrator
+from reslrb_cli.config.integrators import Integrator, WalkAd
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.parameters import size_of
 from reslrb_cli.config.schema import Config
@@ -152,7 +152,7 @@ def paths_of(integrator: Integrator, scene: mi.Scene, sensors: list[int], moves:
     Where that is left to measurement it is `both`, of which that makes `camera` or another share, or what can render
     the scene at all.
     """
-    if not isinstance(integrator, ReslrbConfig):
+    if not isinstance(integrator, ReslrbConfig | WalkAd):
         return "light" if integrator.type in LIGHT_TRACERS else "camera"
     if moves:
         return "light"
@@ -200,6 +200,8 @@ def make_configured(integrator: Integrator, paths: str) -> StepIntegrator:
     """
     if isinstance(integrator, ReslrbConfig):
         integrator = settled_config(integrator, {}, paths)
+    elif isinstance(integrator, WalkAd):
+        integrator = integrator.model_copy(update={"paths": paths})
     options: dict[str, Any] = integrator.options()
     return make_integrator(integrator.type, **options)
 

@@ -13,7 +13,7 @@ import pytest
 from config.test_config_bad_input import PARAMETER, changed, line_of
 from make_reference import DOCS, EXAMPLE, json_schema, markdown, write
 
-from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, Prb, Reslrb
+from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, Prb, Reslrb, WalkAd
 from reslrb_cli.config.loader import FREE_MAPPINGS, dump, load
 from reslrb_cli.config.optimizers import Adam, RMSProp
 from reslrb_cli.config.parameters import ImageFile, ParameterSpec
@@ -399,6 +399,12 @@ def test_paths_that_an_estimator_named_leaves_to_nobody() -> None:
 def test_paths_that_cannot_be(options: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         Reslrb(**options)
+
+
+def test_naive_differentiation_has_the_paths_that_it_is_told() -> None:
+    assert WalkAd().options()["paths"] == "light"
+    with pytest.raises(ValueError, match="has no effect with paths: camera, but with both"):
+        WalkAd(paths="camera", light_share=0.3)
 
 
 def test_a_chosen_estimator_keeps_the_shared_options_alone() -> None:

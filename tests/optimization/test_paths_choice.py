@@ -131,6 +131,8 @@ def test_beams_alone_and_scaled_ones_are_left_to_light_paths():
 def test_what_moves_light_has_light_paths():
     problem = assemble_scene(load(ROOT / "configs" / "lens_pose.yaml", ["integrator.paths=both"]))
     assert (problem.paths, problem.moves, problem.integrator.paths) == ("light", True, "light")
+    naive = assemble_scene(load(ROOT / "configs" / "lens_pose.yaml", ["integrator={type: walk_ad, paths: both}"]))
+    assert (naive.paths, naive.integrator.paths) == ("light", "light")
 
 
 def test_a_run_goes_on_with_the_paths_that_it_had():
@@ -145,10 +147,12 @@ def test_a_run_goes_on_with_the_paths_that_it_had():
     assert again["plan"] == found["plan"]
 
 
-@pytest.mark.parametrize("paths", ["camera", "both"])
-def test_targets_and_images_have_the_same_light(paths: str):
+@pytest.mark.parametrize(
+    "integrator", ["{paths: camera}", "{paths: both}", "{type: walk_ad, paths: both}", "{type: walk_ad, paths: camera}"]
+)
+def test_targets_and_images_have_the_same_light(integrator: str):
     """At the film's border, too, where light paths alone lack what falls off it."""
-    problem = assemble(load("tiny.yaml", [f"integrator.paths={paths}", "target.render.spp=256", *SMALL]))
+    problem = assemble(load("tiny.yaml", [f"integrator={integrator}", "target.render.spp=256", *SMALL]))
     problem.selection.set_arrays(problem.truth)
     [view] = problem.views
     image, target = problem.render(view.sensor, 256, 0, "test"), np.array(view.target)
