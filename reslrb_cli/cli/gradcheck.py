@@ -182,7 +182,8 @@ logger = logging.getLogger(__name__)
 @click.option("--case", "cases", multiple=True, metavar="NAME", help="Run this case of the suite; may be repeated.")
 @click.option("--estimators", metavar="LIST",
               help="What to check: ESTIMATOR[(OPTION=VALUE,...)], separated by commas. Default: all four, with the "
-                   "options of CONFIG.")  # fmt: skip
+                   "options of CONFIG, and stack(paths=both) where CONFIG leaves the paths open and the scene allows "
+                   "both.")  # fmt: skip
 @click.option("--budget", type=click.FloatRange(min=0), default=45.0, show_default=True, metavar="SECONDS",
               help="Time for the whole, loading and compiling included; it decides how many seeds there are. What it "
                    "does not suffice for is named, with what it would take.")  # fmt: skip

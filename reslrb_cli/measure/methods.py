@@ -131,7 +131,10 @@ def parse_estimators(text: str) -> list[Case]:
 
 
 def all_estimators(config: Config) -> list[Case]:
-    """Every estimator of `reslrb`; that of the configuration has the options that stand there."""
+    """Every estimator of `reslrb`; that of the configuration has the options that stand there.
+
+    Where paths are left to measurement, both kinds of them as well: light paths are what all estimators have.
+    """
     cases, own = [], config.integrator
     camera = isinstance(own, ReslrbConfig) and own.paths == "camera"  # of which there is one estimator alone
     for name in ESTIMATOR_OPTIONS:
@@ -142,6 +145,8 @@ def all_estimators(config: Config) -> list[Case]:
             text = ",".join(f"{option}={value}" for option, value in options.items())
             label = f"reslrb:{name}({text})" if text else f"reslrb:{name}"
             cases.append(Case(label, "reslrb", {"estimator": name} | options))
+    if isinstance(own, ReslrbConfig) and own.paths == "auto":
+        cases.append(Case("reslrb:stack(paths=both)", "reslrb", {"estimator": "stack", "paths": "both"}))
     return cases
 
 

@@ -33,6 +33,7 @@ from reslrb_cli.measure.scenes import small
 from reslrb_cli.measure.stepper import multiple_of, shrink
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.loading import check_integrator
+from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.measurements import Reference
 from reslrb_cli.scene.catalog import value_shape
 from reslrb_cli.scene.visibility import interior
@@ -161,15 +162,12 @@ class Participants:
         depth = config.integrator.max_depth
         self._situation = Situation.of_problem(problem, sensor)
         self.attached, moved = self._situation.attached, self._situation.moved
-        if not moved:
-            for config in {Way.of(config): config for config in configs.values()}.values():
-                check_integrator(config, config.integrator, scene, problem.sensors)
         #: Whether there is a forward mode: of emitters that move there is none.
         nodes = [self.case.params.properties[key][2] for key in moved]
         self.forward_mode = not any(
             isinstance(node, mi.Emitter) or (isinstance(node, mi.Shape) and node.is_emitter()) for node in nodes
         )
-        self.listed = self._able(settings)
+        self.listed = self._able(settings, configs, problem)
         shared = {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
         naive = {"samples_per_pass": options.get("samples_per_pass")}
         if self.attached:
@@ -216,20 +214,38 @@ class Participants:
         known = {key: known_gradient(self._situation, self.sensor, key, weights) for key in self.case.keys}
         self.exact = {key: value for key, value in known.items() if value is not None}
 
-    def _able(self, settings: Settings) -> list[Listed]:
-        """The estimators that can take part. Raises ConfigError where one was named that cannot."""
-        able = [case for case in settings.integrators if ESTIMATORS[case.options["estimator"]].attaches]
-        others = [case for case in settings.integrators if case not in able]
-        told = [case.label for case in settings.integrators if case.options.get("paths", "light") != "light"]
-        if self._situation.moved and told:
-            raise ConfigError("--estimators", told[0], "what moves light has derivatives on light paths alone")
+    def _able(self, settings: Settings, configs: dict[str, Config], problem: Problem) -> list[Listed]:
+        """The estimators that can take part. Raises ConfigError where one was named that cannot, or where none is."""
+        listed = self._with_paths(settings, configs, problem)
+        able = [case for case in listed if ESTIMATORS[case.options["estimator"]].attaches]
+        others = [case for case in listed if case not in able]
         if not self.attached or not others:
-            return list(settings.integrators)
+            return listed
         if settings.named or not able:
             names = ", ".join(name for name, kind in ESTIMATORS.items() if kind.attaches)
             without = others[0].options["estimator"]
             raise ConfigError("--estimators", "", f"{without} has no derivatives of what moves light; take {names}")
         return able
+
+    def _with_paths(self, settings: Settings, configs: dict[str, Config], problem: Problem) -> list[Listed]:
+        """The estimators whose paths can render the scene and, where light moves, have derivatives; raises as above."""
+        if self._situation.moved:
+            told = [case for case in settings.integrators if case.options.get("paths", "light") != "light"]
+            if told and settings.named:
+                raise ConfigError(
+                    "--estimators", told[0].label, "what moves light has derivatives on light paths alone"
+                )
+            return [case for case in settings.integrators if case not in told]
+        refused: dict[Way, ConfigError] = {}
+        for way, config in {Way.of(config): config for config in configs.values()}.items():
+            try:
+                check_integrator(config, config.integrator, problem.scene, problem.sensors)
+            except ConfigError as error:
+                refused[way] = error
+        listed = [case for case in settings.integrators if Way.of(configs[case.label]) not in refused]
+        if refused and (settings.named or not listed):
+            raise next(iter(refused.values()))
+        return listed
 
     def _configured(self, configs: dict[str, Config]) -> dict[str, StepIntegrator]:
         """The integrators by label, and, where derivatives are attached, with what references ask for."""

@@ -438,7 +438,11 @@ def test_who_takes_part():
         Gradcheck(Settings(config, parse_estimators("gather,stack"), 0, 3))
     still = room_moving("lamp_over_floor.xml", "floor.bsdf.reflectance.value")
     all_of_them = Gradcheck(Settings(still, all_estimators(still), 0, 3, named=False))
-    assert len(all_of_them.participants.listed) == 4
+    assert [case.label for case in all_of_them.participants.listed] == [
+        *(f"reslrb:{name}" for name in ("reservoir", "gather", "event", "stack")), "reslrb:stack(paths=both)"
+    ]  # fmt: skip
+    asked = room_moving("lamp_over_floor.xml", "floor.bsdf.reflectance.value", "integrator={paths: light}")
+    assert len(Gradcheck(Settings(asked, all_estimators(asked), 0, 3, named=False)).participants.listed) == 4
 
 
 @pytest.mark.usefixtures("llvm")
