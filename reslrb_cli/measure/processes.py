@@ -31,8 +31,9 @@ POLL_SECONDS = 0.05
 #: How long the end of a killed process is waited for: it may still be writing into its folder.
 ABANDON_SECONDS = 5.0
 
-#: A process that crashes with as much of its limit in use is taken to have died of it.
-CLOSE_TO_LIMIT = 0.75
+#: A process that crashes with as much of its limit in use is taken to have died of it. The last look at it is from before
+#: its end, and from half of a limit to all of it takes microseconds.
+CLOSE_TO_LIMIT = 0.25
 
 #: Signals by which a program ends when it goes on after an allocation that failed.
 _CRASHES = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS)
@@ -139,7 +140,7 @@ class Process:
         reason = f"ended by {name}" + (f": {words}" if words else "")
         close = self.limit is not None and self.peak_bytes >= CLOSE_TO_LIMIT * self.limit
         if close:
-            reason += f" ({self.peak_bytes >> 20} of {self.limit >> 20} MiB in use)"  # type: ignore[operator]
+            reason += f" ({self.peak_bytes >> 20} of {self.limit >> 20} MiB seen in use)"  # type: ignore[operator]
         memory = code == -signal.SIGKILL or mentions_memory(text) or (close and -code in _CRASHES)
         return (BenchStatus.OUT_OF_MEMORY if memory else BenchStatus.FAILED), reason
 

@@ -294,11 +294,11 @@ def test_ends_are_told_apart(script: str, status: BenchStatus, reason: str) -> N
     assert reason in end.reason
 
 
-def test_a_crash_close_to_the_limit_is_one_of_memory() -> None:
+def test_a_crash_near_the_limit_is_one_of_memory() -> None:
     crash = "time.sleep(0.3); os.kill(os.getpid(), signal.SIGSEGV)"
     end = end_of(crash, limit=4 * 2**20)  # not set by this process, but in use many times over
     assert end.status is OUT_OF_MEMORY
-    assert "of 4 MiB in use" in end.reason
+    assert "of 4 MiB seen in use" in end.reason
     assert end_of(crash, limit=2**50).status is FAILED
 
 
