@@ -31,8 +31,8 @@ POLL_SECONDS = 0.05
 #: How long the end of a killed process is waited for: it may still be writing into its folder.
 ABANDON_SECONDS = 5.0
 
-#: A process that crashes with as much of its limit in use is taken to have died of it. The last look at it is from before
-#: its end, and from half of a limit to all of it takes microseconds.
+#: A process that crashes with as much of its limit in use is taken to have died of it. The last look at it is from
+#: before its end, and from half of a limit to all of it takes microseconds.
 CLOSE_TO_LIMIT = 0.25
 
 #: Signals by which a program ends when it goes on after an allocation that failed.
