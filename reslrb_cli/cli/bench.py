@@ -13,6 +13,7 @@ from reslrb_cli.cli.options import (
     COUNT,
     Counts,
     Keeper,
+    allow_code_option,
     budget_option,
     exit_code,
     files_of,
@@ -52,11 +53,13 @@ INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,
               help="Greatest path depth; measured are 2, 4, 8, ... and this one.")  # fmt: skip
 @click.option("--integrators", metavar="LIST",
               help="What to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)], separated by commas; OPTION is one of the "
-                   f"integrator's, or adjoint. Default: those of {INTEGRATORS} that can do CONFIG.")  # fmt: skip
+                   "integrator's, or adjoint; or FILE.py:CLASS, one of your own. Default: those of "
+                   f"{INTEGRATORS} that can do CONFIG.")  # fmt: skip
 @click.option("--baseline", metavar="NAME",
               help="Entry of that list that times are divided by; default: ptracer, or else the first.")  # fmt: skip
 @click.option("--objective", type=click.Choice(["fixed", "l2"]), default="fixed", show_default=True,
               help="fixed: dL/dI is given before the image; l2: it comes from the image, by run.adjoint.")  # fmt: skip
+@allow_code_option
 @memory_limit_option
 @budget_option
 @click.option("--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
@@ -68,8 +71,8 @@ INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,
               help="PNG of time and memory against what is varied; default: beside the JSON file.")  # fmt: skip
 def command(
     config_file: Path | None, overrides: tuple[str, ...], swept: str, values: tuple[int, ...] | None, max_depth: int,
-    integrators: str | None, baseline: str | None, objective: str, memory_limit: int | None, budget: float,
-    rounds: int | None, resumed: Path | None, json_file: Path | None, plot_file: Path | None,
+    integrators: str | None, baseline: str | None, objective: str, allow_code: bool, memory_limit: int | None,
+    budget: float, rounds: int | None, resumed: Path | None, json_file: Path | None, plot_file: Path | None,
 ) -> int:  # fmt: skip
     """Measure time and peak memory of gradient steps against path depth, or what else --sweep names.
 
@@ -93,7 +96,7 @@ def command(
     )
     from reslrb_cli.records.measurements import BenchStatus
 
-    config = read_or_box(config_file, overrides)
+    config = read_or_box(config_file, overrides).with_code(allow_code)
     if (swept != "depth" or values is not None) and is_given("max_depth"):
         reason = "goes with --sweep depth" if values is None else "does not go with --values"
         raise ConfigError("--max-depth", "", f"{reason}; take --set integrator.max_depth={max_depth}")

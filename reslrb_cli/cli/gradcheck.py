@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 
 
 #: Options that say something about comparisons, of which `--missing` makes none.
-COMPARING = {"suite": "--suite", "cases": "--case", "estimators": "--estimators", "markdown_file": "--markdown",
-             "folder": "--images"}  # fmt: skip
+COMPARING = {"suite": "--suite", "cases": "--case", "estimators": "--estimators", "integrators": "--integrators",
+             "markdown_file": "--markdown", "folder": "--images"}  # fmt: skip
 
 #: Options that mean nothing without a configuration, as of a suite.
 CONFIGURED = {"config_file": "CONFIG", "overrides": "--set", "budget": "--budget", "spp": "--spp", "folder": "--images"}
@@ -184,6 +184,9 @@ logger = logging.getLogger(__name__)
               help="What to check: ESTIMATOR[(OPTION=VALUE,...)], separated by commas. Default: all four, with the "
                    "options of CONFIG, and stack(paths=both) where CONFIG leaves the paths open and the scene allows "
                    "both.")  # fmt: skip
+@click.option("--integrators", metavar="LIST",
+              help="Check Mitsuba integrators of your own, FILE.py:CLASS[(OPTION=VALUE,...)], separated by commas, in "
+                   "place of ours, and say where to look if one is wrong; with --allow-code.")  # fmt: skip
 @click.option("--budget", type=click.FloatRange(min=0), default=45.0, show_default=True, metavar="SECONDS",
               help="Time for the whole, loading and compiling included; it decides how many seeds there are. What it "
                    "does not suffice for is named, with what it would take.")  # fmt: skip
@@ -207,8 +210,9 @@ logger = logging.getLogger(__name__)
                    "layers of EXR files.")  # fmt: skip
 def command(
     config_file: Path | None, overrides: tuple[str, ...], suite: str | None, cases: tuple[str, ...],
-    estimators: str | None, budget: float, seeds: int | None, allow_code: bool, resumed: Path | None, spp: int | None,
-    missing: bool, directions: int | None, json_file: Path | None, markdown_file: Path | None, folder: Path | None,
+    estimators: str | None, integrators: str | None, budget: float, seeds: int | None, allow_code: bool,
+    resumed: Path | None, spp: int | None, missing: bool, directions: int | None, json_file: Path | None,
+    markdown_file: Path | None, folder: Path | None,
 ) -> int:  # fmt: skip
     """Compare the gradients of every parameter of CONFIG with references, at its initial values.
 
@@ -248,7 +252,7 @@ def command(
         echo(f"{device_name(variant)}, {variant}")
         return run_missing(config, variant, budget, seeds, spp, directions, json_file, resumed)
     _check_folder(folder)
-    checked = settings_of(config, estimators, budget, seeds, spp, time.monotonic() - began)
+    checked = settings_of(config, estimators, budget, seeds, spp, time.monotonic() - began, integrators)
     variant = set_variant(config.variant)
     to_keep = settings_to_keep(checked, variant, device_name(variant))
     check = Gradcheck(checked, earlier=Earlier.read(KIND, resumed, to_keep))
@@ -258,6 +262,11 @@ def command(
     none = "interrupted before there were enough seeds to compare"
     for line in summary_lines(records) if records else [none]:
         echo(line)
+    if integrators is not None and records and not interrupted:
+        from reslrb_cli.measure.own import look_into
+
+        for line in look_into(check, records):
+            echo(line)
     if markdown_file is not None:
         markdown_file.write_text(markdown_table(records), encoding="utf-8")
     nothing = all(record.verdict in (Verdict.NOT_MEASURED, Verdict.NO_REFERENCE) for record in records)

@@ -256,11 +256,12 @@ def resume_option(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def allow_code_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add `--allow-code` (`allow_code`) to a command that calls the loss."""
+    """Add `--allow-code` (`allow_code`) to a command that calls what users have written."""
     return click.option(
         "--allow-code",
         is_flag=True,
-        help="Run the files of Python code that CONFIG names (loss.type: custom), with all your rights.",
+        help="Run the files of Python code that CONFIG or a list names (type: custom, FILE.py:NAME), with all your "
+        "rights.",
     )(function)
 
 

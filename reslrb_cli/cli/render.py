@@ -13,6 +13,7 @@ import click
 from reslrb_cli.cli.options import (
     COUNT,
     FOLDER,
+    allow_code_option,
     check_writable,
     is_given,
     optional_experiment_arguments,
@@ -65,6 +66,7 @@ class Exposure(click.ParamType):
     type=FOLDER,
     help="Render the scene of the run in this folder with the values that it recovered, in place of CONFIG.",
 )
+@allow_code_option
 @click.option("--spp", type=COUNT, help="Samples per pixel; default: run.spp.")
 @click.option("--sensor", type=click.IntRange(min=0), help="Index of the sensor; default: the experiment's first.")
 @click.option(
@@ -85,6 +87,7 @@ def command(
     overrides: tuple[str, ...],
     output: Path,
     run: Path | None,
+    allow_code: bool,
     spp: int | None,
     sensor: int | None,
     exposure: float | None,
@@ -96,7 +99,7 @@ def command(
     linear = output.suffix.lower() in FLOAT_FORMATS
     if linear and is_given("exposure"):
         raise click.UsageError(f"{output.suffix} holds light as it is; --exposure is for PNG and JPG")
-    config = _read(config_file, run, overrides)
+    config = _read(config_file, run, overrides).with_code(allow_code)
     check_image_path(output)
     start_variant(config)
 

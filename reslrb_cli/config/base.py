@@ -109,6 +109,23 @@ def config_path(value: Any, info: ValidationInfo) -> Path:
     return _path(_folder(info), value)
 
 
+def code_place(value: Any, info: ValidationInfo) -> str:
+    """FILE.py:NAME with the path joined to the folder of the configuration; raises as `config_path`."""
+    path, colon, name = str(value).rpartition(":") if isinstance(value, str) else ("", "", "")
+    if not (colon and path.endswith(".py") and name.isidentifier()):
+        raise wrong("must be FILE.py:NAME, a file of Python code and the name of what is meant in it")
+    return f"{config_path(path, info)}:{name}"
+
+
+#: FILE.py:NAME, of a user's own code.
+CodePlace = Annotated[str, BeforeValidator(code_place)]
+
+
+def code_file(place: str) -> Path:
+    """The file of a `CodePlace`."""
+    return Path(place.rpartition(":")[0])
+
+
 #: A path relative to the working directory.
 WorkPath = Annotated[Path, BeforeValidator(lambda value: _path(Path.cwd(), value)), _PATH_SCHEMA]
 

@@ -5,6 +5,7 @@ How the samples of a step are split into passes, and what is too many of them, i
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -16,7 +17,18 @@ from pydantic import (
 )
 from typing_extensions import Self
 
-from reslrb_cli.config.base import MARK, NEEDS_TYPE, ByType, Choice, Count, located, mark, must
+from reslrb_cli.config.base import (
+    MARK,
+    NEEDS_TYPE,
+    ByType,
+    Choice,
+    CodePlace,
+    Count,
+    code_file,
+    located,
+    mark,
+    must,
+)  # fmt: skip
 from reslrb_cli.config.files import CAPACITY, LOCAL_ENTRIES, PASS_PATHS, PASS_SAMPLES, PASSES, PATH_LENGTH
 
 _DEPTH = must(
@@ -259,7 +271,28 @@ class Trajectory(LightTracerOptions, json_schema_extra=NEEDS_TYPE):
     """Longest path in segments, as above; the record has room for as many vertices, so that there must be a limit."""
 
 
-AnyIntegrator = Annotated[Reslrb | Ptracer | Prb | WalkAd | Trajectory, ByType("reslrb")]
+class Own(Integrator, json_schema_extra=NEEDS_TYPE):
+    """A Mitsuba integrator of one's own, a class in a file of Python code; only where the command line has
+    `--allow-code` ([your_integrator.md](your_integrator.md))."""
+
+    type: Literal["custom"] = Field(default="custom", description="A Mitsuba integrator of one's own.")
+    file: CodePlace
+    """`FILE.py:CLASS`: a file of Python code, relative to the config file, and the class in it, which is made of a
+    `mi.Properties` with `max_depth`, `rr_depth`, `hide_emitters` and `properties`. A run keeps a digest of the file's
+    bytes, not of what it imports, and goes on with no other."""
+    paths: Literal["camera", "light"] = "camera"
+    """Where its paths begin: what it can see, and whether its images are darker along the film's border, as those of
+    light paths are."""
+    properties: dict[str, bool | int | float | str] = Field(default_factory=dict)
+    """What else it is made of."""
+
+    @property
+    def path(self) -> Path:
+        """The file of code."""
+        return code_file(self.file)
+
+
+AnyIntegrator = Annotated[Reslrb | Ptracer | Prb | WalkAd | Trajectory | Own, ByType("reslrb")]
 
 
 def _check_share(paths: str, light_share: float | str) -> None:

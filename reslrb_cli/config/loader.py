@@ -16,6 +16,7 @@ from pydantic import ValidationError
 
 from reslrb_cli.config.errors import Problem, problems
 from reslrb_cli.config.files import CONFIG_BYTES, DEPTH, NODES, OVERRIDES, OVERRIDES_LENGTH, read_file
+from reslrb_cli.config.integrators import Own
 from reslrb_cli.config.optimizers import Custom
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import UNFIT, Location, count_values, format_location, parse, write
@@ -185,10 +186,10 @@ def told(first: Mapping[str, Any]) -> Config:
     return loads(first["config"], first["source"]).with_code(first.get("allow_code") is True)
 
 
-def check_code(config: Config, losses: Mapping[str, Custom] | None = None) -> None:
-    """Raise ConfigError, located by the key, where losses that users have written are not to be run; None for all of
-    the experiment's. Nothing is loaded."""
-    for key, one in (config.code_losses if losses is None else losses).items():
+def check_code(config: Config, codes: Mapping[str, Custom | Own] | None = None) -> None:
+    """Raise ConfigError, located by the key, where code that users have written is not to be run; None for all of the
+    experiment's. Nothing is loaded."""
+    for key, one in (config.codes if codes is None else codes).items():
         if one.file is None and config.own_loss is None:
             reason = "missing: FILE.py:NAME, or in Python a function that is handed over, as it was when the run began"
             raise ConfigError(config.source, key, reason)

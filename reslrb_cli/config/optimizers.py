@@ -13,7 +13,6 @@ from pydantic import (
     Discriminator,
     Field,
     SerializerFunctionWrapHandler,
-    ValidationInfo,
     WithJsonSchema,
     model_serializer,
     model_validator,
@@ -25,10 +24,11 @@ from reslrb_cli.config.base import (
     NEEDS_TYPE,
     ByType,
     Choice,
+    CodePlace,
     Count,
     Positive,
     Section,
-    config_path,
+    code_file,
     located,
     mark,
     wrong,
@@ -112,20 +112,12 @@ class SSIM(Loss, json_schema_extra=NEEDS_TYPE):
 CODE_BYTES = 2**20
 
 
-def _code(value: Any, info: ValidationInfo) -> str:
-    """FILE.py:NAME with the path joined to the folder of the configuration."""
-    path, colon, name = str(value).rpartition(":") if isinstance(value, str) else ("", "", "")
-    if not (colon and path.endswith(".py") and name.isidentifier()):
-        raise wrong("must be FILE.py:NAME, a file of Python code and the name of a function in it")
-    return f"{config_path(path, info)}:{name}"
-
-
 class Custom(Loss, json_schema_extra=NEEDS_TYPE):
     """What a function of one's own returns, `file`; only where the command line has `--allow-code`
     ([method.md](method.md#a-loss-of-ones-own))."""
 
     type: Literal["custom"] = Field(default="custom", description="What a function of one's own returns.")
-    file: Annotated[str, BeforeValidator(_code)] | None = None
+    file: CodePlace | None = None
     """`FILE.py:NAME`: a file of Python code, relative to the config file, and the function in it:
     `NAME(image: mi.TensorXf, target: mi.TensorXf) -> mi.Float`, or with a third argument, `weights`. A run keeps a
     digest of the file's bytes, not of what it imports, and goes on with no other. null: the function that a caller in
@@ -134,7 +126,7 @@ class Custom(Loss, json_schema_extra=NEEDS_TYPE):
     @property
     def path(self) -> Path | None:
         """The file of code."""
-        return None if self.file is None else Path(self.file.rpartition(":")[0])
+        return None if self.file is None else code_file(self.file)
 
     @property
     def name(self) -> str:

@@ -32,7 +32,7 @@ from reslrb_cli.config.base import (
     must,
     wrong,
 )
-from reslrb_cli.config.integrators import AnyIntegrator, Integrator, largest_pass, passes_obstacle
+from reslrb_cli.config.integrators import AnyIntegrator, Integrator, Own, largest_pass, passes_obstacle
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.optimizers import (
     AS_CONFIGURED,
@@ -231,12 +231,16 @@ class Config(Section):
         return config
 
     @property
-    def code_losses(self) -> dict[str, Custom]:
-        """The losses that users have written, each with the key that names its file."""
+    def codes(self) -> dict[str, Custom | Own]:
+        """The losses and integrators that users have written, each with the key that names its file."""
+        integrators: dict[str, Integrator | None] = {"integrator": self.integrator}
+        if self.target.render is not None:
+            integrators["target.render.integrator"] = self.target.render.integrator
+        own: dict[str, Custom | Own] = {f"{key}.file": one for key, one in integrators.items() if isinstance(one, Own)}
         places: dict[str, Any] = {"loss": self.loss}
         places |= {f"views[{place}].loss": view.loss for place, view in enumerate(self.views or ())}
-        return {key: one for place, given in places.items() for key, one in loss_keys(place, "file", given)
-                if isinstance(one, Custom)}  # fmt: skip
+        return own | {key: one for place, given in places.items() for key, one in loss_keys(place, "file", given)
+                      if isinstance(one, Custom)}  # fmt: skip
 
     @property
     def halves(self) -> Literal[1, 2]:

@@ -27,6 +27,7 @@ from reslrb_cli.config.files import PASS_SAMPLES, PASSES
 from reslrb_cli.estimators.base import one_of
 from reslrb_cli.integrators.baselines import NaiveAD, Replayed
 from reslrb_cli.integrators.context import resolve_sensor
+from reslrb_cli.integrators.own import OwnIntegrator
 from reslrb_cli.integrators.plugin import TRACERS, make_tracer
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator, halves_of, whole_of
 
@@ -84,13 +85,16 @@ class StepResult:
 
 
 def make_integrator(type: str, **options: Any) -> StepIntegrator:
-    """An integrator by its plugin's name and options: `reslrb`, `walk_ad`, or a stock one such as `ptracer`, `prb`.
+    """An integrator by its plugin's name and options: `reslrb`, `walk_ad`, or a stock one such as `ptracer`, `prb`; or
+    `custom`, a user's own (`OwnIntegrator`).
 
     An option that is None is left out: Mitsuba would end the process. Raises ValueError for one that is unknown.
     """
     given = {name: value for name, value in options.items() if value is not None}
     if type in TRACERS:
         return make_tracer(type, given)
+    if type == "custom":
+        return OwnIntegrator(**given)
     properties = mi.Properties(type)
     for name, value in given.items():
         properties[name] = value

@@ -93,10 +93,17 @@ class Gradcheck:
             for way, (reference, _) in parts.images.items()
             if reference is not None
         ]
+        for listed in parts.listed:
+            reference, _ = parts.images[parts.ways[listed.label]]
+            if listed.type == "custom" and reference is not None:
+                found.append(Row(None, listed.label, reference, Kind.IMAGE, parts.ways[listed.label]))
         plain = [label for label, config in self.settings.configs().items() if _draws_plainly(config)]
         for key in parts.case.keys:
             for listed in parts.listed:
                 label, way = listed.label, parts.ways[listed.label]
+                if listed.type == "custom":
+                    found += [Row(key, label, one, Kind.EXPECTATION, way) for one in parts.of_own(key, way)]
+                    continue
                 exact = ESTIMATORS[listed.options["estimator"]].exact and label in plain
                 kind = Kind.EQUAL_SEEDS if exact else Kind.EXPECTATION
                 found.append(Row(key, label, Reference.WALK_AD, kind, way))
@@ -157,7 +164,7 @@ class Gradcheck:
         """The samples that a comparison is made of: of ours, and of the reference where that is not exact."""
         naive = row.way.named("walk_ad")
         if row.key is None:
-            return [("image", naive), ("image", row.reference.value)]
+            return [("image", naive if row.label == "reslrb" else row.label), ("image", row.reference.value)]
         ours = "gradient", self.participants.sampled(row.label, row.reference)
         its = {
             Reference.ANALYTIC: [],
@@ -210,7 +217,7 @@ class Gradcheck:
         return Result(self._record(row, figures, len(ours)), maps)
 
     def _record(self, row: Row, figures: Comparison, seeds: int) -> GradcheckRecord:
-        kind, _, estimator = row.label.partition(":")
+        kind, _, estimator = row.label.partition(":") if row.label.startswith("reslrb") else (row.label, "", "")
         return GradcheckRecord(
             str(self.settings.config.source), row.key, kind, estimator or None, row.reference, row.kind, seeds,
             **vars(figures), **records_of(row.way.paths, row.way.light_share),

@@ -9,12 +9,13 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 from reslrb_cli.backend.doctor import device_name, memory_bytes
 from reslrb_cli.backend.variant import choose
 from reslrb_cli.config.base import SEED_END
-from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, UNDECIDED, Prb, Ptracer, Trajectory, WalkAd
+from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, UNDECIDED, Own, Prb, Ptracer, Trajectory, WalkAd
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import dump, with_integrator
 from reslrb_cli.config.parameters import ByWord, ParameterSpec
@@ -54,13 +55,16 @@ PLUGIN_ESTIMATOR = "reservoir"
 
 #: Options of a case that are those of `run`, for itself alone.
 ADJOINT = ("adjoint", "batches", "first_batch")
-_TYPES = {str(kind.model_fields["type"].default): kind for kind in (ReslrbConfig, Ptracer, Prb, WalkAd, Trajectory)}
+_KINDS = (ReslrbConfig, Ptracer, Prb, WalkAd, Trajectory, Own)
+_TYPES = {str(kind.model_fields["type"].default): kind for kind in _KINDS}
 
 #: Options that make an estimator another one, in records.
 _ESTIMATOR_OPTIONS = {option for options in ESTIMATOR_OPTIONS.values() for option in options} - {"capacity"}
 _ESTIMATOR_OPTIONS |= set(UNDECIDED)
 
 _OPTION = "--integrators"
+#: A user's own integrator.
+_OWN = re.compile(r"(?P<file>[^()]+\.py):(?P<name>\w+)(?:\((?P<options>.*)\))?")
 _ITEM = re.compile(r"(?P<type>\w+)(?::(?P<estimator>\w+))?(?:\((?P<options>.*)\))?")
 
 
@@ -91,14 +95,20 @@ class Case:
         values = {name: value for name, value in values.items() if name not in UNDECIDED or value != "auto"}
         if "paths" in self.options:  # a share is of the experiment's own paths
             values.pop("light_share", None)
-        values |= {name: value for name, value in self.options.items() if name not in ADJOINT}
+        given = {name: value for name, value in self.options.items() if name not in ADJOINT}
+        if self.type == "custom":  # what is not ours is for the class
+            given["properties"] = {name: given.pop(name) for name in [*given] if name not in own}
+        values |= given
         if self.type == "reslrb" and values.setdefault("estimator", PLUGIN_ESTIMATOR) == "auto" and not auto:
             raise ConfigError(blame, "estimator", "`auto` measures which to take; name those to compare")
         ways = {"guiding": "`on` with `off`", "sequence": "`independent` with `low_discrepancy`"}
         for option, compared in (ways | {"paths": "`light`, `camera` and `both`"}).items():
             if values.get(option) == "auto" and not auto:
                 raise ConfigError(blame, option, f"`auto` measures whether it pays; compare {compared}")
-        return with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
+        made = with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
+        if self.type == "custom" and not config.allows_code:
+            raise ConfigError(blame, "", "would be run, with all your rights; --allow-code has it run")
+        return made
 
     @property
     def estimator(self) -> str | None:
@@ -130,6 +140,15 @@ def parse_estimators(text: str) -> list[Case]:
     return _parse(text, "--estimators", "reslrb:", "estimator; write ESTIMATOR[(OPTION=VALUE,...)]", False)
 
 
+def parse_own(text: str) -> list[Case]:
+    """The cases in a list of a user's own integrators, FILE.py:CLASS[(OPTION=VALUE,...)]; raises as `parse_cases`."""
+    cases = _parse(text, _OPTION, "", "integrator of your own; write FILE.py:CLASS[(OPTION=VALUE,...)]", False)
+    if others := [case.label for case in cases if case.type != "custom"]:
+        reason = f"`{others[0]}` is none of your own (FILE.py:CLASS); estimators of reslrb go with --estimators"
+        raise ConfigError(_OPTION, "", reason)
+    return cases
+
+
 def all_estimators(config: Config) -> list[Case]:
     """Every estimator of `reslrb`; that of the configuration has the options that stand there.
 
@@ -154,9 +173,13 @@ def _parse(text: str, source: str, prefix: str, wanted: str, deep: bool) -> list
     cases: list[Case] = []
     for item in _split(text):
         match = _ITEM.fullmatch(prefix + item)
-        if match is None or (prefix and not match["estimator"]):
+        kind, options = (match["type"], {"estimator": match["estimator"]}) if match else ("", {})
+        if own := None if prefix else _OWN.fullmatch(item):
+            place = f"{Path(own['file']).expanduser().absolute()}:{own['name']}"
+            match, kind, options = own, "custom", {"file": place}
+        options = {name: value for name, value in options.items() if value is not None}
+        if match is None or (prefix and "estimator" not in options):
             raise ConfigError(source, "", f"`{item}` is no {wanted}")
-        options = {} if match["estimator"] is None else {"estimator": match["estimator"]}
         for pair in _split(match["options"]) if match["options"] else []:
             name, equals, value = (part.strip() for part in pair.partition("="))
             if not equals or not name:
@@ -167,7 +190,7 @@ def _parse(text: str, source: str, prefix: str, wanted: str, deep: bool) -> list
                 section = "run" if name in ADJOINT else "integrator"
                 raise ConfigError(source, item, f"all share one {name}; take --set {section}.{pair}")
             options[name] = parse(value, f"{source} {item}", name_line=False)
-        case = Case(prefix + item, match["type"], options, source)
+        case = Case(prefix + item, kind, options, source)
         if case.label in [other.label for other in cases]:
             raise ConfigError(source, "", f"`{item}` is named twice")
         cases.append(case)

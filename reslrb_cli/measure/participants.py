@@ -12,14 +12,16 @@ import numpy as np
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators import ESTIMATORS
+from reslrb_cli.integrators.own import OwnIntegrator
 from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import Case, all_directions, choose_step, seeds, smooth_weights
 from reslrb_cli.measure.methods import Case as Listed
-from reslrb_cli.measure.methods import all_estimators, parse_estimators
+from reslrb_cli.measure.methods import all_estimators, parse_estimators, parse_own
 from reslrb_cli.measure.references import (
     CAMERA_PATHS,
     Situation,
+    bsdfs_of,
     choose,
     divides_by_film,
     ends,
@@ -35,7 +37,7 @@ from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.loading import check_integrator
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.measurements import Reference
-from reslrb_cli.scene.catalog import value_shape
+from reslrb_cli.scene.catalog import parameter_kind, value_shape
 from reslrb_cli.scene.visibility import interior
 
 #: Light paths of one gradient, as near as whole samples per pixel come.
@@ -93,14 +95,18 @@ class Settings:
 
 
 def settings_of(
-    config: Config, estimators: str | None, budget_s: float, seeds: int | None, spp: int | None, spent_s: float
-) -> Settings:
-    """What is checked of `config`: the list of `estimators`, as `--estimators` has it, or all of them.
+    config: Config, estimators: str | None, budget_s: float, seeds: int | None, spp: int | None, spent_s: float,
+    integrators: str | None = None,
+) -> Settings:  # fmt: skip
+    """What is checked of `config`: the lists of `estimators`, as `--estimators` has it, and of a user's own
+    `integrators`, as `--integrators` has it; all estimators where there is neither.
 
     Raises ConfigError where one cannot be.
     """
-    listed = all_estimators(config) if estimators is None else parse_estimators(estimators)
-    checked = Settings(config, listed, budget_s, seeds, spp, estimators is not None, spent_s)
+    listed = [] if estimators is None else parse_estimators(estimators)
+    listed += [] if integrators is None else parse_own(integrators)
+    named = estimators is not None or integrators is not None
+    checked = Settings(config, listed if named else all_estimators(config), budget_s, seeds, spp, named, spent_s)
     checked.configs()  # before anything is loaded
     return checked
 
@@ -147,8 +153,9 @@ class Participants:
 
     def __init__(self, settings: Settings) -> None:
         config, configs, self.known = settings.config, settings.configs(), settings.known
+        self._configs = configs
         # Whatever moves, an estimator that follows it can be made.
-        able = [case.label for case in settings.integrators if ESTIMATORS[case.options["estimator"]].attaches]
+        able = [case.label for case in settings.integrators if _attaches(case)]
         first = (configs[able[0]] if able else next(iter(configs.values()))).with_exposures_fixed()
         built_in = config.scene.file == small.FILE
         problem = assemble_scene(first, small.build(config.scene.options) if built_in else None)
@@ -174,13 +181,15 @@ class Participants:
             naive |= {"attached": True, "filter_normalization": options.get("filter_normalization", "attached")}
         light = Way()
         self.ways = {
-            case.label: light if self._situation.moved else Way.of(configs[case.label]) for case in self.listed
+            case.label: light if moved and case.type == "reslrb" else Way.of(configs[case.label])
+            for case in self.listed
         }
         self.each_way = list(dict.fromkeys(self.ways.values()))
         self.integrators = self._configured({case.label: configs[case.label] for case in self.listed})
         for way in self.each_way:
+            attached = naive if way.paths == "light" else {**naive, "attached": False}
             self.integrators |= {
-                way.named("walk_ad"): make_integrator("walk_ad", **shared, **naive, **way.options),
+                way.named("walk_ad"): make_integrator("walk_ad", **shared, **attached, **way.options),
                 # With roulette differences are heavy-tailed: now and then a path ends for one of the values alone.
                 way.named(DIFFERENCED): make_integrator(
                     "walk_ad", **shared | ({"rr_depth": NEVER} if ends(depth) else {}), **way.options
@@ -217,8 +226,8 @@ class Participants:
     def _able(self, settings: Settings, configs: dict[str, Config], problem: Problem) -> list[Listed]:
         """The estimators that can take part. Raises ConfigError where one was named that cannot, or where none is."""
         listed = self._with_paths(settings, configs, problem)
-        able = [case for case in listed if ESTIMATORS[case.options["estimator"]].attaches]
-        others = [case for case in listed if case not in able]
+        others = [case for case in listed if case.type == "reslrb" and not _attaches(case)]
+        able = [case for case in listed if case not in others]
         if not self.attached or not others:
             return listed
         if settings.named or not able:
@@ -230,7 +239,8 @@ class Participants:
     def _with_paths(self, settings: Settings, configs: dict[str, Config], problem: Problem) -> list[Listed]:
         """The estimators whose paths can render the scene and, where light moves, have derivatives; raises as above."""
         if self._situation.moved:
-            told = [case for case in settings.integrators if case.options.get("paths", "light") != "light"]
+            ours = [case for case in settings.integrators if case.type == "reslrb"]
+            told = [case for case in ours if case.options.get("paths", "light") != "light"]
             if told and settings.named:
                 raise ConfigError(
                     "--estimators", told[0].label, "what moves light has derivatives on light paths alone"
@@ -249,9 +259,14 @@ class Participants:
 
     def _configured(self, configs: dict[str, Config]) -> dict[str, StepIntegrator]:
         """The integrators by label, and, where derivatives are attached, with what references ask for."""
-        made = {}
+        made: dict[str, StepIntegrator] = {}
         for label, config in configs.items():
             kind, options = config.integrator.type, config.integrator.options()
+            if kind == "custom":
+                own = OwnIntegrator(**options, allowed=config.allows_code)
+                own.ready()  # before anything is rendered
+                made[label] = own
+                continue
             if self._situation.moved:  # as the run
                 options |= {"paths": "light", "light_share": 0.5}
             made[label] = make_integrator(kind, **options)
@@ -259,6 +274,30 @@ class Participants:
                 if options | alike != options:
                     made[_alike(label, reference)] = make_integrator(kind, **options | alike)
         return made
+
+    def options_of(self, label: str) -> dict[str, Any]:
+        """`max_depth`, `rr_depth` and `hide_emitters` of an integrator."""
+        options = self._configs[label].integrator.options()
+        return {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
+
+    def own_with(self, label: str, **other: int) -> StepIntegrator:
+        """The user's own integrator of this label with `other` depths."""
+        config = self._configs[label]
+        return OwnIntegrator(**config.integrator.options() | other, allowed=config.allows_code)
+
+    def bsdfs_of(self, key: str) -> list[mi.BSDF]:
+        """The BSDFs that a parameter belongs to, nested ones and those around them; none of what is no BSDF's."""
+        is_bsdf = key in self.case.params.properties and parameter_kind(self.case.params, key) == "bsdf"
+        return bsdfs_of(self._situation, key) if is_bsdf else []
+
+    def of_own(self, key: str, way: Way) -> list[Reference]:
+        """What a user's own integrator is compared with: all that the scene allows for the gradient of `key`."""
+        if self._situation.moved:  # derivatives of camera paths are ours to no longer than light rests
+            return [Reference.FINITE_DIFFERENCE]
+        stock = self.stock[way.named(key)]
+        found = [] if stock is None else [stock]
+        found += [Reference.ANALYTIC] if key in self.exact else []
+        return [*found, Reference.WALK_AD, Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE]
 
     def sampled(self, label: str, reference: Reference) -> str:
         """The integrator whose gradients stand for those of `label` beside this reference (`ALIKE`)."""
@@ -313,8 +352,14 @@ class Participants:
         if kind == "differences":
             tracer, along = self.integrators[way.named(DIFFERENCED)], self.directions[of]
             return np.array([direction.difference(self.case, tracer, seed, self.spp) for direction in along])
-        tracer = self.integrators[next(label for label, its in self.ways.items() if its == way)]
+        ours = [case.label for case in self.listed if case.type == "reslrb" and self.ways[case.label] == way]
+        tracer = self.integrators[ours[0] if ours else way.named("walk_ad")]
         return np.array([self.case.tangent(tracer, d.vector, seed, self.spp) for d in self.directions[of]])
+
+
+def _attaches(case: Listed) -> bool:
+    """Whether this is an estimator of ours with derivatives of what moves light."""
+    return case.type == "reslrb" and ESTIMATORS[case.options["estimator"]].attaches
 
 
 def _alike(label: str, reference: Reference) -> str:

@@ -230,7 +230,7 @@ def ptracer_gradient(at: Situation, key: str) -> str | None:
         return None
     if key.split(".")[-2 if key.endswith((".value", ".data")) else -1] in _ROUGHNESS:
         return "it differentiates how roughness is sampled"
-    others = {bsdf.class_name() for bsdf in _bsdfs(at, key)} - set(_FIXED_SAMPLING)
+    others = {bsdf.class_name() for bsdf in bsdfs_of(at, key)} - set(_FIXED_SAMPLING)
     return f"it differentiates how a {sorted(others)[0]} is sampled" if others else None
 
 
@@ -255,13 +255,13 @@ def prb_gradient(at: Situation, key: str) -> str | None:
     if np.any(np.array(at.params[key]) == 0):
         return "it loses derivatives where a channel is exactly 0"
     if parameter_kind(at.params, key) != "emitter" and any(
-        int(bsdf.flags()) & int(mi.BSDFFlags.Delta) for bsdf in _bsdfs(at, key)
+        int(bsdf.flags()) & int(mi.BSDFFlags.Delta) for bsdf in bsdfs_of(at, key)
     ):
         return "it does not differentiate delta lobes and masks"
     return None
 
 
-def _bsdfs(at: Situation, key: str) -> list[Any]:
+def bsdfs_of(at: Situation, key: str) -> list[Any]:
     """The BSDFs that a parameter belongs to, nested ones and those around them."""
     node = at.params.properties[key][2]
     if isinstance(node, mi.Shape):  # an attribute, which some texture of its BSDF reads

@@ -33,7 +33,7 @@ def settings(config: Config, variant: str, device: str, **options: Any) -> dict[
     The files of scene and code count by their content, and so does what computes, whose times stand beside each other.
     """
     contents = {"scene.file": config.scene.file}
-    contents |= {key: one.path for key, one in config.code_losses.items() if one.path is not None}
+    contents |= {key: one.path for key, one in config.codes.items() if one.path is not None}
     found = {}
     for key, path in contents.items():
         try:

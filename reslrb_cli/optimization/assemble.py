@@ -19,6 +19,7 @@ from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.parameters import HEIGHTMAP, ParameterSpec, TransportValue
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.integrators.own import OwnIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.optimization import start
 from reslrb_cli.optimization.autotune.estimators import find_options
@@ -66,6 +67,8 @@ def assemble(
     if to_run:
         check_code(config)
     problem = assemble_scene(config, starts=True)
+    if isinstance(problem.integrator, OwnIntegrator):
+        problem.integrator.ready()
     if settled is not None:
         begin_as(problem, settled)
     options = find_options(problem)
@@ -108,7 +111,7 @@ def load_for_rendering(
     scene = load_configured(config, selects=False)
     sensors = choose_sensors(config, scene)
     check_integrator(config, config.integrator, scene, sensors)
-    integrator = make_configured(config.integrator, paths_of(config.integrator, scene, sensors))
+    integrator = make_configured(config, config.integrator, paths_of(config.integrator, scene, sensors))
     return scene, sensors, integrator, samples_per_pass(config)
 
 
@@ -169,7 +172,7 @@ def assemble_scene(
         scene=scene,
         views=views,
         selection=selection,
-        integrator=make_configured(config.integrator, paths),
+        integrator=make_configured(config, config.integrator, paths),
         paths=paths,
         moves=moves,
         optimizer=make_optimizer(config, selection),

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.integrators import Integrator, WalkAd
+from reslrb_cli.config.integrators import Integrator, Own, WalkAd
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.parameters import size_of
 from reslrb_cli.config.schema import Config
@@ -152,6 +152,8 @@ def paths_of(integrator: Integrator, scene: mi.Scene, sensors: list[int], moves:
     Where that is left to measurement it is `both`, of which that makes `camera` or another share, or what can render
     the scene at all.
     """
+    if isinstance(integrator, Own):
+        return integrator.paths
     if not isinstance(integrator, ReslrbConfig | WalkAd):
         return "light" if integrator.type in LIGHT_TRACERS else "camera"
     if moves:
@@ -176,7 +178,7 @@ def check_integrator(
     try:
         paths = paths_of(integrator, scene, sensors, moves)
         for sensor in sensors:
-            if integrator.type in LIGHT_TRACERS:
+            if integrator.type in LIGHT_TRACERS or (integrator.type == "custom" and paths == "light"):
                 check_paths(scene, scene.sensors()[sensor], paths, integrator.hide_emitters)
                 if integrator.type == "ptracer":
                     _warn_of_clipping(config, scene.sensors()[sensor], scene)
@@ -192,8 +194,8 @@ def _warn_of_clipping(config: Config, sensor: mi.Sensor, scene: mi.Scene) -> Non
         warn_once(f"{config.scene.file}: sensor {sensor.id()}: ptracer {wrong}; reslrb is right there")
 
 
-def make_configured(integrator: Integrator, paths: str) -> StepIntegrator:
-    """The integrator that a configuration describes, with these `paths` (`paths_of`); all estimators have the same
+def make_configured(config: Config, integrator: Integrator, paths: str) -> StepIntegrator:
+    """The `integrator`, as `config` or its target has it, with these `paths` (`paths_of`); all estimators have the same
     image, so for `auto` any will do.
 
     What is not decided yet (`guiding`, `sequence`) is off.
@@ -203,6 +205,8 @@ def make_configured(integrator: Integrator, paths: str) -> StepIntegrator:
     elif isinstance(integrator, WalkAd):
         integrator = integrator.model_copy(update={"paths": paths})
     options: dict[str, Any] = integrator.options()
+    if isinstance(integrator, Own):
+        options["allowed"] = config.allows_code
     return make_integrator(integrator.type, **options)
 
 

@@ -172,7 +172,7 @@ def _render_targets(problem: Problem, say: Callable[[str], None]) -> dict[str, A
     chosen = render.integrator or config.integrator
     check_integrator(config, chosen, true_scene, problem.sensors, problem.moves)
     paths = paths_of(chosen, true_scene, problem.sensors, problem.moves)
-    integrator = make_configured(chosen, paths)
+    integrator = make_configured(config, chosen, paths)
     multiple = chosen.options().get("samples_per_pass")
     for view in problem.views:
         if view.wanted.file is not None:

@@ -207,7 +207,7 @@ def digests(config: Config) -> dict[str, str]:
     named: dict[str, Path | None] = {"scene.file": config.scene.file, "scene.cameras": config.scene.cameras}
     named |= {f"target.file[{place}]": path for place, path in enumerate(config.target.file or ())}
     named |= {f"views[{place}].target": view.target for place, view in enumerate(config.views or ())}
-    named |= {key: one.path for key, one in config.code_losses.items()}
+    named |= {key: one.path for key, one in config.codes.items()}
     return {
         key: hashlib.blake2b(read_file(path, IMAGE_BYTES), digest_size=16).hexdigest()
         for key, path in named.items()

@@ -264,7 +264,7 @@ class Curvature:
             return []
         chosen = render.integrator or config.integrator
         paths = paths_of(chosen, self.problem.scene, self.problem.sensors, self.problem.moves)
-        integrator = make_configured(chosen, paths)
+        integrator = make_configured(config, chosen, paths)
         multiple = chosen.options().get("samples_per_pass")
         by_view = [self._noises(view, integrator, render.spp, multiple) for view in trained]
         return [list(sample) for sample in zip(*by_view, strict=True)]

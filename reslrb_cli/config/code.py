@@ -1,0 +1,72 @@
+"""A user's own Python code, named as FILE.py:NAME: a loss, or an integrator (`type: custom`).
+
+A file is run with the user's rights, and nothing looks at what it does: so it is run only where the command line, or
+the caller in Python, allows it (`Config.with_code`), which no YAML can, and not before it is called for. Commands that
+read, show or export a run call for nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+import traceback
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from reslrb_cli.config.files import read_file
+from reslrb_cli.config.optimizers import CODE_BYTES
+from reslrb_cli.errors import ConfigError, describe, is_machine_fault, is_out_of_memory
+
+
+def load_named(file: Path, name: str, source: object, key: str) -> Callable[..., Any]:
+    """What the file calls `name`, once it is run. Files beside it can be imported by it, behind all other modules.
+
+    Raises ConfigError, located at `key` of `source`, where it cannot be read or run, or has nothing callable of that
+    name.
+    """
+    try:
+        text = read_file(file, CODE_BYTES)
+    except ConfigError as error:
+        raise ConfigError(source, key, f"{file}: {error.message}") from None
+    module = types.ModuleType(f"reslrb_own_{hashlib.blake2b(str(file).encode(), digest_size=6).hexdigest()}")
+    module.__file__ = str(file)
+    if str(file.parent) not in sys.path:
+        sys.path.append(str(file.parent))
+    sys.modules[module.__name__] = module  # dataclasses and pickle look it up there
+    with_place = Guard(source, key, file, "the file")
+    with with_place:
+        exec(compile(text, str(file), "exec"), module.__dict__)
+    found = getattr(module, name, None)
+    if not callable(found):
+        what = "nothing" if not hasattr(module, name) else f"a {type(found).__name__}, not a function,"
+        raise ConfigError(source, key, f"{file} has {what} of the name `{name}`")
+    return found
+
+
+class Guard:
+    """While this is entered, what a user's code raises becomes one located line; what the machine raises stays."""
+
+    def __init__(self, source: object, key: str, file: Path | None, what: str) -> None:
+        self.source, self.key, self.file, self.what = source, key, file, what
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: Any) -> None:
+        if error is None or not isinstance(error, Exception | SystemExit) or isinstance(error, ConfigError):
+            return
+        if is_out_of_memory(error) or is_machine_fault(error):
+            return
+        lines = [each.lineno for each in traceback.extract_tb(trace) if self.file and each.filename == str(self.file)]
+        if isinstance(error, SyntaxError) and error.filename == str(self.file):
+            lines = [error.lineno]
+        where = f" in line {lines[-1]}" if lines else ""
+        said = f"{type(error).__name__}: {error}".rstrip(": ") if str(error) else describe(error)
+        raise ConfigError(self.source, self.key, f"{self.what} raises{where} {said}") from error
+
+
+def code_digest(file: Path) -> str:
+    """What is in a file of code, in short; what it imports is not in it. Raises ConfigError."""
+    return hashlib.blake2b(read_file(file, CODE_BYTES), digest_size=16).hexdigest()

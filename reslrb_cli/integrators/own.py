@@ -1,0 +1,96 @@
+"""Integrators that users have written: loaded from a file, and kept from ending a command without a word.
+
+What is asked of one is what Mitsuba asks: `render` and `render_backward`, as `mi.ad.integrators.common.ADIntegrator`
+and `RBIntegrator` have them for whoever writes `sample`.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.config.base import code_file
+from reslrb_cli.config.code import Guard, load_named
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.integrators.baselines import Replayed, Reversed
+from reslrb_cli.integrators.protocol import Job
+
+
+class OwnIntegrator(Reversed):
+    """A user's integrator in a step; what it raises, and what is no image, becomes one line that names the class.
+
+    The file is run when an image or a gradient is first asked for, or `ready` is.
+    """
+
+    #: Its gradient is a pass of its own; naive AD of one whose `render` alone is differentiable is Mitsuba's affair.
+    image_apart = True
+
+    def __init__(
+        self, file: str, max_depth: int, rr_depth: int, hide_emitters: bool, properties: dict[str, Any] | None = None,
+        paths: str = "camera", allowed: bool = False,
+    ) -> None:  # fmt: skip
+        """The class FILE.py:CLASS, to be made of a `mi.Properties` with these options and `properties`; what of the
+        first three it does not ask for it does not have. `paths` are for those who judge it (`config.Own`). Code is run
+        where that is `allowed`."""
+        self.file, self.name, self.allowed = code_file(file), file.rpartition(":")[2], allowed
+        self._options = {"max_depth": max_depth, "rr_depth": rr_depth, "hide_emitters": hide_emitters}
+        self._properties = properties or {}
+
+    def ready(self) -> None:
+        """Run the file and make the integrator. Raises ConfigError, located by the file, where that is not allowed, or
+        cannot be done, or one of the `properties` is nothing that it asks for."""
+        _ = self._work
+
+    @cached_property
+    def _work(self) -> Replayed:
+        if not self.allowed:
+            raise ConfigError(self.file, self.name, "would be run, with all your rights; --allow-code has it run")
+        found = load_named(self.file, self.name, self.file, self.name)
+        options = mi.Properties("custom")
+        for key, value in {**self._options, **self._properties}.items():
+            options[key] = value
+        with Guard(self.file, self.name, self.file, "making it"):
+            plugin = found(options)
+        if not isinstance(plugin, mi.Integrator):
+            raise ConfigError(self.file, self.name, f"is no Mitsuba integrator, but makes a {type(plugin).__name__}")
+        unknown = [key for key in options.unqueried() if key in self._properties]
+        if unknown:
+            raise ConfigError(self.file, self.name, f"has no option {', '.join(unknown)}")
+        return Replayed(plugin)
+
+    def image(self, job: Job) -> mi.TensorXf:
+        self.ready()
+        with self._guarded("its render"):
+            image = self._work.image(job)
+        return self._checked(job, image)
+
+    def backward(self, job: Job, gradient: mi.TensorXf) -> None:
+        self.ready()
+        with self._guarded("its render_backward"):
+            self._work.backward(job, gradient)
+
+    def tangent(self, job: Job) -> mi.TensorXf:
+        """The derivative of the image along the tangents of the job's parameters, by its `render_forward`."""
+        plugin = self._work.plugin
+        with self._guarded("its render_forward"), dr.resume_grad():
+            image = plugin.render_forward(job.scene, job.params, job.sensor, job.seed, job.spp)
+        return self._checked(job, image)
+
+    def _guarded(self, what: str) -> Guard:
+        return Guard(self.file, self.name, self.file, what)
+
+    def _checked(self, job: Job, image: Any) -> mi.TensorXf:
+        """The image, of the film's size. Raises ConfigError."""
+        width, height = (int(n) for n in job.sensor.film().crop_size())
+        shape = tuple(image.shape) if isinstance(image, mi.TensorXf) else None
+        if shape is None:
+            raise ConfigError(self.file, self.name, f"its render returns {type(image).__name__}, not mi.TensorXf")
+        if shape[:2] != (height, width) or len(shape) != 3:
+            said = "x".join(str(n) for n in shape)
+            raise ConfigError(
+                self.file, self.name, f"its image is {said}, not {height}x{width} (height, width) with channels"
+            )
+        return image

@@ -1,0 +1,342 @@
+"""Where to look in an integrator of a user's own that `gradcheck` found wrong, derived from measurements.
+
+What it estimates is compared with what `reslrb` does by the same kind of paths, as a ratio: of gradients along the
+reference's own direction,
+
+    r = E<g, u> / E<G, u>,      u from other seeds of G than the denominator,
+
+with its standard error; of images of their sums. The ratios are taken for paths of 1, 2, 3, ... segments, without
+Russian roulette, and for each parameter. Images are linear in emission: so that at each seed sum(dL/dE E) is the image
+itself, where both passes trace the same paths and add the same at their vertices. Each finding rules out places where a
+fault may be, and the sentence is made of those that are left. It says what was measured, and is no proof.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.integrators.protocol import StepIntegrator
+from reslrb_cli.integrators.step import make_integrator
+from reslrb_cli.measure.gradcheck import Gradcheck
+from reslrb_cli.measure.gradients import Case, seeds
+from reslrb_cli.measure.participants import NEVER, Participants
+from reslrb_cli.records.measurements import GradcheckRecord, Verdict
+from reslrb_cli.scene.catalog import parameter_kind
+
+Array = np.ndarray
+
+#: Seeds of each measurement, and of the reference, whose first half is the direction.
+SEEDS, REFERENCE_SEEDS = 16, 32
+
+#: Paths are looked at up to so many segments.
+DEEPEST = 5
+
+#: A ratio is another than 1 where it is so many standard errors, and by so much, away.
+ERRORS, LEAST = 5.0, 0.01
+
+#: What ends so is emission that images are linear in.
+LINEAR = (".value", "scale")
+
+#: Of the same paths, sums taken in another order scatter by less.
+SAME_PATHS = 1e-3
+
+#: Constants that slip in, with how they are written.
+CONSTANTS = {"2": 2.0, "1/2": 0.5, "pi": np.pi, "1/pi": 1 / np.pi, "2 pi": 2 * np.pi, "1/(2 pi)": 0.5 / np.pi,
+             "4 pi": 4 * np.pi, "1/(4 pi)": 0.25 / np.pi, "-1": -1.0}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """What is estimated over what it should be; None where the reference is too noisy to say."""
+
+    value: float
+    error: float
+
+    @property
+    def wrong(self) -> bool:
+        """Whether it is not 1."""
+        return not np.isfinite(self.value) or abs(self.value - 1) > max(ERRORS * self.error, LEAST)
+
+    def same(self, other: Ratio) -> bool:
+        """Whether it may be the other."""
+        return abs(self.value - other.value) <= max(ERRORS * np.hypot(self.error, other.error), LEAST)
+
+    def __str__(self) -> str:
+        return f"{self.value:.3g} +- {self.error:.1g} times"
+
+
+def look_into(check: Gradcheck, records: Sequence[GradcheckRecord]) -> list[str]:
+    """What is to be said of each of the user's own integrators, after its `records`: how noisy and dear it is, and,
+    where it is wrong, where to look."""
+    lines = []
+    for listed in check.participants.listed:
+        if listed.type != "custom":
+            continue
+        mine = [record for record in records if record.integrator == listed.label]
+        lines.append(_cost(check, listed.label))
+        failing = [record for record in mine if record.verdict is Verdict.FAILS]
+        if failing:
+            lines.append(f"{listed.label}: {Looking(check.participants, listed.label).sentence(failing)}")
+    return lines
+
+
+def _cost(check: Gradcheck, label: str) -> str:
+    """Noise and time of a gradient beside those of `reslrb` by the same paths."""
+    parts = check.participants
+    ours = _ours(parts, label)
+    figures = []
+    for integrator in (parts.integrators[label], ours):
+        rows, times = [], []
+        for seed in seeds(SEEDS, 5):
+            begin = time.perf_counter()
+            rows.append(_gradient(parts, integrator, seed))
+            times.append(time.perf_counter() - begin)
+        figures.append((np.var(rows, axis=0, ddof=1).sum(), float(np.median(times[1:]))))
+    (noise, seconds), (our_noise, our_seconds) = figures
+    way = parts.ways[label].paths
+    times_noise = f"{noise / our_noise:.3g} times the variance" if our_noise > 0 else "variance unknown"
+    return (
+        f"{label}: {times_noise} and {seconds / our_seconds:.3g} times the time ({1e3 * seconds:.3g} ms) of a "
+        f"gradient by reslrb:stack(paths={way}), medians of {SEEDS - 1}"
+    )
+
+
+def _ours(parts: Participants, label: str, **other: int) -> StepIntegrator:
+    """The reference: `reslrb` by the same kind of paths, with `other` depths."""
+    options = parts.options_of(label) | other
+    return make_integrator("reslrb", estimator="stack", **parts.ways[label].options, **options)
+
+
+def _gradient(parts: Participants, integrator: StepIntegrator, seed: int) -> Array:
+    options = {"step": parts.case.known_step} if parts.known else {}
+    return parts.case.gradient(integrator, seed, parts.spp, **options)
+
+
+class Looking:
+    """What is measured of one integrator, `label`, once it failed."""
+
+    def __init__(self, parts: Participants, label: str) -> None:
+        self.parts, self.label = parts, label
+        self.keys = parts.case.keys
+        self._options = parts.options_of(label)
+        self.depth = self._options["max_depth"]
+        self.deepest = DEEPEST if self.depth == -1 else min(self.depth, DEEPEST)
+
+    # --- measuring ----------------------------------------------------------------------------------------------------
+
+    def _pair(self, **other: int) -> tuple[StepIntegrator, StepIntegrator]:
+        """The integrator and the reference, with `other` depths."""
+        return self.parts.own_with(self.label, **other), _ours(self.parts, self.label, **other)
+
+    def images(self, **other: int) -> Ratio:
+        """Of images, weighted alike in all pixels."""
+        sums = [
+            np.array([self.parts.case.image(one, seed, self.parts.spp).sum() for seed in seeds(SEEDS, block)])
+            for block, one in zip((5, 6), self._pair(**other), strict=True)
+        ]
+        return _over(*sums)
+
+    def gradients(self, **other: int) -> dict[str, Ratio]:
+        """Of each parameter that the reference has a gradient of."""
+        return self._ratios(*self._pair(**other))
+
+    def _ratios(self, own: StepIntegrator, ours: StepIntegrator) -> dict[str, Ratio]:
+        reference = np.stack([_gradient(self.parts, ours, seed) for seed in seeds(REFERENCE_SEEDS, 6)])
+        mine = np.stack([_gradient(self.parts, own, seed) for seed in seeds(SEEDS, 5)])
+        found = {}
+        for key, place in self.parts.case.places.items():
+            first, second = np.split(reference[:, place], 2)
+            direction = first.mean(0)
+            if not (size := float(np.linalg.norm(direction))):
+                continue
+            sides = mine[:, place] @ direction / size, second @ direction / size
+            if abs(sides[1].mean()) > ERRORS * _error(sides[1]):
+                found[key] = _over(*sides)
+        return found
+
+    def emission(self, depth: int | None = None, seen: int | None = None) -> tuple[Ratio, float] | None:
+        """The derivative by all emission, times emission, over the image, which it has to equal: images are linear in
+        it. And by how much that scatters between seeds, at each of which both are of the same paths; None where some
+        light is not a number (`.value`, `scale`). Of paths of `depth` segments, over an image of `seen`."""
+        scene = self.parts.case.scene
+        depth = self.depth if depth is None else depth
+        own, image = (self.parts.own_with(self.label, max_depth=n) for n in (depth, depth if seen is None else seen))
+        params = mi.traverse(scene)
+        keys = [key for key, _ in params if parameter_kind(params, key) == "emitter" and key.endswith(LINEAR)]
+        if len(keys) != len(scene.emitters()):
+            return None
+        case = Case(scene, keys, self.parts.case.sensor)
+        case.weigh(np.array(self.parts.case.weights))
+        emitted = np.concatenate([case.initial[key] for key in keys])
+        rows = []
+        for seed in seeds(SEEDS, 7):
+            gradient = case.gradient(own, seed, self.parts.spp, step=case.known_step)
+            rows.append(gradient @ emitted / case.weighted(case.image(image, seed, self.parts.spp)))
+        found = np.array(rows)
+        return Ratio(float(found.mean()), _error(found)), float(found.std(ddof=1))
+
+    # --- saying -------------------------------------------------------------------------------------------------------
+
+    def sentence(self, failing: Iterable[GradcheckRecord]) -> str:
+        """Where to look."""
+        if self.parts.attached:
+            return "wrong where light moves; what it lacks there is not told apart from here"
+        if any(record.parameter is None for record in failing) and (image := self.images()).wrong:
+            return self._of_image(image)
+        found = self.gradients()
+        wrong = {key: ratio for key, ratio in found.items() if ratio.wrong}
+        if wrong:
+            return "; ".join([self._of_gradient(found, wrong), *self._narrowed(wrong)])
+        passes = self._of_passes({})
+        if passes is not None:
+            return f"its image holds; {passes}"
+        return (
+            f"its gradient is right along the reference's own direction ({_list(found)}), and wrong entry by entry: "
+            "look at where derivatives land (texture coordinates, the pixel that dL/dI is taken from)"
+        )
+
+    def _of_image(self, ratio: Ratio) -> str:
+        where, _ = self._from_depth(lambda depth: self.images(max_depth=depth))
+        parts = [f"its image is {ratio} the reference's, so look at what it renders first: the gradient follows it"]
+        if where is not None:
+            parts.append(_segments(where, self._options["hide_emitters"]))
+        if self._roulette() and not self.images(rr_depth=NEVER).wrong:
+            parts.append("without roulette it is right: the weight 1/p of a path that goes on")
+        return "; ".join(parts)
+
+    def _of_gradient(self, found: dict[str, Ratio], wrong: dict[str, Ratio]) -> str:
+        zero = [key for key, ratio in wrong.items() if ratio.value == 0 and ratio.error == 0]
+        if zero:
+            return (
+                f"its image holds; the gradient of {_names(zero)} is exactly 0: no derivative arrives there (a BSDF "
+                "or an emitter that is evaluated outside of dr.resume_grad, or detached)"
+            )
+        first, *others = wrong.values()
+        if len(wrong) == len(found) and all(first.same(other) for other in others):
+            known = [
+                name
+                for name, value in CONSTANTS.items()
+                if abs(first.value - value) <= ERRORS * first.error + 0.01 * abs(value)
+            ]
+            named = f", which is {known[0]}" if known else ""
+            return f"its image holds; its gradient is {first} the reference's{named}"
+        right = [key for key in found if key not in wrong]
+        beside = f", while {_names(right)} {'holds' if len(right) == 1 else 'hold'}" if right else ""
+        return f"its image holds; of the reference's gradient it has {_list(wrong)}{beside}"
+
+    def _narrowed(self, wrong: dict[str, Ratio]) -> list[str]:
+        """What is left: passes that do not agree, roulette, derivatives from some depth on, lobes."""
+        worst = max(wrong, key=lambda key: abs(wrong[key].value - 1) / max(wrong[key].error, 1e-12))
+        passes = self._of_passes(wrong)
+        if passes is not None:
+            return [passes]
+        if self._roulette():
+            without = self.gradients(rr_depth=NEVER).get(worst)
+            if without is not None and not without.wrong:
+                return ["without roulette (rr_depth) it is right: the probability to go on is differentiated, or its "
+                        "weight stands in one of the two passes alone"]  # fmt: skip
+        said = []
+        at, before = self._from_depth(lambda depth: self.gradients(max_depth=depth).get(worst))
+        if at is not None:
+            said.append(
+                f"{_from(at, before)}, though its derivative by emission is right, and so are its paths and what "
+                "their vertices add: look at what is differentiated there (the BSDF's value over its detached self), "
+                "and at the light from behind it: L less all that was added up to this vertex, its own light included"
+            )
+        if lobes := self._lobes(worst):
+            said.append(lobes)
+        return said
+
+    def _of_passes(self, wrong: dict[str, Ratio]) -> str | None:
+        """Why the pass that differentiates is not that of the image: what it adds, or its paths; None where it is."""
+        measured = self.emission()
+        if measured is None:
+            return None
+        ratio, scatter = measured
+        if not ratio.wrong:
+            return None if scatter <= SAME_PATHS else (
+                f"at equal seeds its derivative by all emission scatters by {100 * scatter:.2g} % about its image, "
+                "which it has to equal: the pass that differentiates traces other paths than the first (random numbers "
+                "out of step)"
+            )  # fmt: skip
+        begin = f"its derivative by all emission is {ratio} its image, which it has to equal: "
+        if scatter <= 0.01 * abs(ratio.value - 1) and all(ratio.same(other) for other in wrong.values()):
+            return (
+                f"{begin}one factor at every seed, so that it is dL/dI that is passed on wrongly (its sign, its scale)"
+            )
+        if self._too_short():
+            return f"{begin}the pass that differentiates ends paths a segment too soon"
+        at, before = self._from_depth(lambda depth: (self.emission(depth) or (None,))[0])
+        where = "" if at is None else f"; {_segments(at, self._options['hide_emitters'], before)}"
+        return f"{begin}what a vertex adds in the pass that differentiates is not what it adds in the first{where}"
+
+    def _too_short(self) -> bool:
+        """Whether the pass that differentiates paths of three segments has those of two alone."""
+        found = self.emission(3, 2) if self.deepest >= 3 else None
+        return found is not None and not found[0].wrong and found[1] <= SAME_PATHS
+
+    def _roulette(self) -> bool:
+        return not 0 <= self.depth <= self._options["rr_depth"]
+
+    def _from_depth(self, ratio: Callable[[int], Ratio | None]) -> tuple[int | None, bool]:
+        """The least length of paths with which it is wrong, and whether shorter ones were seen to be right."""
+        seen = False
+        for depth in range(1, self.deepest + 1):
+            found = ratio(depth)
+            if found is not None and found.wrong:
+                return depth, seen
+            seen = seen or found is not None
+        return None, seen
+
+    def _lobes(self, key: str) -> str:
+        """A word on the lobes of the BSDF that the parameter belongs to, where it has several."""
+        for bsdf in self.parts.bsdfs_of(key):
+            if bsdf.component_count() > 1 and bsdf.class_name() != "TwoSidedBRDF":
+                return (
+                    f"it belongs to a {bsdf.class_name()} of {bsdf.component_count()} lobes: the weight of "
+                    "`bsdf.sample` has the probability of the lobe in it, whose derivative does not belong there; take "
+                    "that of `bsdf.eval`, over a detached density"
+                )
+        return ""
+
+
+def _from(depth: int, before: bool) -> str:
+    shorter = f"right up to {depth - 1} and " if depth > 1 and before else ""
+    return f"{shorter}wrong from paths of {depth} segment{'s' if depth > 1 else ''} on"
+
+
+def _segments(depth: int, hides: bool, before: bool = True) -> str:
+    """What paths of so many segments have that shorter ones do not."""
+    what = "throughput, and the BSDF's value over its density"
+    if depth == 1:
+        hidden = " (hide_emitters is on here)" if hides else ""
+        what = f"emission that the sensor sees itself{hidden}, the film, or how samples are counted"
+    if depth == 2:
+        what = (
+            "light that comes straight from a lamp, which is the BSDF's value with its cosine, over the density of the "
+            "emitter's sample with the choice of the emitter, times a weight of multiple importance sampling"
+        )
+    return f"{_from(depth, before)}: {what}"
+
+
+def _over(own: Array, reference: Array) -> Ratio:
+    """The ratio of two means, with its standard error."""
+    value = own.mean() / reference.mean()
+    return Ratio(float(value), float(np.hypot(_error(own), value * _error(reference)) / abs(reference.mean())))
+
+
+def _error(samples: Array) -> float:
+    return float(samples.std(ddof=1) / np.sqrt(len(samples)))
+
+
+def _names(keys: Sequence[str]) -> str:
+    return keys[0] if len(keys) == 1 else f"{', '.join(keys[:-1])} and {keys[-1]}"
+
+
+def _list(ratios: dict[str, Ratio]) -> str:
+    return ", ".join(f"{ratio} of {key}" for key, ratio in ratios.items())

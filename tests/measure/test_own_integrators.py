@@ -1,0 +1,195 @@
+"""Integrators that users write: checked against all references, and told where to look."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from reslrb_cli.cli import main
+from reslrb_cli.errors import ExitCode
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+FILE = Path(__file__).with_name("own_replay.py")
+
+#: A floor of two materials, mixed by a texture, beside a wall; two lamps.
+SCENE = """<scene version="3.0.0">
+    <sensor type="perspective" id="camera">
+        <float name="fov" value="60"/>
+        <transform name="to_world"><lookat origin="0, 1.2, 3.2" target="0, 0.6, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/></film>
+    </sensor>
+    <shape type="rectangle" id="floor">
+        <transform name="to_world"><scale value="1.5"/><rotate x="1" angle="-90"/></transform>
+        <bsdf type="blendbsdf" id="mixed">
+            <texture type="checkerboard" name="weight">
+                <float name="color0" value="0.3"/><float name="color1" value="0.7"/>
+            </texture>
+            <bsdf type="diffuse"><rgb name="reflectance" value="0.8, 0.6, 0.3"/></bsdf>
+            <bsdf type="roughconductor"><float name="alpha" value="0.5"/></bsdf>
+        </bsdf>
+    </shape>
+    <shape type="rectangle" id="wall">
+        <transform name="to_world"><scale value="1.5"/><translate y="1.5" z="-1.5"/></transform>
+        <bsdf type="diffuse" id="paint"><rgb name="reflectance" value="0.5, 0.7, 0.6"/></bsdf>
+    </shape>
+    <shape type="rectangle" id="left">
+        <transform name="to_world">
+            <scale value="1.5"/><rotate y="1" angle="90"/><translate x="-1.5" y="1.5"/>
+        </transform>
+        <bsdf type="diffuse"><rgb name="reflectance" value="0.7, 0.7, 0.7"/></bsdf>
+    </shape>
+    <shape type="rectangle" id="lamp">
+        <transform name="to_world"><scale value="0.5"/><rotate x="1" angle="90"/><translate y="2.6"/></transform>
+        <emitter type="area"><rgb name="radiance" value="6, 5, 4"/></emitter>
+    </shape>
+    <shape type="rectangle" id="small">
+        <transform name="to_world">
+            <scale value="0.2"/><rotate y="1" angle="-90"/><translate x="1.4" y="0.8"/>
+        </transform>
+        <emitter type="area"><rgb name="radiance" value="9, 9, 12"/></emitter>
+    </shape>
+</scene>
+"""
+
+CONFIG = """
+scene: {file: scene.xml}
+target: {render: {spp: 16}}
+parameters:
+  - {key: wall.bsdf.reflectance.value, initial: [0.5, 0.7, 0.6]}
+integrator: {type: reslrb, max_depth: 5, rr_depth: 1, paths: camera, estimator: stack}
+run: {iterations: 2, spp: 64}
+"""
+
+#: Both parameters.
+TWO = "parameters=[{key: floor.bsdf.weight.color0.value, initial: 0.3}, {key: wall.bsdf.reflectance.value}]"
+
+
+@pytest.fixture(autouse=True)
+def experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    Path("scene.xml").write_text(SCENE)
+    Path("room.yaml").write_text(CONFIG)
+    Path("own_replay.py").write_text(FILE.read_text())
+    return tmp_path
+
+
+def call(words: list[str]) -> int:
+    """The exit code of a command."""
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    return int(ended.value.code or 0)
+
+
+def checked(capsys: pytest.CaptureFixture[str], options: str, *more: str) -> tuple[int, list[str]]:
+    """The exit code of a check of the integrator with these options, and what it says of it."""
+    name = f"own_replay.py:Replay({options})" if options else "own_replay.py:Replay"
+    words = ["gradcheck", "room.yaml", "--integrators", name, "--allow-code", "--seeds", "24", "--spp", "64", *more]
+    code = call(words)
+    lines = capsys.readouterr().out.splitlines()
+    return code, [line for line in lines if line.startswith(f"{name}:")]
+
+
+def test_one_that_is_right_holds_and_its_cost_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    code, lines = checked(capsys, "", "--set", TWO)
+    assert code == 0
+    assert len(lines) == 1
+    assert "times the variance and" in lines[0]
+
+
+#: Faults, and what the sentence has to say of them.
+FOUND = {
+    "fault=cosine": ["its derivative by all emission is 1.", "light that comes straight from a lamp", "its cosine"],
+    "fault=replay": ["scatters by", "other paths than the first"],
+    "fault=roulette": ["without roulette (rr_depth) it is right"],
+    "fault=lobe": ["wall.bsdf.reflectance.value holds", "a BlendBSDF of", "the probability of the lobe"],
+    "fault=kept": ["its own light included"],
+    "fault=emitters": ["wrong from paths of 2 segments on", "the choice of the emitter"],
+    "fault=twice": ["wrong from paths of 2 segments on", "light that comes straight from a lamp"],
+    "fault=first": ["segments on, though its derivative by emission is right", "what is differentiated there"],
+    "fault=sign": ["is -1", "one factor at every seed"],
+    "fault=depth": ["a segment too soon"],
+    "primal_fault=emitters": ["its image is", "look at what it renders first", "from paths of 2 segments on"],
+}
+QUICK = ("fault=cosine", "fault=roulette")
+
+
+@pytest.mark.parametrize(
+    "fault", [name if name in QUICK else pytest.param(name, marks=pytest.mark.long) for name in FOUND]
+)
+def test_a_fault_is_found_and_the_sentence_points_at_it(capsys: pytest.CaptureFixture[str], fault: str) -> None:
+    code, lines = checked(capsys, fault, *(["--set", TWO] if fault == "fault=lobe" else []))
+    assert code == ExitCode.CHECK_FAILED
+    assert len(lines) == 2, lines
+    for words in FOUND[fault]:
+        assert words in lines[1], lines[1]
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("own_replay.py:Replay", "would be run, with all your rights; --allow-code has it run"),
+        ("missing.py:Replay", "no such file"),
+        ("own_replay.py:Other", "has nothing of the name `Other`"),
+        ("own_replay.py:NONE", "has a int, not a function, of the name"),
+        ("own_replay.py:makes_none", "is no Mitsuba integrator, but makes a str"),
+        ("own_replay.py:Replay(falt=cosine)", "has no option falt"),
+        ("own_replay.py:Replay(fault=raises)", "making it raises in line 23 RuntimeError: of all things"),
+        ("own_replay.py:Black(what=raises)", "its render raises in line"),
+        ("own_replay.py:Black(what=list)", "its render returns list, not mi.TensorXf"),
+        ("own_replay.py:Black(what=wide)", "its image is 16x17x3, not 16x16 (height, width) with channels"),
+        ("own_replay:Replay", "is none of your own (FILE.py:CLASS)"),
+        ("own_replay.py", "is no integrator of your own; write FILE.py:CLASS"),
+        ("reslrb:stack", "is none of your own (FILE.py:CLASS)"),
+    ],
+)
+def test_what_is_no_integrator_is_one_line(capsys: pytest.CaptureFixture[str], name: str, said: str) -> None:
+    allowed = [] if "would be run" in said else ["--allow-code"]
+    code = call(["gradcheck", "room.yaml", "--integrators", name, *allowed, "--seeds", "3", "--spp", "4"])
+    error = capsys.readouterr().err
+    assert code == ExitCode.USAGE, error
+    assert said in error
+    assert "Traceback" not in error
+
+
+def test_an_image_that_is_no_number_fails(capsys: pytest.CaptureFixture[str]) -> None:
+    code = call(["gradcheck", "room.yaml", "--integrators", "own_replay.py:Replay(primal_fault=nan)", "--allow-code",
+                 "--seeds", "8", "--spp", "4"])  # fmt: skip
+    said = capsys.readouterr().out
+    assert code == ExitCode.CHECK_FAILED
+    assert "image: own_replay.py:Replay(primal_fault=nan)" in said
+
+
+def test_a_run_by_one_is_that_of_prb(capsys: pytest.CaptureFixture[str]) -> None:
+    """`integrator.type: custom` recovers parameters, needs leave again to go on, and `render` asks for it too."""
+    own = "integrator={type: custom, file: own_replay.py:Replay, max_depth: 3}"
+    words = ["optimize", "room.yaml", "--set", own, "--set", "run.name=own", "--set", "run.certainty=false"]
+    words += ["--set", "target.render.integrator={type: prb, max_depth: 3}"]
+    assert call(words) == ExitCode.USAGE
+    assert "--allow-code has it run" in capsys.readouterr().err
+    assert call([*words, "--allow-code"]) == 0
+    capsys.readouterr()
+    assert call(["optimize", "--resume", "runs/own", "--set", "run.iterations=3"]) == ExitCode.USAGE
+    assert "--allow-code has it run" in capsys.readouterr().err
+    assert call(["optimize", "--resume", "runs/own", "--set", "run.iterations=3", "--allow-code"]) == 0
+    assert call(["report", "runs/own"]) == 0
+    with Path("own_replay.py").open("a") as file:
+        file.write("\n# changed\n")
+    assert call(["optimize", "--resume", "runs/own", "--set", "run.iterations=4", "--allow-code"]) == ExitCode.USAGE
+    assert "integrator.file: has changed since runs/own began" in capsys.readouterr().err
+
+
+def test_bench_and_convergence_take_one(capsys: pytest.CaptureFixture[str]) -> None:
+    name = "own_replay.py:Replay"
+    code = call(
+        ["bench", "room.yaml", "--integrators", f"prb,{name}", "--values", "3", "--rounds", "3", "--allow-code"]
+    )
+    said = capsys.readouterr().out
+    assert code == 0, said
+    assert said.count(name) >= 1
+    code = call(["convergence", "room.yaml", "--integrators", f"prb,{name}", "--rounds", "8", "--allow-code",
+                 "--set", "run.spp=8"])  # fmt: skip
+    said = capsys.readouterr().out
+    assert code == 0, said
+    assert name in said
