@@ -190,18 +190,21 @@ def gradcheck(
     budget: float = 45.0,
     seeds: int | None = None,
     spp: int | None = None,
+    integrators: str | None = None,
+    allow_code: bool = False,
 ) -> list[GradcheckRecord]:
     """The comparisons of `reslrb gradcheck`, one record each, as `--json` writes them (docs/gradcheck.md).
 
     `estimators` is the list that `--estimators` takes (all four, unless it is given), `budget` the seconds for the
     whole, `seeds` their number whatever time they take, at least 3, `spp` the samples per pixel of one gradient.
-    `record.holds` is False where a comparison fails.
+    `record.holds` is False where a comparison fails. `integrators` are Mitsuba integrators of your own,
+    `FILE.py:CLASS[(OPTION=VALUE,...)]`, in place of ours; `allow_code` has their files run (docs/your_integrator.md).
 
     Sets the Mitsuba variant of the experiment where none is set. Raises ConfigError, UnsupportedScene.
     """
     began = time.monotonic()
     with called():
-        config = load(experiment)
+        config = load(experiment).with_code(allow_code)
         for name, value, least in (("seeds", seeds, 3), ("spp", spp, 1)):
             if value is not None and value < least:
                 raise ConfigError(name, "", f"is {value}; at least {least} are needed")
@@ -210,7 +213,7 @@ def gradcheck(
         from reslrb_cli.measure.participants import settings_of
 
         gc.collect()  # scenes that are done with would take part, and their parameters' gradients be in the way
-        checked = settings_of(config, estimators, budget, seeds, spp, time.monotonic() - began)
+        checked = settings_of(config, estimators, budget, seeds, spp, time.monotonic() - began, integrators)
         return [result.record for result in Gradcheck(checked).run(lambda: False, logger.info)]
 
 
@@ -222,19 +225,20 @@ def convergence(
     rounds: int | None = None,
     spps: Sequence[int] = (),
     reference: str | None = None,
+    allow_code: bool = False,
 ) -> list[Line]:
     """What `reslrb convergence --json` writes: points, methods, references, and a sentence (docs/convergence.md).
 
     The arguments are the command's options: `integrators` and `reference` as `--integrators` and `--reference` take
     them, `budget` the seconds for the whole, `rounds` the number of turns whatever time they take, `spps` samples per
-    pixel that are compared. Each method computes in a process of its own, under the experiment's variant; none is set
-    in this one.
+    pixel that are compared; `allow_code` has the files of integrators of your own run. Each method computes in a
+    process of its own, under the experiment's variant; none is set in this one.
 
     Raises ConfigError.
     """
     began = time.monotonic()
     with called():
-        config = load(experiment)
+        config = load(experiment).with_code(allow_code)
         from reslrb_cli.measure.convergence.judgement import Judgement
         from reslrb_cli.measure.convergence.session import Session
         from reslrb_cli.measure.methods import DEFAULTS, Plan, compared, machine_of

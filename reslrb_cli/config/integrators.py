@@ -278,12 +278,12 @@ class Own(Integrator, json_schema_extra=NEEDS_TYPE):
     type: Literal["custom"] = Field(default="custom", description="A Mitsuba integrator of one's own.")
     file: CodePlace
     """`FILE.py:CLASS`: a file of Python code, relative to the config file, and the class in it, which is made of a
-    `mi.Properties` with `max_depth`, `rr_depth`, `hide_emitters` and `properties`. A run keeps a digest of the file's
+    `mi.Properties` with `max_depth`, `rr_depth`, `hide_emitters` and `arguments`. A run keeps a digest of the file's
     bytes, not of what it imports, and goes on with no other."""
     paths: Literal["camera", "light"] = "camera"
     """Where its paths begin: what it can see, and whether its images are darker along the film's border, as those of
     light paths are."""
-    properties: dict[str, bool | int | float | str] = Field(default_factory=dict)
+    arguments: dict[str, bool | int | float | str] = Field(default_factory=dict)
     """What else it is made of."""
 
     @property

@@ -29,19 +29,19 @@ class OwnIntegrator(Reversed):
     image_apart = True
 
     def __init__(
-        self, file: str, max_depth: int, rr_depth: int, hide_emitters: bool, properties: dict[str, Any] | None = None,
+        self, file: str, max_depth: int, rr_depth: int, hide_emitters: bool, arguments: dict[str, Any] | None = None,
         paths: str = "camera", allowed: bool = False,
     ) -> None:  # fmt: skip
-        """The class FILE.py:CLASS, to be made of a `mi.Properties` with these options and `properties`; what of the
+        """The class FILE.py:CLASS, to be made of a `mi.Properties` with these options and `arguments`; what of the
         first three it does not ask for it does not have. `paths` are for those who judge it (`config.Own`). Code is run
         where that is `allowed`."""
         self.file, self.name, self.allowed = code_file(file), file.rpartition(":")[2], allowed
         self._options = {"max_depth": max_depth, "rr_depth": rr_depth, "hide_emitters": hide_emitters}
-        self._properties = properties or {}
+        self._arguments = arguments or {}
 
     def ready(self) -> None:
         """Run the file and make the integrator. Raises ConfigError, located by the file, where that is not allowed, or
-        cannot be done, or one of the `properties` is nothing that it asks for."""
+        cannot be done, or one of the `arguments` is nothing that it asks for."""
         _ = self._work
 
     @cached_property
@@ -50,13 +50,13 @@ class OwnIntegrator(Reversed):
             raise ConfigError(self.file, self.name, "would be run, with all your rights; --allow-code has it run")
         found = load_named(self.file, self.name, self.file, self.name)
         options = mi.Properties("custom")
-        for key, value in {**self._options, **self._properties}.items():
+        for key, value in {**self._options, **self._arguments}.items():
             options[key] = value
         with Guard(self.file, self.name, self.file, "making it"):
             plugin = found(options)
         if not isinstance(plugin, mi.Integrator):
             raise ConfigError(self.file, self.name, f"is no Mitsuba integrator, but makes a {type(plugin).__name__}")
-        unknown = [key for key in options.unqueried() if key in self._properties]
+        unknown = [key for key in options.unqueried() if key in self._arguments]
         if unknown:
             raise ConfigError(self.file, self.name, f"has no option {', '.join(unknown)}")
         return Replayed(plugin)

@@ -95,9 +95,11 @@ class Case:
         values = {name: value for name, value in values.items() if name not in UNDECIDED or value != "auto"}
         if "paths" in self.options:  # a share is of the experiment's own paths
             values.pop("light_share", None)
+        if self.type == "custom":  # which paths it has is its own affair
+            values.pop("paths", None)
         given = {name: value for name, value in self.options.items() if name not in ADJOINT}
         if self.type == "custom":  # what is not ours is for the class
-            given["properties"] = {name: given.pop(name) for name in [*given] if name not in own}
+            given["arguments"] = {name: given.pop(name) for name in [*given] if name not in own}
         values |= given
         if self.type == "reslrb" and values.setdefault("estimator", PLUGIN_ESTIMATOR) == "auto" and not auto:
             raise ConfigError(blame, "estimator", "`auto` measures which to take; name those to compare")

@@ -185,7 +185,10 @@ class Looking:
     def sentence(self, failing: Iterable[GradcheckRecord]) -> str:
         """Where to look."""
         if self.parts.attached:
-            return "wrong where light moves; what it lacks there is not told apart from here"
+            return (
+                "wrong where light moves: look at derivatives of silhouettes, of edges of shadows, and of where light "
+                "goes; --missing, without --integrators, says how much the first two make up"
+            )
         if any(record.parameter is None for record in failing) and (image := self.images()).wrong:
             return self._of_image(image)
         found = self.gradients()

@@ -132,3 +132,23 @@ def test_a_notebooks_stop_button_keeps_the_result(checkout: Path) -> None:
     assert any("image/png" in output.get("data", {}) for output in cells[1].outputs)
     text = "".join(output.text for output in cells[2].outputs if output.get("name") == "stdout")
     assert text == "interrupted True ['floor.reflectance.data'] True\nTrue\n"
+
+
+@pytest.mark.long
+def test_the_integrator_of_the_page_is_found_to_be_wrong(checkout: Path) -> None:
+    """And what the program says of it is what the page says; with two lines exchanged it is right."""
+    page = (DOCS / "your_integrator.md").read_text(encoding="utf-8")
+    code, (said,) = script_of(page), re.findall(r"^    mine.py:Replay: (its image holds.*)$", page, re.MULTILINE)
+    first, second = (line for line in code.splitlines() if "behind = " in line or "L = L + Le" in line)
+    (checkout / "mine.py").write_text(code, encoding="utf-8")
+    (checkout / "right.py").write_text(code.replace(f"{first}\n{second}", f"{second}\n{first}"), encoding="utf-8")
+    (words,) = re.findall(r"^    reslrb (gradcheck --integrators.*?)\n\n", page, re.MULTILINE | re.DOTALL)
+    for name, code_of in (("mine", 1), ("right", 0)):
+        command = words.replace("\\\n", " ").replace("mine.py", f"{name}.py").split()
+        done = subprocess.run([sys.executable, "-m", "reslrb_cli", *command], capture_output=True, text=True,
+                              timeout=300, cwd=checkout, env=environment(checkout))  # fmt: skip
+        assert done.returncode == code_of, done.stderr
+        (sentence,) = [line for line in done.stdout.splitlines() if "its image holds" in line] or [""]
+        assert re.sub(r"[0-9.]+ \+- [0-9.]+", "R", sentence) == (
+            f"mine.py:Replay: {re.sub(r'[0-9.]+ [+]- [0-9.]+', 'R', said)}" if code_of else ""
+        )

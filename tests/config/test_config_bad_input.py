@@ -170,7 +170,7 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
     "home of nobody": (scene("~no-such-user-here/a"), "scene.file: must be a path"),
     "unknown integrator": (
         GOOD + "integrator: {type: reslbr}\n",
-        "integrator.type: must be one of reslrb, ptracer, prb, walk_ad, trajectory (did you mean reslrb?)",
+        "integrator.type: must be one of reslrb, ptracer, prb, walk_ad, trajectory, custom (did you mean reslrb?)",
     ),
     "type is a list": (GOOD + "integrator: {type: [prb]}\n", "integrator.type: must be one of"),
     "option of another integrator": (

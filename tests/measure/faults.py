@@ -21,7 +21,7 @@ SMALL = ["scene.options.size=32", "scene.options.texture=4", "run.spp=8", "integ
 SMALL += ["run.adjoint=correlated"]  # what is kept between image and gradient takes part then
 
 
-def room(name: str, *keys: str) -> Config:
+def room(name: str, *keys: str, overrides: Iterable[str] = ()) -> Config:
     """The experiment of finding the parameters of a room that stands beside this file."""
     parameters = "".join(f"  - {{key: {key}}}\n" for key in keys)
     text = f"""\
@@ -31,7 +31,7 @@ parameters:
 {parameters}integrator: {{max_depth: 4, rr_depth: 1000000}}
 run: {{spp: 64}}
 """
-    return loads(text, name, [])
+    return loads(text, name, [*overrides])
 
 
 def checked(config: Config, estimators: str, seeds: int) -> list[GradcheckRecord]:

@@ -441,7 +441,7 @@ def test_who_takes_part():
     assert [case.label for case in all_of_them.participants.listed] == [
         *(f"reslrb:{name}" for name in ("reservoir", "gather", "event", "stack")), "reslrb:stack(paths=both)"
     ]  # fmt: skip
-    asked = room_moving("lamp_over_floor.xml", "floor.bsdf.reflectance.value", "integrator={paths: light}")
+    asked = room_moving("lamp_over_floor.xml", "floor.bsdf.reflectance.value", overrides=["integrator.paths=light"])
     assert len(Gradcheck(Settings(asked, all_estimators(asked), 0, 3, named=False)).participants.listed) == 4
 
 
