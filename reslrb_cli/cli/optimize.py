@@ -5,7 +5,6 @@ With `--dry-run` it prints the forecast of a run (`show_forecast`, `templates/fo
 
 from __future__ import annotations
 
-import importlib.util
 import logging
 import os
 import time
@@ -22,6 +21,7 @@ from reslrb_cli.cli.options import (
     start_variant,
 )
 from reslrb_cli.cli.terminal import echo, fill
+from reslrb_cli.cluster.connection import Place
 from reslrb_cli.config.files import in_words, rough_duration
 from reslrb_cli.errors import ConfigError, ExitCode
 
@@ -102,9 +102,10 @@ logger = logging.getLogger(__name__)
 @allow_code_option
 @click.option(
     "--cluster",
-    metavar="local:N",
-    help="Have the shards of each step (run.shards) computed by N processes on this machine; the result is that of "
-    "one. Needs `pip install reslrb[cluster]`.",
+    metavar="WHERE",
+    help="Have the shards of each step (run.shards) computed by others: local:N, N processes on this machine, or "
+    "tls://HOST:PORT, the workers of a scheduler of dask's; the result is that of one process. Needs `pip install "
+    "reslrb[cluster]`.",
 )
 @click.option("--quiet", is_flag=True, help="Print the last line only.")
 @click.option("-v", "--verbose", is_flag=True, help="Say more of what is measured before the first iteration.")
@@ -126,7 +127,7 @@ def command(
     """
     if quiet or verbose:
         logging.getLogger("reslrb_cli").setLevel(logging.WARNING if quiet else logging.DEBUG)
-    workers = None if cluster is None else _workers(cluster)
+    workers = None if cluster is None else Place.parse(cluster)
     if resumed is not None:
         if force:
             raise click.UsageError("--force replaces a run, --resume goes on with one; give one of the two")
@@ -140,23 +141,7 @@ def command(
     return _begin(config_file, overrides, force, dry_run, allow_code, workers, quiet)
 
 
-#: Processes that one machine may be asked for.
-_MOST_WORKERS = 1024
-
-
-def _workers(cluster: str) -> int:
-    """The number of workers of `local:N`. Raises UsageError where it is none, or dask is not installed."""
-    kind, _, count = cluster.partition(":")
-    if kind != "local" or not count.isdecimal() or not 1 <= int(count) <= _MOST_WORKERS:
-        raise click.UsageError(
-            f"--cluster: must be local:N, N processes on this machine, such as local:2, not {cluster}"
-        )
-    if any(importlib.util.find_spec(name) is None for name in ("distributed", "cryptography")):
-        raise click.UsageError("--cluster: dask.distributed is not installed; `pip install reslrb[cluster]` has it")
-    return int(count)
-
-
-def _check_shards(config: Config, workers: int | None) -> None:
+def _check_shards(config: Config, workers: Place | None) -> None:
     """Raise ConfigError where a step has nothing to share out."""
     if workers is not None and config.shards == 1:
         reason = "a step is one shard, which --cluster has nothing to share out of; set run.shards to auto, or a number"
@@ -171,7 +156,7 @@ def _begin(
     force: bool,
     dry_run: bool,
     allow_code: bool,
-    workers: int | None,
+    workers: Place | None,
     quiet: bool,
 ) -> int:
     from reslrb_cli.records.run_folder import check_output
@@ -180,6 +165,8 @@ def _begin(
     run = config.run
     _check_shards(config, workers)
     check_output(config_file, run.output, run.folder_name, force)
+    if workers is not None:
+        workers.check()
     variant = start_variant(config)
     if dry_run:
         show_forecast(config)
@@ -195,7 +182,7 @@ def _resume(
     config_file: Path | None,
     overrides: tuple[str, ...],
     allow_code: bool,
-    workers: int | None,
+    workers: Place | None,
     quiet: bool,
 ) -> int:
     from reslrb_cli.runs.resume import open_earlier
@@ -208,18 +195,20 @@ def _resume(
             return ExitCode.DONE
         earlier.config = config = earlier.config.with_code(allow_code)
         _check_shards(config, workers)
+        if workers is not None:
+            workers.check()
         variant = start_variant(config.model_copy(update={"variant": earlier.variant}))
         begun = earlier.begin(variant, logger.info, logger.warning)
         logger.info(f"going on with {run} after {earlier.iteration} of {config.run.iterations} iterations")
         return _run(begun, workers, quiet)
 
 
-def _run(begun: Begun, workers: int | None, quiet: bool) -> int:
+def _run(begun: Begun, workers: Place | None, quiet: bool) -> int:
     """Run it in the folder, which is not made before signals are watched: from then on it is to say how it ended."""
     if workers is not None:
-        from reslrb_cli.cluster.engine import local_engine
+        from reslrb_cli.cluster.engine import engine_at
 
-        with local_engine(begun.course, workers) as engine:
+        with engine_at(begun.course, workers) as engine:
             begun.course.compute_with(engine)
             return _run(begun, None, quiet)
     from reslrb_cli.cli.progress import Progress

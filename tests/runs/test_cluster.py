@@ -17,6 +17,7 @@ import pytest
 from cli import tiny
 from runs.going_on import MOTION, optimize, write_experiment
 
+from reslrb_cli.cluster.connection import Place
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.state import guiding_of
@@ -88,7 +89,7 @@ def check(folder: Path, case: str, workers: int) -> None:
     """Bit by bit, with one thread each."""
     alone = end(make(folder, *CASES[case]))
     course = make(folder, *CASES[case])
-    with engine.local_engine(course, workers, threads=1) as local:
+    with engine.engine_at(course, Place(workers), threads=1) as local:
         course.compute_with(local)
         together = end(course)
     assert {name: array.tobytes() for name, array in alone.items()} == {
@@ -104,7 +105,7 @@ def test_killed_workers_lose_nothing(experiment: Path, killing: str) -> None:
     sets = ["run.shards=4", f"run.iterations={kills}", "views=[{sensor: 0}]"]
     alone = end(make(experiment, *sets))
     course, rng = make(experiment, *sets), random.Random(workers)
-    with engine.local_engine(course, workers, threads=1) as local:
+    with engine.engine_at(course, Place(workers), threads=1) as local:
         course.compute_with(local)
         killed: list[int] = []
 
@@ -114,7 +115,7 @@ def test_killed_workers_lose_nothing(experiment: Path, killing: str) -> None:
             killed.append(pid)
 
         def strike(iteration: int) -> None:
-            pids = sorted(local._client.run(os.getpid).values())
+            pids = sorted(local.crew.client.run(os.getpid).values())
             threading.Thread(target=kill, args=(rng.choice(pids), rng.uniform(0, 0.05))).start()
 
         together = end(course, strike)
@@ -127,8 +128,10 @@ def test_killed_workers_lose_nothing(experiment: Path, killing: str) -> None:
 
 BAD = [
     (["--cluster", "2"], "--cluster: must be local:N"),
+    (["--cluster", "tcp://here:8786"], "--cluster: must be local:N"),
+    (["--cluster", "tls://here"], "--cluster: must be local:N"),
     (["--cluster", "local:0"], "--cluster: must be local:N"),
-    (["--cluster", "tls://here:8786"], "--cluster: must be local:N"),
+    (["--cluster", "tls://127.0.0.1:9", "--set", "run.shards=4"], "distributed.comm.tls.ca-file: is not set"),
     (["--cluster", "local:2"], "run.shards: a step is one shard"),
     (["--cluster", "local:2", "--set", "run.shards=4", "--dry-run"], "leave --cluster out"),
 ]

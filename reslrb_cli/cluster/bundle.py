@@ -1,0 +1,137 @@
+"""An experiment's files, as they are sent to who has none of them: its configuration, its scene as one file with
+nothing left to include, and all that the two name, beside them.
+
+    folder/config.yaml     as resolved, with the paths below
+    folder/scene.xml       all includes and variables put in
+    folder/files/N-NAME    whatever is read: meshes, textures, spectra, cameras, images, code
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from reslrb_cli.config.base import code_file
+from reslrb_cli.config.loader import loads
+from reslrb_cli.config.schema import Config
+from reslrb_cli.config.yaml_text import write
+from reslrb_cli.errors import ConfigError, MachineError
+from reslrb_cli.records.atomic import unfinished_folder
+from reslrb_cli.scene.xml.read import read_description, tag_lines
+
+CONFIG_FILE, SCENE_FILE, FILES = "config.yaml", "scene.xml", "files"
+
+
+@dataclass
+class Bundle:
+    """The bytes of files, by their paths below the folder that they are to be in, with `/`."""
+
+    files: dict[str, bytes] = field(default_factory=dict)
+    _names: dict[Path, str] = field(default_factory=dict)
+
+    def add(self, path: Path) -> str:
+        """Take a file, once, and return its path; its ending stays. Raises ConfigError where it cannot be read."""
+        path = path.absolute()
+        if path not in self._names:
+            name = self._names[path] = f"{FILES}/{len(self._names)}-{path.name}"
+            try:
+                self.files[name] = path.read_bytes()
+            except OSError as error:
+                raise ConfigError(path, "", f"cannot be sent to workers: {error.strerror}") from None
+        return self._names[path]
+
+    def digest(self) -> str:
+        """What is in the files, in short."""
+        found = hashlib.blake2b(digest_size=16)
+        for name, data in sorted(self.files.items()):
+            found.update(f"{name} {len(data)}\n".encode())
+            found.update(data)
+        return found.hexdigest()
+
+
+def bundle_of(config: Config) -> Bundle:
+    """All files that a process without any needs to load what `config` names, but for targets, which are sent as
+    arrays. Raises ConfigError."""
+    bundle = Bundle()
+    data = config.model_dump(exclude_none=True, exclude={"fabrication"})
+    scene, cameras = data["scene"], config.scene.cameras
+    if cameras is not None and cameras.suffix.lower() != ".json":  # COLMAP's, which are read in pairs
+        beside = cameras.with_name("cameras.txt")
+        for name, path in ((cameras.name, cameras), (beside.name, beside)):
+            bundle.files[f"{FILES}/colmap/{name}"] = path.read_bytes()
+        scene["cameras"] = f"{FILES}/colmap/{cameras.name}"
+    bundle.files[SCENE_FILE] = _scene_text(bundle, config).encode()
+    scene |= {"file": SCENE_FILE, "options": {}}
+    data["run"]["output"] = "runs"
+    for parameter in data["parameters"]:
+        initial = parameter.get("initial")
+        if isinstance(initial, dict) and not initial.keys() <= {"file", "color_space"}:
+            del parameter["initial"]  # of a run, or by transport: its values are sent by themselves
+    shown = {name: data.pop(name) for name in ("target", "views") if name in data}
+    data = _packed(bundle, data) | _packed(None, shown)
+    for key, code in config.codes.items():
+        if code.path is not None and code.file is not None:
+            _put(data, key, f"{bundle.add(code_file(code.file))}:{code.file.rpartition(':')[2]}")
+    bundle.files[CONFIG_FILE] = write(data).encode()
+    return bundle
+
+
+def _scene_text(bundle: Bundle, config: Config) -> str:
+    """The scene as one file, which names files of the bundle."""
+    texts = {name: _text(value) for name, value in config.scene.options.items()}
+    description = read_description(config.scene.file, texts)
+    for element in description.root.walk():
+        for key, named in (("value", element.tag == "string" and element.name == "filename"),
+                           ("filename", element.tag == "spectrum" and "filename" in element.attributes)):  # fmt: skip
+            path = description.find_file(element.attributes.get(key, "")) if named else None
+            if path is not None and path.is_file():
+                element.attributes[key] = bundle.add(path)
+    return "".join(f"{line}\n" for line, _ in tag_lines(description.root))
+
+
+def _text(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _packed(bundle: Bundle | None, value: Any) -> Any:
+    """Settings with the files that are there in the bundle, if there is one, and all other paths as text."""
+    if isinstance(value, Mapping):
+        return {key: _packed(bundle, each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_packed(bundle, each) for each in value]
+    if isinstance(value, Path):
+        return bundle.add(value) if bundle is not None and value.is_file() else f"{FILES}/{value.name}"
+    return value
+
+
+def _put(data: dict[str, Any], key: str, value: str) -> None:
+    """Put a value at a key such as `views[0].loss.file`."""
+    *way, last = key.replace("[", ".").replace("]", "").split(".")
+    at: Any = data
+    for part in way:
+        at = at[int(part)] if isinstance(at, list) else at[part]
+    at[last] = value
+
+
+def unpack(files: Mapping[str, bytes], folder: Path) -> None:
+    """Write files into `folder`, which appears when it is whole; it may be there already. Raises MachineError."""
+    if folder.is_dir():
+        return
+    try:
+        with unfinished_folder(folder.parent) as unfinished:
+            for name, data in files.items():
+                path = unfinished / name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(data)
+            unfinished.rename(folder)
+    except OSError as error:
+        raise MachineError(f"{folder}: the experiment cannot be written there: {error.strerror}") from None
+
+
+def read_bundle(folder: Path) -> Config:
+    """The experiment whose files are in `folder`. Raises ConfigError."""
+    text = (folder / CONFIG_FILE).read_text(encoding="utf-8")
+    return loads(text, folder / CONFIG_FILE)

@@ -1,0 +1,172 @@
+"""Where workers are: processes of this machine that dask starts, or a scheduler that others have joined (`--cluster`).
+
+Connections are by TLS alone. For `local:N` dask makes certificates for this run, which are never written down; for
+`tls://HOST:PORT` they are those of dask's own settings, `distributed.comm.tls`, which say what scheduler and workers
+were started with. Who holds such a certificate can run anything on the workers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import logging
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from reslrb_cli.errors import ConfigError, MachineError, one_line
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+logger = logging.getLogger(__name__)
+
+#: Processes that one machine may be asked for.
+MOST_WORKERS = 1024
+_ADDRESS = re.compile(r"tls://(\[[0-9A-Fa-f:.]+\]|[^\s:/\[\]]+):([0-9]{1,5})")
+
+#: dask's settings. How many workers may die of one task before it is given up; a worker that is not heard of for so
+#: long counts as gone, and has to come to the end of its longest compilation before; a connection is given up after 30
+#: silent seconds. Large arguments are nothing to warn of.
+SETTINGS = {
+    "distributed.scheduler.allowed-failures": 3,
+    "distributed.scheduler.worker-ttl": "30 minutes",
+    "distributed.comm.timeouts.connect": "30s",
+    "distributed.comm.timeouts.tcp": "30s",
+    "distributed.admin.tick.limit": "1h",
+    "distributed.admin.large-graph-warning-threshold": "1TB",
+}
+#: Of the workers that are started here: nothing answers to who is not one of them; no task is put on disk; and Ctrl-C,
+#: which goes to all processes of a terminal, leaves them to the run, which ends after its iteration.
+OWN_SETTINGS = {
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
+}
+
+
+@dataclass(frozen=True)
+class Place:
+    """So many `workers` of this machine, or the scheduler at `address`."""
+
+    workers: int = 0
+    address: str | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> Place:
+        """That of `local:N` or `tls://HOST:PORT`. Raises ConfigError where it is neither, or dask is not installed."""
+        kind, _, count = text.partition(":")
+        address = _ADDRESS.fullmatch(text)
+        if address and 0 < int(address[2]) < 2**16:
+            place = cls(address=text)
+        elif kind == "local" and count.isdecimal() and 1 <= int(count[:9]) <= MOST_WORKERS:
+            place = cls(int(count))
+        else:
+            what = "local:N, N processes on this machine, such as local:2, or tls://HOST:PORT, a scheduler of dask's"
+            raise ConfigError("--cluster", "", f"must be {what}, not {one_line(text, 60)}")
+        if any(importlib.util.find_spec(name) is None for name in ("distributed", "cryptography")):
+            raise ConfigError(
+                "--cluster", "", "dask.distributed is not installed; `pip install reslrb[cluster]` has it"
+            )
+        return place
+
+    def check(self) -> None:
+        """Raise ConfigError without certificates, and MachineError where the scheduler does not answer."""
+        if self.address is not None:
+            with connected(self):
+                pass
+
+
+@contextlib.contextmanager
+def connected(place: Place) -> Iterator[tuple[Client, Path]]:
+    """A client of the workers at a place, and a folder that is removed in the end.
+
+    Raises MachineError where none can be started, or the scheduler does not answer; ConfigError without certificates.
+    """
+    import dask
+    from distributed import Client
+
+    for name in ("distributed", "tornado"):  # what they would log is said in our own words, or is nothing to a user
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    with contextlib.ExitStack() as stack:
+        folder = Path(tempfile.mkdtemp(prefix="reslrb-cluster-"))
+        stack.callback(shutil.rmtree, folder, ignore_errors=True)
+        stack.enter_context(dask.config.set(SETTINGS))
+        if place.address is None:
+            stack.enter_context(dask.config.set(OWN_SETTINGS))
+            address, security = stack.enter_context(_started(place.workers, folder))
+        else:
+            address, security = place.address, _certificates()
+        try:
+            client = Client(
+                address, security=security, direct_to_workers=False, set_as_default=False, timeout="30s",
+                heartbeat_interval="2s",
+            )  # fmt: skip
+        except (OSError, RuntimeError, TimeoutError) as error:
+            raise MachineError(f"--cluster: {_why_not(place, error)}") from None
+        stack.callback(_close, client)
+        yield client, folder
+
+
+@contextlib.contextmanager
+def _started(workers: int, folder: Path) -> Iterator[tuple[object, object]]:
+    """A scheduler in this process and so many workers in their own, and what one connects by."""
+    from distributed import LocalCluster
+
+    from reslrb_cli.backend.memory import free_bytes
+
+    try:
+        cluster = LocalCluster(
+            n_workers=workers, threads_per_worker=1, processes=True, security=True, protocol="tls://",
+            dashboard_address="127.0.0.1:0", scheduler_kwargs={"dashboard": False}, silence_logs=logging.CRITICAL,
+            local_directory=str(folder), memory_limit=free_bytes("llvm") // workers,
+        )  # fmt: skip
+    except (OSError, RuntimeError, TimeoutError) as error:
+        raise MachineError(f"--cluster: no workers could be started: {error}") from None
+    try:
+        yield cluster, cluster.security
+    finally:
+        with contextlib.suppress(OSError, RuntimeError, TimeoutError):
+            cluster.close(timeout=10)
+
+
+def _certificates() -> object:
+    """What dask's settings say of certificates. Raises ConfigError where a file of them is not said or not there."""
+    from distributed import Security
+
+    try:
+        security = Security(require_encryption=True)
+        files = {
+            "ca-file": security.tls_ca_file,
+            "client.cert": security.tls_client_cert,
+            "client.key": security.tls_client_key,
+        }
+    except (TypeError, ValueError) as error:
+        raise ConfigError("--cluster", "distributed.comm.tls", f"{error}") from None
+    for name, file in files.items():
+        variable = f"DASK_DISTRIBUTED__COMM__TLS__{name.upper().replace('-', '_').replace('.', '__')}"
+        if not file:
+            reason = f"is not set; say where the file is, for example by {variable}=FILE (docs/cluster.md)"
+            raise ConfigError("--cluster", f"distributed.comm.tls.{name}", reason)
+        if "\n" not in file and not os.access(file, os.R_OK):
+            raise ConfigError("--cluster", f"distributed.comm.tls.{name}", f"{file} cannot be read")
+    return security
+
+
+def _why_not(place: Place, error: Exception) -> str:
+    """Why a client did not come to be."""
+    said = one_line(str(error.__cause__ or error), 200)
+    return f"the scheduler at {place.address or 'this machine'} cannot be reached, or refuses this certificate: {said}"
+
+
+def _close(client: Client) -> None:
+    with contextlib.suppress(OSError, RuntimeError, TimeoutError):
+        client.close(timeout=5)

@@ -1,0 +1,516 @@
+"""Calls on the workers of a dask scheduler: what they work on, what comes back, and what becomes of those that fail.
+
+A worker first comes to what it works on (`Opening`): it is sent files, once, and a function makes a state of them,
+which it keeps. A call is a function of that state, and of where it stands (`Context`), to a value that can be sent.
+dask hands calls out to the workers that are ready, and sends those again that a worker has died of. What is ours is to
+ask again: of a worker that says nothing for three times as long as calls take, another is asked, and the first answer
+counts; one that says nothing for much longer has dask start it anew.
+
+Everything goes by way of the scheduler: nobody needs a way to a worker.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import statistics
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from distributed import CancelledError, Client, Future, KilledWorker, get_worker
+from distributed.comm import CommClosedError
+
+from reslrb_cli.cluster.bundle import unpack
+from reslrb_cli.errors import (
+    ConfigError,
+    MachineError,
+    OutOfMemory,
+    ReslrbError,
+    is_machine_fault,
+    is_out_of_memory,
+    one_line,
+)
+from reslrb_cli.records.manifest import versions
+
+logger = logging.getLogger(__name__)
+
+#: How many times as long as its calls take a worker may say nothing, and seconds beside that, until another is asked.
+LATE, LATE_S = 3.0, 0.2
+#: The same until dask is asked to start it anew; and seconds that dask has for that.
+HUNG, HUNG_S, RESTART_S = 30.0, 30.0, 20.0
+#: Seconds that a worker may take to come to what it works on, while kernels are compiled; and, once one is there, how
+#: many times as long as that one and seconds beside that the others are waited for.
+OPENING_S, OTHERS, OTHERS_S = 900.0, 2.0, 10.0
+#: Seconds for which nobody may be there, and between looks at who is.
+NOBODY_S, LOOK_S = 60.0, 1.0
+#: How many workers may fail in one call by a fault of their machine's; how often one is started anew for such faults.
+FAULTS, RESTARTS = 3, 3
+#: How often what has got lost is sent again in one round.
+LOSSES = 100
+
+
+class Context(Protocol):
+    """Where the state of all workers is to stand for a call; `digest` tells one from another."""
+
+    @property
+    def digest(self) -> str:
+        """What tells it from others."""
+
+    def take(self, state: Any) -> None:
+        """Bring a worker's state there."""
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What workers work on: `function(folder, threads, *arguments)` makes the state of the files in a folder.
+
+    It returns that, and the seconds that a call of each function takes whose kernels it has warmed, by name. `digest`
+    is of the files. `asks_for_code`: whether users' own code is to run, and the workers are not this run's own.
+    """
+
+    digest: str
+    function: Callable[..., tuple[Any, dict[str, float]]]
+    arguments: tuple[Any, ...] = ()
+    asks_for_code: bool = False
+    versions: Mapping[str, str] = field(default_factory=versions)
+
+
+# --- on a worker ------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class _State:
+    """What a worker works on, and the digest of where it stands."""
+
+    opening: str
+    value: Any
+    stands: str = ""
+
+
+_state: _State | None = None
+
+#: In a worker's environment: 1 where users' own code may run there, if whoever runs the experiment allows it, too.
+ALLOW_CODE = "RESLRB_ALLOW_CODE"
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What a worker says; `worker` is its address."""
+
+    worker: str
+
+
+@dataclass(frozen=True)
+class Answer(Reply):
+    """The value of a call, and the seconds that it took to compute."""
+
+    value: Any
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Lacks(Reply):
+    """What a worker needs first: the opening's `files`, the `opening` itself, or the `context`."""
+
+    what: str
+
+
+@dataclass(frozen=True)
+class Fault(Reply):
+    """What is wrong with a worker's machine, and not with what was asked; `memory`: that is out."""
+
+    text: str
+    memory: bool = False
+
+
+def open_state(opening: Opening, files: Mapping[str, bytes] | None, threads: int) -> Reply:
+    """Have this worker come to what it works on."""
+    global _state
+    begin, me = time.perf_counter(), get_worker().address
+    here = versions()
+    for name, version in opening.versions.items():
+        if here.get(name) != version:
+            return Fault(me, f"has {name} {here.get(name)}, and the run {version}: install the same")
+    if opening.asks_for_code and os.environ.get(ALLOW_CODE) != "1":
+        return Fault(me, f"runs no code of users' own: start it with {ALLOW_CODE}=1 in its environment")
+    folder = Path(get_worker().local_directory) / f"reslrb-{opening.digest}"  # dask removes it with the worker
+    if files is None and not folder.is_dir():
+        return Lacks(me, "files")
+    _state = None
+    logging.getLogger("reslrb_cli").addHandler(logging.NullHandler())  # the run has said what there is to say
+    try:
+        unpack(files or {}, folder)
+        value, seconds = opening.function(folder, threads, *opening.arguments)
+    except Exception as error:
+        return _fault(error)
+    _state = _State(opening.digest, value)
+    return Answer(me, seconds, time.perf_counter() - begin)
+
+
+def stand(opening: str, context: Context) -> Reply:
+    """Bring the state to `context`."""
+    begin, me = time.perf_counter(), get_worker().address
+    if _state is None or _state.opening != opening:
+        return Lacks(me, "opening")
+    if _state.stands != context.digest:
+        _state.stands = ""
+        try:
+            context.take(_state.value)
+        except Exception as error:
+            return _fault(error)
+        _state.stands = context.digest
+    return Answer(me, None, time.perf_counter() - begin)
+
+
+def perform(opening: str, context: str, function: Callable[..., Any], arguments: Sequence[Any]) -> Reply:
+    """What `function` says of the state, which stands at `context`, and of `arguments`."""
+    begin, me = time.perf_counter(), get_worker().address
+    if _state is None or _state.opening != opening:
+        return Lacks(me, "opening")
+    if _state.stands != context:
+        return Lacks(me, "context")
+    try:
+        return Answer(me, function(_state.value, *arguments), time.perf_counter() - begin)
+    except Exception as error:
+        return _fault(error)
+
+
+def _fault(error: Exception) -> Fault:
+    """What a worker's machine failed in. Raises what is the call's own fault, as an error that can be sent."""
+    me = get_worker().address
+    if is_out_of_memory(error):
+        return Fault(me, one_line(str(error)), memory=True)
+    if isinstance(error, MachineError | OSError) or is_machine_fault(error):
+        return Fault(me, one_line(str(error)))
+    if isinstance(error, ConfigError):
+        raise ReslrbError(str(error)) from None
+    raise error
+
+
+def _whereabouts() -> tuple[str, tuple[int, ...]]:
+    """This process's machine, and the cores that it may use."""
+    cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+    return os.uname().nodename, tuple(sorted(cores))
+
+
+# --- where `reslrb` runs ----------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Spent:
+    """Seconds of a worker, or of all rounds of calls: of computing them, of a round that of the worker that had most;
+    `wall`, from the first question to the last answer. `calls` were answered, `again` were asked for once more."""
+
+    wall: float = 0.0
+    computing: float = 0.0
+    calls: int = 0
+    again: int = 0
+
+
+@dataclass
+class _Round:
+    """Calls that are being answered: what is `left`, by place, and for each future its place and who may answer."""
+
+    function: Callable[..., Any]
+    context: Context
+    left: dict[int, Sequence[Any]]
+    flying: dict[Future, tuple[int, frozenset[str]]] = field(default_factory=dict)
+    faults: Counter[int] = field(default_factory=Counter)
+    losses: int = 0
+    computing: dict[str, float] = field(default_factory=dict)
+
+    def answerable(self, workers: Mapping[str, Any]) -> set[int]:
+        """The places that one of these workers may answer."""
+        return {place for place, allowed in self.flying.values() if not allowed.isdisjoint(workers)}
+
+
+class Crew:
+    """The workers of a client that have come to what `opening` says; `files` are sent to those that have none.
+
+    `threads` is the number of each worker's, None: its share of the cores that it may use. `say` is told what becomes
+    of them.
+    """
+
+    def __init__(
+        self, client: Client, opening: Opening, files: Mapping[str, bytes] | None = None, threads: int | None = None,
+        say: Callable[[str], None] = logger.info,
+    ) -> None:  # fmt: skip
+        self.client, self.opening, self._files, self._threads, self._say = client, opening, files, threads, say
+        self._done: queue.SimpleQueue[Future] = queue.SimpleQueue()
+        self._opening: dict[str, tuple[Future, float]] = {}
+        self._own_threads: dict[str, int] = {}
+        #: When each worker that has come last said anything, or was asked; `_late` are those that take long.
+        self._heard: dict[str, float] = {}
+        self._late: set[str] = set()
+        self._left_out: dict[str, str] = {}  # and why
+        self._restarts: Counter[str] = Counter()
+        self._looked = -LOOK_S
+        self._nobody_since: float | None = None
+        self._seconds: dict[str, deque[float]] = {}  # from one answer of a worker to its next, by function
+        self._names: dict[str, str] = {}
+        self.spent, self.by_worker = Spent(), dict[str, Spent]()
+
+    # --- who there is -------------------------------------------------------------------------------------------------
+
+    @property
+    def ready(self) -> list[str]:
+        """The workers that are asked."""
+        return [worker for worker in self._heard if worker not in self._late] or [*self._heard]
+
+    def start(self) -> None:
+        """Wait until one is ready, and some time for the others.
+
+        Raises MachineError where there is none, with what is wrong with those that are not, and what is wrong with the
+        experiment.
+        """
+        begin = time.monotonic()
+        first_s: float | None = None
+        while first_s is None or (self._opening and time.monotonic() - begin < OTHERS * first_s + OTHERS_S):
+            self._look()
+            if (future := self._next(LOOK_S / 4)) is not None:
+                self._take_opened(future)
+            if self._heard and first_s is None:
+                first_s = time.monotonic() - begin
+
+    def _next(self, seconds: float) -> Future | None:
+        """The next future that is done, if one is within so many seconds."""
+        try:
+            return self._done.get(timeout=seconds)
+        except queue.Empty:
+            return None
+
+    def _look(self) -> None:
+        """See who has come and gone; those that have come are opened. Raises MachineError where nobody is there."""
+        now = time.monotonic()
+        if now - self._looked < LOOK_S:
+            return
+        self._looked = now
+        if self.client.status != "running" or self.client.scheduler is None:
+            raise MachineError("--cluster: the scheduler has gone; --resume goes on where the run was")
+        here = self.client.scheduler_info(n_workers=-1)["workers"]
+        for gone in [worker for worker in {*self._heard, *self._opening, *self._left_out} if worker not in here]:
+            self._forget(gone)
+            self._left_out.pop(gone, None)
+        new = [worker for worker in here if worker not in {*self._heard, *self._opening, *self._left_out}]
+        if new:
+            self._open(new, here)
+        for worker, (_, began) in [*self._opening.items()]:
+            if now - began > OPENING_S:
+                self._leave_out(worker, f"did not come to the experiment within {OPENING_S:.0f} s")
+        self._nobody_since = None if self._heard or self._opening else self._nobody_since or now
+        if self._nobody_since is not None and (self._left_out or now - self._nobody_since > NOBODY_S):
+            raise MachineError(self._nobody())
+
+    def _forget(self, worker: str) -> None:
+        self._heard.pop(worker, None)
+        self._late.discard(worker)
+        if worker in self._opening:
+            self._opening.pop(worker)[0].release()
+
+    def _open(self, workers: Sequence[str], here: Mapping[str, Any]) -> None:
+        """Have workers come to what they work on, each with its share of the cores that it may use."""
+        found = {} if self._threads else self.client.run(_whereabouts, on_error="ignore", workers=[*here])
+        sharing = Counter(found.values())
+        for worker in workers:
+            cores = found.get(worker, ("", ()))
+            self._own_threads[worker] = self._threads or max(len(cores[1]) // max(sharing[cores], 1), 1)
+            self._names[worker] = f"worker {here[worker].get('name', worker)} ({here[worker].get('host', worker)})"
+            self._ask_to_open(worker, None)
+
+    def _ask_to_open(self, worker: str, files: Mapping[str, bytes] | None) -> None:
+        future = self._send(worker, open_state, self.opening, files, self._own_threads[worker])
+        self._opening[worker] = future, time.monotonic()
+
+    def _send(self, worker: str, function: Callable[..., Reply], *arguments: Any) -> Future:
+        future = self.client.submit(function, *arguments, pure=False, workers=[worker], priority=10)
+        future.add_done_callback(self._done.put)
+        return future
+
+    def _nobody(self) -> str:
+        if not self._left_out:
+            return f"--cluster: no worker was there for {NOBODY_S:.0f} s"
+        worker, reason = next(iter(self._left_out.items()))
+        more = f" (so it is with {len(self._left_out)} of them)" if len(self._left_out) > 1 else ""
+        return f"--cluster: no worker can be used: {self._name(worker)} {reason}{more}"
+
+    def _name(self, worker: str) -> str:
+        return self._names.get(worker, "a worker")
+
+    def _take_opened(self, future: Future) -> bool:
+        """Note that a worker has come to what it works on, or what stands against it; False of another future."""
+        worker = next((worker for worker, (own, _) in self._opening.items() if own is future), None)
+        if worker is None:
+            return False
+        del self._opening[worker]
+        answer = _reply(future)
+        if isinstance(answer, Lacks):
+            self._ask_to_open(worker, self._files)
+        elif isinstance(answer, Fault):
+            self._leave_out(worker, answer.text)
+        elif isinstance(answer, Answer):
+            self._heard[worker] = time.monotonic()
+            for name, seconds in answer.value.items():
+                self._note(name, seconds)
+        return True
+
+    def _leave_out(self, worker: str, reason: str) -> None:
+        self._forget(worker)
+        self._left_out[worker] = reason
+        logger.warning(f"--cluster: {self._name(worker)} {reason}; it takes no part")
+
+    def _start_anew(self, worker: str, reason: str) -> None:
+        """Have dask start a worker anew, which takes some time."""
+        name = self._name(worker)
+        self._restarts[name] += 1
+        if self._restarts[name] > RESTARTS:
+            self._leave_out(worker, f"{reason}, again and again")
+            return
+        logger.warning(f"--cluster: {name} {reason}; it is started anew")
+        self._forget(worker)
+        self._left_out[worker] = reason
+
+        def start_anew() -> None:
+            try:
+                self.client.restart_workers([worker], timeout=RESTART_S, raise_for_error=False)
+                self._left_out.pop(worker, None)
+            except (ValueError, OSError, TimeoutError):
+                logger.warning(f"--cluster: {name} has nobody to start it anew; it takes no part")
+
+        threading.Thread(target=start_anew, daemon=True).start()
+
+    # --- calls --------------------------------------------------------------------------------------------------------
+
+    def run(
+        self, function: Callable[..., Any], work: Sequence[Sequence[Any]], context: Context
+    ) -> Iterator[tuple[int, Any]]:
+        """Yields place and value of each call, as they come; raises what a call raised.
+
+        Raises MachineError or OutOfMemory where worker after worker fails, or none is there.
+        """
+        begin = time.monotonic()
+        todo = _Round(function, context, dict(enumerate(work)))
+        self._look()
+        beside = [self._send(worker, stand, self.opening.digest, context) for worker in self._heard]
+        for worker in self.ready:
+            self._heard[worker] = begin
+        try:
+            while todo.left:
+                self._submit(todo, [place for place in todo.left if place not in todo.answerable(self._heard)])
+                future = self._next(min(max(self._limit(todo, LATE, LATE_S) / 4, 0.05), LOOK_S))
+                if future is not None:
+                    yield from self._take(todo, future, beside)
+                if future is None or time.monotonic() - self._looked > LOOK_S:
+                    self._look()
+                    self._ask_again(todo)
+        finally:
+            for future in [*todo.flying, *beside]:
+                future.release()
+        self.spent.wall += time.monotonic() - begin
+        self.spent.computing += max(todo.computing.values(), default=0.0)
+
+    def _submit(self, todo: _Round, places: Sequence[int]) -> None:
+        """Ask for calls, those that have come to the experiment; nothing where nobody has."""
+        workers = self.ready
+        for place in places if workers else ():
+            future = self.client.submit(
+                perform, self.opening.digest, todo.context.digest, todo.function, todo.left[place], pure=False,
+                workers=workers,
+            )  # fmt: skip
+            todo.flying[future] = place, frozenset(workers)
+            future.add_done_callback(self._done.put)
+
+    def _take(self, todo: _Round, future: Future, beside: list[Future]) -> Iterator[tuple[int, Any]]:
+        """What comes of a future: the value of a call, or nothing; what has no answer then is asked for once more."""
+        if self._take_opened(future):
+            return
+        place = todo.flying.pop(future, (None, None))[0]
+        answer = _reply(future)
+        if answer is None:
+            todo.losses += place is not None
+            if todo.losses > LOSSES:
+                raise MachineError(f"--cluster: worker after worker ended; shards without an answer: {len(todo.left)}")
+            time.sleep(min(0.02 * todo.losses, 0.5))  # until it is noticed who has ended
+            return
+        if isinstance(answer, Fault):
+            self._take_fault(todo, answer, place)
+            return
+        now = time.monotonic()
+        silent_s = 0.0
+        if answer.worker in self._heard:
+            silent_s = now - self._heard[answer.worker]
+            self._heard[answer.worker] = now
+            self._late.discard(answer.worker)
+        if isinstance(answer, Lacks):
+            if answer.what == "opening":  # a worker that was started anew, at the same address
+                self._forget(answer.worker)
+                self._looked = -LOOK_S
+            else:
+                beside.append(self._send(answer.worker, stand, self.opening.digest, todo.context))
+        elif isinstance(answer, Answer) and place in todo.left:
+            del todo.left[place]
+            self._note(todo.function.__name__, max(answer.seconds, silent_s))
+            todo.computing[answer.worker] = todo.computing.get(answer.worker, 0.0) + answer.seconds
+            of_worker = self.by_worker.setdefault(self._name(answer.worker), Spent())
+            of_worker.computing += answer.seconds
+            of_worker.calls += 1
+            self.spent.calls += 1
+            yield place, answer.value
+
+    def _take_fault(self, todo: _Round, fault: Fault, place: int | None) -> None:
+        """Ask others, and have the worker started anew. Raises MachineError or OutOfMemory once that was of no use."""
+        if place is not None:
+            todo.faults[place] += 1
+            if todo.faults[place] >= FAULTS:
+                raise (OutOfMemory if fault.memory else MachineError)(f"--cluster: {fault.text}")
+        if fault.worker in self._heard:
+            self._start_anew(fault.worker, f"failed: {fault.text}")
+
+    def _note(self, name: str, seconds: float) -> None:
+        self._seconds.setdefault(name, deque(maxlen=64)).append(seconds)
+
+    # --- who says nothing ---------------------------------------------------------------------------------------------
+
+    def _limit(self, todo: _Round, times: float, beside_s: float) -> float:
+        """Seconds that a worker may say nothing."""
+        known = self._seconds.get(todo.function.__name__)
+        return times * statistics.median(known) + beside_s if known else OPENING_S
+
+    def _ask_again(self, todo: _Round) -> None:
+        """Ask others for what workers have that said nothing for too long; have those started anew that hang."""
+        now = time.monotonic()
+        late_s, hung_s = self._limit(todo, LATE, LATE_S), self._limit(todo, HUNG, HUNG_S)
+        silent = [worker for worker, heard in self._heard.items() if now - heard > late_s]
+        new = [worker for worker in silent if worker not in self._late]
+        if new:
+            holding = self.client.processing(new)
+            keys = {future.key: place for future, (place, _) in todo.flying.items() if place in todo.left}
+            held = {worker: {keys[key] for key in holding.get(worker, ()) if key in keys} for worker in new}
+            self._late |= {worker for worker in new if held[worker]}
+            again = sorted(set().union(*held.values()))
+            if again and self._late != {*self._heard}:
+                self.spent.again += len(again)
+                for worker in self._late.intersection(new):
+                    self.by_worker.setdefault(self._name(worker), Spent()).again += len(held[worker])
+                self._submit(todo, again)
+        for worker in [worker for worker in silent if worker in self._late and now - self._heard[worker] > hung_s]:
+            self._start_anew(worker, f"said nothing for {now - self._heard[worker]:.0f} s")
+
+
+def _reply(future: Future) -> Reply | None:
+    """What came back; None where it was lost with a worker. Raises what the call did."""
+    try:
+        found = future.result()
+    except KilledWorker as error:
+        return Fault("", f"worker after worker ended over one shard, the last one of them {error.last_worker.address}")
+    except (CancelledError, CommClosedError):
+        return None
+    finally:
+        future.release()
+    assert isinstance(found, Reply)
+    return found
