@@ -32,6 +32,7 @@ from reslrb_cli.errors import (
     MachineError,
     OutOfMemory,
     ReslrbError,
+    describe,
     is_machine_fault,
     is_out_of_memory,
     one_line,
@@ -42,8 +43,8 @@ logger = logging.getLogger(__name__)
 
 #: How many times as long as its calls take a worker may say nothing, and seconds beside that, until another is asked.
 LATE, LATE_S = 3.0, 0.2
-#: The same until dask is asked to start it anew; and seconds that dask has for that.
-HUNG, HUNG_S, RESTART_S = 30.0, 30.0, 20.0
+#: The same until dask is asked to start it anew, where others are there and where nobody is; seconds that dask has.
+HUNG, HUNG_ALONE, HUNG_S, RESTART_S = 30.0, 10.0, 20.0, 20.0
 #: Seconds that a worker may take to come to what it works on, while kernels are compiled; and, once one is there, how
 #: many times as long as that one and seconds beside that the others are waited for.
 OPENING_S, OTHERS, OTHERS_S = 900.0, 2.0, 10.0
@@ -51,6 +52,8 @@ OPENING_S, OTHERS, OTHERS_S = 900.0, 2.0, 10.0
 NOBODY_S, LOOK_S = 60.0, 1.0
 #: How many workers may fail in one call by a fault of their machine's; how often one is started anew for such faults.
 FAULTS, RESTARTS = 3, 3
+#: Seconds for which a value may be on its way, again and again: each time from the beginning.
+GATHER_S = (5.0, 15.0, 60.0, 240.0)
 #: How often what has got lost is sent again in one round.
 LOSSES = 100
 
@@ -147,8 +150,8 @@ def open_state(opening: Opening, files: Mapping[str, bytes] | None, threads: int
     try:
         unpack(files or {}, folder)
         value, seconds = opening.function(folder, threads, *opening.arguments)
-    except Exception as error:
-        return _fault(error)
+    except Exception as error:  # the run could load it: it is this machine that cannot
+        return Fault(me, f"cannot: {describe(error)}", is_out_of_memory(error))
     _state = _State(opening.digest, value)
     return Answer(me, seconds, time.perf_counter() - begin)
 
@@ -249,6 +252,7 @@ class Crew:
         self._heard: dict[str, float] = {}
         self._late: set[str] = set()
         self._left_out: dict[str, str] = {}  # and why
+        self._anew: set[str] = set()  # those that are being started anew
         self._restarts: Counter[str] = Counter()
         self._looked = -LOOK_S
         self._nobody_since: float | None = None
@@ -294,17 +298,20 @@ class Crew:
         if self.client.status != "running" or self.client.scheduler is None:
             raise MachineError("--cluster: the scheduler has gone; --resume goes on where the run was")
         here = self.client.scheduler_info(n_workers=-1)["workers"]
-        for gone in [worker for worker in {*self._heard, *self._opening, *self._left_out} if worker not in here]:
+        known = {*self._heard, *self._opening, *self._left_out, *self._anew}
+        for gone in known.difference(here):
             self._forget(gone)
             self._left_out.pop(gone, None)
-        new = [worker for worker in here if worker not in {*self._heard, *self._opening, *self._left_out}]
+            self._anew.discard(gone)
+        new = [worker for worker in here if worker not in known]
         if new:
             self._open(new, here)
         for worker, (_, began) in [*self._opening.items()]:
             if now - began > OPENING_S:
                 self._leave_out(worker, f"did not come to the experiment within {OPENING_S:.0f} s")
         self._nobody_since = None if self._heard or self._opening else self._nobody_since or now
-        if self._nobody_since is not None and (self._left_out or now - self._nobody_since > NOBODY_S):
+        wait_s = 0 if self._left_out and not self._anew else NOBODY_S
+        if self._nobody_since is not None and now - self._nobody_since > wait_s:
             raise MachineError(self._nobody())
 
     def _forget(self, worker: str) -> None:
@@ -373,14 +380,16 @@ class Crew:
             return
         logger.warning(f"--cluster: {name} {reason}; it is started anew")
         self._forget(worker)
-        self._left_out[worker] = reason
+        self._anew.add(worker)
 
         def start_anew() -> None:
             try:
                 self.client.restart_workers([worker], timeout=RESTART_S, raise_for_error=False)
-                self._left_out.pop(worker, None)
             except (ValueError, OSError, TimeoutError):
-                logger.warning(f"--cluster: {name} has nobody to start it anew; it takes no part")
+                if self.client.status == "running":  # else the run has ended
+                    self._left_out[worker] = f"{reason}, and has nobody to start it anew"
+                    logger.warning(f"--cluster: {name} has nobody to start it anew; it takes no part")
+            self._anew.discard(worker)
 
         threading.Thread(target=start_anew, daemon=True).start()
 
@@ -484,7 +493,7 @@ class Crew:
     def _ask_again(self, todo: _Round) -> None:
         """Ask others for what workers have that said nothing for too long; have those started anew that hang."""
         now = time.monotonic()
-        late_s, hung_s = self._limit(todo, LATE, LATE_S), self._limit(todo, HUNG, HUNG_S)
+        late_s = self._limit(todo, LATE, LATE_S)
         silent = [worker for worker, heard in self._heard.items() if now - heard > late_s]
         new = [worker for worker in silent if worker not in self._late]
         if new:
@@ -498,19 +507,32 @@ class Crew:
                 for worker in self._late.intersection(new):
                     self.by_worker.setdefault(self._name(worker), Spent()).again += len(held[worker])
                 self._submit(todo, again)
+        alone = self._late.issuperset(self._heard)
+        hung_s = self._limit(todo, HUNG_ALONE if alone else HUNG, HUNG_S)
         for worker in [worker for worker in silent if worker in self._late and now - self._heard[worker] > hung_s]:
             self._start_anew(worker, f"said nothing for {now - self._heard[worker]:.0f} s")
 
 
 def _reply(future: Future) -> Reply | None:
-    """What came back; None where it was lost with a worker. Raises what the call did."""
+    """What came back; None where it was lost with a worker. Raises what the call did.
+
+    What a worker has computed is lost with it until it is here: dask then takes the future for one that is to be
+    computed again.
+    """
     try:
-        found = future.result()
+        for seconds in GATHER_S:
+            if future.status not in ("finished", "error"):
+                return None
+            try:
+                found = future.result(timeout=seconds)
+            except TimeoutError:
+                continue
+            assert isinstance(found, Reply)
+            return found
+        return None
     except KilledWorker as error:
         return Fault("", f"worker after worker ended over one shard, the last one of them {error.last_worker.address}")
     except (CancelledError, CommClosedError):
         return None
     finally:
         future.release()
-    assert isinstance(found, Reply)
-    return found

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import random
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import drjit as dr
@@ -16,6 +18,7 @@ import numpy as np
 import pytest
 from cli import tiny
 from runs.going_on import MOTION, optimize, write_experiment
+from runs.hosts import hosts, make_certificates, missing
 
 from reslrb_cli.cluster.connection import Place
 from reslrb_cli.config.loader import load
@@ -23,6 +26,7 @@ from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.runs.prepare import Course, prepare
 
+crew = pytest.importorskip("reslrb_cli.cluster.crew", reason="pip install reslrb[cluster]", exc_type=ImportError)
 engine = pytest.importorskip("reslrb_cli.cluster.engine", reason="pip install reslrb[cluster]", exc_type=ImportError)
 
 SETS = ["run.iterations=3", "run.spp=8", "run.measuring=0", "run.certainty=false"]
@@ -97,33 +101,266 @@ def check(folder: Path, case: str, workers: int) -> None:
     }
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("killing", ["2 of 2", "6 of 1", "6 of 3"])
-def test_killed_workers_lose_nothing(experiment: Path, killing: str) -> None:
-    """One of them is killed at a random moment of each iteration but the first."""
-    kills, workers = (int(word) for word in killing.split(" of "))
-    sets = ["run.shards=4", f"run.iterations={kills}", "views=[{sensor: 0}]"]
-    alone = end(make(experiment, *sets))
-    course, rng = make(experiment, *sets), random.Random(workers)
+# --- what becomes of workers that fail --------------------------------------------------------------------------------
+
+
+@contextmanager
+def beside(folder: Path, workers: int, iterations: int, *sets: str):
+    """A course with so many workers, and what it should come to."""
+    sets = ("run.shards=4", f"run.iterations={iterations}", "views=[{sensor: 0}]", *sets)
+    alone = end(make(folder, *sets))
+    course = make(folder, *sets)
     with engine.engine_at(course, Place(workers), threads=1) as local:
         course.compute_with(local)
-        killed: list[int] = []
-
-        def kill(pid: int, wait: float) -> None:
-            time.sleep(wait)
-            os.kill(pid, signal.SIGKILL)
-            killed.append(pid)
-
-        def strike(iteration: int) -> None:
-            pids = sorted(local.crew.client.run(os.getpid).values())
-            threading.Thread(target=kill, args=(rng.choice(pids), rng.uniform(0, 0.05))).start()
-
-        together = end(course, strike)
-        time.sleep(0.2)
-    assert len(killed) == kills
+        yield course, local.crew
+        together = end(course)
     assert {name: array.tobytes() for name, array in alone.items()} == {
         name: array.tobytes() for name, array in together.items()
     }
+
+
+def hang() -> None:
+    """Have the worker that this is called on say nothing any more."""
+    spoil(lambda: threading.Event().wait())
+
+
+def run_full() -> None:
+    """Have its disk be full."""
+
+    def fail() -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    spoil(fail)
+
+
+def take_memory() -> None:
+    """Have its next call take twice the memory that it is allowed."""
+
+    def fill() -> None:
+        taken = [np.ones(2**27) for _ in range(3)]
+        time.sleep(60)
+        del taken
+
+    spoil(fill)
+
+
+def spoil(act: Callable[[], object]) -> None:
+    class Spoilt:
+        def __getattr__(self, name: str) -> None:
+            act()
+
+    found = crew._state
+    if found is not None:
+        found.value = Spoilt()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("fault", [hang, run_full, take_memory])
+def test_workers_that_fail_are_started_anew(
+    experiment: Path, monkeypatch: pytest.MonkeyPatch, fault: Callable[[], None], workers: int
+) -> None:
+    """One of them, in the midst of a run, which ends the same, and is never held up for longer than a minute."""
+    monkeypatch.setattr("reslrb_cli.backend.memory.free_bytes", lambda variant: workers * 2 * 2**30)
+    longest, before = 0.0, time.monotonic()
+
+    with beside(experiment, workers, 8) as (course, found):
+        for state, _ in iterate(course.stages, course.state):
+            longest, before = max(longest, time.monotonic() - before), time.monotonic()
+            course.state = state
+            if state.iteration == 2:
+                found.client.run(fault, workers=found.ready[:1])
+            if state.iteration == 6:
+                break
+    assert longest < 60
+
+
+@pytest.mark.long
+def test_who_takes_twenty_times_as_long_is_not_waited_for(experiment: Path) -> None:
+    """A worker that has a twentieth of its time, from the second iteration on."""
+    stopped = threading.Event()
+
+    def slow(pid: int) -> None:
+        while not stopped.is_set():
+            os.kill(pid, signal.SIGSTOP)
+            time.sleep(0.19)
+            os.kill(pid, signal.SIGCONT)
+            time.sleep(0.01)
+
+    with beside(experiment, 3, 30, "run.spp=512") as (course, found):
+        times: list[float] = []
+        before = time.monotonic()
+        for state, _ in iterate(course.stages, course.state):
+            times.append(time.monotonic() - before)
+            before = time.monotonic()
+            course.state = state
+            if state.iteration == 6:
+                worker = found.ready[0]
+                pid = found.client.run(os.getpid)[worker]
+                threading.Thread(target=slow, args=(pid,), daemon=True).start()
+            if state.iteration == 24:
+                break
+        stopped.set()
+        again = found.spent.again
+    assert again > 0
+    assert np.median(times[6:]) < 6 * np.median(times[2:6])
+
+
+@pytest.mark.long
+def test_thirty_kills_lose_nothing(experiment: Path) -> None:
+    """Of a random worker at random moments of 200 iterations."""
+    rng = random.Random(1)
+    moments = sorted(rng.sample(range(2, 199), 30))
+    killed: list[int] = []
+
+    def kill(pid: int, wait: float) -> None:
+        time.sleep(wait)
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+            killed.append(pid)
+
+    with beside(experiment, 3, 200) as (course, found):
+        for state, _ in iterate(course.stages, course.state):
+            course.state = state
+            if state.iteration in moments:
+                pids = sorted(found.client.run(os.getpid, on_error="ignore").values())
+                threading.Thread(target=kill, args=(rng.choice(pids), rng.uniform(0, 0.1))).start()
+            if state.iteration == 199:
+                break
+    assert len(killed) == 30
+    assert not [pid for pid in killed if Path(f"/proc/{pid}/cmdline").exists() and _is_worker(pid)]
+
+
+def _is_worker(pid: int) -> bool:
+    return b"distributed" in Path(f"/proc/{pid}/cmdline").read_bytes()
+
+
+@pytest.mark.long
+def test_memory_does_not_grow(experiment: Path) -> None:
+    """Of the run and its workers, from iteration 200 to 2,000."""
+    import psutil
+
+    sizes: dict[int, list[int]] = {}
+    course = make(experiment, "run.shards=4", "run.iterations=2001", "views=[{sensor: 0}]")
+    with engine.engine_at(course, Place(2), threads=1) as local:
+        course.compute_with(local)
+        with one_thread():
+            for state, _ in iterate(course.stages, course.state):
+                if state.iteration in (200, 2000):
+                    pids = [os.getpid(), *sorted(local.crew.client.run(os.getpid).values())]
+                    sizes[state.iteration] = [psutil.Process(pid).memory_info().rss for pid in pids]
+    growth = [late / early for early, late in zip(sizes[200], sizes[2000], strict=True)]
+    assert max(growth) < 1.05, growth
+
+
+# --- hosts that reach nobody but the scheduler ------------------------------------------------------------------------
+
+
+@pytest.fixture
+def net(experiment: Path, tmp_path: Path):
+    if reason := missing():
+        pytest.skip(reason)
+    with hosts(4, tmp_path) as made:
+        yield made
+
+
+RUN = ["optimize", "tiny.yaml", *tiny.settings(*SETS, "run.shards=4", "views=[{sensor: 0}]")]
+
+
+def reslrb(net, host: int, *words: object, **variables: str):
+    return net.start(host, [sys.executable, "-m", "reslrb_cli", *words], **variables)
+
+
+def values(folder: Path) -> dict[str, bytes]:
+    with np.load(folder / "parameters" / "parameters.npz") as found:
+        return {name: found[name].tobytes() for name in found.files}
+
+
+def said(net, process) -> str:
+    """What a command that has ended said."""
+    number = net.running.index(process)
+    (log,) = net.folder.glob(f"log-{number}-*.txt")
+    return log.read_text()
+
+
+@pytest.mark.long
+def test_hosts_without_another_way_come_to_the_same(net, tmp_path: Path) -> None:
+    """One is cut off for 20 seconds in the midst; who has no certificate is refused."""
+    more = tiny.settings("run.iterations=40", "run.spp=64")
+    local = reslrb(net, 2, *RUN, *more, "--cluster", "local:2", "--set", "run.name=local")
+    assert local.wait(300) == 0, said(net, local)
+    net.scheduler()
+    for host in range(2):
+        net.worker(host, host)
+    remote = reslrb(net, 2, *RUN, *more, "--cluster", net.address(2), "--set", "run.name=remote")
+    metrics = tmp_path / "runs" / "remote" / "metrics.jsonl"
+    wait_for(lambda: metrics.exists() and len(metrics.read_text().splitlines()) > 4, 120)
+    net.cut(0)
+    time.sleep(20)
+    net.cut(0, False)
+    assert remote.wait(300) == 0, said(net, remote)
+    assert values(tmp_path / "runs" / "remote") == values(tmp_path / "runs" / "local")
+
+    other = make_certificates(made(tmp_path / "other"))
+    stranger = reslrb(net, 3, *RUN, "--cluster", net.address(3), "--set", "run.name=stranger", **other)
+    assert stranger.wait(120) == 6
+    assert (
+        said(net, stranger)
+        .splitlines()[-1]
+        .startswith("Error: --cluster: the scheduler at tls://10.77.3.1:8786 cannot")
+    )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("whom", ["scheduler", "coordinator"])
+def test_five_kills_of_who_is_alone_are_gone_on_with(net, tmp_path: Path, whom: str) -> None:
+    """One line within a minute, and the same parameters by --resume."""
+    more = tiny.settings("run.iterations=60", "run.spp=64", "run.checkpoint_every=5")
+    local = reslrb(net, 2, *RUN, *more, "--cluster", "local:2", "--set", "run.name=local")
+    assert local.wait(300) == 0, said(net, local)
+    folder = tmp_path / "runs" / "tiny"
+    words, rng, scheduler = [*RUN, *more], random.Random(2), None
+    workers = []
+    for kill in range(6):
+        if scheduler is None or scheduler.poll() is not None:
+            for worker in workers:
+                os.killpg(worker.pid, signal.SIGKILL)
+                worker.wait()
+            scheduler = net.scheduler()
+            workers = [net.worker(host, host) for host in range(2)]
+        run = reslrb(net, 2, *words, "--cluster", net.address(2))
+        words = ["optimize", "--resume", "runs/tiny"]
+        if kill == 5:
+            assert run.wait(300) == 0, said(net, run)
+            break
+        least = 10 * (kill + 1) - rng.randrange(5)
+        wait_for(lambda least=least: done(folder) >= least, 120)
+        time.sleep(rng.uniform(0, 0.3))
+        os.killpg((scheduler if whom == "scheduler" else run).pid, signal.SIGKILL)
+        if whom == "scheduler":
+            scheduler.wait()
+            assert run.wait(60) == 6, said(net, run)
+            assert said(net, run).splitlines()[-1].startswith("Error: --cluster: the scheduler has gone")
+        else:
+            run.wait()
+    assert values(folder) == values(tmp_path / "runs" / "local")
+
+
+def done(folder: Path) -> int:
+    metrics = folder / "metrics.jsonl"
+    return len(metrics.read_text().splitlines()) if metrics.exists() else 0
+
+
+def made(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+def wait_for(holds: Callable[[], bool], seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.05)
 
 
 BAD = [
