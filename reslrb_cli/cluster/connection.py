@@ -94,7 +94,11 @@ def connected(place: Place) -> Iterator[tuple[Client, Path]]:
     import dask
     from distributed import Client
 
-    for name in ("distributed", "tornado"):  # what they would log is said in our own words, or is nothing to a user
+    for name in (
+        "distributed",
+        "tornado",
+        "asyncio",
+    ):  # what they would log is said in our own words, or is nothing to a user
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with contextlib.ExitStack() as stack:
         folder = Path(tempfile.mkdtemp(prefix="reslrb-cluster-"))

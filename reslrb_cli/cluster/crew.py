@@ -21,7 +21,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from distributed import CancelledError, Client, Future, KilledWorker, get_worker
 from distributed.comm import CommClosedError
@@ -40,6 +40,8 @@ from reslrb_cli.errors import (
 from reslrb_cli.records.manifest import versions
 
 logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 #: How many times as long as its calls take a worker may say nothing, and seconds beside that, until another is asked.
 LATE, LATE_S = 3.0, 0.2
@@ -126,10 +128,12 @@ class Lacks(Reply):
 
 @dataclass(frozen=True)
 class Fault(Reply):
-    """What is wrong with a worker's machine, and not with what was asked; `memory`: that is out."""
+    """What is wrong with a worker's machine, and not with what was asked; `memory`: that is out; `stays`: also where
+    the worker is started anew."""
 
     text: str
     memory: bool = False
+    stays: bool = False
 
 
 def open_state(opening: Opening, files: Mapping[str, bytes] | None, threads: int) -> Reply:
@@ -139,9 +143,9 @@ def open_state(opening: Opening, files: Mapping[str, bytes] | None, threads: int
     here = versions()
     for name, version in opening.versions.items():
         if here.get(name) != version:
-            return Fault(me, f"has {name} {here.get(name)}, and the run {version}: install the same")
+            return Fault(me, f"has {name} {here.get(name)}, and the run {version}: install the same", stays=True)
     if opening.asks_for_code and os.environ.get(ALLOW_CODE) != "1":
-        return Fault(me, f"runs no code of users' own: start it with {ALLOW_CODE}=1 in its environment")
+        return Fault(me, f"runs no code of users' own: start it with {ALLOW_CODE}=1 in its environment", stays=True)
     folder = Path(get_worker().local_directory) / f"reslrb-{opening.digest}"  # dask removes it with the worker
     if files is None and not folder.is_dir():
         return Lacks(me, "files")
@@ -295,9 +299,7 @@ class Crew:
         if now - self._looked < LOOK_S:
             return
         self._looked = now
-        if self.client.status != "running" or self.client.scheduler is None:
-            raise MachineError("--cluster: the scheduler has gone; --resume goes on where the run was")
-        here = self.client.scheduler_info(n_workers=-1)["workers"]
+        here = self._scheduler(lambda: self.client.scheduler_info(n_workers=-1))["workers"]
         known = {*self._heard, *self._opening, *self._left_out, *self._anew}
         for gone in known.difference(here):
             self._forget(gone)
@@ -310,9 +312,18 @@ class Crew:
             if now - began > OPENING_S:
                 self._leave_out(worker, f"did not come to the experiment within {OPENING_S:.0f} s")
         self._nobody_since = None if self._heard or self._opening else self._nobody_since or now
-        wait_s = 0 if self._left_out and not self._anew else NOBODY_S
+        wait_s = 0 if self._left_out and not self._restarts else NOBODY_S
         if self._nobody_since is not None and now - self._nobody_since > wait_s:
             raise MachineError(self._nobody())
+
+    def _scheduler(self, call: Callable[[], T]) -> T:
+        """What the scheduler answers. Raises MachineError where it has gone."""
+        try:
+            if self.client.status == "running" and self.client.scheduler is not None:
+                return call()
+        except (OSError, CancelledError, TimeoutError):
+            pass
+        raise MachineError("--cluster: the scheduler has gone; --resume goes on where the run was")
 
     def _forget(self, worker: str) -> None:
         self._heard.pop(worker, None)
@@ -322,7 +333,9 @@ class Crew:
 
     def _open(self, workers: Sequence[str], here: Mapping[str, Any]) -> None:
         """Have workers come to what they work on, each with its share of the cores that it may use."""
-        found = {} if self._threads else self.client.run(_whereabouts, on_error="ignore", workers=[*here])
+        found: dict[str, tuple[str, tuple[int, ...]]] = {}
+        if self._threads is None:
+            found = self._scheduler(lambda: self.client.run(_whereabouts, on_error="ignore", workers=[*here]))
         sharing = Counter(found.values())
         for worker in workers:
             cores = found.get(worker, ("", ()))
@@ -358,8 +371,10 @@ class Crew:
         answer = _reply(future)
         if isinstance(answer, Lacks):
             self._ask_to_open(worker, self._files)
-        elif isinstance(answer, Fault):
+        elif isinstance(answer, Fault) and answer.stays:
             self._leave_out(worker, answer.text)
+        elif isinstance(answer, Fault):
+            self._start_anew(worker, answer.text)
         elif isinstance(answer, Answer):
             self._heard[worker] = time.monotonic()
             for name, seconds in answer.value.items():
@@ -497,7 +512,7 @@ class Crew:
         silent = [worker for worker, heard in self._heard.items() if now - heard > late_s]
         new = [worker for worker in silent if worker not in self._late]
         if new:
-            holding = self.client.processing(new)
+            holding = self._scheduler(self.client.processing)
             keys = {future.key: place for future, (place, _) in todo.flying.items() if place in todo.left}
             held = {worker: {keys[key] for key in holding.get(worker, ()) if key in keys} for worker in new}
             self._late |= {worker for worker in new if held[worker]}

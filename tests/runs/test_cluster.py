@@ -187,7 +187,7 @@ def test_who_takes_twenty_times_as_long_is_not_waited_for(experiment: Path) -> N
             os.kill(pid, signal.SIGCONT)
             time.sleep(0.01)
 
-    with beside(experiment, 3, 30, "run.spp=512") as (course, found):
+    with beside(experiment, 3, 30, "run.spp=16384") as (course, found):
         times: list[float] = []
         before = time.monotonic()
         for state, _ in iterate(course.stages, course.state):
@@ -304,11 +304,7 @@ def test_hosts_without_another_way_come_to_the_same(net, tmp_path: Path) -> None
     other = make_certificates(made(tmp_path / "other"))
     stranger = reslrb(net, 3, *RUN, "--cluster", net.address(3), "--set", "run.name=stranger", **other)
     assert stranger.wait(120) == 6
-    assert (
-        said(net, stranger)
-        .splitlines()[-1]
-        .startswith("Error: --cluster: the scheduler at tls://10.77.3.1:8786 cannot")
-    )
+    assert "cannot be reached, or refuses this certificate" in said(net, stranger).splitlines()[-1]
 
 
 @pytest.mark.long
@@ -340,7 +336,7 @@ def test_five_kills_of_who_is_alone_are_gone_on_with(net, tmp_path: Path, whom: 
         if whom == "scheduler":
             scheduler.wait()
             assert run.wait(60) == 6, said(net, run)
-            assert said(net, run).splitlines()[-1].startswith("Error: --cluster: the scheduler has gone")
+            assert "--cluster: the scheduler has gone" in said(net, run).splitlines()[-1]
         else:
             run.wait()
     assert values(folder) == values(tmp_path / "runs" / "local")
