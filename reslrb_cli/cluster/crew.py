@@ -150,6 +150,7 @@ def open_state(opening: Opening, files: Mapping[str, bytes] | None, threads: int
     if files is None and not folder.is_dir():
         return Lacks(me, "files")
     _state = None
+    _take_device(get_worker().name)
     logging.getLogger("reslrb_cli").addHandler(logging.NullHandler())  # the run has said what there is to say
     try:
         unpack(files or {}, folder)
@@ -158,6 +159,14 @@ def open_state(opening: Opening, files: Mapping[str, bytes] | None, threads: int
         return Fault(me, f"cannot: {describe(error)}", is_out_of_memory(error))
     _state = _State(opening.digest, value)
     return Answer(me, seconds, time.perf_counter() - begin)
+
+
+def _take_device(name: object) -> None:
+    """Of the GPUs that this machine shows have a worker that is known by its number see one alone, in turn."""
+    listed = os.environ.get("CUDA_VISIBLE_DEVICES")
+    found = listed.split(",") if listed else [str(k) for k, _ in enumerate(Path("/proc/driver/nvidia/gpus").glob("*"))]
+    if isinstance(name, int) and len(found) > 1:
+        os.environ["CUDA_VISIBLE_DEVICES"] = found[name % len(found)]
 
 
 def stand(opening: str, context: Context) -> Reply:

@@ -12,16 +12,20 @@ import time
 from collections.abc import Callable
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from cli import tiny
 from runs.going_on import MOTION, optimize, write_experiment
 from runs.hosts import hosts, make_certificates, missing
 
+from reslrb_cli.cluster import bundle
 from reslrb_cli.cluster.connection import Place
 from reslrb_cli.config.loader import load
+from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.runs.prepare import Course, prepare
@@ -99,6 +103,107 @@ def check(folder: Path, case: str, workers: int) -> None:
     assert {name: array.tobytes() for name, array in alone.items()} == {
         name: array.tobytes() for name, array in together.items()
     }
+
+
+# --- what a worker is sent --------------------------------------------------------------------------------------------
+
+
+SCENE = """\
+<scene version="3.0.0">
+    <default name="size" value="8"/>
+    <path value="parts"/>
+    <include filename="lamps.xml"/>
+    <sensor type="perspective">
+        <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="$size"/><integer name="height" value="$size"/></film>
+    </sensor>
+    <shape type="obj">
+        <string name="filename" value="quad.obj"/>
+        <bsdf type="diffuse" id="wall">
+            <texture type="bitmap" name="reflectance"><string name="filename" value="../textures/print.exr"/></texture>
+        </bsdf>
+    </shape>
+</scene>
+"""
+QUAD = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
+
+
+def test_a_bundle_has_all_that_an_experiment_reads(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Includes, folders of <path>, variables, meshes, textures, initial values and cameras, wherever they are; in the
+    end nothing of the experiment's own folder is read."""
+    rng, where = np.random.default_rng(1), made(tmp_path / "here")
+    for name in ("parts", "textures", "shots"):
+        made(where / name)
+    (where / "parts" / "lamps.xml").write_text(
+        f'<scene version="3.0.0"><emitter type="envmap" id="sky"><string name="filename" value="{where}/sky.exr"/>'
+        "</emitter></scene>"
+    )
+    (where / "parts" / "quad.obj").write_text(QUAD)
+    for name, size in (("sky.exr", 4), ("textures/print.exr", 6), ("start.exr", 6)):
+        mi.Bitmap(rng.uniform(0.2, 0.8, (size, size, 3)).astype(np.float32)).write(str(where / name))
+    (where / "scene.xml").write_text(SCENE)
+    (where / "shots" / "cameras.txt").write_text("1 PINHOLE 12 10 12 12 6 5\n")
+    (where / "shots" / "images.txt").write_text("1 1 0 0 0 0 0 4 1 one.png\n\n")
+    text = (
+        "scene: {file: scene.xml, options: {size: 16}, cameras: shots/images.txt}\n"
+        "target: {render: {}}\nintegrator: {paths: camera}\n"
+        "parameters: [{key: Obj_1.bsdf.reflectance.data, initial: {file: start.exr}}]\n"
+    )
+    (where / "x.yaml").write_text(text)
+    config = load(where / "x.yaml")
+    files = bundle.bundle_of(config).files
+    before = assemble_scene(config)
+    where.rename(tmp_path / "elsewhere")
+    bundle.unpack(files, tmp_path / "there")
+    after = assemble_scene(bundle.read_bundle(tmp_path / "there"))
+    assert [int(n) for n in after.scene.sensors()[0].film().size()] == [12, 10]
+    both = [mi.traverse(problem.scene) for problem in (before, after)]
+    assert list(both[0].properties) == list(both[1].properties)
+    for key in both[0].properties:
+        assert np.array_equal(np.array(both[0][key]), np.array(both[1][key])), key
+    runs = [problem.config.run.model_dump(exclude={"output"}) for problem in (before, after)]
+    assert runs[0] == runs[1]
+
+
+@pytest.fixture
+def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """This process as a worker."""
+    me = SimpleNamespace(address="tls://here:1", local_directory=str(tmp_path), name=1)
+    monkeypatch.setattr(crew, "get_worker", lambda: me)
+    monkeypatch.setattr(crew, "_state", None)
+
+
+def reads(folder: Path, threads: int) -> tuple[str, dict[str, float]]:
+    return (folder / "a").read_text(), {"reads": 0.5}
+
+
+def test_a_worker_says_what_it_lacks(worker: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another version and code that is not asked for stand against it for good; files are sent once."""
+    opening = crew.Opening("1", reads)
+    other = crew.Opening("1", reads, versions={"mitsuba": "0.1"})
+    said = crew.open_state(other, None, 1)
+    assert said.stays
+    assert said.text.startswith("has mitsuba ")
+    assert said.text.endswith("and the run 0.1: install the same")
+    asking = crew.Opening("1", reads, asks_for_code=True)
+    assert crew.open_state(asking, None, 1).stays
+    monkeypatch.setenv(crew.ALLOW_CODE, "1")
+    assert crew.open_state(asking, None, 1) == crew.Lacks("tls://here:1", "files")
+    assert crew.perform("1", "", reads, ()) == crew.Lacks("tls://here:1", "opening")
+    assert crew.open_state(opening, {"a": b"one"}, 1).value == {"reads": 0.5}
+    assert crew.open_state(opening, None, 1).value == {"reads": 0.5}
+    assert crew.perform("1", "elsewhere", reads, ()) == crew.Lacks("tls://here:1", "context")
+    assert crew.perform("1", "", str.upper, ()).value == "ONE"
+    broken = crew.open_state(crew.Opening("2", reads), {"b": b""}, 1)
+    assert not broken.stays
+    assert "No such file" in broken.text
+
+
+@pytest.mark.parametrize(("shown", "seen"), [("3,5", "5"), ("7", "7"), ("0,1,2", "1")])
+def test_workers_see_a_gpu_each(worker: None, monkeypatch: pytest.MonkeyPatch, shown: str, seen: str) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", shown)
+    crew.open_state(crew.Opening("1", reads), {"a": b""}, 1)
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == seen
 
 
 # --- what becomes of workers that fail --------------------------------------------------------------------------------
@@ -311,7 +416,7 @@ def test_hosts_without_another_way_come_to_the_same(net, tmp_path: Path) -> None
 @pytest.mark.parametrize("whom", ["scheduler", "coordinator"])
 def test_five_kills_of_who_is_alone_are_gone_on_with(net, tmp_path: Path, whom: str) -> None:
     """One line within a minute, and the same parameters by --resume."""
-    more = tiny.settings("run.iterations=60", "run.spp=64", "run.checkpoint_every=5")
+    more = tiny.settings("run.iterations=60", "run.spp=64", "run.checkpoint_every={iterations: 5}")
     local = reslrb(net, 2, *RUN, *more, "--cluster", "local:2", "--set", "run.name=local")
     assert local.wait(300) == 0, said(net, local)
     folder = tmp_path / "runs" / "tiny"
