@@ -40,6 +40,13 @@ SETTINGS = {
     "distributed.comm.timeouts.tcp": "30s",
     "distributed.admin.tick.limit": "1h",
     "distributed.admin.large-graph-warning-threshold": "1TB",
+    # What nobody looks at is not kept.
+    "distributed.admin.log-length": 100,
+    "distributed.admin.low-level-log-length": 100,
+    "distributed.admin.system-monitor.log-length": 60,
+    "distributed.admin.system-monitor.gil.enabled": False,
+    "distributed.diagnostics.computations.max-history": 1,
+    "distributed.worker.profile.enabled": False,
 }
 #: Of the workers that are started here: nothing answers to who is not one of them; no task is put on disk; and Ctrl-C,
 #: which goes to all processes of a terminal, leaves them to the run, which ends after its iteration.
