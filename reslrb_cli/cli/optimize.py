@@ -16,6 +16,7 @@ import click
 from reslrb_cli.cli.options import (
     FOLDER,
     allow_code_option,
+    cluster_option,
     optional_experiment_arguments,
     read_config,
     start_variant,
@@ -100,13 +101,7 @@ logger = logging.getLogger(__name__)
     "--set may change iterations, learning rates, and with run.output or run.name the folder.",
 )
 @allow_code_option
-@click.option(
-    "--cluster",
-    metavar="WHERE",
-    help="Have the shards of each step (run.shards) computed by others: local:N, N processes on this machine, or "
-    "tls://HOST:PORT, the workers of a scheduler of dask's; the result is that of one process. Needs `pip install "
-    "reslrb[cluster]`.",
-)
+@cluster_option("Have the shards of each step (run.shards) computed by others", "the result is that of one process")
 @click.option("--quiet", is_flag=True, help="Print the last line only.")
 @click.option("-v", "--verbose", is_flag=True, help="Say more of what is measured before the first iteration.")
 def command(

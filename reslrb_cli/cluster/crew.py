@@ -204,11 +204,13 @@ def _whereabouts() -> tuple[str, tuple[int, ...]]:
 
 @dataclass
 class Spent:
-    """Seconds of a worker, or of all rounds of calls: of computing them, of a round that of the worker that had most;
-    `wall`, from the first question to the last answer. `calls` were answered, `again` were asked for once more."""
+    """Seconds of a worker, or of all rounds of calls: `computing`, of a round the mean of its workers; `waiting`, which
+    these did for the one that had most; `wall`, from the first question to the last answer, of which the rest went into
+    sending. `calls` were answered, `again` were asked for once more."""
 
     wall: float = 0.0
     computing: float = 0.0
+    waiting: float = 0.0
     calls: int = 0
     again: int = 0
 
@@ -222,8 +224,14 @@ class _Round:
     left: dict[int, Sequence[Any]]
     flying: dict[Future, tuple[int, frozenset[str]]] = field(default_factory=dict)
     faults: Counter[int] = field(default_factory=Counter)
+    cold: str | None = None
     losses: int = 0
     computing: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """What calls that take about as long have in common."""
+        return self.function.__name__ if self.cold is None else f"{self.function.__name__} {self.cold}"
 
     def answerable(self, workers: Mapping[str, Any]) -> set[int]:
         """The places that one of these workers may answer."""
@@ -387,14 +395,15 @@ class Crew:
     # --- calls --------------------------------------------------------------------------------------------------------
 
     def run(
-        self, function: Callable[..., Any], work: Sequence[Sequence[Any]], context: Context
+        self, function: Callable[..., Any], work: Sequence[Sequence[Any]], context: Context, cold: str | None = None
     ) -> Iterator[tuple[int, Any]]:
         """Yields place and value of each call, as they come; raises what a call raised.
 
+        `cold` names what no worker has warmed kernels for: the first call of each compiles, and nobody hangs who does.
         Raises MachineError or OutOfMemory where worker after worker fails, or none is there.
         """
         begin = time.monotonic()
-        todo = _Round(function, context, dict(enumerate(work)))
+        todo = _Round(function, context, dict(enumerate(work)), cold=cold)
         self._look()
         beside = [self._send(worker, stand, self.opening.digest, context) for worker in self._heard]
         for worker in self.ready:
@@ -411,8 +420,10 @@ class Crew:
         finally:
             for future in [*todo.flying, *beside]:
                 future.release()
+        mean = sum(todo.computing.values()) / max(len({*todo.computing, *self._heard}), 1)
         self.spent.wall += time.monotonic() - begin
-        self.spent.computing += max(todo.computing.values(), default=0.0)
+        self.spent.computing += mean
+        self.spent.waiting += max(todo.computing.values(), default=0.0) - mean
 
     def _submit(self, todo: _Round, places: Sequence[int]) -> None:
         """Ask for calls, those that have come to the experiment; nothing where nobody has."""
@@ -454,7 +465,7 @@ class Crew:
                 beside.append(self._send(answer.worker, stand, self.opening.digest, todo.context))
         elif isinstance(answer, Answer) and place in todo.left:
             del todo.left[place]
-            self._note(todo.function.__name__, max(answer.seconds, silent_s))
+            self._note(todo.name, max(answer.seconds, silent_s))
             todo.computing[answer.worker] = todo.computing.get(answer.worker, 0.0) + answer.seconds
             of_worker = self.by_worker.setdefault(self._name(answer.worker), Spent())
             of_worker.computing += answer.seconds
@@ -478,7 +489,7 @@ class Crew:
 
     def _limit(self, todo: _Round, times: float, beside_s: float) -> float:
         """Seconds that a worker may say nothing."""
-        known = self._seconds.get(todo.function.__name__)
+        known = self._seconds.get(todo.name)
         return times * statistics.median(known) + beside_s if known else OPENING_S
 
     def _ask_again(self, todo: _Round) -> None:
@@ -498,7 +509,9 @@ class Crew:
                 for worker in self._late.intersection(new):
                     self.by_worker.setdefault(self._name(worker), Spent()).again += len(held[worker])
                 self._submit(todo, again)
-        for worker in [worker for worker in silent if worker in self._late and now - self._heard[worker] > hung_s]:
+        compiling = {worker for worker in silent if todo.cold is not None and worker not in todo.computing}
+        limits = {worker: OPENING_S if worker in compiling else hung_s for worker in silent if worker in self._late}
+        for worker in [worker for worker, limit in limits.items() if now - self._heard[worker] > limit]:
             self._start_anew(worker, f"said nothing for {now - self._heard[worker]:.0f} s")
 
 
