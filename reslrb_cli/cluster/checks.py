@@ -20,7 +20,7 @@ import numpy as np
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.cluster.bundle import CONFIG_FILE, Bundle, bundle_of, read_bundle
 from reslrb_cli.cluster.connection import Place, connected
-from reslrb_cli.cluster.crew import Crew, Opening
+from reslrb_cli.cluster.crew import Anywhere, Crew, Opening
 from reslrb_cli.config.loader import dump, loads
 from reslrb_cli.config.parameters import RunValue, TransportValue
 from reslrb_cli.config.schema import Config
@@ -47,16 +47,6 @@ class Steps:
     def take(self, participants: Participants) -> None:
         """Have finite differences take them."""
         step_as(participants, self.steps)
-
-
-@dataclass(frozen=True)
-class Anywhere:
-    """Where workers stand of whom nothing is to be remembered from one call to the next."""
-
-    digest: str = "anywhere"
-
-    def take(self, state: object) -> None:
-        """Do nothing."""
 
 
 # --- on a worker ------------------------------------------------------------------------------------------------------

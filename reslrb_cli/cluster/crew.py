@@ -67,6 +67,16 @@ class Context(Protocol):
 
 
 @dataclass(frozen=True)
+class Anywhere:
+    """Where workers stand whose calls are functions of their arguments alone (`Context`)."""
+
+    digest: str = "anywhere"
+
+    def take(self, state: Any) -> None:
+        """Leave the state as it is."""
+
+
+@dataclass(frozen=True)
 class Opening:
     """What workers work on: `function(folder, threads, *arguments)` makes the state of the files in a folder.
 
@@ -204,12 +214,14 @@ def _whereabouts() -> tuple[str, tuple[int, ...]]:
 
 @dataclass
 class Spent:
-    """Seconds of a worker, or of all rounds of calls: `computing`, of a round the mean of its workers; `waiting`, which
-    these did for the one that had most; `wall`, from the first question to the last answer, of which the rest went into
-    sending. `calls` were answered, `again` were asked for once more."""
+    """Seconds of a worker, or of all rounds of calls: `computing` and before that `standing`, being brought to where
+    calls are of, of a round the mean of its workers; `waiting`, which these did for the one that had most; `wall`, from
+    the first question to the last answer, of which the rest went into sending. `calls` were answered, `again` were
+    asked for once more."""
 
     wall: float = 0.0
     computing: float = 0.0
+    standing: float = 0.0
     waiting: float = 0.0
     calls: int = 0
     again: int = 0
@@ -227,6 +239,7 @@ class _Round:
     cold: str | None = None
     losses: int = 0
     computing: dict[str, float] = field(default_factory=dict)
+    standing: dict[str, float] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -420,10 +433,13 @@ class Crew:
         finally:
             for future in [*todo.flying, *beside]:
                 future.release()
-        mean = sum(todo.computing.values()) / max(len({*todo.computing, *self._heard}), 1)
+        workers = {*todo.computing, *todo.standing, *self._heard}
+        both = [todo.computing.get(worker, 0.0) + todo.standing.get(worker, 0.0) for worker in workers]
+        computing, standing = (sum(each.values()) / max(len(workers), 1) for each in (todo.computing, todo.standing))
         self.spent.wall += time.monotonic() - begin
-        self.spent.computing += mean
-        self.spent.waiting += max(todo.computing.values(), default=0.0) - mean
+        self.spent.computing += computing
+        self.spent.standing += standing
+        self.spent.waiting += max(both, default=0.0) - computing - standing
 
     def _submit(self, todo: _Round, places: Sequence[int]) -> None:
         """Ask for calls, those that have come to the experiment; nothing where nobody has."""
@@ -463,6 +479,9 @@ class Crew:
                 self._looked = -LOOK_S
             else:
                 beside.append(self._send(answer.worker, stand, self.opening.digest, todo.context))
+        elif isinstance(answer, Answer) and future in beside:
+            todo.standing[answer.worker] = todo.standing.get(answer.worker, 0.0) + answer.seconds
+            self.by_worker.setdefault(self._name(answer.worker), Spent()).standing += answer.seconds
         elif isinstance(answer, Answer) and place in todo.left:
             del todo.left[place]
             self._note(todo.name, max(answer.seconds, silent_s))

@@ -8,12 +8,14 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from contextlib import contextmanager
 from pathlib import Path
 
+import drjit as dr
 import numpy as np
 import pytest
 from cli import tiny
-from runs.going_on import MOTION, one_thread, optimize, write_experiment
+from runs.going_on import MOTION, optimize, write_experiment
 
 from reslrb_cli.cluster.connection import Place
 from reslrb_cli.config.loader import load
@@ -42,6 +44,19 @@ def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
     return tmp_path
+
+
+@contextmanager
+def one_thread():
+    """Sums of a kernel have one order then."""
+    dr.sync_thread()
+    before = dr.thread_count()
+    dr.set_thread_count(1)
+    try:
+        yield
+    finally:
+        dr.sync_thread()
+        dr.set_thread_count(before)
 
 
 def make(folder: Path, *sets: str) -> Course:
