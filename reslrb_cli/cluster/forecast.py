@@ -23,6 +23,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -258,6 +259,11 @@ def _size(value: object) -> int:
     return len(pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL))
 
 
+def idle(folder: Path, threads: int) -> tuple[None, dict[str, float]]:
+    """What workers open who have nothing to do."""
+    return None, {}
+
+
 def nothing(state: object) -> None:
     """The work of a call that has none."""
 
@@ -270,16 +276,18 @@ def echo(state: object, value: object) -> object:
 def measure_rounds(crew: Crew) -> tuple[float, float, float]:
     """Seconds of a round of nothing, of each call in it and each worker that is told where to stand, and of a byte."""
     workers = len(crew.ready)
-    few, many = (round_seconds(crew, count * workers) for count in (1, CALLS))
+    few, many = round_seconds(crew, [workers, CALLS * workers])
     call_s = max(many - few, 0.0) / ((CALLS - 1) * workers)
     payload = np.random.default_rng(0).bytes(PAYLOAD)
     sent = statistics.median(_seconds_of(crew, echo, [(payload,)] * workers) for _ in range(3))
     return max(few - 2 * workers * call_s, 0.0), call_s, max(sent - few, 0.0) / (2 * PAYLOAD * workers)
 
 
-def round_seconds(crew: Crew, calls: int, rounds: int = ROUNDS) -> float:
-    """Seconds of a round of so many calls with nothing to do, the median of some."""
-    return statistics.median(_seconds_of(crew, nothing, [()] * calls) for _ in range(rounds))
+def round_seconds(crew: Crew, counts: Sequence[int], rounds: int = ROUNDS) -> list[float]:
+    """Seconds of a round of so many calls with nothing to do: medians of rounds that are taken in turns."""
+    _seconds_of(crew, nothing, [()] * max(counts))  # the first one is longer
+    found = [[_seconds_of(crew, nothing, [()] * calls) for calls in counts] for _ in range(rounds)]
+    return [statistics.median(each) for each in zip(*found, strict=True)]
 
 
 def _seconds_of(crew: Crew, function: Callable[..., Any], work: Sequence[tuple[Any, ...]]) -> float:
