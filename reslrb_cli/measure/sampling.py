@@ -173,7 +173,9 @@ class Sampling:
                 first_s, next_s = now - begin, 0.0  # which says nothing of the next one
                 self._first_s[_kind(name)] = max(first_s, self._first_s.get(_kind(name), 0.0))
                 ends = self._ends(name, now)
-            if stop() or (limited and now + next_s >= next(end for least, end in ends if len(samples) < least)):
+            if limited and now + next_s >= next(end for least, end in ends if len(samples) < least):
+                break
+            if len(samples) < begun + len(work) and stop():
                 break
         if len(samples) > begun:
             say(f"{kind} {name[1]}: seeds {len(samples)}, {now - begin:.1f} s, of which the first {first_s:.1f} s")
