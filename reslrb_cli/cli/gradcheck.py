@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import logging
 import os
 import time
-from collections.abc import Iterable
-from itertools import takewhile
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ from reslrb_cli.cli.options import (
     allow_code_option,
     allowance,
     check_writable,
+    cluster_option,
     is_given,
     look_at,
     optional_experiment_arguments,
@@ -30,6 +31,7 @@ from reslrb_cli.cli.options import (
     resume_option,
 )
 from reslrb_cli.cli.terminal import Interrupts, echo
+from reslrb_cli.cluster.connection import Place
 from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
 from reslrb_cli.config.loader import check_code
 from reslrb_cli.errors import ConfigError, ExitCode
@@ -80,16 +82,17 @@ def run_missing(
 
 def run_suite_command(
     names: tuple[str, ...], estimators: str | None, seeds: int | None, json_file: Path | None,
-    markdown_file: Path | None, resumed: Path | None,
+    markdown_file: Path | None, resumed: Path | None, place: Place | None,
 ) -> int:  # fmt: skip
     """Run the cases of these names, all where there is none; print a line for each, write the files.
 
-    Cases that the file `resumed` has are not run again.
+    Cases that the file `resumed` has are not run again. At a `place` its workers run them.
     """
     chosen = _estimators(estimators)
     variant = set_variant("auto")
 
-    from reslrb_cli.measure.extreme import CASES, run_suite, suite
+    from reslrb_cli.measure.extreme import CASES, case_records, suite
+    from reslrb_cli.optimization.shards import in_order, serially
     from reslrb_cli.report.tables import summary_lines
 
     for name in names:
@@ -111,9 +114,12 @@ def run_suite_command(
         return [record for rows in done.values() for record in rows]
 
     keeper = Keeper(json_file, origin_of(variant), lines, lambda: [], lambda: suite.kept(to_keep, done))
-    with Interrupts() as interrupts:
-        for name in to_do:
-            rows = list(takewhile(lambda _: not interrupts.requested, run_suite([name], chosen, seeds)))
+    work = [(name, chosen, seeds) for name in to_do]
+    with contextlib.ExitStack() as stack:
+        run = serially if place is None else stack.enter_context(_cases_at(place, variant))
+        interrupts = stack.enter_context(Interrupts())
+        found = in_order(run(lambda: interrupts.requested, case_records, work))
+        for name, rows in zip(to_do, found, strict=True):
             if interrupts.requested:  # there may be more of this one
                 break
             done[name] = rows
@@ -127,6 +133,12 @@ def run_suite_command(
         about = {name: case.about for name, case in CASES.items()}
         markdown_file.write_text(_document(lines(), about, machine), encoding="utf-8")
     return ExitCode.INTERRUPTED if interrupted else _exit_code(lines())
+
+
+def _cases_at(place: Place, variant: str) -> contextlib.AbstractContextManager[Callable[..., Any]]:
+    from reslrb_cli.cluster.checks import cases_at
+
+    return cases_at(place, variant)
 
 
 def _estimators(text: str | None) -> list[str] | None:
@@ -193,6 +205,7 @@ logger = logging.getLogger(__name__)
 @click.option("--seeds", type=click.IntRange(min=3, max=COUNT.max), metavar="N",
               help="Number of seeds, whatever time they take, those of --resume included.")  # fmt: skip
 @allow_code_option
+@cluster_option("Have samples, or the cases of a suite, taken by others", "the result is that of one process")
 @resume_option
 @click.option("--spp", type=COUNT,
               help="Samples per pixel of one gradient. Default: 65536 light paths, no more than run.spp.")  # fmt: skip
@@ -211,8 +224,8 @@ logger = logging.getLogger(__name__)
 def command(
     config_file: Path | None, overrides: tuple[str, ...], suite: str | None, cases: tuple[str, ...],
     estimators: str | None, integrators: str | None, budget: float, seeds: int | None, allow_code: bool,
-    resumed: Path | None, spp: int | None, missing: bool, directions: int | None, json_file: Path | None,
-    markdown_file: Path | None, folder: Path | None,
+    cluster: str | None, resumed: Path | None, spp: int | None, missing: bool, directions: int | None,
+    json_file: Path | None, markdown_file: Path | None, folder: Path | None,
 ) -> int:  # fmt: skip
     """Compare the gradients of every parameter of CONFIG with references, at its initial values.
 
@@ -235,6 +248,9 @@ def command(
         raise ConfigError("--missing", "", "needs a CONFIG, whose parameters and loss it looks at")
     if directions is not None and not missing:
         raise ConfigError("--directions", "", "goes with --missing alone")
+    place = None if cluster is None else Place.parse(cluster)
+    if missing and place is not None:
+        raise ConfigError("--cluster", "", "does not go with --missing, which shares nothing out; leave out one")
     json_file = json_file or resumed
     check_writable("--json", json_file)
     check_writable("--markdown", markdown_file)
@@ -242,7 +258,7 @@ def command(
         if option := _given(CONFIGURED):
             reason = f"{option} has no effect on a suite, whose cases have their own; remove it"
             raise ConfigError("--suite", "", reason)
-        return run_suite_command(cases, estimators, seeds, json_file, markdown_file, resumed)
+        return run_suite_command(cases, estimators, seeds, json_file, markdown_file, resumed, place)
     if cases:
         raise ConfigError("--case", "", "names a case of a suite; take --suite extreme with it")
     config = read_or_box(config_file, overrides).with_code(allow_code)
@@ -253,12 +269,22 @@ def command(
         return run_missing(config, variant, budget, seeds, spp, directions, json_file, resumed)
     _check_folder(folder)
     checked = settings_of(config, estimators, budget, seeds, spp, time.monotonic() - began, integrators)
+    if place is not None:
+        from reslrb_cli.cluster.checks import check_shareable
+
+        check_shareable(checked)
+        place.check()
     variant = set_variant(config.variant)
     to_keep = settings_to_keep(checked, variant, device_name(variant))
     check = Gradcheck(checked, earlier=Earlier.read(KIND, resumed, to_keep))
     echo(f"{device_name(variant)}, {variant}; {allowance(budget, seeds, 'seed')}")
     echo(check.conditions())
-    records, interrupted = _run(check, variant, to_keep, json_file, folder)
+    with contextlib.ExitStack() as stack:
+        if place is not None:
+            from reslrb_cli.cluster.checks import samples_at
+
+            check.sample_with(stack.enter_context(samples_at(checked, check.participants, place, variant)))
+        records, interrupted = _run(check, variant, to_keep, json_file, folder)
     none = "interrupted before there were enough seeds to compare"
     for line in summary_lines(records) if records else [none]:
         echo(line)

@@ -16,6 +16,7 @@ import click
 from reslrb_cli.cli.options import (
     FOLDER,
     allow_code_option,
+    cluster_option,
     optional_experiment_arguments,
     read_config,
     start_variant,
@@ -58,16 +59,20 @@ def forecast_run(config: Config) -> tuple[Forecast, list[tuple[str, float, bool]
     return forecast, before, forecast.whole_s + sum(seconds for _, seconds, kept in before if not kept)
 
 
-def show_forecast(config: Config) -> None:
-    """Print what a run of `config` will take, as `forecast_run` measures it."""
+def show_forecast(config: Config, variant: str, place: Place | None) -> None:
+    """Print what a run of `config` will take, as `forecast_run` measures it; where workers are at a place, what a step
+    would take on so many of them, as `cluster.forecast.measure` has it."""
     from reslrb_cli.backend.memory import resident_bytes
+    from reslrb_cli.cluster import forecast as model  # which asks for dask where there is a place
+    from reslrb_cli.report.format import duration
 
     forecast, before, whole_s = forecast_run(config)
     sums = f"{forecast.iterations} x {1e3 * forecast.iteration_s:.3g} ms"
     sums += f" + {rough_duration(forecast.start_s)}" if forecast.start_s > 0.01 * forecast.elapsed_s else ""
+    shared = None if place is None else model.measure(config, variant, place, logging.getLogger(__name__).info)
     text = fill(
         "forecast.txt.j2",
-        {"bytes": in_words, "time": rough_duration},
+        {"bytes": in_words, "time": rough_duration, "duration": duration},
         source=config.source,
         forecast=forecast,
         budget=config.run.budget_bytes,
@@ -75,6 +80,9 @@ def show_forecast(config: Config) -> None:
         sums=sums,
         before=before,
         whole_s=whole_s,
+        place=place,
+        shared=shared,
+        model=model,
     )
     click.echo(text, nl=False)
 
@@ -100,13 +108,7 @@ logger = logging.getLogger(__name__)
     "--set may change iterations, learning rates, and with run.output or run.name the folder.",
 )
 @allow_code_option
-@click.option(
-    "--cluster",
-    metavar="WHERE",
-    help="Have the shards of each step (run.shards) computed by others: local:N, N processes on this machine, or "
-    "tls://HOST:PORT, the workers of a scheduler of dask's; the result is that of one process. Needs `pip install "
-    "reslrb[cluster]`.",
-)
+@cluster_option("Have the shards of each step (run.shards) computed by others", "the result is that of one process")
 @click.option("--quiet", is_flag=True, help="Print the last line only.")
 @click.option("-v", "--verbose", is_flag=True, help="Say more of what is measured before the first iteration.")
 def command(
@@ -136,8 +138,6 @@ def command(
         return _resume(resumed, config_file, overrides, allow_code, workers, quiet)
     if config_file is None:
         raise click.UsageError("Missing argument 'CONFIG'")
-    if dry_run and workers is not None:
-        raise click.UsageError("--dry-run measures this process alone; leave --cluster out")
     return _begin(config_file, overrides, force, dry_run, allow_code, workers, quiet)
 
 
@@ -169,7 +169,7 @@ def _begin(
         workers.check()
     variant = start_variant(config)
     if dry_run:
-        show_forecast(config)
+        show_forecast(config, variant, workers)
         return ExitCode.DONE
 
     from reslrb_cli.runs.prepare import begin
@@ -209,7 +209,7 @@ def _run(begun: Begun, workers: Place | None, quiet: bool) -> int:
         from reslrb_cli.cluster.engine import engine_at
 
         with engine_at(begun.course, workers) as engine:
-            begun.course.compute_with(engine)
+            begun.course.compute_with(engine, engine.spent)
             return _run(begun, None, quiet)
     from reslrb_cli.cli.progress import Progress
     from reslrb_cli.cli.terminal import Interrupts

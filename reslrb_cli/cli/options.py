@@ -255,6 +255,14 @@ def resume_option(function: Callable[..., Any]) -> Callable[..., Any]:
     )(function)
 
 
+def cluster_option(what: str, result: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Add `--cluster` (`cluster`) to a command; `what` it has others do, and what comes of it, in its help."""
+    where = "local:N, N processes on this machine, or tls://HOST:PORT, the workers of a scheduler of dask's"
+    return click.option(
+        "--cluster", metavar="WHERE", help=f"{what}: {where}; {result}. Needs `pip install reslrb[cluster]`."
+    )
+
+
 def allow_code_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add `--allow-code` (`allow_code`) to a command that calls what users have written."""
     return click.option(

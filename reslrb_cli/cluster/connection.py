@@ -85,6 +85,9 @@ class Place:
             )
         return place
 
+    def __str__(self) -> str:
+        return self.address or f"local:{self.workers}"
+
     def check(self) -> None:
         """Raise ConfigError without certificates, and MachineError where the scheduler does not answer."""
         if self.address is not None:

@@ -72,6 +72,16 @@ class Context(Protocol):
 
 
 @dataclass(frozen=True)
+class Anywhere:
+    """Where workers stand whose calls are functions of their arguments alone (`Context`)."""
+
+    digest: str = "anywhere"
+
+    def take(self, state: Any) -> None:
+        """Leave the state as it is."""
+
+
+@dataclass(frozen=True)
 class Opening:
     """What workers work on: `function(folder, threads, *arguments)` makes the state of the files in a folder.
 
@@ -220,11 +230,15 @@ def _whereabouts() -> tuple[str, tuple[int, ...]]:
 
 @dataclass
 class Spent:
-    """Seconds of a worker, or of all rounds of calls: of computing them, of a round that of the worker that had most;
-    `wall`, from the first question to the last answer. `calls` were answered, `again` were asked for once more."""
+    """Seconds of a worker, or of all rounds of calls: `computing` and before that `standing`, being brought to where
+    calls are of, of a round the mean of its workers; `waiting`, which these did for the one that had most; `wall`, from
+    the first question to the last answer, of which the rest went into sending. `calls` were answered, `again` were
+    asked for once more."""
 
     wall: float = 0.0
     computing: float = 0.0
+    standing: float = 0.0
+    waiting: float = 0.0
     calls: int = 0
     again: int = 0
 
@@ -238,8 +252,15 @@ class _Round:
     left: dict[int, Sequence[Any]]
     flying: dict[Future, tuple[int, frozenset[str]]] = field(default_factory=dict)
     faults: Counter[int] = field(default_factory=Counter)
+    cold: str | None = None
     losses: int = 0
     computing: dict[str, float] = field(default_factory=dict)
+    standing: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """What calls that take about as long have in common."""
+        return self.function.__name__ if self.cold is None else f"{self.function.__name__} {self.cold}"
 
     def answerable(self, workers: Mapping[str, Any]) -> set[int]:
         """The places that one of these workers may answer."""
@@ -420,14 +441,15 @@ class Crew:
     # --- calls --------------------------------------------------------------------------------------------------------
 
     def run(
-        self, function: Callable[..., Any], work: Sequence[Sequence[Any]], context: Context
+        self, function: Callable[..., Any], work: Sequence[Sequence[Any]], context: Context, cold: str | None = None
     ) -> Iterator[tuple[int, Any]]:
         """Yields place and value of each call, as they come; raises what a call raised.
 
+        `cold` names what no worker has warmed kernels for: the first call of each compiles, and nobody hangs who does.
         Raises MachineError or OutOfMemory where worker after worker fails, or none is there.
         """
         begin = time.monotonic()
-        todo = _Round(function, context, dict(enumerate(work)))
+        todo = _Round(function, context, dict(enumerate(work)), cold=cold)
         self._look()
         beside = [self._send(worker, stand, self.opening.digest, context) for worker in self._heard]
         for worker in self.ready:
@@ -444,8 +466,13 @@ class Crew:
         finally:
             for future in [*todo.flying, *beside]:
                 future.release()
+        workers = {*todo.computing, *todo.standing, *self._heard}
+        both = [todo.computing.get(worker, 0.0) + todo.standing.get(worker, 0.0) for worker in workers]
+        computing, standing = (sum(each.values()) / max(len(workers), 1) for each in (todo.computing, todo.standing))
         self.spent.wall += time.monotonic() - begin
-        self.spent.computing += max(todo.computing.values(), default=0.0)
+        self.spent.computing += computing
+        self.spent.standing += standing
+        self.spent.waiting += max(both, default=0.0) - computing - standing
 
     def _submit(self, todo: _Round, places: Sequence[int]) -> None:
         """Ask for calls, those that have come to the experiment; nothing where nobody has."""
@@ -485,9 +512,15 @@ class Crew:
                 self._looked = -LOOK_S
             else:
                 beside.append(self._send(answer.worker, stand, self.opening.digest, todo.context))
+        elif isinstance(answer, Answer) and future in beside:
+            todo.standing[answer.worker] = todo.standing.get(answer.worker, 0.0) + answer.seconds
+            self.by_worker.setdefault(self._name(answer.worker), Spent()).standing += answer.seconds
         elif isinstance(answer, Answer) and place in todo.left:
             del todo.left[place]
-            self._note(todo.function.__name__, max(answer.seconds, silent_s))
+            for other in [other for other, (its, _) in todo.flying.items() if its == place]:
+                del todo.flying[other]  # nobody needs to begin with it
+                other.release()
+            self._note(todo.name, max(answer.seconds, silent_s))
             todo.computing[answer.worker] = todo.computing.get(answer.worker, 0.0) + answer.seconds
             of_worker = self.by_worker.setdefault(self._name(answer.worker), Spent())
             of_worker.computing += answer.seconds
@@ -511,7 +544,7 @@ class Crew:
 
     def _limit(self, todo: _Round, times: float, beside_s: float) -> float:
         """Seconds that a worker may say nothing."""
-        known = self._seconds.get(todo.function.__name__)
+        known = self._seconds.get(todo.name)
         return times * statistics.median(known) + beside_s if known else OPENING_S
 
     def _ask_again(self, todo: _Round) -> None:
@@ -519,21 +552,26 @@ class Crew:
         now = time.monotonic()
         late_s = self._limit(todo, LATE, LATE_S)
         silent = [worker for worker, heard in self._heard.items() if now - heard > late_s]
-        new = [worker for worker in silent if worker not in self._late]
-        if new:
-            holding = self._scheduler(self.client.processing)
-            keys = {future.key: place for future, (place, _) in todo.flying.items() if place in todo.left}
-            held = {worker: {keys[key] for key in holding.get(worker, ()) if key in keys} for worker in new}
-            self._late |= {worker for worker in new if held[worker]}
-            again = sorted(set().union(*held.values()))
-            if again and self._late != {*self._heard}:
-                self.spent.again += len(again)
-                for worker in self._late.intersection(new):
-                    self.by_worker.setdefault(self._name(worker), Spent()).again += len(held[worker])
-                self._submit(todo, again)
+        if not silent:
+            return
+        holding = self._scheduler(self.client.processing)
+        places = {future.key: place for future, (place, _) in todo.flying.items() if place in todo.left}
+        held = {worker: [key for key in holding.get(worker, ()) if key in places] for worker in silent}
+        self._late |= {worker for worker in silent if held[worker]}
+        late = {key for worker in self._late.intersection(silent) for key in held[worker]}
+        others = {place for key, place in places.items() if key not in late}
+        again = sorted({places[key] for key in late} - others)
+        if again and not self._late.issuperset(self._heard):
+            self.spent.again += len(again)
+            for worker in self._late.intersection(silent):
+                of_worker = self.by_worker.setdefault(self._name(worker), Spent())
+                of_worker.again += len({places[key] for key in held[worker]}.intersection(again))
+            self._submit(todo, again)
         alone = self._late.issuperset(self._heard)
         hung_s = self._limit(todo, HUNG_ALONE if alone else HUNG, HUNG_S)
-        for worker in [worker for worker in silent if worker in self._late and now - self._heard[worker] > hung_s]:
+        compiling = {worker for worker in silent if todo.cold is not None and worker not in todo.computing}
+        limits = {worker: OPENING_S if worker in compiling else hung_s for worker in silent if worker in self._late}
+        for worker in [worker for worker, limit in limits.items() if now - self._heard[worker] > limit]:
             self._start_anew(worker, f"said nothing for {now - self._heard[worker]:.0f} s")
 
 

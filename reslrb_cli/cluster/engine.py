@@ -32,6 +32,7 @@ from reslrb_cli.optimization.shards import Task, make_tasks, shard_gradient, sha
 from reslrb_cli.optimization.state import Settled, begin_as, decide_as, guiding_of, restore_tables
 from reslrb_cli.optimization.views import set_targets, target_arrays
 from reslrb_cli.records.checkpoint import STATE_FILE, open_state, write_archive
+from reslrb_cli.records.clock import SharedTime, WorkerTime
 from reslrb_cli.records.tree import Stored, like, to_array
 from reslrb_cli.runs.prepare import Course
 
@@ -129,16 +130,28 @@ def opening_of(course: Course, folder: Path, own: bool) -> tuple[Opening, Bundle
 
 
 class Engine:
-    """Computes shards on workers (`shards.Engine`)."""
+    """Computes shards on workers (`shards.Engine`), who are at a place that is called `where`."""
 
-    def __init__(self, crew: Crew) -> None:
-        self.crew = crew
+    def __init__(self, crew: Crew, where: str) -> None:
+        self.crew, self.where = crew, where
 
     def __call__(
         self, problem: Problem, function: Callable[..., Any], work: Sequence[tuple[Any, ...]]
     ) -> Iterator[tuple[int, Any]]:
         """Yields place and result of each call as they come, and raises what one raised."""
-        return self.crew.run(function, work, Standing.of(problem))
+        return self.crew.run(function, work, self.standing(problem))
+
+    @staticmethod
+    def standing(problem: Problem) -> Standing:
+        """What each worker is told before a round."""
+        return Standing.of(problem)
+
+    def spent(self) -> SharedTime:
+        """The time that it has taken by now."""
+        rounds, workers = self.crew.spent, self.crew.by_worker.items()
+        by_worker = {name: WorkerTime(one.calls, one.computing + one.standing, one.again) for name, one in workers}
+        computing = rounds.computing + rounds.standing
+        return SharedTime((self.where,), rounds.wall, computing, rounds.waiting, by_worker)
 
 
 @contextlib.contextmanager
@@ -151,4 +164,4 @@ def engine_at(course: Course, place: Place, threads: int | None = None) -> Itera
         opening, bundle = opening_of(course, folder, own=place.address is None)
         crew = Crew(client, opening, bundle.files, threads)
         crew.start()
-        yield Engine(crew)
+        yield Engine(crew, str(place))

@@ -29,7 +29,7 @@ from reslrb_cli.measure.methods import records_of
 from reslrb_cli.measure.participants import Settings, Way
 from reslrb_cli.measure.processes import NO_TIME
 from reslrb_cli.measure.resume_store import Earlier
-from reslrb_cli.measure.sampling import NAIVE, Name, Sampling
+from reslrb_cli.measure.sampling import NAIVE, Engine, Name, Sampling
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
 
@@ -83,6 +83,10 @@ class Gradcheck:
     ) -> None:
         self.settings, self._sampling = settings, Sampling(settings, now, earlier)
         self.participants = self._sampling.participants
+
+    def sample_with(self, engine: Engine) -> None:
+        """Have samples taken by `engine`, where their number is given."""
+        self._sampling.engine = engine
 
     @cached_property
     def rows(self) -> list[Row]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import mitsuba as mi
@@ -72,7 +72,7 @@ class Settings:
     """What is checked. `seeds` and `spp` are None where they are to be chosen.
 
     `named`: the user named the integrators; otherwise those that cannot take part are left out. Of the budget `spent_s`
-    have gone before.
+    have gone before. `initial` are values of parameters that `config` does not say, as `Selection.array` has them.
     """
 
     config: Config
@@ -82,6 +82,7 @@ class Settings:
     spp: int | None = None
     named: bool = True
     spent_s: float = 0.0
+    initial: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def known(self) -> bool:
@@ -159,6 +160,9 @@ class Participants:
         first = (configs[able[0]] if able else next(iter(configs.values()))).with_exposures_fixed()
         built_in = config.scene.file == small.FILE
         problem = assemble_scene(first, small.build(config.scene.options) if built_in else None)
+        self.selection = problem.selection
+        if settings.initial:
+            self.selection.set_arrays(settings.initial)
         scene, sensor = problem.scene, problem.sensors[0]
         shrink(scene, sensor, PATHS)
         self.case = Case(scene, problem.selection.keys, sensor, problem.selection)

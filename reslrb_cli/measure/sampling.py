@@ -1,22 +1,24 @@
 """Samples of what takes part in a gradcheck, taken when they are first needed, until they are enough or time is up.
 
-A session may go on from the samples that an earlier one has taken, with the seeds after theirs.
+A session may go on from the samples that an earlier one has taken, with the seeds after theirs. What takes the samples
+may be another process (`Engine`): each is a function of who takes part, of the steps of differences, and of its seed.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from reslrb_cli.measure import resume_store
-from reslrb_cli.measure.gradients import Direction, seeds
+from reslrb_cli.measure.gradients import seeds
 from reslrb_cli.measure.participants import Participants, Settings
 from reslrb_cli.measure.resume_store import Earlier
+from reslrb_cli.optimization.shards import in_order, serially
 from reslrb_cli.records.measurement_files import Kept
 
 #: What is kept says that it is of this.
@@ -24,6 +26,30 @@ KIND = "gradcheck"
 
 #: What samples are of: `gradient` or `image` and an integrator's label, `differences` or `tangents` and a parameter.
 Name = tuple[str, str]
+
+#: The step of a direction of finite differences, and the error that it brings.
+Step = tuple[float, float]
+
+#: What takes samples: of who takes part, a function of that and of further arguments, and these arguments. Yields place
+#: and result of each, in any order (`shards.serially`).
+Engine = Callable[[Participants, Callable[..., Any], Sequence[tuple[Any, ...]]], Iterable[tuple[int, Any]]]
+
+
+def take_sample(participants: Participants, kind: str, of: str, seed: int) -> np.ndarray:
+    """One sample (`Participants.sample`)."""
+    return participants.sample(kind, of, seed)
+
+
+def steps_of(participants: Participants, keys: Iterable[str]) -> dict[str, list[Step]]:
+    """The steps of finite differences of parameters, by way, one of each direction."""
+    return {key: [(one.step, one.truncation) for one in participants.directions[key]] for key in keys}
+
+
+def step_as(participants: Participants, steps: Mapping[str, Sequence[Step]]) -> None:
+    """Have finite differences take these steps."""
+    for key, chosen in steps.items():
+        along = zip(participants.directions[key], chosen, strict=True)
+        participants.directions[key] = [replace(one, step=step, truncation=error) for one, (step, error) in along]
 
 
 def settings(checked: Settings, variant: str, device: str) -> dict[str, Any]:
@@ -55,8 +81,11 @@ class Sampling:
     is for the others. Only what runs already is waited for: nothing is begun whose first sample, which compiles, would
     take longer than is left, by those of its kind so far, or, of the first of its kind, by the others'.
 
-    What an `earlier` session has sampled counts, and seeds go on behind its own.
+    What an `earlier` session has sampled counts, and seeds go on behind its own. The samples of a name are taken by
+    `engine`; within a budget by this process, since it is its time.
     """
+
+    engine: Engine = staticmethod(serially)
 
     def __init__(
         self, settings: Settings, now: Callable[[], float] = time.monotonic, earlier: Earlier | None = None
@@ -66,15 +95,13 @@ class Sampling:
         self._end = self._start + settings.budget_s
         self.participants = Participants(settings)
         self._samples: dict[Name, list[np.ndarray]] = {}
-        #: Directions whose steps have been chosen, by parameter: differences go on with the same ones.
-        self._chosen: dict[str, list[Direction]] = {}
+        #: Parameters, by way, of whose directions the steps have been chosen: differences go on with the same ones.
+        self._chosen: list[str] = []
         if earlier is not None:
             names = enumerate(earlier.head["samples"])
             self._samples = {(kind, of): list(earlier.arrays[f"samples/{k}"]) for k, (kind, of) in names}
-            for key, steps in earlier.head["steps"].items():
-                along = zip(self.participants.directions[key], steps, strict=True)
-                self._chosen[key] = [replace(one, step=step, truncation=error) for one, (step, error) in along]
-            self.participants.directions.update(self._chosen)
+            step_as(self.participants, earlier.head["steps"])
+            self._chosen = list(earlier.head["steps"])
         self._before = {name: len(samples) for name, samples in self._samples.items()}
         #: Called after each sample.
         self.between: Callable[[], None] = lambda: None
@@ -99,7 +126,9 @@ class Sampling:
         found = {name: np.stack(rows) for name, rows in self._samples.items() if rows}
         if not found:
             return None
-        steps = {key: [[d.step, d.truncation] for d in directions] for key, directions in self._chosen.items()}
+        steps = {
+            key: [list(one) for one in chosen] for key, chosen in steps_of(self.participants, self._chosen).items()
+        }
         arrays = {f"samples/{number}": rows for number, rows in enumerate(found.values())}
         return resume_store.head(KIND, settings, samples=list(found), steps=steps), arrays
 
@@ -127,13 +156,14 @@ class Sampling:
             return
         if kind == "differences" and name[1] not in self._chosen:
             self.participants.choose_steps(name[1])
-            self._chosen[name[1]] = self.participants.directions[name[1]]
+            self._chosen.append(name[1])
         before = first_s = 0.0
         begun = len(samples)
-        for seed in seeds(self._most(name))[begun:]:
-            if stop():
-                break
-            samples.append(self.participants.sample(*name, seed).astype(np.float32))
+        work = [(*name, seed) for seed in seeds(self._most(name))[begun:]]
+        if not work or stop():
+            return
+        for sample in in_order(self.engine(self.participants, take_sample, work)):
+            samples.append(sample.astype(np.float32))
             self.between()
             now = self._now()
             next_s = now - before
@@ -144,6 +174,8 @@ class Sampling:
                 self._first_s[_kind(name)] = max(first_s, self._first_s.get(_kind(name), 0.0))
                 ends = self._ends(name, now)
             if limited and now + next_s >= next(end for least, end in ends if len(samples) < least):
+                break
+            if len(samples) < begun + len(work) and stop():
                 break
         if len(samples) > begun:
             say(f"{kind} {name[1]}: seeds {len(samples)}, {now - begin:.1f} s, of which the first {first_s:.1f} s")

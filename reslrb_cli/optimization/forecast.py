@@ -93,12 +93,12 @@ def _measure_stage(problem: Problem) -> Steps:
 
 def _peak(problem: Problem, spp: int) -> int:
     """Bytes that two iterations of `spp` samples per pixel take: the second is one that was recorded."""
-    with _trial(problem, spp) as trial:
-        return _highest(problem, list(islice(optimize(trial), 2)))
+    with trial(problem, spp) as tried:
+        return _highest(problem, list(islice(optimize(tried), 2)))
 
 
 @contextmanager
-def _trial(problem: Problem, spp: int) -> Iterator[Problem]:
+def trial(problem: Problem, spp: int) -> Iterator[Problem]:
     """The problem before its first iteration, of `spp` samples per pixel; then the scene is as it was."""
     run = problem.config.run
     enough = {"spp": spp, "iterations": max(run.iterations, WARM_UP + MOST), "stages": []}  # of a run of two, too
@@ -119,9 +119,9 @@ def _measure(problem: Problem, spp: int) -> Steps:
     records: list[Record] = []
     taught: list[int] = []  # how often tables had learned after each
     begin = time.perf_counter()
-    with _trial(problem, spp) as trial:
-        guiding = guiding_of(trial)
-        for record in optimize(trial):
+    with trial(problem, spp) as tried:
+        guiding = guiding_of(tried)
+        for record in optimize(tried):
             records.append(record)
             taught.append(0 if guiding is None else guiding.lessons)
             if len(records) == WARM_UP:
@@ -191,7 +191,7 @@ def make_forecast(
     Raises ConfigError and UnsupportedScene as the run would, and what its steps raise.
     """
     # Errors are no part of a step.
-    problem = replace(assemble(_with_short_target(config), say, cache), truth={})
+    problem = replace(assemble(with_short_target(config), say, cache), truth={})
     image_s, views = _image_seconds(problem), len(problem.views)
     before(problem)
     say("measuring a few steps")
@@ -218,7 +218,7 @@ def make_forecast(
     )
 
 
-def _with_short_target(config: Config) -> Config:
+def with_short_target(config: Config) -> Config:
     """The experiment with a target of no more samples than tell its noise from a step's: four steps' worth."""
     render = config.target.render
     if render is None:

@@ -41,6 +41,7 @@ from reslrb_cli.records.tree import like, to_array
 from reslrb_cli.seeds import seed
 
 Array = np.ndarray[Any, Any]
+S = TypeVar("S")
 T = TypeVar("T")
 
 #: What computes the shards: of the problem, a function of it and of further arguments, and these arguments, each with a
@@ -184,12 +185,10 @@ def _held(problem: Problem) -> Iterator[None]:
 # --- and their sums ---------------------------------------------------------------------------------------------------
 
 
-def serially(
-    problem: Problem, function: Callable[..., T], work: Sequence[tuple[Any, ...]]
-) -> Iterator[tuple[int, T]]:  # fmt: skip
-    """Compute one after the other, in this process (`Engine`)."""
+def serially(state: S, function: Callable[..., T], work: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, T]]:
+    """Compute one after the other, in this process (`Engine`, of whatever `state`)."""
     for place, given in enumerate(work):
-        yield place, function(problem, *given)
+        yield place, function(state, *given)
 
 
 def in_order(found: Iterable[tuple[int, T]]) -> Iterator[T]:

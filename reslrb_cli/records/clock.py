@@ -6,7 +6,7 @@ import gc
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -63,6 +63,54 @@ class StepClock:
         yield
         dr.sync_thread()
         self.elapsed_s += time.perf_counter() - start
+
+
+@dataclass(frozen=True)
+class WorkerTime:
+    """What one worker did: calls that it answered, seconds of computing them, and how many of what it had were asked of
+    others too, since it said nothing for long."""
+
+    calls: int = 0
+    computing_s: float = 0.0
+    again: int = 0
+
+    def __add__(self, other: WorkerTime) -> WorkerTime:
+        return WorkerTime(self.calls + other.calls, self.computing_s + other.computing_s, self.again + other.again)
+
+
+@dataclass(frozen=True)
+class SharedTime:
+    """Seconds for which workers were asked to compute, by part, and what each of them did, by name.
+
+    `wall_s` goes from the first question of a round to its last answer. Of that the mean worker computed for
+    `computing_s`, and waited for `waiting_s` for the one that had most; the rest is `sending_s`, the handing out
+    included. `places` are those of the workers, as `--cluster` had them.
+    """
+
+    places: tuple[str, ...] = ()
+    wall_s: float = 0.0
+    computing_s: float = 0.0
+    waiting_s: float = 0.0
+    workers: dict[str, WorkerTime] = field(default_factory=dict)
+
+    @property
+    def sending_s(self) -> float:
+        """What is neither computing nor waiting."""
+        return max(self.wall_s - self.computing_s - self.waiting_s, 0.0)
+
+    def __add__(self, other: SharedTime) -> SharedTime:
+        """Both, one after the other."""
+        workers = dict(self.workers)
+        for name, spent in other.workers.items():
+            workers[name] = workers.get(name, WorkerTime()) + spent
+        return replace(
+            self,
+            places=tuple(dict.fromkeys([*self.places, *other.places])),
+            wall_s=self.wall_s + other.wall_s,
+            computing_s=self.computing_s + other.computing_s,
+            waiting_s=self.waiting_s + other.waiting_s,
+            workers=workers,
+        )
 
 
 def summarise(history: list[dict[str, Any]]) -> tuple[float, float]:

@@ -42,6 +42,7 @@ from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
 from reslrb_cli.optimization.views import view_records
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.checkpoint import save_checkpoint
+from reslrb_cli.records.clock import SharedTime
 from reslrb_cli.records.decisions import RivalRecord
 from reslrb_cli.records.manifest import Manifest
 from reslrb_cli.records.metrics import ClampTally, NonFiniteTally, Record, RegularizedTally
@@ -226,6 +227,7 @@ class Met:
     certainty: Noted
     best: Least | None = None
     last: Record | None = None
+    shared: SharedTime | None = None
     best_values: Arrays = field(default_factory=dict, metadata=entry("best", "finite"))
     squares: Arrays = field(default_factory=dict, metadata=entry("squares"))
 
@@ -245,11 +247,23 @@ class Course:
         self.nonfinite, self.clamped, self.regularized = NonFiniteTally(), ClampTally(), RegularizedTally()
         self.last: Record | None = None
         self.watch, self.average = Watch(problem.config), Averaged()
+        self._shared: SharedTime | None = None
+        self._spent: Callable[[], SharedTime] | None = None
 
-    def compute_with(self, engine: Callable[..., Any]) -> None:
-        """Have the shards of a run without stages computed by `engine` (`shards.Engine`)."""
+    def compute_with(self, engine: Callable[..., Any], spent: Callable[[], SharedTime] | None = None) -> None:
+        """Have the shards of a run without stages computed by `engine` (`shards.Engine`); `spent` says what time that
+        has taken by now."""
         self.problem = replace(self.problem, engine=engine)
         self.stages = Stages(self.problem)
+        self._spent = spent
+
+    @property
+    def shared(self) -> SharedTime | None:
+        """What the shards of all iterations took that workers computed, those before the run was gone on with included;
+        None where there were none."""
+        if self._spent is None:
+            return self._shared
+        return self._spent() if self._shared is None else self._shared + self._spent()
 
     @property
     def done(self) -> int:
@@ -345,7 +359,7 @@ class Course:
     def save(self, folder: Path) -> int:
         """Keep it in `folder` as it was after its last whole iteration; return how many it had. Raises OSError."""
         met = Met(
-            self.results.images["initial"], self.certainty.noted, self.best.least, self.last,
+            self.results.images["initial"], self.certainty.noted, self.best.least, self.last, self.shared,
             self.best_values(), self.certainty.squares,
         )  # fmt: skip
         found, values = entries(self._settled, self.state.on_file(self.stages.at(self.state.stage)), met,
@@ -377,6 +391,7 @@ class Course:
         self.best.least, self.best.values = met.best, met.best_values
         self.results.images["initial"] = met.images
         self.certainty.noted, self.certainty.squares = met.certainty, met.squares
+        self._shared = met.shared
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import os
 import shlex
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -248,6 +248,7 @@ class Recording:
         """Note in the manifest that the run was interrupted, in a process that is about to end in the midst of it."""
         if not self.manifest.results and self.course.last is not None:
             self.manifest.results = {"iterations": self.done, "elapsed_s": self.course.last.elapsed_s}
+        self._note_shared()
         if self.folder.is_there:
             self.manifest.end_for_good(self.folder.path, Status.INTERRUPTED)
 
@@ -374,6 +375,7 @@ class Recording:
             write_report(self.folder.path, self.manifest.content(), {})
         else:
             found = self._found()
+            self._note_shared()
             write_report(self.folder.path, self.manifest.content() | {"results": found}, self.problem.values())
 
     def _add(self, failed: str, measure: Callable[[], None]) -> None:
@@ -424,7 +426,13 @@ class Recording:
         self._note_results()
 
     def _note_results(self) -> None:
+        self._note_shared()
         self.manifest.results = self._found()
+
+    def _note_shared(self) -> None:
+        """Note what workers have done by now."""
+        if self.course.shared is not None:
+            self.manifest.shared = finite(asdict(self.course.shared))
 
     def _found(self) -> dict[str, Any]:
         """What the run came to, or has come to by now."""

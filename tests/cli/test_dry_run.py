@@ -101,7 +101,7 @@ def test_each_trial_begins_where_the_run_does(experiment: Path) -> None:
     begin = {key: value.copy() for key, value in problem.values().items()}
     losses = []
     for _ in range(2):
-        with trial._trial(problem, 4) as before:
+        with trial.trial(problem, 4) as before:
             losses.append([record.loss for record in islice(optimize(before), 3)])
             assert all(np.abs(value - begin[key]).max() > 0.3 for key, value in problem.values().items())
         assert all(np.array_equal(value, begin[key]) for key, value in problem.values().items())

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,19 @@ def write_experiment(folder: Path) -> None:
     (folder / "scene.xml").write_text(scene)
     config = tiny.CONFIG.replace(f"\n  - {{key: {tiny.KEY}, initial: 0.5, bounds: [0, 1]}}", f" {PARAMETERS}")
     (folder / "tiny.yaml").write_text(config)
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Sums of a kernel have one order then."""
+    dr.sync_thread()
+    before = dr.thread_count()
+    dr.set_thread_count(1)
+    try:
+        yield
+    finally:
+        dr.sync_thread()
+        dr.set_thread_count(before)
 
 
 def work_alone(patch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from itertools import takewhile
 
 from reslrb_cli.measure.extreme import geometry, light
 from reslrb_cli.measure.extreme.suite import run_case
@@ -33,3 +34,10 @@ def run_suite(
     """
     for name in CASES if names is None else names:
         yield from run_case(CASES[name], estimators, seeds)
+
+
+def case_records(
+    stop: Callable[[], bool], name: str, estimators: Iterable[str] | None, seeds: int | None
+) -> list[GradcheckRecord]:
+    """The records of one case, of which some are missing once `stop()`."""
+    return list(takewhile(lambda _: not stop(), run_suite([name], estimators, seeds)))

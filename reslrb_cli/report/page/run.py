@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
+from pydantic import TypeAdapter
 
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.correlated_bias import CorrelatedBias, share_words
+from reslrb_cli.records.clock import SharedTime
 from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, PathsRecord, RivalRecord, SequenceRecord
 from reslrb_cli.records.images import load_image
 from reslrb_cli.records.run_folder import FABRICATION_FILE, SOLID_PICTURE
@@ -116,6 +118,21 @@ def correlated_bias_table(measured: Mapping[str, Any] | None) -> Markup:
     return lay_out("run.correlated_bias", bias, {row.key: share_words(row, "±") for row in bias.parameters})
 
 
+def workers(shared: Mapping[str, Any] | None, elapsed_s: float | None) -> Markup:
+    """What the shards took that workers computed, by part and by worker, of all iterations; nothing without any."""
+    if not shared:
+        return Markup()
+    time = TypeAdapter(SharedTime).validate_python(shared)
+    parts = {
+        "computing, the mean of the workers": time.computing_s,
+        "waiting for the worker that had most": time.waiting_s,
+        "sending and handing out": time.sending_s,
+    }
+    if elapsed_s is not None:
+        parts["the rest of the iterations, here"] = max(elapsed_s - time.wall_s, 0.0)
+    return lay_out("run.workers", time, parts, sum(parts.values()) or 1.0)
+
+
 #: Bytes of a configuration that is shown, at most.
 MOST_CONFIG = 2**20
 DAMAGED = "This part cannot be shown: what was recorded of it is damaged."
@@ -197,6 +214,7 @@ def record_parts(run: Run) -> dict[str, Markup]:
         "Bias of correlated samples": lambda: correlated_bias_table(manifest.get("correlated_bias")),
         "Scale of the parameters": lambda: lay_out("run.scaling", manifest.get("scaling") or []),
         "Memory budget": lambda: lay_out("run.memory", kept) if (kept := manifest.get("memory")) else Markup(),
+        "Workers": lambda: workers(manifest.get("shared"), run.last("elapsed_s")),
         "Configuration": lambda: lay_out("pre", _read(run.path / "config.yaml")),
     }
     return {title: guarded(make) for title, make in parts.items()}

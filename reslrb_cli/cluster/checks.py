@@ -1,0 +1,159 @@
+"""The samples of `gradcheck`, and the cases of its suite, on workers (`crew.Crew`).
+
+A sample is a function of who takes part, made of an experiment's files, of the steps of finite differences, which are
+chosen where `gradcheck` runs and nowhere else, and of its seed; a case is one of its name.
+
+Imports dask: for those that `--cluster` has asked for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from reslrb_cli.backend.variant import set_variant
+from reslrb_cli.cluster.bundle import CONFIG_FILE, Bundle, bundle_of, read_bundle
+from reslrb_cli.cluster.connection import Place, connected
+from reslrb_cli.cluster.crew import Anywhere, Crew, Opening
+from reslrb_cli.config.loader import dump, loads
+from reslrb_cli.config.parameters import RunValue, TransportValue
+from reslrb_cli.config.schema import Config
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure.methods import Case as Listed
+from reslrb_cli.measure.participants import Participants, Settings
+from reslrb_cli.measure.sampling import Step, step_as, steps_of
+from reslrb_cli.measure.scenes import small
+
+Stop = Callable[[], bool]
+
+
+@dataclass(frozen=True)
+class Steps:
+    """The steps that finite differences take, by parameter and way (`sampling.steps_of`)."""
+
+    steps: Mapping[str, Sequence[Step]]
+
+    @property
+    def digest(self) -> str:
+        """All of them."""
+        return repr(self.steps)
+
+    def take(self, participants: Participants) -> None:
+        """Have finite differences take them."""
+        step_as(participants, self.steps)
+
+
+# --- on a worker ------------------------------------------------------------------------------------------------------
+
+
+def participants_in(
+    folder: Path, threads: int, variant: str, allows_code: bool, settings: Mapping[str, Any]
+) -> tuple[Participants, dict[str, float]]:
+    """Who takes part, of the experiment in `folder`; no kernel is warm. `settings` are the others of `Settings`."""
+    set_variant(variant)
+    listed = [_with_file(case, lambda file: f"{folder / file}") for case in settings["integrators"]]
+    participants = Participants(Settings(_read(folder).with_code(allows_code), **{**settings, "integrators": listed}))
+    _with_threads(threads)
+    return participants, {}
+
+
+def nothing_in(folder: Path, threads: int, variant: str) -> tuple[Stop, dict[str, float]]:
+    """What a case of the suite takes beside its name: whether it is to stop, which it is not."""
+    set_variant(variant)
+    _with_threads(threads)
+    return lambda: False, {}
+
+
+def _with_threads(threads: int) -> None:
+    dr.sync_thread()
+    dr.set_thread_count(threads)
+
+
+def _read(folder: Path) -> Config:
+    text = (folder / CONFIG_FILE).read_text(encoding="utf-8")
+    return loads(text, small.CORNELL_BOX_SOURCE) if f"file: {small.FILE}" in text else read_bundle(folder)
+
+
+def _with_file(case: Listed, put: Callable[[str], str]) -> Listed:
+    """An integrator with the file of its code, if it has any, in another place."""
+    if case.type != "custom":
+        return case
+    file, _, name = str(case.options["file"]).rpartition(":")
+    return replace(case, options={**case.options, "file": f"{put(file)}:{name}"})
+
+
+# --- where `gradcheck` runs -------------------------------------------------------------------------------------------
+
+
+def check_shareable(settings: Settings) -> None:
+    """Raise ConfigError where samples depend on who takes them, or when."""
+    if settings.seeds is None:
+        reason = "a budget of seconds says nothing of other machines; say how many seeds there are with --seeds"
+        raise ConfigError("--cluster", "", reason)
+    for label, config in settings.configs().items():
+        if config.integrator.options().get("guiding", "off") != "off":
+            reason = f"{label} learns from the samples before; --set integrator.guiding=off, or leave --cluster out"
+            raise ConfigError(config.source, "integrator.guiding", reason)
+
+
+@contextlib.contextmanager
+def samples_at(
+    settings: Settings, participants: Participants, place: Place, variant: str, threads: int | None = None
+) -> Iterator[Callable[..., Any]]:
+    """What takes samples of `participants` (`sampling.Engine`) on the workers at a place; raises as `Crew.start`."""
+    opening, bundle = _opening_of(settings, participants, variant, own=place.address is None)
+    with _crew_at(place, opening, bundle.files, threads) as crew:
+
+        def take(
+            participants: Participants, function: Callable[..., Any], work: Sequence[tuple[Any, ...]]
+        ) -> Iterator[tuple[int, Any]]:
+            kind, of, _ = work[0]
+            steps = Steps(steps_of(participants, participants.directions))
+            return crew.run(function, work, steps, cold=f"{kind} {of}")
+
+        yield take
+
+
+def _opening_of(settings: Settings, participants: Participants, variant: str, own: bool) -> tuple[Opening, Bundle]:
+    """What workers need to have the same participants, `own`: which are this command's."""
+    config = settings.config
+    built_in = config.scene.file == small.FILE
+    bundle = Bundle({CONFIG_FILE: dump(config).encode()}) if built_in else bundle_of(config)
+    selection = participants.selection
+    apart = [key for key in selection.keys if isinstance(selection.spec(key).initial, RunValue | TransportValue)]
+    apart += [key for key in selection.keys if selection.spec(key).word]  # which the bundle leaves out, too
+    sent = {
+        "integrators": [_with_file(case, lambda file: bundle.add(Path(file))) for case in settings.integrators],
+        "budget_s": settings.budget_s,
+        "seeds": settings.seeds,
+        "spp": settings.spp,
+        "named": settings.named,
+        "initial": {key: np.array(selection.array(key)) for key in apart},
+    }
+    asks = config.allows_code and not own
+    return Opening(bundle.digest(), participants_in, (variant, config.allows_code, sent), asks_for_code=asks), bundle
+
+
+@contextlib.contextmanager
+def cases_at(place: Place, variant: str, threads: int | None = None) -> Iterator[Callable[..., Any]]:
+    """What runs cases (`extreme.case_records`, as `shards.serially`) on the workers at a place; raises as above."""
+    with _crew_at(place, Opening(Bundle().digest(), nothing_in, (variant,)), {}, threads) as crew:
+
+        def run(stop: Stop, function: Callable[..., Any], work: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:
+            return crew.run(function, work, Anywhere(), cold="of the suite")
+
+        yield run
+
+
+@contextlib.contextmanager
+def _crew_at(place: Place, opening: Opening, files: Mapping[str, bytes], threads: int | None) -> Iterator[Crew]:
+    with connected(place) as (client, _):
+        crew = Crew(client, opening, files, threads)
+        crew.start()
+        yield crew
