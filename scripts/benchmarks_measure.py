@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 import shutil
 import statistics
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -67,9 +69,22 @@ def run_lines(folder: Path) -> list[dict[str, Any]]:
         "step_ms": statistics.median(step["step_ms"] for step in warm),
         "peak_mib": max(step["peak_mib"] for step in steps),
         "estimator": (manifest.get("plan") or {}).get("estimator"),
+        **traced(manifest),
         "pilot": pilot and {name: pilot.get(name) for name in PILOT},
     }
     return [origin | {"written": manifest["started"]}, figures]
+
+
+def traced(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """Of a run by `reslrb`: its `paths`, which share of them are light paths, and whether these are guided."""
+    rows = {row["feature"]: row for row in (manifest.get("plan") or {}).get("rows") or ()}
+    camera = rows.get("camera paths")
+    if camera is None:
+        return {"paths": None, "light_share": None, "guided": None}
+    paths = re.match(r"paths: (\w+)", camera["reason"])[1] if camera["needed"] else "light"
+    chosen = (manifest.get("paths") or {}).get("light_share")
+    share = {"light": 1.0, "camera": 0.0}.get(paths, chosen)
+    return {"paths": paths, "light_share": share, "guided": rows["guided emission"]["needed"]}
 
 
 def _read(file: Path) -> list[dict[str, Any]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from textwrap import fill
 
 import benchmarks_tables as tables
 from benchmarks_list import CHECKED, EXPERIMENTS, MEASUREMENTS, OTHERS, RECORDS, ROOT, experiment_record
@@ -14,6 +15,10 @@ PAGE, README, TEMPLATE = ROOT / "docs" / "benchmarks.md", ROOT / "README.md", "p
 #: Where a table stands in the template, in a line of its own, and between what in the README.
 PLACE = re.compile(r"^\{\{ (\w+) \}\}$", re.MULTILINE)
 BLOCK = re.compile(r"<!-- benchmarks: (\w+) -->\n.*?<!-- end -->", re.DOTALL)
+#: When `integrator.paths: auto` became the default: runs that were recorded before are of light paths alone.
+AUTO_SINCE = "2026-11-23T08:05"
+#: Columns of the README's text.
+WIDTH = 120
 #: What the README says of each experiment.
 ABOUT = {
     "cornell_floor": "a carpet of 64 x 64 texels",
@@ -46,6 +51,7 @@ class Blocks:
             "gradcheck": self.gradcheck,
             "experiments": self.experiments,
             "others": self.others,
+            "paths": self.paths,
             "runs": self.runs,
             "gpu": lambda: gpu_section(self.folder),
         }
@@ -94,6 +100,19 @@ class Blocks:
         """The README's table of whole runs by other integrators."""
         return self._ends({name: words for name, (words, _) in OTHERS.items()})
 
+    def paths(self) -> str:
+        """The README's words on which paths its runs traced."""
+        text = "Which paths each run took stands in [docs/benchmarks.md](docs/benchmarks.md#whole-runs)."
+        if names := [f"`{name}`" for name in self.recorded() if self._is_older(name)]:
+            old = "of light paths alone, recorded before `integrator.paths: auto` became the default"
+            text = f"The rows of {', '.join(names)} are {old}. {text}"
+        return fill(text, WIDTH, break_long_words=False, break_on_hyphens=False)
+
+    def _is_older(self, experiment: str) -> bool:
+        """Whether a run that chooses its estimator had no paths to choose when it was recorded."""
+        record = self.record(experiment_record(experiment))
+        return record.rows[0]["pilot"] is not None and record.origin["written"] < AUTO_SINCE
+
     def _ends(self, runs: Mapping[str, str]) -> str:
         """Errors at the start and at the end of runs, by the names of their records, and what they are called."""
         head = ("experiment", "parameter RMSE, start", "end", "time", "command that prints it")
@@ -107,16 +126,16 @@ class Blocks:
     def runs(self) -> str:
         """Time and memory of whole runs, and what a pilot chose."""
         head = ("run", "iterations", "spp", "a step, ms", "iterations in all, s", "with everything, s", "peak, MiB",
-                "estimator", "chosen by a pilot, share of the run")  # fmt: skip
+                "estimator", "chosen by a pilot, share of the run", "paths")  # fmt: skip
         rows = []
         for name in self.recorded():
             record = self.record(experiment_record(name))
-            row = record.rows[0]
+            row, paths = record.rows[0], tables.paths(record)
             pilot = "" if row["pilot"] is None else f"{row['pilot']['label']}, {row['pilot']['share']:.1%}"
             rows.append([
                 f"`{name}`", str(row["iterations"]), str(row["spp"]),
                 tables.figure(row["step_ms"]), tables.figure(row["elapsed_s"]), f"{record.origin['seconds']:.0f}",
-                f"{row['peak_mib']:.1f}", f"`{row['estimator']}`" if row["estimator"] else "", pilot,
+                f"{row['peak_mib']:.1f}", f"`{row['estimator']}`" if row["estimator"] else "", pilot, paths,
             ])  # fmt: skip
         return tables.table(head, rows)
 

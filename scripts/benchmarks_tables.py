@@ -116,6 +116,16 @@ def run_errors(record: Record, moment: str) -> str:
     return "; ".join(f"{name} {figure(of[moment])}" for name, of in zip(names, errors.values(), strict=True))
 
 
+def paths(record: Record) -> str:
+    """The paths of a run by `reslrb`; empty where that is not recorded, as before there were others."""
+    row = record.rows[0]
+    name, share = row.get("paths"), row.get("light_share")
+    if name is None:
+        return ""
+    words = name if share in (None, 0, 1) else f"{share:.0%} light"
+    return words + ", guided" * bool(row["guided"])
+
+
 def took(record: Record) -> str:
     """The seconds of a run's iterations, as a whole number of at least one."""
     return f"{max(record.rows[0]['elapsed_s'], 1):.0f} s"

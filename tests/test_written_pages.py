@@ -11,7 +11,7 @@ import benchmarks_measure
 import benchmarks_page as pages
 import paper_page
 import pytest
-from benchmarks_list import MEASUREMENTS, OTHERS, RECORDS, ROOT, Measurement
+from benchmarks_list import MEASUREMENTS, OTHERS, RECORDS, ROOT, Measurement, experiment_record
 from benchmarks_tables import read
 from make_benchmarks import main
 
@@ -98,6 +98,42 @@ def test_the_readme_takes_its_figures_from_records(folder: Path) -> None:
     row = "| `cornell_floor`: a carpet of 64 x 64 texels | 0.987 | 0.0123 | 1234 s |"
     assert row in pages.readme(pages.Blocks(folder), text)
     assert row not in text
+
+
+def test_the_readme_says_of_what_paths_its_rows_are_as_long_as_that_is_not_the_default(folder: Path) -> None:
+    runs = {name: folder / f"{experiment_record(name)}.jsonl" for name in ("cornell_floor", "stiff/lamp")}
+    for file in folder.glob("optimize_*.jsonl"):
+        origin, row = map(json.loads, file.read_text(encoding="utf-8").splitlines())
+        origin["written"] = "2026-11-2" + ("2" if file in runs.values() else "4") + "T09:41:54+00:00"
+        file.write_text(f"{json.dumps(origin)}\n{json.dumps(row)}\n", encoding="utf-8")
+    said = pages.Blocks(folder).paths()
+    # A named estimator has light paths alone before and after.
+    assert said.startswith("The rows of `cornell_floor` are of light paths alone, recorded before")
+    runs["cornell_floor"].write_text((folder / "optimize_mixed_room.jsonl").read_text(encoding="utf-8"))
+    assert pages.Blocks(folder).paths().startswith("Which paths each run took stands in")
+
+
+@pytest.mark.parametrize(
+    ("needed", "reason", "chosen", "shown"),
+    [
+        (True, "paths: both; paths: auto, 2 times", {"light_share": 0.2}, "20% light, guided"),
+        (True, "paths: both", None, "both, guided"),
+        (True, "paths: camera; paths: auto, 3 times", {"light_share": 0.0}, "camera, guided"),
+        (False, "paths: light; paths: auto, 3 times", {"light_share": 1.0}, "light, guided"),
+        (False, "paths: light", None, "light, guided"),
+    ],
+)
+def test_the_paths_of_a_run_are_those_of_its_manifest(
+    needed: bool, reason: str, chosen: dict | None, shown: str
+) -> None:
+    rows = [
+        {"feature": "camera paths", "needed": needed, "reason": reason},
+        {"feature": "guided emission", "needed": True, "reason": ""},
+    ]
+    row = benchmarks_measure.traced({"plan": {"rows": rows}, "paths": chosen})
+    assert pages.tables.paths(pages.tables.Record({}, [row])) == shown
+    of_prb = benchmarks_measure.traced({"plan": {"rows": []}, "paths": None})
+    assert pages.tables.paths(pages.tables.Record({}, [of_prb])) == ""
 
 
 def test_ratios_are_of_medians() -> None:

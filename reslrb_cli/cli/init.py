@@ -191,7 +191,9 @@ def command(
     """
     from reslrb_cli.backend.variant import set_variant
 
-    named = scene_file.absolute().parent.name if scene_file.stem == "scene" else scene_file.stem
+    # Of the folder's own name, also where it is given as `..`; the root of all has none.
+    folder = Path(os.path.abspath(scene_file)).parent.name if scene_file.stem == "scene" else ""
+    named = folder or scene_file.stem
     path = output or Path(f"{named}.yaml")
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise ConfigError("--output", "", f"{path} must end in .yaml, as configurations do")

@@ -362,7 +362,7 @@ def edges_of(scene: Any, selection: Selection) -> list[str]:
 
 def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, counts: bool) -> PlanReport | str:
     """The plan of a step for the first sensor that is used, or why there is none."""
-    from reslrb_cli.integrators.plan_report import GUIDED, SEQUENCE, report_plan, with_reason
+    from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, SEQUENCE, report_plan, with_reason
     from reslrb_cli.integrators.reslrb import Reslrb
     from reslrb_cli.optimization.loading import choose_sensors, pass_spp, paths_of
     from reslrb_cli.optimization.moving import moves_anything
@@ -389,6 +389,8 @@ def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, c
         report = report_plan(integrator, scene, scene.sensors()[sensor], params, keys, known=known, counts=counts)
     except (ConfigError, UnsupportedScene) as error:
         return str(error)
+    if integrator.paths == "camera":  # where nothing begins at a light, nothing is left to a run
+        reasons = {PATHS_FROM: reasons.get(PATHS_FROM, "")}
     for feature, why in reasons.items():
         report = dataclasses.replace(report, rows=with_reason(report.rows, feature, why)) if why else report
     return report

@@ -25,12 +25,13 @@ from reslrb_cli.transport.plan import UNBOUNDED, Plan
 from reslrb_cli.transport.samples import passes
 from reslrb_cli.transport.sobol import make_coordinates
 
-#: The feature that guiding is.
-GUIDED = "guided emission"
-
-#: And that which evenly spread numbers are.
+#: The features that paths from the sensor, guiding, and evenly spread numbers are.
 PATHS_FROM = "camera paths"
+GUIDED = "guided emission"
 SEQUENCE = "low-discrepancy numbers"
+
+#: Why camera paths alone have no use for what says where paths start at the lights.
+NO_START = "no path begins at a light"
 
 #: Kinds of parameters that features come with.
 EMITTERS, BSDFS = "emitter", "bsdf"
@@ -40,15 +41,15 @@ EMITTERS, BSDFS = "emitter", "bsdf"
 class Feature:
     """One feature of a plan.
 
-    `needed(plan)` says whether it is part of it; `present` (of a plan that has it) and `absent` say why. `toggle(plan)`
-    is the plan without it, or with it, or the reason why there is no such plan; None: the step has it once all
-    `parameters` of that kind are differentiated.
+    `needed(plan)` says whether it is part of it; `present` (of a plan that has it) and `absent` (of one that has not)
+    say why. `toggle(plan)` is the plan without it, or with it, or the reason why there is no such plan; None: the step
+    has it once all `parameters` of that kind are differentiated.
     """
 
     name: str
     needed: Callable[[Plan], bool]
     present: str | Callable[[Plan], str]
-    absent: str
+    absent: str | Callable[[Plan], str]
     toggle: Callable[[Plan], Plan | str | None]
     parameters: str | None = None
 
@@ -149,7 +150,9 @@ def _aimed(plan: Plan) -> Plan | str:
     return replace(plan, aims=not plan.aims) if not plan.attached else "something moves"
 
 
-def _guided(plan: Plan) -> Plan:
+def _guided(plan: Plan) -> Plan | str:
+    if plan.paths == "camera":
+        return NO_START
     if plan.grid is not None:
         return replace(plan, grid=None, aims=False)
     return replace(plan, grid=grid_for([True] * 4, [1.0] * len(plan.needs.emitters), 1))
@@ -163,10 +166,17 @@ def _paths(plan: Plan) -> Plan | str:
     return replace(plan, paths="light" if plan.weighs else "both", whole=not plan.weighs)
 
 
-def _sequence(plan: Plan) -> Plan:
+def _sequence(plan: Plan) -> Plan | str:
+    if plan.paths == "camera":
+        return NO_START
     if plan.sequence is not None:
         return replace(plan, sequence=None)
     return replace(plan, sequence=make_coordinates([True] * 4, len(plan.needs.emitters), plan.max_depth))
+
+
+def _of_lights(plan: Plan, why: str) -> str:
+    """Why the plan lacks a feature of paths that begin at the lights: there are none of these, or `why`."""
+    return NO_START if plan.paths == "camera" else why
 
 
 def _bsdfs(plan: Plan) -> Plan | None:
@@ -236,17 +246,19 @@ FEATURES = (
             else "no lamp moves, or none is to be seen"),
     Feature("small lamps in view", lambda p: bool(p.small_lamps), "found by points on them, not by rays through pixels",
             "no lamp in view is smaller than a pixel", _small),
-    Feature("placed lamps", lambda p: bool(p.placed_lamps), "spheres, parallel lamps, meshes that move: by the walk",
-            "Mitsuba samples all emitters",
-            lambda p: "what Mitsuba makes of them is wrong" if p.placed_lamps else "there are none"),
+    Feature("placed lamps", lambda p: bool(p.placed_lamps) and p.paths != "camera",
+            "spheres, parallel lamps, meshes that move: by the walk",
+            lambda p: _of_lights(p, "Mitsuba samples all emitters"),
+            lambda p: _of_lights(p, "what Mitsuba makes of them is wrong" if p.placed_lamps else "there are none")),
     Feature("black texels of lamps", lambda p: bool(p.evened_lamps), "drawn too, since their derivative counts",
             "no texture of a lamp is differentiated: texels are drawn by their radiance", _evened),
     Feature(PATHS_FROM, lambda p: p.paths != "light", lambda p: f"paths: {p.paths}", "paths: light", _paths),
-    Feature(GUIDED, lambda p: p.grid is not None, _tables, "guiding: off", _guided),
+    Feature(GUIDED, lambda p: p.grid is not None, _tables, lambda p: _of_lights(p, "guiding: off"), _guided),
     Feature("aimed scattering", lambda p: p.aimed, "a quarter of scattered paths go where the sensor looks",
             "only guided paths are, in scenes with glossy surfaces, where nothing moves", _aimed),
     Feature(SEQUENCE, lambda p: p.sequence is not None,
-            "where paths start, and how they first scatter, is evenly spread", "sequence: independent", _sequence),
+            "where paths start, and how they first scatter, is evenly spread",
+            lambda p: _of_lights(p, "sequence: independent"), _sequence),
     Feature("derivative of the filter's normalization", lambda p: p.attached and p.attached_normalization,
             "as finite differences have it", "nothing moves, or it is detached", _normalization),
     Feature("zero-factor bookkeeping", lambda p: p.track_zeros, "a parameter is zero somewhere, or nearly so",
@@ -381,9 +393,9 @@ def _update(params: mi.SceneParameters, keys: Iterable[str]) -> None:
 
 
 def _row(feature: Feature, plan: Plan) -> PlanRow:
-    if not feature.needed(plan):
-        return PlanRow(feature.name, False, feature.absent)
-    return PlanRow(feature.name, True, feature.present if isinstance(feature.present, str) else feature.present(plan))
+    needed = feature.needed(plan)
+    why = feature.present if needed else feature.absent
+    return PlanRow(feature.name, needed, why if isinstance(why, str) else why(plan))
 
 
 def _toggled(integrator: Reslrb, feature: Feature, plan: Plan, scene: mi.Scene, sensor: mi.Sensor,

@@ -66,6 +66,17 @@ def test_a_scene_alone_gets_a_configuration_that_lacks_its_photograph_only(folde
     assert read_manifest(folder / "runs/room")["status"] == "finished"
 
 
+def test_it_is_named_after_the_folder_of_the_scene_wherever_that_is(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "room/photos").mkdir()
+    for place, scene in (("room", "scene.xml"), ("room/photos", "../scene.xml")):
+        monkeypatch.chdir(folder / place)
+        result = reslrb("init", scene)
+        assert result.exit_code == 0, result.output
+        assert load(folder / place / "room.yaml").scene.file.resolve() == folder / "room/scene.xml"
+
+
 def test_what_is_commented_out_is_accepted_once_it_is_not(folder: Path) -> None:
     assert reslrb("init", "room/scene.xml").exit_code == 0
     text = (folder / "room.yaml").read_text().replace("  # - {", "  - {")
