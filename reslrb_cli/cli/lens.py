@@ -166,14 +166,14 @@ def command(
         output.mkdir(parents=True, exist_ok=True)
         finer = min(FINER, max(1, MOST_VERTICES // pixels))
         ny, nx = (finer * cells for cells in surface.heights.shape)
-        heights = experiment.at_vertices(surface, nx, ny).astype(np.float32)[:, :, None]
-        write_file(output / "start.exr", heights, linear=True)
+        heights = experiment.at_vertices(surface, nx, ny).astype(np.float32)
+        write_file(output / "start.exr", heights[:, :, None], linear=True)
         for name, seen in (("target.exr", target), ("picture.exr", experiment.on_film(image, surface, margin))):
             write_file(output / name, np.repeat(seen.astype(np.float32)[:, :, None], 3, 2), linear=True)
         texts = {
             "face.ply": experiment.face_ply(setting, nx, ny),
             "scene.xml": experiment.scene_xml(surface, film, columns, power, sun, both).encode(),
-            "lens.yaml": experiment.lens_yaml(surface, nx, ny, picture.name, ITERATIONS, sun, both).encode(),
+            "lens.yaml": experiment.lens_yaml(surface, heights, picture.name, ITERATIONS, sun, both).encode(),
         }
         if both:
             texts["back.ply"] = experiment.face_ply(setting, nx, ny, back=True)
