@@ -114,6 +114,8 @@ def command(
         raise ConfigError("--sun", "", f"is {sun:g} degrees; it must be from 0 to below 10, 0.53 of the sun itself")
     if not 0 <= margin <= 1:
         raise ConfigError("--margin", "", f"is {margin:g}; it must be from 0 to 1, as far as the receiver reaches")
+    if not all(-80 <= angle <= 80 for angle in tilt):
+        raise ConfigError("--tilt", "", f"is {tilt[0]:g} and {tilt[1]:g} degrees; both must be between -80 and 80")
     if sun and light_distance is not None:
         raise ConfigError("--sun", "", "is of parallel light, and --light-distance of a point; leave one out")
     if both and mirror:

@@ -136,6 +136,18 @@ class Problem:
                 gradients[key] = gradients.get(key, 0.0) + own
         return told, gradients
 
+    def stiffness(self, key: str, direction: Array) -> Array:
+        """What the gradient of regularizers by `key` changes by along a direction, both in a row: their curvature times
+        that; zeros where they are not about `key`."""
+        values, size = self._heights(), float(np.abs(direction).max(initial=0.0))
+        if key not in values or size == 0:
+            return np.zeros_like(direction)
+        value = values[key]
+        step = 1e-4 * (float(np.abs(value).max(initial=0.0)) or 1.0) / size
+        ends = [self.costs({**values, key: value + side * step * direction.reshape(value.shape)})[1][key].ravel()
+                for side in (1, -1)]  # fmt: skip
+        return np.asarray((ends[0] - ends[1]) / (2 * step))
+
     def _heights(self) -> dict[str, Array]:
         """The values that regularizers are about, by key."""
         others = [cost.other for costs in self.regularizers.values() for cost in costs.values()
