@@ -114,6 +114,8 @@ def command(
         raise ConfigError("--sun", "", f"is {sun:g} degrees; it must be from 0 to below 10, 0.53 of the sun itself")
     if not 0 <= margin <= 1:
         raise ConfigError("--margin", "", f"is {margin:g}; it must be from 0 to 1, as far as the receiver reaches")
+    if not all(-80 <= angle <= 80 for angle in tilt):
+        raise ConfigError("--tilt", "", f"is {tilt[0]:g} and {tilt[1]:g} degrees; both must be between -80 and 80")
     if sun and light_distance is not None:
         raise ConfigError("--sun", "", "is of parallel light, and --light-distance of a point; leave one out")
     if both and mirror:
@@ -166,14 +168,14 @@ def command(
         output.mkdir(parents=True, exist_ok=True)
         finer = min(FINER, max(1, MOST_VERTICES // pixels))
         ny, nx = (finer * cells for cells in surface.heights.shape)
-        heights = experiment.at_vertices(surface, nx, ny).astype(np.float32)[:, :, None]
-        write_file(output / "start.exr", heights, linear=True)
+        heights = experiment.at_vertices(surface, nx, ny).astype(np.float32)
+        write_file(output / "start.exr", heights[:, :, None], linear=True)
         for name, seen in (("target.exr", target), ("picture.exr", experiment.on_film(image, surface, margin))):
             write_file(output / name, np.repeat(seen.astype(np.float32)[:, :, None], 3, 2), linear=True)
         texts = {
             "face.ply": experiment.face_ply(setting, nx, ny),
             "scene.xml": experiment.scene_xml(surface, film, columns, power, sun, both).encode(),
-            "lens.yaml": experiment.lens_yaml(surface, nx, ny, picture.name, ITERATIONS, sun, both).encode(),
+            "lens.yaml": experiment.lens_yaml(surface, heights, picture.name, ITERATIONS, sun, both).encode(),
         }
         if both:
             texts["back.ply"] = experiment.face_ply(setting, nx, ny, back=True)

@@ -292,11 +292,19 @@ class Thickness(Regularizer, json_schema_extra={"required": ["type", "thickness"
     has a tenth of `least`, so that its faces never cross; how many were is recorded."""
     thickness: Positive = Field(description="Of the plate where the heightmap is 0, in scene units.")
     least: Positive = Field(description="Below this it costs, in scene units.")
+    opposite: Annotated[str, Field(min_length=1)] | None = None
+    """Id of the mesh on the other side, where that has a heightmap as well: its heights, outwards where each texel
+    stands, are part of the thickness, and it is pushed and held back as this one is. null: the other side is flat."""
+
+    @property
+    def thinnest(self) -> float:
+        """The thickness at which it is held."""
+        return _HELD * self.least
 
     @property
     def lowest(self) -> float:
-        """The height at which it is held."""
-        return _HELD * self.least - self.thickness
+        """The height at which it is held, over a flat back."""
+        return self.thinnest - self.thickness
 
 
 #: Share of `least` that a plate always keeps.
@@ -419,6 +427,11 @@ class ParameterSpec(Section):
                 found += [(option, i, name) for i, name in enumerate(names or ())]
         return found
 
+    @property
+    def _plates(self) -> list[Thickness]:
+        """The plates whose other side is flat: their thickness bounds the heights."""
+        return [each for each in self.regularizers if isinstance(each, Thickness) and each.opposite is None]
+
     def at(self, option: str, word: str) -> str:
         """Where in this section `option` is set for what `word` names."""
         return f"{option}.{word}" if isinstance(getattr(self, option, None), ByWord) else option
@@ -431,7 +444,7 @@ class ParameterSpec(Section):
             return value.words().get(word, default) if isinstance(value, ByWord) else value
 
         resolution = self.resolution if self.heightmap is None else self.heightmap.resolution
-        bounds, lowest = of("bounds"), [each.lowest for each in self.regularizers if isinstance(each, Thickness)]
+        bounds, lowest = of("bounds"), [each.lowest for each in self._plates]
         if lowest:
             low, high = bounds or (-math.inf, math.inf)
             bounds = max(low, *lowest), high
@@ -499,7 +512,7 @@ class ParameterSpec(Section):
                 raise located(at("bounds"), reason)
             numbers = [said.initial] if isinstance(said.initial, float) else said.initial
             for number in numbers if isinstance(numbers, list) else ():
-                if any(number < each.lowest for each in self.regularizers if isinstance(each, Thickness)):
+                if any(number < each.lowest for each in self._plates):
                     reason = f"{number:g} leaves less than a tenth of the least thickness in `regularizers`; raise it"
                     raise located(at("initial"), reason)
                 if not low <= number <= high:

@@ -31,6 +31,9 @@ _GAP = 1.0
 #: Directions in which the light of a sun comes; each of them is parallel.
 SUNS = 19
 
+#: Of the longer side: a plate that is thinner costs, so that the face keeps off its back.
+_LEAST = 0.02
+
 
 def leaving(surface: Surface) -> float:
     """Light (mm^2) that leaves the face, of parallel light of irradiance 1, or of a point light of intensity 1."""
@@ -263,10 +266,13 @@ def scene_xml(
 
 
 def lens_yaml(
-    surface: Surface, nx: int, ny: int, name: str, iterations: int, sun: float = 0.0, both: bool = False
+    surface: Surface, heights: NDArray[Any], name: str, iterations: int, sun: float = 0.0, both: bool = False
 ) -> str:
-    """The configuration, which begins at the heights in `start.exr`; the back, where it is free, begins flat."""
-    s = surface.setting
+    """The configuration, which begins at these `heights` (ny, nx), those in `start.exr`; the back, where it is free,
+    begins flat."""
+    s, (ny, nx) = surface.setting, heights.shape
+    least = min(_LEAST * max(s.size), float(heights.min()) + s.thickness)
+    plate = f"type: thickness, thickness: {s.thickness:.9g}, least: {least:.4g}, weight: {1e6 / max(s.size) ** 4:.4g}"
     more = (
         f"""  - heightmap: {{mesh: back, resolution: [{nx}, {ny}]}}  # mm along -z
     precondition: {{laplacian: 0.03}}
@@ -287,6 +293,7 @@ parameters:
   - heightmap: {{mesh: face, resolution: [{nx}, {ny}]}}  # mm along +z
     initial: {{file: start.exr}}  # by transport of light: docs/lens.md
     precondition: {{laplacian: 0.03}}  # smooth steps: without them the finest ripples decide how long one may be
+    regularizers: [{{{plate}{", opposite: back" if both else ""}}}]  # mm; faces never cross
 {more}integrator:
   type: reslrb
   max_depth: {4 if surface.setting.kind == "lens" else 3}

@@ -1,7 +1,8 @@
-"""What a finished lens or mirror throws where things are not as planned: its light, its place, its glass, its tool.
+"""What a finished lens or mirror throws: where its light goes, and what becomes of the picture where things are not as
+planned: its light, its place, its glass, its tool.
 
-Each is a rendering of the scene with what it is about really moved, by the integrator that Mitsuba has for it. Where
-turning moves the picture as a whole the shift is told, and taken out before the picture is compared.
+Of the latter each is a rendering of the scene with what it is about really moved, by the integrator that Mitsuba has
+for it. Where turning moves the picture as a whole the shift is told, and taken out before the picture is compared.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import scipy.ndimage
@@ -20,6 +22,9 @@ from reslrb_cli.lens.solid import Array, Sheet
 
 #: Of the distance, of the index, and in degrees: by how much each is off.
 DISTANCE, INDEX, TURN = 0.02, 0.005, 1.0
+
+#: Rays that tell where light goes: shares of 0.1 % to a twentieth of themselves. And how often each may meet a face.
+RAYS, BOUNCES = 2**19, 8
 
 #: Directions of a light as wide as the sun, by its radius: its middle, and six on a circle, on average as far from the
 #: middle (squared: a half) as those of an even disc.
@@ -58,8 +63,7 @@ def figures(image: Array, target: Array) -> dict[str, float]:
     """
     from skimage.metrics import structural_similarity
 
-    rows, columns = (np.flatnonzero(np.any(target > 0, axis=axis)) for axis in (1, 0))
-    inside = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    inside = picture_within(target)
     seen, wanted = image[inside], target[inside]
     seen, wanted = seen / max(float(seen.mean()), 1e-30), wanted / wanted.mean()
     return {
@@ -69,6 +73,66 @@ def figures(image: Array, target: Array) -> dict[str, float]:
         "contrast": float(seen.std()),
         "target_contrast": float(wanted.std()),
     }
+
+
+def picture_within(target: Array) -> tuple[slice, slice]:
+    """Rows and columns of the picture in a target (H, W): the rectangle about what of it is not black."""
+    rows, columns = (np.flatnonzero(np.any(target > 0, axis=axis)) for axis in (1, 0))
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+
+def where_light_goes(
+    scene: mi.Scene, sensor: mi.Sensor, plan: Fabrication, target: Array, seed: int = 0
+) -> dict[str, float]:
+    """Of the light that leaves the front face, what goes `inside` of the picture, `beside` it on the film, and
+    `beyond`, elsewhere on the receiver or past it: shares of `RAYS` rays.
+
+    Rays from the lamps, by Mitsuba's own samples of BSDFs, reflections inside of the glass among them. The picture is
+    where the luminance `target` (H, W) is not black. What a lens throws back towards its light does not count, nor what
+    passes it by. All are 0 where no light leaves it.
+    """
+    rows, columns = picture_within(target)
+    shapes = {shape.id(): shape for shape in scene.shapes()}
+    front, receiver = mi.ShapePtr(shapes[plan.faces[0]]), mi.ShapePtr(shapes[plan.receiver])
+    solid = [mi.ShapePtr(shape) for name, shape in shapes.items() if name in (*plan.faces, "back")]
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, RAYS)
+    ray, weight, _ = scene.sample_emitter_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), True)
+    light = mi.Float(mi.luminance(weight) if mi.is_rgb else weight.x)
+    context = mi.BSDFContext(mi.TransportMode.Importance)
+    left, active = dr.zeros(mi.Bool, RAYS), light > 0
+    dr.make_opaque(ray, light, left, active)  # so that each turn launches one kernel
+    totals = dict.fromkeys(("inside", "beside", "beyond"), 0.0)
+    for _ in range(BOUNCES):
+        si = scene.ray_intersect(ray, active)
+        again = active & si.is_valid() & _any_of(si.shape, solid)
+        ended = active & left & ~again
+        ds, importance = sensor.sample_direction(si, mi.Point2f(0.5), ended)
+        on_film = ended & (si.shape == receiver) & (dr.max(importance) > 0)
+        inside = on_film & (ds.uv.x >= columns.start) & (ds.uv.x < columns.stop)
+        inside &= (ds.uv.y >= rows.start) & (ds.uv.y < rows.stop)
+        parts = {"inside": inside, "beside": on_film & ~inside, "beyond": ended & ~on_film}
+        sums = {name: dr.sum(dr.select(part, light, 0)) for name, part in parts.items()}
+        bs, factor = si.bsdf(ray).sample(context, si, sampler.next_1d(again), sampler.next_2d(again), again)
+        towards = si.to_world(bs.wo)
+        ray = si.spawn_ray(towards)
+        light = dr.select(again, light * mi.Float(mi.luminance(factor) if mi.is_rgb else factor.x), 0)
+        active = again & (light > 0)
+        left = active & (si.shape == front) & (dr.dot(towards, si.n) * dr.sign(si.n.z) > 0)
+        dr.eval(ray, light, active, left, sums)
+        for name, part in sums.items():
+            totals[name] += float(part[0])
+        if not dr.any(active):
+            break
+    whole = sum(totals.values())
+    return {name: total / max(whole, 1e-30) for name, total in totals.items()}
+
+
+def _any_of(shape: mi.ShapePtr, others: Sequence[mi.ShapePtr]) -> mi.Bool:
+    found = mi.Bool(False)
+    for other in others:
+        found = found | (shape == other)
+    return found
 
 
 def shift_between(image: Array, reference: Array) -> Array:

@@ -187,10 +187,25 @@ def assemble_scene(
         problem.integrator.expect(pass_spp(config))
     problem.apply()
     check_moving(problem)
+    if values is None:
+        _check_plates(problem)
     for number in range(len(config.run.stages)):
         _film_at(problem, number)
         _specs_at(problem, number)
     return problem
+
+
+def _check_plates(problem: Problem) -> None:
+    """Raise ConfigError where two free faces begin nearer to each other than they are held apart."""
+    for key, plate in problem.plates.items():
+        thin = float(plate.thickness(*(problem.selection.array(each).astype(np.float64) for each in (key, plate.other)))
+                     .min())  # fmt: skip
+        if thin < plate.settings.thinnest:
+            index = next(i for i, spec in enumerate(problem.config.parameters) if key in spec.names)
+            raise ConfigError(problem.config.source, f"parameters[{index}].regularizers", f"`{key}` and "
+                              f"`{plate.other}` begin {thin:.3g} apart at their nearest, and are held "
+                              f"{plate.settings.thinnest:.3g} apart, a tenth of `least`; lower that, or thicken the "
+                              "plate")  # fmt: skip
 
 
 def _check_values(selection: Selection, values: Mapping[str, Array]) -> None:

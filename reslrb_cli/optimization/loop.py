@@ -114,6 +114,7 @@ def step(
             moved = {key: optimizer[key] for key in optimizer.keys() if key not in held}  # noqa: SIM118
             clamped, clamp, clamp_sums = clamp_gradients(limit, moved, clamp, clamp_sums)
         found.updates = optimizer.step(factor, skip=held)
+        problem.hold_apart()
         problem.apply()
     standstill = state.standstill + 1 if held or found.updates else 0
     state = standing(

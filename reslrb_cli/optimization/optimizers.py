@@ -215,6 +215,10 @@ class Optimizer:
     def set_value(self, key: str, value: Any) -> None:
         """Begin at another value of the scene's; to be called before the first step."""
         self.stands_at = None
+        self.move(key, value)
+
+    def move(self, key: str, value: Any) -> None:
+        """Go on from another value of the scene's, between two steps; moments stay."""
         variable = self._variables.get(key)
         if variable is None:
             self._own[key][key] = value

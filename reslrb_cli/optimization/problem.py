@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.parameters import Laplacian, Thickness
+from reslrb_cli.config.parameters import HEIGHTMAP, Laplacian, Thickness
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import OnSamples
@@ -20,7 +20,7 @@ from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.optimization.loading import BETWEEN_SPP, render_in_passes
 from reslrb_cli.optimization.optimizers import Optimizer, make_transform
 from reslrb_cli.optimization.precondition import make_smoother
-from reslrb_cli.optimization.regularizers import Cost, Span, make_cost, mesh_cost, spans_of
+from reslrb_cli.optimization.regularizers import Cost, Plate, Span, make_cost, make_plate, mesh_cost, spans_of
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, Jsonable, PathsRecord, SequenceRecord
 from reslrb_cli.scene.parameters import Selection
@@ -75,7 +75,7 @@ class Problem:
     sequence: SequenceRecord | None = None
     memory: MemoryPlan | None = None
     #: What values cost by themselves, by key and type.
-    regularizers: dict[str, dict[str, Cost]] = field(default_factory=dict)
+    regularizers: dict[str, dict[str, Cost | Plate]] = field(default_factory=dict)
     #: What computes the shards of a step (`shards.Engine`); None: this process, one after the other.
     engine: Callable[..., Any] | None = None
     #: What learning rates are multiplied by, beside their schedule.
@@ -114,25 +114,80 @@ class Problem:
 
     def regularize(self) -> dict[str, dict[str, float]]:
         """Add what values cost by themselves to the gradients, once a step; return that, by key and type."""
-        told: dict[str, dict[str, float]] = {}
-        for key, costs in self.regularizers.items():
+        told, gradients = self.costs(self._heights())
+        for key, gradient in gradients.items():
             value = self.optimizer[key]
-            array = np.array(dr.detach(value), dtype=np.float64)
-            found = {name: cost(array) for name, cost in costs.items()}
-            told[key] = {name: total for name, (total, _) in found.items()}
-            gradient = np.ascontiguousarray(sum(each for _, each in found.values()), dtype=np.float32)
-            # A sum, since NumPy's own memory has an alignment on which kernels depend.
-            dr.accum_grad(value, type(value)(gradient) + dr.opaque(mi.Float, 0))
+            dr.accum_grad(value, _handed(value, gradient))
         return told
+
+    def costs(self, values: Mapping[str, Array]) -> tuple[dict[str, dict[str, float]], dict[str, Array]]:
+        """What these values (by key, of all that `regularizers` are about) cost by themselves, by key and type, and the
+        gradient of the sum of that, by key."""
+        told: dict[str, dict[str, float]] = {}
+        gradients: dict[str, Array] = {}
+        for key, costs in self.regularizers.items():
+            told[key] = {}
+            for name, cost in costs.items():
+                if isinstance(cost, Plate):
+                    told[key][name], own, there = cost.cost(values[key], values[cost.other])
+                    gradients[cost.other] = gradients.get(cost.other, 0.0) + there
+                else:
+                    told[key][name], own = cost(values[key])
+                gradients[key] = gradients.get(key, 0.0) + own
+        return told, gradients
+
+    def stiffness(self, key: str, direction: Array) -> Array:
+        """What the gradient of regularizers by `key` changes by along a direction, both in a row: their curvature times
+        that; zeros where they are not about `key`."""
+        values, size = self._heights(), float(np.abs(direction).max(initial=0.0))
+        if key not in values or size == 0:
+            return np.zeros_like(direction)
+        value = values[key]
+        step = 1e-4 * (float(np.abs(value).max(initial=0.0)) or 1.0) / size
+        ends = [self.costs({**values, key: value + side * step * direction.reshape(value.shape)})[1][key].ravel()
+                for side in (1, -1)]  # fmt: skip
+        return np.asarray((ends[0] - ends[1]) / (2 * step))
+
+    def _heights(self) -> dict[str, Array]:
+        """The values that regularizers are about, by key."""
+        others = [cost.other for costs in self.regularizers.values() for cost in costs.values()
+                  if isinstance(cost, Plate)]  # fmt: skip
+        return {key: np.array(dr.detach(self.optimizer[key]), dtype=np.float64)
+                for key in dict.fromkeys([*self.regularizers, *others])}  # fmt: skip
+
+    @property
+    def plates(self) -> dict[str, Plate]:
+        """What is between two free faces, by the key of the one that says so."""
+        found = {key: costs.get("thickness") for key, costs in self.regularizers.items()}
+        return {key: each for key, each in found.items() if isinstance(each, Plate)}
+
+    def hold_apart(self) -> None:
+        """Hold free faces apart, at a tenth of the least thickness; what has a flat back is held by its bounds."""
+        for key, plate in self.plates.items():
+            before = {each: np.array(dr.detach(self.optimizer[each])) for each in (key, plate.other)}
+            after = plate.held(*(each.astype(np.float64) for each in before.values()))
+            for (each, old), new in zip(before.items(), after, strict=True):
+                if np.any(new > old):
+                    low, high = self.selection.spec(each).bounds or (-np.inf, np.inf)
+                    self.optimizer.move(each, _handed(self.optimizer[each], np.clip(new, low, high)))
 
     def held(self) -> dict[str, int]:
         """How many heights are held at the least thickness, by key, of the heightmaps that have one."""
         counts = {}
         for key, costs in self.regularizers.items():
-            if "thickness" in costs:
+            plate = costs.get("thickness")
+            if plate is None:
+                continue
+            height = np.array(dr.detach(self.optimizer[key]))
+            if isinstance(plate, Plate):
+                there = np.array(dr.detach(self.optimizer[plate.other]))
+                rounding = 1e-5 * plate.settings.thickness  # two of single precision are added
+                thin = plate.thickness(height, there) <= plate.settings.thinnest + rounding
+            else:
                 lowest = next(each.lowest for each in self.selection.spec(key).regularizers
                               if isinstance(each, Thickness))  # fmt: skip
-                counts[key] = int(np.count_nonzero(np.array(dr.detach(self.optimizer[key])) <= np.float32(lowest)))
+                thin = height <= np.float32(lowest)
+            counts[key] = int(np.count_nonzero(thin))
         return counts
 
     @property
@@ -221,14 +276,24 @@ def make_optimizer(config: Config, selection: Selection) -> Optimizer:
     )
 
 
-def make_regularizers(selection: Selection, times: float = 1.0) -> dict[str, dict[str, Cost]]:
+def _handed(value: Any, array: Array) -> Any:
+    """An array as Dr.Jit has `value`: a sum, since NumPy's own memory has an alignment on which kernels depend."""
+    return type(value)(np.ascontiguousarray(array, dtype=np.float32)) + dr.opaque(mi.Float, 0)
+
+
+def make_regularizers(selection: Selection, times: float = 1.0) -> dict[str, dict[str, Cost | Plate]]:
     """What the values of `selection` cost by themselves, by key and type, their weights multiplied by `times`; empty
     where nothing does."""
-    found: dict[str, dict[str, Cost]] = {}
+    found: dict[str, dict[str, Cost | Plate]] = {}
     for key in selection.keys:
         for each in selection.spec(key).regularizers:
             each = each.model_copy(update={"weight": times * each.weight})
-            if isinstance(each, Laplacian) and selection.kind(key) == "mesh":
+            cost: Cost | Plate
+            if isinstance(each, Thickness) and each.opposite is not None:
+                name = f"{each.opposite}.{HEIGHTMAP}"
+                own, there = ((*selection.deformation.laid_over(k), selection.array(k).shape) for k in (key, name))
+                cost = make_plate(each, own, there, name)
+            elif isinstance(each, Laplacian) and selection.kind(key) == "mesh":
                 faces = np.array(selection.params[f"{key.rpartition('.')[0]}.faces"], dtype=np.int64)
                 cost = mesh_cost(each.weight, selection.array(key), faces)
             else:

@@ -11,6 +11,8 @@ taken between neighbours, and what they stand for is shared out so that the weig
      variation       texels, so that no chequerboard is overlooked
     laplacian        hxx + hyy in the inner texels; of a mesh L p / A by cotangents (Pinkall and Polthier 1993), A a
                      third of the area about a vertex, L and A those of the mesh as it begins
+    thickness        thickness + h; between two free faces thickness + h + B g, g the other map, bilinearly where the
+                     texels of h stand (`Plate`)
 """
 
 from __future__ import annotations
@@ -28,6 +30,9 @@ Array = np.ndarray[Any, Any]
 
 #: A value of a parameter, as an array: what it costs, and the derivative of that, of the array's shape.
 Cost = Callable[[Array], tuple[float, Array]]
+
+#: A map: positions (N, 3) and texture coordinates (N, 2) of the mesh that it is laid over, and its shape (H, W, ...).
+Map = tuple[Array, Array, tuple[int, ...]]
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,67 @@ def make_cost(regularizer: Regularizer, spans: Spans) -> Cost:
     else:
         raise TypeError(f"{regularizer.type} is no cost of a map")
     return _weighed(function, regularizer.weight)
+
+
+@dataclass(frozen=True)
+class Plate:
+    """The thickness between two free faces: maps h and g of heights outwards, g that of the parameter `other`.
+
+    `across` (texels of h, texels of g) has g where the texels of h stand, `back` h where those of g do.
+    """
+
+    settings: Thickness
+    spans: Spans
+    other: str
+    across: csr_matrix
+    back: csr_matrix
+
+    def cost(self, h: Array, g: Array) -> tuple[float, Array, Array]:
+        """What h and g cost, weight included, and the derivatives by both, of their shapes."""
+        value, slope = _hinge(-self.thickness(h, g), -self.settings.least)
+        area = self.settings.weight * _area(self.spans, h.shape, 0.5)
+        by_h = -area * slope
+        return float(np.sum(area * value)), by_h, (self.across.T @ by_h.ravel()).reshape(g.shape)
+
+    def thickness(self, h: Array, g: Array) -> Array:
+        """That of the plate at each texel of h."""
+        there = self.across @ np.asarray(g, np.float64).ravel()
+        return np.asarray(self.settings.thickness + h + there.reshape(h.shape))
+
+    def held(self, h: Array, g: Array) -> tuple[Array, Array]:
+        """h and g no lower than where the plate has `thinnest`, at the texels of both: they give way alike."""
+        least, thickness = self.settings.thinnest, self.settings.thickness
+        h = h + np.maximum(least - self.thickness(h, g), 0) / 2
+        between = thickness + g + (self.back @ h.ravel()).reshape(g.shape)
+        g = g + np.maximum(least - between, 0)
+        return h + np.maximum(least - self.thickness(h, g), 0), g
+
+
+def make_plate(settings: Thickness, own: Map, other: Map, key: str) -> Plate:
+    """The plate between two maps, of which `other` is the parameter `key`'s."""
+    return Plate(settings, spans_of(*own[:2]), key, _sampling(own, other), _sampling(other, own))
+
+
+def _sampling(own: Map, other: Map) -> csr_matrix:
+    """What makes of the texels of `other` (in a row) its heights, bilinearly, where the texels of `own` stand."""
+    (slopes, origin), (slopes_there, origin_there) = _laid(*own[:2]), _laid(*other[:2])
+    height, width = own[2][:2]
+    u, v = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
+    points = np.stack([u.ravel(), v.ravel()], axis=1) @ slopes + origin
+    uv = (points - origin_there) @ np.linalg.pinv(slopes_there)
+    rows, columns, weights = [], [], []
+    corners: list[list[tuple[Array, Array]]] = []
+    for axis, count in ((0, other[2][1]), (1, other[2][0])):
+        at = np.clip(uv[:, axis] * count - 0.5, 0, count - 1)
+        low = np.minimum(at.astype(np.int64), max(count - 2, 0))
+        corners.append([(low, 1 - (at - low)), (np.minimum(low + 1, count - 1), at - low)])
+    for x, by_x in corners[0]:
+        for y, by_y in corners[1]:
+            rows.append(np.arange(len(uv)))
+            columns.append(y * other[2][1] + x)
+            weights.append(by_x * by_y)
+    shape = height * width, other[2][0] * other[2][1]
+    return coo_matrix((np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=shape).tocsr()
 
 
 def _weighed(cost: Cost, weight: float) -> Cost:
@@ -250,8 +316,14 @@ def spans_of(positions: Array, texcoords: Array) -> Spans:
 
     Units are those of the plane map from texture coordinates to positions that fits best.
     """
-    matrix = np.column_stack([texcoords, np.ones(len(texcoords))]).astype(np.float64)
-    slopes = np.linalg.lstsq(matrix, positions.astype(np.float64), rcond=None)[0][:2]
+    slopes, _ = _laid(positions, texcoords)
     low, high = np.clip(texcoords.min(axis=0), 0, 1), np.clip(texcoords.max(axis=0), 0, 1)
     x, y = (Span(float(np.linalg.norm(slopes[k])), float(low[k]), float(high[k])) for k in range(2))
     return x, y
+
+
+def _laid(positions: Array, texcoords: Array) -> tuple[Array, Array]:
+    """The plane map from texture coordinates to positions that fits best: uv @ slopes (2, 3) + origin (3,)."""
+    matrix = np.column_stack([texcoords, np.ones(len(texcoords))]).astype(np.float64)
+    found = np.linalg.lstsq(matrix, positions.astype(np.float64), rcond=None)[0]
+    return found[:2], found[2]

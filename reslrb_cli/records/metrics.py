@@ -293,7 +293,8 @@ class RegularizedTally(_Tally):
 
     def __str__(self) -> str:
         """For the last line of a run; empty where nothing is regularized."""
-        told = [f"{name} of {key} {value:.3g}" for key, costs in self.costs.items() for name, value in costs.items()]
+        told = [f"{name} of {key} {value:.3g}" for key, costs in self.costs.items() for name, value in costs.items()
+                if value]  # fmt: skip
         if self.held_iterations:
             heights = sum(self.held.values())
             told.append(f"heights held at the least thickness in {self.held_iterations} iterations ({heights} at last)")

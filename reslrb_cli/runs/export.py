@@ -29,7 +29,7 @@ from reslrb_cli.lens.solid import (
     within,
 )
 from reslrb_cli.measure.references import DEEPEST, Situation, ptracer_image
-from reslrb_cli.measure.tolerance import Bench, figures, luminance
+from reslrb_cli.measure.tolerance import Bench, figures, luminance, where_light_goes
 from reslrb_cli.measure.tolerance import tolerances as measure
 from reslrb_cli.optimization.loading import check_integrator, choose_sensors, load_configured, paths_of
 from reslrb_cli.optimization.moving import moves_anything
@@ -84,12 +84,23 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
     if plan is not None:
         if tolerances:
             off = measure_tolerances(config, scene, selection.params, sheets, integrator, say)
-        beside = solid_files(plan, sheets, solid, off)
+        light = tell_light(config, plan, scene, scene.sensors()[sensors[0]])
+        beside = solid_files(plan, sheets, solid, light, off)
     with writing("--output", output):
         export_scene(described[0], selection.params, selection.scene_keys, integrator, output, run, beside)
     say(f"{output / 'scene.xml'}: {', '.join(selection.keys)}; rendered by {integrator['type']}{why}")
+    faces = [spec.heightmap.mesh[0] for spec in config.parameters if spec.heightmap is not None]
+    if plan is None and faces:
+        how = (
+            "fabrication.thickness=25" if faces == ["face"] else f"'fabrication={{thickness: 25, faces: [{faces[0]}]}}'"
+        )
+        say(f"no solid was made of `{faces[0]}`: --set {how} makes one of that thickness, where the scene is in mm")
     if plan is not None:
         tell_solid(output / f"{plan.kind}.stl", plan, sheets, solid, say)
+        if light:
+            inside, aside, beyond = (100 * light[name] for name in ("inside", "beside", "beyond"))
+            say(f"of the light that leaves it {inside:.4g} % goes into the picture, {aside:.2g} % beside it on the "
+                f"film, {beyond:.2g} % beyond")  # fmt: skip
         if f"{plan.kind}.3mf" not in beside:
             say(f"{plan.kind}.3mf is left out, since lib3mf is missing: pip install 'reslrb[fabrication]'")
     if off:
@@ -99,17 +110,21 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
 # --- what the run's own folder has of its solid -----------------------------------------------------------------------
 
 
-def keep_solid(config: Config, params: mi.SceneParameters, run: Path, image: Array, target: Array) -> None:
+def keep_solid(
+    config: Config, scene: mi.Scene, params: mi.SceneParameters, sensor: int, run: Path, image: Array, target: Array
+) -> None:
     """Write into the folder of a run what a maker wants to know of its solid (`fabrication.json`), and a picture of it.
 
-    `params` are those of the scene as it stands, `image` and `target` (H, W, C) what is thrown and what is wanted.
-    Raises ConfigError where there is no solid between the faces.
+    `params` are those of the scene as it stands, `image` and `target` (H, W, C) what the sensor of that number sees and
+    what is wanted. Raises ConfigError where there is no solid between the faces.
     """
     assert config.fabrication is not None
     sheets, solid = read_solid(config, config.fabrication, params)
     numbers, wanted = measured(solid, sheets, config.fabrication), luminance(target)
     thrown = luminance(image)
     numbers["thrown"] = figures(thrown, wanted)
+    if is_there(scene, config.fabrication):
+        numbers["light"] = where_light_goes(scene, scene.sensors()[sensor], config.fabrication, wanted)
     if config.fabrication.picture is not None:
         picture = luminance(read_image(config.fabrication.picture))
         if picture.shape == wanted.shape:
@@ -117,6 +132,11 @@ def keep_solid(config: Config, params: mi.SceneParameters, run: Path, image: Arr
             numbers["thrown"]["ssim_of_picture"] = figures(thrown, kept)["ssim"]
     write_image(run / "images" / SOLID_PICTURE, picture_of(solid))
     _write_numbers(run, numbers)
+
+
+def is_there(scene: mi.Scene, plan: Fabrication) -> bool:
+    """Whether the scene has what the light leaves, and what it falls on."""
+    return {plan.faces[0], plan.receiver} <= {shape.id() for shape in scene.shapes()}
 
 
 def keep_tolerances(config: Config, run: Path, off: dict[str, dict[str, Any]], say: Say) -> None:
@@ -174,7 +194,8 @@ def check_file(path: Path, config: Config) -> None:
     """Raise ConfigError where no solid can be written to the file `path`."""
     if config.fabrication is None:
         raise ConfigError("--output", "", f"{path}: name a folder; of a scene a solid is made where the configuration "
-                          "has a section `fabrication`, which `reslrb lens` writes")  # fmt: skip
+                          "has a section `fabrication`, which `reslrb lens` writes; or add "
+                          "--set fabrication.thickness=25")  # fmt: skip
     if os.path.lexists(path):
         raise ConfigError("--output", "", f"{path} exists; name a file that does not exist yet")
     if path.suffix.lower() == ".3mf" and not _writes_3mf():
@@ -203,6 +224,19 @@ def read_solid(config: Config, plan: Fabrication, params: mi.SceneParameters) ->
         raise ConfigError(config.source, error.key, error.message) from None
 
 
+def read_target(config: Config, sensor: mi.Sensor) -> Array:
+    """The luminance (H, W) that the film of a sensor is to see. Raises ConfigError."""
+    files = config.target.file
+    if files is None or len(files) != 1:
+        raise ConfigError("--tolerances", "", "what is thrown is compared with target.file, which has to be one image")
+    target = luminance(read_photo(files[0]).image)
+    width, height = (int(n) for n in sensor.film().crop_size())
+    if target.shape != (height, width):
+        raise ConfigError("--tolerances", "", f"target.file has {target.shape[1]}x{target.shape[0]} pixels, the film "
+                          f"{width}x{height}")  # fmt: skip
+    return target
+
+
 def measure_tolerances(
     config: Config,
     scene: mi.Scene,
@@ -216,14 +250,7 @@ def measure_tolerances(
 
     assert config.fabrication is not None
     sensor = choose_sensors(config, scene)[0]
-    files = config.target.file
-    if files is None or len(files) != 1:
-        raise ConfigError("--tolerances", "", "what is thrown is compared with target.file, which has to be one image")
-    target = luminance(read_photo(files[0]).image)
-    width, height = (int(n) for n in scene.sensors()[sensor].film().crop_size())
-    if target.shape != (height, width):
-        raise ConfigError("--tolerances", "", f"target.file has {target.shape[1]}x{target.shape[0]} pixels, the film "
-                          f"{width}x{height}")  # fmt: skip
+    target = read_target(config, scene.sensors()[sensor])
     try:
         bench = Bench(scene, params, config.fabrication, mi.load_dict(dict(integrator)), sensor)
     except ConfigError as error:
@@ -231,12 +258,27 @@ def measure_tolerances(
     return measure(bench, sheets, target, config.run.final_spp, say)
 
 
+def tell_light(config: Config, plan: Fabrication, scene: mi.Scene, sensor: mi.Sensor) -> dict[str, float]:
+    """Where the light of a finished face goes; empty where the scene or its target does not tell."""
+    if not is_there(scene, plan):
+        return {}
+    try:
+        target = read_target(config, sensor)
+    except ConfigError:
+        return {}
+    return where_light_goes(scene, sensor, plan, target)
+
+
 def solid_files(
-    plan: Fabrication, sheets: Sequence[Sheet], solid: Solid, off: dict[str, dict[str, Any]]
+    plan: Fabrication,
+    sheets: Sequence[Sheet],
+    solid: Solid,
+    light: dict[str, float],
+    off: dict[str, dict[str, Any]],
 ) -> dict[str, Callable[[Path], object]]:
     """Who writes what an exported folder holds of a solid, by the file's name; without 3MF where lib3mf is missing.
 
-    `off`: what was measured of tolerances.
+    `light`: where it goes, `off`: what was measured of tolerances.
     """
 
     files: dict[str, Callable[[Path], object]] = {}
@@ -260,6 +302,8 @@ def solid_files(
             "rows": "from the greatest y to the least; columns from the least x",
             "pitch": [float(np.diff(line).mean()) for line in (sheet.x, sheet.y)],
         }
+    if light:
+        numbers["light"] = light
     if off:
         numbers["tolerances"] = off
     files["fabrication.json"] = lambda path: path.write_text(json.dumps(numbers, indent=2) + "\n")

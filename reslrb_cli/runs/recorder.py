@@ -417,9 +417,11 @@ class Recording:
         shown = load_image(self.folder.images / f"{self._image_name('final', view.sensor)}.exr")
         if shown is not None:
             logger.info("making the solid")
+            problem = self.problem
             keep_solid(
-                self.problem.config, self.problem.selection.params, self.folder.path, shown, np.array(view.target)
-            )
+                problem.config, problem.scene, problem.selection.params, view.sensor, self.folder.path, shown,
+                np.array(view.target),
+            )  # fmt: skip
 
     def _write_final_images(self) -> None:
         self._write_images("final")

@@ -86,7 +86,9 @@ def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> 
     except Exception as error:
         if is_out_of_memory(error):
             raise
-        raise ConfigError(path, "", "is damaged or cut off, or of a kind that Mitsuba does not decode") from None
+        raise ConfigError(
+            path, "", "is damaged or cut off, or of a kind that Mitsuba does not decode, as CMYK; save it as RGB"
+        ) from None
     for line in complaints:
         if line.startswith(("Corrupt JPEG data", "Premature end")):
             raise ConfigError(path, "", f"is damaged or cut off ({line}); copy or save it again")

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.parameters import HEIGHTMAP, REGULARIZERS, WORDS, ParameterSpec, Settings
+from reslrb_cli.config.parameters import HEIGHTMAP, REGULARIZERS, WORDS, ParameterSpec, Settings, Thickness
 from reslrb_cli.scene.catalog import ParameterInfo, describe, list_parameters
 from reslrb_cli.scene.deformation import Deformation, Movable, find_movable
 from reslrb_cli.scene.load import warn_once
@@ -80,6 +80,21 @@ class Selection:
             if each.type in seen:
                 raise place.fail(at, f"{each.type} stands twice; give it once, with the sum of the weights")
             seen.add(each.type)
+            if isinstance(each, Thickness) and each.opposite is not None:
+                self._check_opposite(key, each.opposite, place, f"regularizers[{number}].opposite")
+
+    def _check_opposite(self, key: str, mesh: str, place: Place, at: str) -> None:
+        """Raise ConfigError where no heightmap of `mesh` looks away from that of `key`."""
+        name = f"{mesh}.{HEIGHTMAP}"
+        maps = [each for each in self.deformation.values if each.endswith(f".{HEIGHTMAP}") and each != key]
+        if name not in maps:
+            meshes = [f"`{each.rpartition('.')[0]}`" for each in maps]
+            hint = f"; {' or '.join(meshes)} would do" if meshes else ""
+            raise place.fail(at, f"`{mesh}` has no heightmap in `parameters` that lies opposite{hint}")
+        own, there = (self.deformation.displaced(each)[3].mean(axis=0) for each in (key, name))
+        if own @ there > -0.99 * np.linalg.norm(own) * np.linalg.norm(there):
+            raise place.fail(at, f"the outside of `{mesh}` does not look away from that of `{key.rpartition('.')[0]}`; "
+                             "thickness is that of a plate, whose faces are opposite")  # fmt: skip
 
     def value(self, key: str) -> Any:
         """The current value of `key`, as Dr.Jit has it."""
@@ -175,7 +190,7 @@ def select_parameters(scene: mi.Scene, specs: Sequence[ParameterSpec], source: o
         slot = selection.slot(key)
         value = initial_array(slot, settings.initial, settings.resolution, place)
         if settings.bounds is not None:
-            plate = any(each.type == "thickness" for each in settings.regularizers)
+            plate = any(isinstance(each, Thickness) and each.opposite is None for each in settings.regularizers)
             held = Place(place.source, place.key, lambda _: "regularizers") if plate else place
             check_bounds(slot, value, settings.bounds, held)
         check_transform(slot, value, settings, place)

@@ -262,21 +262,61 @@ def test_a_run_s_folder_holds_the_solid_that_its_scene_shows(run: Path, tmp_path
     assert map["pitch"] == pytest.approx([75 / 35, 100 / 47])
 
 
-def test_the_solid_throws_what_the_run_s_scene_shows(run: Path, tmp_path: Path) -> None:
+def read_back(path: Path) -> trimesh.Trimesh:
+    """The solid in a file, by a library that wrote none of it."""
+    if path.suffix == ".3mf":
+        pytest.importorskip("lib3mf")  # without it that file is left out
+        pytest.importorskip("lxml")
+    return trimesh.load(path, force="mesh")
+
+
+def write_mesh(read: trimesh.Trimesh, path: Path) -> None:
+    """Its vertices and triangles as Mitsuba writes them."""
+    made = mi.Mesh("solid", len(read.vertices), len(read.faces))
+    values = mi.traverse(made)
+    values["vertex_positions"] = np.asarray(read.vertices, np.float32).ravel()
+    values["faces"] = np.asarray(read.faces, np.uint32).ravel()
+    values.update()
+    made.write_ply(str(path))
+
+
+@pytest.mark.parametrize("kind", ["stl", "3mf"])
+def test_the_solid_that_is_read_back_throws_what_the_run_s_scene_shows(kind: str, run: Path, tmp_path: Path) -> None:
     said = done("export", run, "-o", tmp_path / "out").output
     assert "interpolated" not in said
+    read = read_back(tmp_path / f"out/lens.{kind}")
+    assert read.is_watertight
+    assert read.is_winding_consistent
+    told = json.loads((tmp_path / "out/fabrication.json").read_text())
+    heights = read_image(tmp_path / "out/heights.exr", "linear", signed=True)[:, :, 0].astype(np.float64)
+    middles = (heights[1:, 1:] + heights[:-1, 1:] + heights[1:, :-1] + heights[:-1, :-1]) / 4
+    assert read.volume == pytest.approx(75 * 100 * (25 + middles.mean()), rel=1e-3)
+    assert told["volume_mm3"] == pytest.approx(read.volume, rel=1e-5)
+
     text = (tmp_path / "out/scene.xml").read_text()
     shown = mi.load_file(str(tmp_path / "out/scene.xml"), optimize=False)
-    trimesh.load(tmp_path / "out/lens.stl").export(tmp_path / "out/read.obj", include_normals=False)
+    write_mesh(read, tmp_path / "out/made.ply")
     own, faces = re.subn(r'<shape type="\w+" id="(face|back)">.*?</shape>', "", text, flags=re.DOTALL)
     assert faces == 2
-    made = """<shape type="obj"><string name="filename" value="read.obj"/><boolean name="face_normals" value="true"/>
+    made = """<shape type="ply"><string name="filename" value="made.ply"/><boolean name="face_normals" value="true"/>
         <ref id="glass"/></shape></scene>"""
     (tmp_path / "out/made.xml").write_text(own.replace("</scene>", made))
-    images = [np.array(mi.render(scene, spp=64, seed=1)) for scene in (
-        shown, mi.load_file(str(tmp_path / "out/made.xml"), optimize=False))]  # fmt: skip
+    solid = mi.load_file(str(tmp_path / "out/made.xml"), optimize=False)
+    images = [np.array(mi.render(scene, spp=64, seed=1)) for scene in (shown, solid)]
     # The same light paths, but for rounding.
     assert np.abs(images[0] - images[1]).mean() < 1e-3 * images[0].mean()
+    target = np.array(mi.Bitmap(str(run.parents[1] / "lens/target.exr")))
+    losses = [float(np.mean((image - target) ** 2)) for image in images]
+    assert losses[1] == pytest.approx(losses[0], rel=0.02)
+    # Light goes in once and out once wherever it passes: nothing crosses.
+    x, y = (np.random.default_rng(3).uniform(-0.49, 0.49, (2, 4096)) * [[75], [100]]).astype(np.float32)
+    ray, count = mi.Ray3f(mi.Point3f(x, y, 99), mi.Vector3f(0, 0, -1)), 0
+    alone = mi.load_dict({"type": "scene", "it": {"type": "ply", "filename": str(tmp_path / "out/made.ply")}})
+    for _ in range(3):
+        si = alone.ray_intersect(ray)
+        count = count + np.array(si.is_valid()).astype(int)
+        ray = si.spawn_ray(ray.d)
+    assert np.all(count == 2)
 
 
 def test_interpolated_normals_are_warned_of(run: Path, tmp_path: Path) -> None:
@@ -332,6 +372,11 @@ def test_files_that_cannot_be_are_refused_in_one_line(
         assert isinstance(result.exception, ConfigError) or result.exit_code == ExitCode.USAGE
         assert line in f"{result.output}{result.exception}"
         assert sorted(path.name for path in tmp_path.iterdir()) == ["there.stl"]
+    # Without that section there is a scene, and how to have a solid.
+    said = done("export", run, "-o", tmp_path / "bare", "--set", "fabrication=null").output
+    assert "no solid was made of `face`: --set fabrication.thickness=25 makes one of that thickness" in said
+    done("export", run, "-o", tmp_path / "b.stl", "--set", "fabrication=null", "--set", "fabrication.thickness=25")
+    assert trimesh.load(tmp_path / "b.stl").is_watertight
     # A folder has what can be written, and the line says what is missing.
     said = done("export", run, "-o", tmp_path / "out").output
     assert "lens.3mf is left out, since lib3mf is missing" in said

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import mitsuba as mi
@@ -17,7 +18,14 @@ from skimage.metrics import structural_similarity
 from reslrb_cli.config.schema import Fabrication
 from reslrb_cli.lens.solid import as_sheet
 from reslrb_cli.measure import tolerance
-from reslrb_cli.measure.tolerance import Bench, closed_by_ball, figures, shift_between
+from reslrb_cli.measure.tolerance import (
+    Bench,
+    closed_by_ball,
+    figures,
+    luminance,
+    shift_between,
+    where_light_goes,
+)
 from reslrb_cli.records.images import write_file
 
 PTRACER = {"type": "ptracer", "max_depth": 4}
@@ -80,6 +88,59 @@ def in_file(folder: Path, id: str, before: str) -> mi.Scene:
     end = place.end() - len("</transform>")
     (folder / "out/moved.xml").write_text(text[:end] + before + text[end:])
     return mi.load_file(str(folder / "out/moved.xml"), optimize=False)
+
+
+def with_face(folder: Path, heights: Callable[[np.ndarray], np.ndarray]) -> Bench:
+    """The exported lens whose face is a function of x."""
+    made = bench(folder)
+    points = np.array(made.params["face.vertex_positions"]).reshape(-1, 3)
+    points[:, 2] = heights(points[:, 0])
+    made.params["face.vertex_positions"] = points.astype(np.float32).ravel()
+    made.params.update()
+    return made
+
+
+def light_of(made: Bench) -> dict[str, float]:
+    target = np.zeros((40, 40))
+    target[4:36, 4:36] = 1  # an eighth of 32 pixels is beside the picture
+    return where_light_goes(made.scene, made.scene.sensors()[0], made.plan, target)
+
+
+def test_light_is_told_apart_by_where_it_goes(folder: Path) -> None:
+    """A flat lens, of whose width one tenth or so sends its light aside: beside the picture, or off the film."""
+    assert light_of(with_face(folder, np.zeros_like)) == {"inside": 1, "beside": 0, "beyond": 0}
+    wide = 100 / 95  # of its 95 columns of triangles ten are a wedge
+    for aside, name, share in ((8.0, "beside", 8 / 100), (30.0, "beyond", 10 * wide / 100)):
+        slope = np.tan(np.arctan(aside / 200) / 0.49)
+
+        def wedge(x: np.ndarray, slope: float = slope) -> np.ndarray:
+            return np.maximum(x - (50 - 10 * wide), 0) * slope
+
+        found = light_of(with_face(folder, wedge))
+        assert sum(found.values()) == pytest.approx(1)
+        assert found[name] == pytest.approx(share, abs=3e-3)
+        assert sum(part for other, part in found.items() if other not in ("inside", name)) < 3e-3
+
+
+def test_shares_are_those_of_a_film_that_sees_all_of_the_receiver(folder: Path) -> None:
+    """Mitsuba's light tracer with as many reflections, a receiver so dark that none comes back from it."""
+    made = with_face(folder, lambda x: 0.3 * np.sin(x / 3))
+    made.params["screen.bsdf.reflectance.value"] = mi.Color3f(1e-3)
+    made.params.update()
+    found = light_of(made)
+    assert found["beside"] > 0.01
+    whole = mi.traverse(made.scene.sensors()[0])
+    half = 3 * 32 / 40 * np.tan(np.radians(float(np.ravel(whole["x_fov"])[0]) / 2))
+    film = {"type": "hdrfilm", "width": 96, "height": 96, "rfilter": {"type": "box"}}
+    camera = mi.load_dict({
+        "type": "perspective", "fov": float(np.degrees(2 * np.arctan(half))), "film": film, "near_clip": 1.0,
+        "to_world": mi.ScalarTransform4f(np.array(made.scene.sensors()[0].world_transform().matrix).reshape(4, 4)),
+    })  # fmt: skip
+    tracer = mi.load_dict({"type": "ptracer", "max_depth": 9})
+    image = luminance(np.array(mi.render(made.scene, sensor=camera, integrator=tracer, spp=1024)))
+    assert image[32:64, 32:64].sum() / image.sum() == pytest.approx(found["inside"], abs=2e-3)
+    film_share = image[28:68, 28:68].sum() / image.sum()
+    assert film_share == pytest.approx(found["inside"] + found["beside"], abs=2e-3)
 
 
 @pytest.mark.parametrize("name", ["lamp", "screen", "index"])
@@ -177,6 +238,8 @@ def test_the_command_tells_all_of_them(folder: Path) -> None:
         "lens turned by 1 degree about y", "cut by a ball of 40 mm",
     ]  # fmt: skip
     said = (folder / "said.txt").read_text()
+    light = json.loads((folder / "out/fabrication.json").read_text())["light"]
+    assert f"of the light that leaves it {100 * light['inside']:.4g} % goes into the picture" in said
     assert all(f"{name}: SSIM {entry['ssim']:.3f}, " in said for name, entry in told.items())
     # Light that is turned goes the distance times the angle aside: 200 mm, pixels of 100 / 32 mm.
     for axis in "xy":
@@ -208,9 +271,12 @@ def test_the_page_of_a_run_has_what_a_maker_wants_to_know(tmp_path: Path, llvm: 
     with_it = structural_similarity(divided[0], picture, data_range=picture.max())
     assert thrown["ssim_of_picture"] == pytest.approx(with_it, abs=1e-5)
     assert abs(thrown["ssim_of_picture"] - thrown["ssim"]) > 1e-3
+    assert sum(numbers["light"].values()) == pytest.approx(1)
+    assert numbers["light"]["inside"] == pytest.approx(thrown["inside"], abs=0.05)
     assert numbers["volume_mm3"] == pytest.approx(2.5e5, rel=0.5)
     page = (run / "report.html").read_text()
     assert "<h2>Fabrication</h2>" in page
+    assert f"{100 * numbers['light']['inside']:.4g} % of what leaves the face" in page
     assert "the solid of the lens" in page
     assert "where it is off" not in page
     result = done("export", run, "-o", tmp_path / "made", "--tolerances", *settings("run.final_spp=8"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -27,6 +28,7 @@ from optimization.toy import make_problem
 
 from reslrb_cli.optimization.uncertainty import measuring
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS, Certainty
+from reslrb_cli.statistics import rms
 
 # What is said of runs whose truth is known, half of them made to fail: verdicts are right, and none is too kind.
 
@@ -122,6 +124,39 @@ def test_verdicts_of_twenty_runs(folder, seed):
     assert not kind
     assert sum(right) >= 18, wrong
     assert np.sqrt(np.mean(np.square(ratios))) < 1.5  # a spread that is too small would be worse than none
+
+
+#: A texture that its regularizer holds far from what the images alone would have it be.
+HELD = Toy("a texture that is held even", {POSTER: f"{COLOR}, regularizers: [{{type: laplacian, weight: 1.0e-5}}]"},
+           {POSTER: SETTLED}, ("run.spp=256", "run.iterations=80",
+                               "optimizer={type: adam, learning_rate: 0.02, schedule: cosine}"))  # fmt: skip
+
+
+def test_what_regularizers_cost_is_in_gradients_and_curvature(folder, monkeypatch):
+    """The images alone would have it move; and it is surer than they would have it be."""
+    sampled, images, gradients = measuring.sample_gradient, [], []
+
+    def of_images(problem, *rest):
+        sampled(problem, *rest)
+        images.append(np.array(problem.optimizer.gradient(POSTER), dtype=np.float64).ravel())
+
+    weigh = measuring.weigh
+    monkeypatch.setattr(measuring, "sample_gradient", of_images)
+    monkeypatch.setattr(
+        measuring,
+        "weigh",
+        lambda measured, *rest: (gradients.append(measured[POSTER].gradients), weigh(measured, *rest))[1],
+    )
+    held = run(folder, HELD)
+    assert verdicts(HELD, held) == HELD.right
+    assert np.abs(held.errors[POSTER]).max() > 0.1
+    seen = np.mean(images, axis=0)
+    added = gradients[0].mean(axis=0) - seen
+    assert rms(added) > 0
+    assert added @ seen < -0.7 * np.linalg.norm(added) * np.linalg.norm(seen)  # they pull against each other
+    loose = run(folder, replace(HELD, parameters={POSTER: COLOR}))
+    spreads = [np.median(each.certainty.parameters[POSTER].spread) for each in (held, loose)]
+    assert spreads[0] < 0.7 * spreads[1]
 
 
 #: Parameters, and the target's samples per pixel, whose noise is most of what is wrong with them.

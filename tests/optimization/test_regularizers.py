@@ -18,7 +18,7 @@ from reslrb_cli.config.parameters import (
     TotalVariation,
 )
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.optimization.regularizers import Span, make_cost, mesh_cost, spans_of
+from reslrb_cli.optimization.regularizers import Span, make_cost, make_plate, mesh_cost, spans_of
 
 ALL = {
     "curvature": Curvature(radius=50, weight=2),
@@ -244,3 +244,124 @@ def test_what_has_no_meaning_is_refused_in_one_line(case, tmp_path):
         regularized(tmp_path, listed, head)
     assert expected in str(error.value)
     assert "\n" not in str(error.value)
+
+
+# --- two free faces ---------------------------------------------------------------------------------------------------
+
+
+def facing(high=9, wide=11, there=(6, 7), **settings):
+    """The plate between a map over a face, and one over a back whose columns run the other way."""
+    own = sheet(24)[0], sheet(24)[2], (high, wide, 1)
+    below = sheet(24)[0] * [1, 1, 0] - [0, 0, 0.5]
+    other = below, sheet(24)[2] * [-1, 1] + [1, 0], (*there, 1)
+    return make_plate(Thickness(thickness=0.5, least=0.4, opposite="back", **settings), own, other, "back.heightmap")
+
+
+def test_a_plate_of_two_free_faces_has_the_thickness_between_them():
+    plate = facing(32, 48, (24, 40))
+    (y, x), (v, u) = (np.mgrid[:n, :m] for n, m in ((32, 48), (24, 40)))
+
+    def height(x, y):
+        return 0.1 * np.sin(x) + 0.05 * y
+
+    # uv at texels' centres is where the mesh's vertices are, half a texel of the mesh within its edges
+    own, there = (
+        height(*(((np.stack([a, b]) + 0.5) / [[[n]], [[m]]] - 0.5) * 24 / 23 + 0.5) * [[[WIDE]], [[HIGH]]])
+        for a, b, n, m in ((x, y, 48, 32), (39 - u, v, 40, 24))
+    )
+    found = plate.thickness(np.zeros((32, 48, 1)), there[:, :, None])[:, :, 0]
+    assert found[1:-1, 1:-1] == pytest.approx(0.5 + own[1:-1, 1:-1], abs=2e-3)
+    assert plate.thickness(own[:, :, None], 0 * there[:, :, None])[:, :, 0] == pytest.approx(0.5 + own)
+
+
+def test_both_derivatives_of_a_plate_are_those_of_finite_differences():
+    rng = np.random.default_rng(3)
+    plate = facing(weight=3.0)
+    h, g = rng.normal(0, 0.2, (9, 11, 1)), rng.normal(0, 0.2, (6, 7, 1))
+    value, by_h, by_g = plate.cost(h, g)
+    assert value > 0
+    for _ in range(3):
+        a, b = rng.normal(size=h.shape), rng.normal(size=g.shape)
+        for own, there in ((a, 0 * b), (0 * a, b), (a, b)):
+            slope = (plate.cost(h + 1e-6 * own, g + 1e-6 * there)[0]
+                     - plate.cost(h - 1e-6 * own, g - 1e-6 * there)[0]) / 2e-6  # fmt: skip
+            assert np.sum(by_h * own) + np.sum(by_g * there) == pytest.approx(slope, rel=1e-5)
+    # over a flat face on the other side it is what it was
+    flat = make_cost(Thickness(thickness=0.5, least=0.4, weight=3.0), plate.spans)(h)
+    assert plate.cost(h, 0 * g)[0] == pytest.approx(flat[0])
+    assert plate.cost(h, 0 * g)[1] == pytest.approx(flat[1])
+
+
+def test_free_faces_give_way_alike_and_are_held_apart_at_the_texels_of_both():
+    plate, rng = facing(), np.random.default_rng(5)
+    h, g = rng.normal(-0.1, 0.3, (9, 11, 1)), rng.normal(-0.1, 0.3, (6, 7, 1))
+    assert plate.thickness(h, g).min() < 0
+    held, there = plate.held(h, g)
+    assert plate.thickness(held, there).min() >= 0.04 - 1e-12
+    assert (0.5 + there + (plate.back @ held.ravel()).reshape(g.shape)).min() >= 0.04 - 1e-12
+    assert (held - h).min() >= 0
+    assert (there - g).min() >= 0
+    assert min((held - h).max(), (there - g).max()) > 0.1
+    assert held[5, 5] == h[5, 5] or plate.thickness(h, g)[5, 5] < 0.04
+
+
+def lens_with_two_faces(tmp_path, sets=()):
+    from cli.tiny import done
+
+    from reslrb_cli.config.loader import load
+    from reslrb_cli.optimization.assemble import assemble
+    from reslrb_cli.records.images import write_file
+
+    tmp_path.mkdir(exist_ok=True)
+    tones = np.kron(0.5 + 0.5 * np.random.default_rng(1).uniform(size=(4, 4)), np.ones((4, 4)))
+    write_file(tmp_path / "p.exr", np.repeat(tones[:, :, None], 3, 2).astype(np.float32), linear=True)
+    done("lens", tmp_path / "p.exr", "--pixels", 16, "--both", "-o", tmp_path / "l")
+    return assemble(load(tmp_path / "l/lens.yaml", ["run.measuring=1000", *sets]), to_run=True)
+
+
+def test_a_step_that_would_have_both_faces_of_a_lens_cross_is_held_back(llvm, tmp_path):
+    import drjit as dr
+
+    from reslrb_cli.optimization import loop
+    from reslrb_cli.optimization.state import standing
+
+    flat = "parameters[0].initial=scene"
+    problem = lens_with_two_faces(tmp_path, [flat, "optimizer={type: sgd, learning_rate: 1}", "run.spp=4"])
+    [plate] = problem.plates.values()
+    keys = ("face.heightmap", "back.heightmap")
+    pushed = np.zeros((48, 48, 1), np.float32)
+    pushed[20:30, 12:24] = 1.0
+
+    def crossing(self):
+        for key in keys:
+            value = self.optimizer[key]
+            dr.accum_grad(value, type(value)(1e7 * pushed) + dr.opaque(dr.leaf_t(value), 0))
+        return {}
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(problem), "regularize", crossing)
+        _, record = loop.step(problem, standing(problem))
+    face, back = (problem.selection.array(key).astype(np.float64) for key in keys)
+    thin = plate.thickness(face, back)
+    least = plate.settings.thinnest
+    assert thin.min() == pytest.approx(least, rel=1e-2)
+    assert np.min(face) < -1  # both went
+    assert np.min(back) < -1
+    meshes = [np.array(problem.selection.params[f"{name}.vertex_positions"]) for name in ("face", "back")]
+    assert np.min(meshes[0][2::3] - meshes[1][2::3]) > 0.9 * least
+    assert record.regularized.held["face.heightmap"] > 50
+    # and the next step begins at what was held
+    assert np.array(problem.optimizer["face.heightmap"]).ravel() == pytest.approx(face.ravel(), abs=1e-6)
+
+
+def test_faces_that_begin_crossed_or_have_no_opposite_are_refused(llvm, tmp_path):
+    for number, (setting, line) in enumerate((
+        ("parameters[1].initial=-24.9", "parameters[0].regularizers: `face.heightmap` and `back.heightmap` begin"),
+        ("parameters[0].regularizers[0].opposite=lid",
+         "regularizers[0].opposite: `lid` has no heightmap in `parameters` that lies opposite; `back` would do"),
+        ("parameters[0].regularizers[0].opposite=face", "`face` has no heightmap in `parameters` that lies opposite"),
+    )):  # fmt: skip
+        with pytest.raises(ConfigError) as error:
+            lens_with_two_faces(tmp_path / str(number), [setting])
+        assert line in str(error.value)
+        assert "\n" not in str(error.value)

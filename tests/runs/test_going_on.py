@@ -118,6 +118,13 @@ FEW = ("scale auto, sigmoid, rmsprop", "held out", "shards", "stages", "plateau"
 KILLED: dict[str, tuple[int, int]] = {"certainty": (23, 20), "held out, plateau, average": (63, 60)}
 
 
+#: Each a fifth of the run.
+FIVE_STAGES = (
+    "run.stages=[{until: 0.2, resolution: 0.25, film: 0.25, spp: 16}, {until: 0.4, resolution: 0.5, film: 0.5},"
+    " {until: 0.6, resolution: 0.5, spp: 8}, {until: 0.8, learning_rate: 0.5}]"
+)
+
+
 @pytest.fixture
 def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     begin_alone(tmp_path, monkeypatch)
@@ -148,11 +155,7 @@ def test_killed_in_each_of_five_stages_it_ends_as_if_nothing_had_been(
     experiment: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In the midst of a stage, and at the moment at which the next one begins; from each state a life goes on."""
-    stages = (
-        "[{until: 0.2, resolution: 0.25, film: 0.25, spp: 16}, {until: 0.4, resolution: 0.5, film: 0.5},"
-        " {until: 0.6, resolution: 0.5, spp: 8}, {until: 0.8, learning_rate: 0.5}]"
-    )
-    settings = ["run.checkpoint_every={iterations: 1}", "run.certainty=false", f"run.stages={stages}"]
+    settings = ["run.checkpoint_every={iterations: 1}", "run.certainty=false", FIVE_STAGES]
     sets = [word for setting in settings for word in ("--set", setting)]
     whole, left = run_and_kill(monkeypatch, 2, *ITERATIONS[:2], *sets)
     show = progress.Progress.show
@@ -362,6 +365,36 @@ def test_a_run_that_is_killed_again_and_again_ends_where_the_other_does(
     assert differences(tmp_path / "runs/whole", run) == []
     assert [record["iteration"] for record in records_of(run)] == list(range(iterations))
     assert read_manifest(run)["status"] == "finished"  # type: ignore[index]
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="sends SIGKILL")
+@pytest.mark.long
+def test_a_run_that_is_killed_in_each_of_its_five_stages_ends_where_the_other_does(tmp_path: Path) -> None:
+    tiny.write_experiment(tmp_path)
+    of_each, chance = 80, random.Random(7)
+    sets = [*SETS, "--set", f"run.iterations={5 * of_each}", "--set", FIVE_STAGES]
+    assert end(start(tmp_path, "tiny.yaml", *sets, "--set", "run.name=whole")) == (0, "")
+    run, killed = tmp_path / "runs/tiny", []
+    process = start(tmp_path, "tiny.yaml", *sets)
+    for stage in range(5):
+        until = of_each * stage + chance.randrange(5, of_each // 2)
+        while count(run) < until and process.poll() is None:
+            time.sleep(0.001)
+        process.kill()
+        process.communicate()
+        assert process.returncode == -signal.SIGKILL
+        archive, values = open_state(run / "checkpoint" / STATE_FILE)
+        archive.close()
+        killed.append(values["stage"])
+        process = start(tmp_path, "--resume", str(run), "--quiet")
+    assert end(process) == (0, "")
+    assert killed == [0, 1, 2, 3, 4]
+    assert differences(tmp_path / "runs/whole", run) == []
+    assert left_over(run) == []
+    manifest = read_manifest(run)
+    assert manifest is not None
+    assert (manifest["status"], len(manifest["resumed"])) == ("finished", 5)
 
 
 SIZES = [8, 16, 32, 48, 64, 80, 96, 112, 128, 144, 160, 192, 256, 384, 512, 1024]

@@ -226,7 +226,7 @@ LIGHTS_CASES = [
           residual=True),
     ExtremeCase("white_box_100", "a white box with an obstacle, 100 bounces: more than have a bit for visibility",
                 white_box, ("box.bsdf.reflectance.value", "cube.bsdf.reflectance.value"), Stock("ptracer"),
-                image="ptracer", options={"max_depth": 100, "hide_emitters": True}, residual=True),
+                image="path", options={"max_depth": 100, "hide_emitters": True}, residual=True),
     exact("furnace_black", "a furnace of albedo 0, whose derivative is its first bounce",
           lambda: furnace_scene((0, 0, 0), (1, 2, 0.5), 8, 8), FURNACE, 8),
 ]  # fmt: skip

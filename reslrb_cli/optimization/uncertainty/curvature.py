@@ -14,6 +14,8 @@ Of the first kind a standard error is taken off, by the terms of its sum over th
 results look too sure. The second kind is noise for the most part at each entry alone. Entries whose gradients have
 alike noise have alike curvature, so it is averaged over those: `smooth`.
 
+What regularizers cost has a curvature of its own, without noise: differences of its gradient are added to both kinds.
+
 Noise of a rendered target is in all gradients alike: b = J^T d, d what it makes of dL/dI. It is sampled by images of
 the target's own integrator (`_noises`). `d_even` is its mean, which pulls all pixels the same way (a relative loss
 weighs what noise darkens), `d_odd` the rest, taken in blocks of pixels, which the film's filter may have mixed. Then
@@ -218,11 +220,20 @@ class Curvature:
         a, b = (np.nan_to_num(np.array(rows)) for rows in columns)
         a = a * self._in_a_row(self._weights)
         sure = _sure_share(a * b)
-        H = _symmetric(a @ b.T * self._thinned * np.sqrt(np.outer(sure, sure)))
+        H = _symmetric(a @ b.T * self._thinned * np.sqrt(np.outer(sure, sure))) + self._of_regularizers(directions)
         if not self.noises:
             return directions, H, np.zeros_like(H)
         a, b = (np.nan_to_num(np.array(rows)) for rows in odd)
         return directions, H, _symmetric(a @ b.T / len(self.noises)) + np.outer(even, even)
+
+    def _of_regularizers(self, directions: Sequence[Direction]) -> Array:
+        """What regularizers add to H along directions (M, M); of different parameters nothing."""
+        bent = [self.problem.stiffness(direction.key, direction.vector) for direction in directions]
+        return _symmetric(np.array([
+            [one.vector @ change if one.key == other.key else 0.0
+             for other, change in zip(directions, bent, strict=True)]
+            for one in directions
+        ]))  # fmt: skip
 
     def by_entry(self, probes: int, go_on: Callable[[], bool]) -> dict[str, Array]:
         """For each parameter the diagonal of H in a row, unsmoothed; nothing where `go_on` said no at once."""
@@ -233,6 +244,9 @@ class Curvature:
                 break
             roots = [np.sqrt(weight) * random.choice([-1.0, 1.0], size=weight.shape) for weight in self._weights]
             self._add_probe(total, roots, 2 * probe)
+            for key in total:
+                signs = random.choice([-1.0, 1.0], size=total[key].shape)
+                total[key] = total[key] + signs * self.problem.stiffness(key, signs)
         return {key: value / self.probes for key, value in total.items()}
 
     def by_entry_of_target(self, first: int, go_on: Callable[[], bool]) -> dict[str, Array]:

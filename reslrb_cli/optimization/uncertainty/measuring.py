@@ -98,6 +98,7 @@ class Certainty:
                     return None
                 with clock.step() as times:
                     sample_gradient(problem, problem.integrator, number, _PURPOSE, config.run.spp)
+                    problem.regularize()
                     for key, row in take_gradient(problem).items():
                         rows[key].append(row.astype(np.float64))
                 compiled_ms += times.codegen_ms
