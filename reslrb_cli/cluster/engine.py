@@ -39,7 +39,7 @@ from reslrb_cli.optimization.views import set_targets, target_arrays
 from reslrb_cli.records.checkpoint import STATE_FILE, open_state, write_archive
 from reslrb_cli.records.manifest import versions
 from reslrb_cli.records.tree import Stored, like, to_array
-from reslrb_cli.runs.prepare import Course
+from reslrb_cli.runs.prepare import Course, digests
 
 logger = logging.getLogger(__name__)
 
@@ -73,12 +73,13 @@ SETTINGS = {
 @dataclass(frozen=True)
 class Experiment:
     """What a run's workers assemble it from: the files in `folder`, by their `digest`; the `versions` that the run has,
-    and the threads of a worker."""
+    the threads of a worker, and whether it may run code of the user's own, as the run may."""
 
     folder: str
     digest: str
     versions: dict[str, str]
     threads: int
+    allow_code: bool
 
 
 @dataclass(frozen=True)
@@ -167,7 +168,12 @@ def _assembled(experiment: Experiment) -> Problem:
         stored = Stored(archive, values)
         settled = stored.read(Settled)
         set_variant(settled.variant)
-        problem = assemble_scene(loads(settled.config, folder / "config.yaml"))
+        config = loads(settled.config, folder / "config.yaml").with_code(experiment.allow_code)
+        here = digests(config)
+        for key in config.codes:
+            if here.get(key) != settled.files.get(key):
+                raise ConfigError(config.source, key, "has changed since the run began; put it back, or begin anew")
+        problem = assemble_scene(config)
         begin_as(problem, stored)
         problem = decide_as(problem, stored, find_options(problem))
         set_targets(problem.views, dict(targets))
@@ -191,7 +197,7 @@ def write_experiment(course: Course, folder: Path, threads: int) -> Experiment:
     """Put what workers need of a run into `folder`. Raises OSError."""
     course.save(folder)
     write_archive(folder / TARGETS_FILE, target_arrays(course.problem.views))
-    return Experiment(str(folder), files_digest(folder), versions(), threads)
+    return Experiment(str(folder), files_digest(folder), versions(), threads, course.problem.config.allows_code)
 
 
 class Engine:
