@@ -32,7 +32,7 @@ from reslrb_cli.records.measurement_files import Line
 from reslrb_cli.records.measurements import GradcheckRecord
 from reslrb_cli.records.run_folder import recovered
 
-Array: TypeAlias = "np.ndarray[Any, Any]"
+Array: TypeAlias = "np.ndarray[Any, np.dtype[np.float32]]"
 #: Whatever describes an experiment: a configuration's file, a run's folder, what YAML would have been, or a `Config`.
 Experiment: TypeAlias = "Config | str | os.PathLike[str] | Mapping[str, Any]"
 
