@@ -276,7 +276,8 @@ def optimize(
 
     `loss` is a function of your own in place of the experiment's: `loss(image, target)` of two `mi.TensorXf` (height,
     width, channels), the image attached, or `loss(image, target, weights)`; it returns a `mi.Float` of width 1, or a
-    tensor of one entry. A `resume` asks for it again. `allow_code` has the files of code run that the experiment names (`loss.file`).
+    tensor of one entry. A `resume` asks for it again. `allow_code` has the files of code run that the experiment names
+    (`loss.file`, `integrator.file`).
 
     Sets the Mitsuba variant of the experiment where none is set. Loads and checks all that the experiment names, makes
     the target, and measures what is left to measurement, before it returns. Raises ConfigError, located by file and
@@ -306,6 +307,9 @@ def optimize(
 def _with_own(config: Config, loss: Loss | None, allow_code: bool) -> Config:
     """The same experiment with a loss of the caller's, and with code that it names allowed, or not."""
     config = config.with_code(allow_code)
+    if loss is not None and not callable(loss):
+        reason = "is no function; a file's is named by the setting `loss: {type: custom, file: FILE.py:NAME}`"
+        raise ConfigError("loss", "", reason)
     return config if loss is None else config.with_loss(loss)
 
 
