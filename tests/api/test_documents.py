@@ -8,7 +8,6 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 from cli.tiny import ROOT
@@ -79,23 +78,7 @@ def test_what_the_page_links_to_is_there() -> None:
         assert (DOCS / name).exists(), name
 
 
-# --- notebooks --------------------------------------------------------------------------------------------------------
-
-
-def execute(path: Path, folder: Path) -> Any:
-    """The notebook, executed in `folder`."""
-    nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
-    notebook = nbformat.read(path, as_version=4)
-    client = nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(folder)}})
-    client.execute(env=environment(folder))
-    return notebook
-
-
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs(path: Path, checkout: Path) -> None:
-    notebook = execute(path, checkout)
-    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
-    assert any("image/png" in output.get("data", {}) for output in outputs)
+# --- notebooks: tests/test_wheel.py runs them -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -106,32 +89,6 @@ def test_a_notebook_is_valid_and_has_no_outputs(path: Path) -> None:
     assert content["nbformat"] == 4
     assert not any(cell.get("outputs") or cell.get("execution_count") for cell in content["cells"])
     assert path.read_text(encoding="utf-8").endswith("}\n")
-
-
-#: Cells of a notebook whose stop button is pressed in the midst of the first loop.
-CELLS = [
-    'import reslrb_cli as rl\nconfig = rl.load("configs/cornell_floor.yaml", {"run.iterations": 100000, '
-    '"scene.options": {"resx": 16, "resy": 16}, "run.final_spp": 16, "run.measuring": 0})\n'
-    'run = rl.optimize(config, folder="runs/stopped")',
-    "import threading, os, signal\nfor record in run.live():\n    if record.iteration == 3:\n"
-    "        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()",
-    'print(run.status, run.iteration > 3, sorted(run.parameters), (run.folder / "report.html").exists())\n'
-    "again = iter(run)\nprint(next(again).iteration == run.iteration - 1)\nagain.close()",
-]
-
-
-def test_a_notebooks_stop_button_keeps_the_result(checkout: Path) -> None:
-    nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
-    cells = [nbformat.v4.new_code_cell(source) for source in CELLS]
-    cells[1].metadata["tags"] = ["raises-exception"]
-    notebook = nbformat.v4.new_notebook(cells=cells)
-    client = nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(checkout)}})
-    client.execute(env=environment(checkout))
-    [error] = [output for output in cells[1].outputs if output.output_type == "error"]
-    assert error.ename == "KeyboardInterrupt"
-    assert any("image/png" in output.get("data", {}) for output in cells[1].outputs)
-    text = "".join(output.text for output in cells[2].outputs if output.get("name") == "stdout")
-    assert text == "interrupted True ['floor.reflectance.data'] True\nTrue\n"
 
 
 @pytest.mark.long
