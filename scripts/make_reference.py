@@ -241,8 +241,9 @@ _PYTHON = f"""\
 {_MARK}
 <!-- From here on written by `python scripts/make_reference.py` from docstrings; edit these. -->
 
-`Experiment` is what `load` takes, `Folder` a path as text or a `Path`, `Array` a NumPy array. `GradcheckRecord` and
-`Line` are records: attributes of the names that a line of `--json` has, and `to_json()`, which is that line.
+`Experiment` is what `load` takes, `Folder` a path as text or a `Path`, `Array` a NumPy array of float32, `Loss` a
+function as `optimize` says, `Objective` one of an image. `GradcheckRecord` and `Line` are records: attributes of the
+names that a line of `--json` has, and `to_json()`, which is that line.
 """
 
 

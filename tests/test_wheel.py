@@ -1,7 +1,9 @@
-"""What a wheel has in it, and that it works where nothing of this repository is: an example is copied, and run."""
+"""What a wheel has in it, and that it works where nothing of this repository is: an example is copied, and run, and so
+are the notebooks."""
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -9,6 +11,7 @@ import sys
 import sysconfig
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 import setuptools
@@ -58,6 +61,12 @@ def installed(wheel: Path, folder: Path) -> Path:
     # as this environment would, but for what leads to the repository: `.pth` files in such a folder are not read
     (site / "needed.pth").write_text(f"{needed}\n")
     return folder / "bin/python"
+
+
+@pytest.fixture(scope="module")
+def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """That Python."""
+    return installed(wheel, tmp_path_factory.mktemp("installed") / "environment")
 
 
 def test_the_wheel_has_all_that_is_no_module(wheel: Path) -> None:
@@ -120,13 +129,12 @@ def test_what_is_there_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wo
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_an_example_runs_from_another_folder(wheel: Path, tmp_path: Path, llvm: str) -> None:
+def test_an_example_runs_from_another_folder(python: Path, tmp_path: Path, llvm: str) -> None:
     """Also its page, whose templates lie in the package, and a second command by `reslrb` itself."""
-    python = installed(wheel, tmp_path / "environment")
     program, elsewhere = python.with_name("reslrb"), tmp_path / "elsewhere"
     elsewhere.mkdir()
     # the script that pip puts beside the packages, where `--target` has it
-    (script,) = (tmp_path / "environment").rglob("bin/reslrb")
+    (script,) = python.parents[1].rglob("site-packages/bin/reslrb")
     if script != program:
         program.write_text(f"#!{python}\n" + script.read_text().partition("\n")[2])
         program.chmod(0o755)
@@ -140,10 +148,72 @@ def test_an_example_runs_from_another_folder(wheel: Path, tmp_path: Path, llvm: 
 
     where = subprocess.run([python, "-c", "import reslrb_cli; print(reslrb_cli.__file__)"], cwd=elsewhere,
                            env=environment, capture_output=True, text=True, check=True).stdout  # fmt: skip
-    assert Path(where.strip()).is_relative_to(tmp_path / "environment")
+    assert Path(where.strip()).is_relative_to(python.parents[1])
     assert "furnace/furnace.yaml" in call("example", "furnace")
     settings = ("scene.size=[8, 8]", "run.iterations=2", "run.spp=4", "run.measuring=0", "run.final_spp=4",
                 "target.render.spp=16", "integrator.estimator=stack")  # fmt: skip
     said = call("optimize", "furnace/furnace.yaml", *(word for each in settings for word in ("--set", each)))
     assert "finished after 2 iterations" in said
     assert "</html>" in (elsewhere / "runs/furnace/report.html").read_text()
+
+
+# --- notebooks --------------------------------------------------------------------------------------------------------
+
+NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
+
+#: Cells of a notebook whose stop button is pressed in the midst of the first loop.
+STOPPED = [
+    'import reslrb_cli as rl\nconfig = rl.load("configs/cornell_floor.yaml", {"run.iterations": 100000, '
+    '"scene.options": {"resx": 16, "resy": 16}, "run.final_spp": 16, "run.measuring": 0})\n'
+    'run = rl.optimize(config, folder="runs/stopped")',
+    "import threading, os, signal\nfor record in run.live():\n    if record.iteration == 3:\n"
+    "        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()",
+    'print(run.status, run.iteration > 3, sorted(run.parameters), (run.folder / "report.html").exists())\n'
+    "again = iter(run)\nprint(next(again).iteration == run.iteration - 1)\nagain.close()",
+]
+
+
+def execute(notebook: Any, python: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Execute a notebook in a kernel of `python`, in `folder`, with an example where the repository has it."""
+    nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
+    kernel = folder / "jupyter/kernels/wheel/kernel.json"
+    kernel.parent.mkdir(parents=True)
+    words = [str(python), "-m", "ipykernel_launcher", "-f", "{connection_file}"]
+    kernel.write_text(json.dumps({"argv": words, "display_name": "wheel", "language": "python"}))
+    monkeypatch.setenv("JUPYTER_PATH", str(folder / "jupyter"))
+    environment = {**os.environ, "PYTHONPATH": search_path(), "RESLRB_CACHE": str(folder / "cache")}
+    words = [str(python), "-m", "reslrb_cli", "example", "cornell_floor", "-o", "configs"]
+    subprocess.run(words, cwd=folder, env=environment, check=True, capture_output=True)
+    where = "import reslrb_cli\nprint(reslrb_cli.__file__)"
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(where))
+    resources = {"metadata": {"path": str(folder)}}
+    client = nbclient.NotebookClient(notebook, timeout=300, kernel_name="wheel", resources=resources)
+    client.execute(env=environment)
+    first = notebook.cells.pop(0)
+    assert Path(first.outputs[0].text.strip()).is_relative_to(python.parents[1])
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_runs(
+    path: Path, python: Path, tmp_path: Path, llvm: str, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    nbformat = pytest.importorskip("nbformat")
+    notebook = nbformat.read(path, as_version=4)
+    execute(notebook, python, tmp_path, monkeypatch)
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    assert any(output.get("text", "").startswith("finished ") for output in outputs)
+
+
+def test_a_notebooks_stop_button_keeps_the_result(
+    python: Path, tmp_path: Path, llvm: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nbformat = pytest.importorskip("nbformat")
+    cells = [nbformat.v4.new_code_cell(source) for source in STOPPED]
+    cells[1].metadata["tags"] = ["raises-exception"]
+    execute(nbformat.v4.new_notebook(cells=cells), python, tmp_path, monkeypatch)
+    [error] = [output for output in cells[1].outputs if output.output_type == "error"]
+    assert error.ename == "KeyboardInterrupt"
+    assert any("image/png" in output.get("data", {}) for output in cells[1].outputs)
+    text = "".join(output.text for output in cells[2].outputs if output.get("name") == "stdout")
+    assert text == "interrupted True ['floor.reflectance.data'] True\nTrue\n"

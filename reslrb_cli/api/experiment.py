@@ -32,7 +32,7 @@ from reslrb_cli.records.measurement_files import Line
 from reslrb_cli.records.measurements import GradcheckRecord
 from reslrb_cli.records.run_folder import recovered
 
-Array: TypeAlias = "np.ndarray[Any, Any]"
+Array: TypeAlias = "np.ndarray[Any, np.dtype[np.float32]]"
 #: Whatever describes an experiment: a configuration's file, a run's folder, what YAML would have been, or a `Config`.
 Experiment: TypeAlias = "Config | str | os.PathLike[str] | Mapping[str, Any]"
 
@@ -199,6 +199,7 @@ def gradcheck(
     whole, `seeds` their number whatever time they take, at least 3, `spp` the samples per pixel of one gradient.
     `record.holds` is False where a comparison fails. `integrators` are Mitsuba integrators of your own,
     `FILE.py:CLASS[(OPTION=VALUE,...)]`, in place of ours; `allow_code` has their files run (docs/your_integrator.md).
+    How noisy and dear they are, and where to look in one that is wrong, is logged (`logging.INFO`).
 
     Sets the Mitsuba variant of the experiment where none is set. Raises ConfigError, UnsupportedScene.
     """
@@ -214,7 +215,14 @@ def gradcheck(
 
         gc.collect()  # scenes that are done with would take part, and their parameters' gradients be in the way
         checked = settings_of(config, estimators, budget, seeds, spp, time.monotonic() - began, integrators)
-        return [result.record for result in Gradcheck(checked).run(lambda: False, logger.info)]
+        check = Gradcheck(checked)
+        records = [result.record for result in check.run(lambda: False, logger.info)]
+        if integrators is not None:
+            from reslrb_cli.measure.own import look_into
+
+            for line in look_into(check, records, lambda: False, logger.debug):
+                logger.info(line)
+        return records
 
 
 def convergence(

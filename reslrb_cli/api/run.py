@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from inspect import GEN_CLOSED, getgeneratorstate
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -29,8 +29,16 @@ from reslrb_cli.runs.prepare import Begun, begin
 from reslrb_cli.runs.recorder import Recording
 from reslrb_cli.runs.resume import open_earlier
 
-Array: TypeAlias = "np.ndarray[Any, Any]"
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+Array: TypeAlias = "np.ndarray[Any, np.dtype[np.float32]]"
 Folder: TypeAlias = "str | os.PathLike[str]"
+#: `loss(image, target)`, or with `weights` third.
+Loss: TypeAlias = (
+    "Callable[[mi.TensorXf, mi.TensorXf], mi.Float | mi.TensorXf]"
+    " | Callable[[mi.TensorXf, mi.TensorXf, mi.TensorXf | None], mi.Float | mi.TensorXf]"
+)
 
 logger = logging.getLogger(__name__)
 
@@ -248,7 +256,7 @@ def optimize(
     folder: Folder | None = None,
     resume: Folder | None = None,
     overrides: Mapping[str, object] | None = None,
-    loss: Callable[..., Any] | None = None,
+    loss: Loss | None = None,
     allow_code: bool = False,
 ) -> Run:
     """Recover the parameters of an experiment: a `Run`, to be iterated over, which makes one iteration after the other.
@@ -267,8 +275,9 @@ def optimize(
     rates. A run that is finished has nothing to iterate over.
 
     `loss` is a function of your own in place of the experiment's: `loss(image, target)` of two `mi.TensorXf` (height,
-    width, channels), the image attached, or `loss(image, target, weights)`; it returns a `mi.Float` of width 1. A
-    `resume` asks for it again. `allow_code` has the files of code run that the experiment names (`loss.file`).
+    width, channels), the image attached, or `loss(image, target, weights)`; it returns a `mi.Float` of width 1, or a
+    tensor of one entry. A `resume` asks for it again. `allow_code` has the files of code run that the experiment names
+    (`loss.file`, `integrator.file`).
 
     Sets the Mitsuba variant of the experiment where none is set. Loads and checks all that the experiment names, makes
     the target, and measures what is left to measurement, before it returns. Raises ConfigError, located by file and
@@ -295,9 +304,12 @@ def optimize(
         return Run(contextlib.ExitStack(), begun, folder is not None)
 
 
-def _with_own(config: Config, loss: Callable[..., Any] | None, allow_code: bool) -> Config:
+def _with_own(config: Config, loss: Loss | None, allow_code: bool) -> Config:
     """The same experiment with a loss of the caller's, and with code that it names allowed, or not."""
     config = config.with_code(allow_code)
+    if loss is not None and not callable(loss):
+        reason = "is no function; a file's is named by the setting `loss: {type: custom, file: FILE.py:NAME}`"
+        raise ConfigError("loss", "", reason)
     return config if loss is None else config.with_loss(loss)
 
 
@@ -305,7 +317,7 @@ def _reopened(
     folder: Path,
     wanted: Config | None,
     put_in: Sequence[Override],
-    loss: Callable[..., Any] | None,
+    loss: Loss | None,
     allow_code: bool,
 ) -> tuple[contextlib.ExitStack, Begun, bool]:
     """What holds the folder of a run that goes on, that run, and whether there is anything left to be written."""

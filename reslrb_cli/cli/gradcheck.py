@@ -291,8 +291,9 @@ def command(
     if integrators is not None and records and not interrupted:
         from reslrb_cli.measure.own import look_into
 
-        for line in look_into(check, records):
-            echo(line)
+        with Interrupts() as interrupts:
+            for line in look_into(check, records, lambda: interrupts.requested, logger.info):
+                echo(line)
     if markdown_file is not None:
         markdown_file.write_text(markdown_table(records), encoding="utf-8")
     nothing = all(record.verdict in (Verdict.NOT_MEASURED, Verdict.NO_REFERENCE) for record in records)

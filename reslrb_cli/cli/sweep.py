@@ -28,6 +28,7 @@ from reslrb_cli.backend.installation import python_command
 from reslrb_cli.cli.options import (
     COUNT,
     FOLDER,
+    allow_code_option,
     check_writable,
     complete_setting,
     is_given,
@@ -95,6 +96,7 @@ _PROGRAM = "sys.argv[0] = 'reslrb'; from reslrb_cli.cli.sweep import follow; fol
     help="Go on with the sweep in this folder, in place of CONFIG; so does the same command again.",
 )
 @click.option("--retry", is_flag=True, help="Try the runs again that failed.")
+@allow_code_option
 @click.option(
     "--dry-run",
     is_flag=True,
@@ -117,6 +119,7 @@ def command(
     folder: Path | None,
     resumed: Path | None,
     retry: bool,
+    allow_code: bool,
     dry_run: bool,
     json_file: Path | None,
     quiet: bool,
@@ -137,19 +140,19 @@ def command(
     if resumed is not None:
         given = [name for name in ("config_file", "overrides", "vary", "folder", "dry_run") if is_given(name)]
         if given:
-            raise click.UsageError("--resume goes on with a sweep as it began; of others it takes --seeds, --retry "
-                                   "and --json alone")  # fmt: skip
+            raise click.UsageError("--resume goes on with a sweep as it began; of others it takes --seeds, --retry, "
+                                   "--allow-code and --json alone")  # fmt: skip
         folder = resumed
     elif config_file is None:
         raise click.UsageError("Missing argument 'CONFIG'")
     else:
-        plan = make_plan(config_file, vary, seeds or 1, overrides)
+        plan = make_plan(config_file, vary, seeds or 1, overrides, allow_code)
         run = next(iter(plan.configs.values())).run
         folder = folder or run.output / f"{run.folder_name}-sweep"
         if dry_run:
             return _forecast(plan)
     check_writable("--json", json_file)
-    with opened(folder, plan, seeds, retry) as sweep:
+    with opened(folder, plan, seeds, retry, allow_code) as sweep:
         return _run(folder, sweep, json_file, quiet, verbose)
 
 
@@ -187,7 +190,7 @@ def _run(folder: Path, sweep: Sweep, json_file: Path | None, quiet: bool, verbos
                 break
             if not quiet:
                 echo(f"run {number} of {len(runs)}: {label(combination.settings)}, seed {seed}")
-            code, line = call(command_of(folder, combination, seed), interrupts, verbose)
+            code, line = call(command_of(folder, sweep, combination, seed), interrupts, verbose)
             if interrupted := code == ExitCode.INTERRUPTED or (interrupts.requested and code != ExitCode.DONE):
                 break
             if code == ExitCode.MACHINE:

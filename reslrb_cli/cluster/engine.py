@@ -24,7 +24,7 @@ from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.cluster.bundle import Bundle, bundle_of, read_bundle
 from reslrb_cli.cluster.connection import Place, connected
 from reslrb_cli.cluster.crew import Crew, Opening
-from reslrb_cli.errors import MachineError
+from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.autotune.estimators import find_options
 from reslrb_cli.optimization.problem import Problem
@@ -34,7 +34,7 @@ from reslrb_cli.optimization.views import set_targets, target_arrays
 from reslrb_cli.records.checkpoint import STATE_FILE, open_state, write_archive
 from reslrb_cli.records.clock import SharedTime, WorkerTime
 from reslrb_cli.records.tree import Stored, like, to_array
-from reslrb_cli.runs.prepare import Course
+from reslrb_cli.runs.prepare import Course, digests
 
 Array = np.ndarray[Any, Any]
 
@@ -119,13 +119,20 @@ def _warmed(problem: Problem) -> dict[str, float]:
 
 
 def opening_of(course: Course, folder: Path, own: bool) -> tuple[Opening, Bundle]:
-    """What workers need of a run, `own`: which are this run's; `folder` is to write into. Raises OSError."""
-    bundle = bundle_of(course.problem.config)
+    """What workers need of a run, `own`: which are this run's; `folder` is to write into.
+
+    Raises OSError, and ConfigError where users' own code is another than when the run began.
+    """
+    config = course.problem.config
+    bundle, here = bundle_of(config), digests(config)
+    for key in config.codes:
+        if here.get(key) != course.files.get(key):
+            raise ConfigError(config.source, key, "has changed since the run began; put it back, or begin anew")
     course.save(folder)
     write_archive(folder / TARGETS_FILE, target_arrays(course.problem.views))
     for name in (STATE_FILE, TARGETS_FILE):
         bundle.files[name] = (folder / name).read_bytes()
-    allows_code = course.problem.config.allows_code
+    allows_code = config.allows_code
     return Opening(bundle.digest(), assembled, (allows_code,), asks_for_code=allows_code and not own), bundle
 
 

@@ -149,7 +149,7 @@ def _tag(section: type[Section]) -> str | None:
 def _unknown_key(loc: tuple[int | str, ...]) -> str:
     key = str(loc[-1])
     union, chosen = _candidates(loc[:-1])
-    owners = [str(_type_name(section)) for section in union if key in section.model_fields]
+    owners = list(dict.fromkeys(str(_type_name(each)) for each in union if key in each.model_fields))
     if owners:
         return f"not an option of {_type_name(chosen)} but of {', '.join(owners)}; remove it, or change the type"
     here = format_location(tuple(part for part in loc[:-1] if not _is_tag(part)))

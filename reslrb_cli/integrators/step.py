@@ -33,7 +33,7 @@ from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator, hal
 
 Adjoint = Literal["correlated", "independent", "batched"]
 FirstBatch = Literal["image", "again"]
-Objective = Callable[[Any], Any]
+Objective: TypeAlias = "Callable[[mi.TensorXf], mi.Float | mi.TensorXf]"
 
 #: Told of an image and of the dL/dI that its samples were differentiated with.
 OnSamples: TypeAlias = "Callable[[mi.TensorXf, mi.TensorXf], None]"

@@ -14,7 +14,7 @@ fault may be, and the sentence is made of those that are left. It says what was 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -30,8 +30,12 @@ from reslrb_cli.scene.catalog import parameter_kind
 
 Array = np.ndarray
 
-#: Seeds of each measurement, and of the reference, whose first half is the direction.
-SEEDS, REFERENCE_SEEDS = 16, 32
+#: Seeds of each measurement; the reference has twice as many, whose first half is the direction. Where these show
+#: nothing, there are `MORE` times as many.
+SEEDS, MORE = 16, 4
+
+#: Noise and time of a gradient are measured at so many seeds at least, and at more while so many seconds last.
+LEAST_SEEDS, COST_SECONDS = 4, 10.0
 
 #: Paths are looked at up to so many segments.
 DEEPEST = 5
@@ -70,40 +74,49 @@ class Ratio:
         return f"{self.value:.3g} +- {self.error:.1g} times"
 
 
-def look_into(check: Gradcheck, records: Sequence[GradcheckRecord]) -> list[str]:
+def look_into(
+    check: Gradcheck, records: Sequence[GradcheckRecord], stop: Callable[[], bool], say: Callable[[str], None]
+) -> Iterator[str]:
     """What is to be said of each of the user's own integrators, after its `records`: how noisy and dear it is, and,
-    where it is wrong, where to look."""
-    lines = []
+    where it is wrong, where to look. Raises KeyboardInterrupt once `stop()`; `say` is told what is being measured."""
     for listed in check.participants.listed:
         if listed.type != "custom":
             continue
         mine = [record for record in records if record.integrator == listed.label]
-        lines.append(_cost(check, listed.label))
+        yield _cost(check, listed.label, stop)
         failing = [record for record in mine if record.verdict is Verdict.FAILS]
         if failing:
-            lines.append(f"{listed.label}: {Looking(check.participants, listed.label).sentence(failing)}")
-    return lines
+            yield f"{listed.label}: {Looking(check.participants, listed.label, stop, say).sentence(failing)}"
 
 
-def _cost(check: Gradcheck, label: str) -> str:
+def _cost(check: Gradcheck, label: str, stop: Callable[[], bool]) -> str:
     """Noise and time of a gradient beside those of `reslrb` by the same paths."""
     parts = check.participants
     ours = _ours(parts, label)
-    figures = []
+    figures, measured = [], SEEDS
     for integrator in (parts.integrators[label], ours):
         rows, times = [], []
-        for seed in seeds(SEEDS, 5):
+        for seed in seeds(measured, 5):
+            _check(stop)
             begin = time.perf_counter()
             rows.append(_gradient(parts, integrator, seed))
             times.append(time.perf_counter() - begin)
+            if len(times) >= LEAST_SEEDS and sum(times) > COST_SECONDS:
+                break
+        measured = len(rows)
         figures.append((np.var(rows, axis=0, ddof=1).sum(), float(np.median(times[1:]))))
     (noise, seconds), (our_noise, our_seconds) = figures
     way = parts.ways[label].paths
     times_noise = f"{noise / our_noise:.3g} times the variance" if our_noise > 0 else "variance unknown"
     return (
         f"{label}: {times_noise} and {seconds / our_seconds:.3g} times the time ({1e3 * seconds:.3g} ms) of a "
-        f"gradient by reslrb:stack(paths={way}), medians of {SEEDS - 1}"
+        f"gradient by reslrb:stack(paths={way}), medians of {measured - 1}"
     )
+
+
+def _check(stop: Callable[[], bool]) -> None:
+    if stop():
+        raise KeyboardInterrupt
 
 
 def _ours(parts: Participants, label: str, **other: int) -> StepIntegrator:
@@ -120,8 +133,11 @@ def _gradient(parts: Participants, integrator: StepIntegrator, seed: int) -> Arr
 class Looking:
     """What is measured of one integrator, `label`, once it failed."""
 
-    def __init__(self, parts: Participants, label: str) -> None:
-        self.parts, self.label = parts, label
+    def __init__(
+        self, parts: Participants, label: str, stop: Callable[[], bool], say: Callable[[str], None]
+    ) -> None:  # fmt: skip
+        self.parts, self.label, self._stop, self._say = parts, label, stop, say
+        self._seeds = SEEDS
         self.keys = parts.case.keys
         self._options = parts.options_of(label)
         self.depth = self._options["max_depth"]
@@ -135,19 +151,19 @@ class Looking:
 
     def images(self, **other: int) -> Ratio:
         """Of images, weighted alike in all pixels."""
+        self._measure("images", other)
         sums = [
-            np.array([self.parts.case.image(one, seed, self.parts.spp).sum() for seed in seeds(SEEDS, block)])
+            np.array([self.parts.case.image(one, seed, self.parts.spp).sum() for seed in self._each(SEEDS, block)])
             for block, one in zip((5, 6), self._pair(**other), strict=True)
         ]
         return _over(*sums)
 
     def gradients(self, **other: int) -> dict[str, Ratio]:
         """Of each parameter that the reference has a gradient of."""
-        return self._ratios(*self._pair(**other))
-
-    def _ratios(self, own: StepIntegrator, ours: StepIntegrator) -> dict[str, Ratio]:
-        reference = np.stack([_gradient(self.parts, ours, seed) for seed in seeds(REFERENCE_SEEDS, 6)])
-        mine = np.stack([_gradient(self.parts, own, seed) for seed in seeds(SEEDS, 5)])
+        self._measure("gradients", other)
+        own, ours = self._pair(**other)
+        reference = np.stack([_gradient(self.parts, ours, seed) for seed in self._each(2 * self._seeds, 6)])
+        mine = np.stack([_gradient(self.parts, own, seed) for seed in self._each(self._seeds, 5)])
         found = {}
         for key, place in self.parts.case.places.items():
             first, second = np.split(reference[:, place], 2)
@@ -159,10 +175,13 @@ class Looking:
                 found[key] = _over(*sides)
         return found
 
-    def emission(self, depth: int | None = None, seen: int | None = None) -> tuple[Ratio, float] | None:
+    def emission(
+        self, depth: int | None = None, seen: int | None = None, even: bool = False
+    ) -> tuple[Ratio, float] | None:  # fmt: skip
         """The derivative by all emission, times emission, over the image, which it has to equal: images are linear in
         it. And by how much that scatters between seeds, at each of which both are of the same paths; None where some
-        light is not a number (`.value`, `scale`). Of paths of `depth` segments, over an image of `seen`."""
+        light is not a number (`.value`, `scale`). Of paths of `depth` segments, over an image of `seen`; `even`: with
+        dL/dI of 1 in all pixels and channels."""
         scene = self.parts.case.scene
         depth = self.depth if depth is None else depth
         own, image = (self.parts.own_with(self.label, max_depth=n) for n in (depth, depth if seen is None else seen))
@@ -171,14 +190,28 @@ class Looking:
         if len(keys) != len(scene.emitters()):
             return None
         case = Case(scene, keys, self.parts.case.sensor)
-        case.weigh(np.array(self.parts.case.weights))
+        weights = np.array(self.parts.case.weights)
+        case.weigh(np.ones_like(weights) if even else weights)
+        self._measure("derivatives by emission", {"max_depth": depth})
         emitted = np.concatenate([case.initial[key] for key in keys])
         rows = []
-        for seed in seeds(SEEDS, 7):
+        for seed in self._each(SEEDS, 7):
             gradient = case.gradient(own, seed, self.parts.spp, step=case.known_step)
             rows.append(gradient @ emitted / case.weighted(case.image(image, seed, self.parts.spp)))
         found = np.array(rows)
         return Ratio(float(found.mean()), _error(found)), float(found.std(ddof=1))
+
+    def _measure(self, what: str, options: Mapping[str, int]) -> None:
+        """Tell what is being measured."""
+        where = ", ".join(f"{name} {value}" for name, value in options.items() if value != NEVER)
+        without = "without roulette" if NEVER in options.values() else ""
+        self._say(f"looking into {self.label}: {', '.join(filter(None, [what, where, without]))}")
+
+    def _each(self, count: int, block: int) -> Iterator[int]:
+        """Seeds, as long as the user wants to know."""
+        for seed in seeds(count, block):
+            _check(self._stop)
+            yield seed
 
     # --- saying -------------------------------------------------------------------------------------------------------
 
@@ -198,6 +231,9 @@ class Looking:
         passes = self._of_passes({})
         if passes is not None:
             return f"its image holds; {passes}"
+        if self._seeds == SEEDS:
+            self._seeds = MORE * SEEDS
+            return self.sentence(failing)
         return (
             f"its gradient is right along the reference's own direction ({_list(found)}), and wrong entry by entry: "
             "look at where derivatives land (texture coordinates, the pixel that dL/dI is taken from)"
@@ -262,12 +298,16 @@ class Looking:
             return None
         ratio, scatter = measured
         if not ratio.wrong:
+            if scatter > SAME_PATHS and self._right_if_even():
+                return _MIXED
             return None if scatter <= SAME_PATHS else (
                 f"at equal seeds its derivative by all emission scatters by {100 * scatter:.2g} % about its image, "
                 "which it has to equal: the pass that differentiates traces other paths than the first (random numbers "
                 "out of step)"
             )  # fmt: skip
         begin = f"its derivative by all emission is {ratio} its image, which it has to equal: "
+        if self._right_if_even():
+            return _MIXED
         if scatter <= 0.01 * abs(ratio.value - 1) and all(ratio.same(other) for other in wrong.values()):
             return (
                 f"{begin}one factor at every seed, so that it is dL/dI that is passed on wrongly (its sign, its scale)"
@@ -277,6 +317,11 @@ class Looking:
         at, before = self._from_depth(lambda depth: (self.emission(depth) or (None,))[0])
         where = "" if at is None else f"; {_segments(at, self._options['hide_emitters'], before)}"
         return f"{begin}what a vertex adds in the pass that differentiates is not what it adds in the first{where}"
+
+    def _right_if_even(self) -> bool:
+        """Whether it is dL/dI alone that is wrong in the pass that differentiates: where that is even, all is right."""
+        found = self.emission(even=True)
+        return found is not None and not found[0].wrong and found[1] <= SAME_PATHS
 
     def _too_short(self) -> bool:
         """Whether the pass that differentiates paths of three segments has those of two alone."""
@@ -306,6 +351,12 @@ class Looking:
                     "that of `bsdf.eval`, over a detached density"
                 )
         return ""
+
+
+_MIXED = (
+    "its derivative by all emission is the image, which it has to equal, where dL/dI is 1 everywhere, and is not where "
+    "that differs between pixels and channels: look at where dL/dI is taken from (another pixel, another channel)"
+)
 
 
 def _from(depth: int, before: bool) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import secrets
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -24,11 +25,18 @@ class OwnLoss:
     Both images are (H, W, C), `weights` None or of that shape with a mean of 1. Without `weights` pixels that are left
     out are the same in both images, and what is left has to weigh the same. It returns the loss, as an array of width 1
     or as a tensor of one entry. Code is run when it is first called, or tried: before that nothing is loaded.
+    Faults of a function that was handed over are located by its name.
     """
 
     def __init__(self, config: Config, key: str, spec: Custom) -> None:
-        self.source, self.key, self.spec, self._config = config.source, key, spec, config
+        self.source: object = config.source
+        self.key, self.spec, self._config = key, spec, config
+        self._place, self._file = key, spec.path
         self._function = None if spec.file is not None else config.own_loss
+        if self._function is not None:
+            self.source, self.key = "loss", getattr(self._function, "__name__", type(self._function).__name__)
+            code = getattr(self._function, "__code__", None)
+            self._file = None if code is None else Path(code.co_filename)
         self._takes_weights: bool | None = None
         self._token = secrets.token_hex(8)
         self._even: mi.TensorXf | None = None
@@ -36,7 +44,7 @@ class OwnLoss:
     def function(self) -> Callable[..., Any]:
         """The user's function, loaded. Raises ConfigError."""
         if self._takes_weights is None:
-            check_code(self._config, {self.key: self.spec})
+            check_code(self._config, {self._place: self.spec})
             if self.spec.path is not None:
                 self._function = load_named(self.spec.path, self.spec.name, self.source, self.key)
             assert self._function is not None
@@ -46,11 +54,12 @@ class OwnLoss:
     def __call__(self, image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float:
         """The loss, of width 1, attached. Raises ConfigError for what is none."""
         function, what = self.function(), "it"
-        given: tuple[mi.TensorXf | None, ...] = (image, target, weights)
+        # copies: what a function changes in place is its own
+        given = [None if each is None else mi.TensorXf(each) for each in (image, target, weights)]
         if not self._takes_weights:
             self._check_even(weights)
             given = given[:2]
-        with Guard(self.source, self.key, self.spec.path, what):
+        with Guard(self.source, self.key, self._file, what):
             value = function(*given)
         if isinstance(value, mi.TensorXf):
             value = value.array
@@ -75,7 +84,7 @@ class OwnLoss:
         dr.enable_grad(image)
         with dr.resume_grad():
             value = self(image, target, weights)
-            with Guard(self.source, self.key, self.spec.path, "its derivative"):
+            with Guard(self.source, self.key, self._file, "its derivative"):
                 dr.backward(value)
         loss, gradient = float(dr.detach(value)[0]), np.array(dr.grad(image))
         if not np.isfinite(loss):

@@ -266,6 +266,11 @@ class Course:
         return self._spent() if self._shared is None else self._shared + self._spent()
 
     @property
+    def files(self) -> dict[str, str]:
+        """The digests of the files that the experiment names, by the keys that name them, when the run began."""
+        return self._settled.files
+
+    @property
     def done(self) -> int:
         """The number of finished iterations."""
         return self.state.iteration

@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import IO, Any
 
 from reslrb_cli.config.base import SEED_END
+from reslrb_cli.config.code import code_digest
 from reslrb_cli.config.files import NAME_BYTES
-from reslrb_cli.config.loader import Override, dump, loads, parse_override, read_text
+from reslrb_cli.config.loader import Override, check_code, dump, loads, parse_override, read_text
 from reslrb_cli.config.run import folder_name
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import Location, format_location
@@ -92,10 +93,10 @@ def parse_vary(text: str) -> Varied:
     return Varied(key, given.location, tuple(overrides))
 
 
-def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[str]) -> Plan:
+def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[str], allow_code: bool = False) -> Plan:
     """Every combination of what is varied, checked as a configuration, with `seeds` seeds from its own on.
 
-    Raises ConfigError, located by the first setting that is wrong.
+    Raises ConfigError, located by the first setting that is wrong, or that names code where that is not to be run.
     """
     varied = [parse_vary(text) for text in vary]
     for place, each in enumerate(varied):
@@ -117,15 +118,25 @@ def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[s
     combinations, configs = [], {}
     names = _names(varied)
     for name, chosen in zip(names, itertools.product(*(each.overrides for each in varied)), strict=True):
-        config = loads(text, path, [*overrides, *chosen])
+        config = loads(text, path, [*overrides, *chosen]).with_code(allow_code)
+        check_code(config)
         if config.run.seed != first:
             reason = f"is {config.run.seed}, and {first} in the first combination; {OWN['run', 'seed']}"
             raise ConfigError("--vary", "run.seed", reason)
         settings = {each.key: override.value for each, override in zip(varied, chosen, strict=True)}
         combinations.append(Combination(name, settings))
         configs[name] = config
-    sweep = Sweep(str(path), list(overrides), combinations, list(range(first, first + seeds)))
+    files = {one.path for config in configs.values() for one in config.codes.values() if one.path is not None}
+    codes = {str(file): _digest(path, file) for file in sorted(files)}
+    sweep = Sweep(str(path), list(overrides), combinations, list(range(first, first + seeds)), codes=codes)
     return Plan(sweep, configs)
+
+
+def _digest(source: object, file: Path) -> str:
+    try:
+        return code_digest(file)
+    except ConfigError as error:
+        raise ConfigError(source, "", f"{file}: {error.message}") from None
 
 
 def _names(varied: Sequence[Varied]) -> list[str]:
@@ -165,11 +176,14 @@ def _bounded(name: str) -> str:
 
 
 @contextlib.contextmanager
-def opened(folder: Path, plan: Plan | None, seeds: int | None = None, retry: bool = False) -> Iterator[Sweep]:
+def opened(
+    folder: Path, plan: Plan | None, seeds: int | None = None, retry: bool = False, allow_code: bool = False
+) -> Iterator[Sweep]:
     """The sweep in `folder`, which is locked while the block works: that of `plan`, begun where there is none yet.
 
     Without a plan it is the one that is there, with so many `seeds`, if these are more. With `retry` runs that failed
-    count as not done. Raises ConfigError, also where the folder has another sweep, or anything else.
+    count as not done. Raises ConfigError, also where the folder has another sweep, or anything else, and where code of
+    the user's own is not to be run, or is another than the sweep began with.
     """
     if plan is not None:
         _make(folder)
@@ -186,6 +200,7 @@ def opened(folder: Path, plan: Plan | None, seeds: int | None = None, retry: boo
             kept = read_sweep(folder)
             if plan is not None:
                 _check_same(folder, kept, plan)
+            _check_codes(folder, kept, allow_code or plan is not None)
             sweep = _grown(kept, plan.sweep.seeds if plan else None, seeds)
         else:
             _begin(folder, plan)
@@ -260,6 +275,18 @@ def _check_same(folder: Path, kept: Sweep, plan: Plan) -> None:
             raise ConfigError(plan.sweep.config, key, reason)
 
 
+def _check_codes(folder: Path, kept: Sweep, allowed: bool) -> None:
+    """Raise ConfigError where the code that the runs of the sweep call is not to be run, or has changed."""
+    for file, digest in kept.codes.items():
+        if not allowed:
+            raise ConfigError(
+                folder, "", f"would run the code of {file}, with all your rights; --allow-code has it run"
+            )
+        if _digest(folder, Path(file)) != digest:
+            reason = f"has changed since the sweep in {folder} began; put it back, or begin another: -o"
+            raise ConfigError(file, "", reason)
+
+
 def _grown(kept: Sweep, planned: Sequence[int] | None, seeds: int | None) -> Sweep:
     """With more seeds, where more are asked for; fewer than there are would leave out what was done."""
     wanted = len(planned) if planned is not None else seeds
@@ -281,21 +308,23 @@ def is_left(folder: Path, sweep: Sweep, name: str) -> bool:
     return name not in sweep.failures and not is_complete(read_manifest(folder / name) or {})
 
 
-def command(folder: Path, combination: Combination, seed: int) -> list[str]:
-    """What `reslrb` is to be called with for one run: it begins, or goes on from where it was cut off.
+def command(folder: Path, sweep: Sweep, combination: Combination, seed: int) -> list[str]:
+    """What `reslrb` is to be called with for one run: it begins, or goes on from where it was cut off. Code of the
+    user's own is allowed: `opened` has asked.
 
     A process that was killed and still has the run's folder is waited for. Raises ConfigError, located in that, where
     one goes on working there.
     """
     folder, name = folder.absolute(), run_name(combination, seed)
+    allowed = ["--allow-code"] if sweep.codes else []
     run, end = folder / name, time.monotonic() + RELEASE_SECONDS
     while (read_manifest(run) or {}).get("status") == Status.RUNNING:
         if time.monotonic() > end:
             raise ConfigError(run, "", "is in use by a run of its own; end that first")
         time.sleep(_POLL_SECONDS)
     if newest_checkpoint(run / "checkpoint") is not None and read_manifest(run) is not None:
-        return ["optimize", "--resume", str(run)]
-    words = ["optimize", str(config_file(folder, combination))]
+        return ["optimize", "--resume", str(run), *allowed]
+    words = ["optimize", str(config_file(folder, combination)), *allowed]
     for key, value in (("run.seed", seed), ("run.output", str(folder)), ("run.name", name)):
         words += ["--set", f"{key}={json.dumps(value)}"]
     # one that was killed before it kept anything is replaced

@@ -1,4 +1,4 @@
-"""The Python of README and docs/python.md runs as it stands, the reference is that of the docstrings, notebooks run."""
+"""The Python of README and docs runs as it stands, and the reference is that of the docstrings."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import pytest
 from cli.tiny import ROOT
 from compilation import search_path
@@ -57,6 +57,7 @@ def test_the_pages_script_runs(checkout: Path) -> None:
     assert {path.name for path in (checkout / "runs").iterdir()} == {"carpet", "stopped"}
 
 
+@pytest.mark.long  # its target has many samples
 def test_the_readmes_first_script_runs(checkout: Path) -> None:
     """The others: tests/conformance/test_plugin.py."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -65,6 +66,44 @@ def test_the_readmes_first_script_runs(checkout: Path) -> None:
     lines = run(block, checkout)
     assert [line.split()[0] for line in lines] == [str(number) for number in range(len(lines))]
     assert len(lines) >= 5
+
+
+def blocks(name: str) -> list[str]:
+    """The Python blocks of a page."""
+    return re.findall(r"^```python\n(.*?)^```", (ROOT / name).read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+
+
+#: Pages with Python, and their blocks, each of which a test runs: here, or tests/conformance/test_plugin.py.
+PYTHON = {"README.md": 3, "docs/python.md": 7, "docs/method.md": 2, "docs/benchmarks.md": 1,
+          "docs/benchmarks/page.md": 1, "docs/your_integrator.md": 1}  # fmt: skip
+
+
+def test_no_page_has_python_that_no_test_runs() -> None:
+    pages = [ROOT / "README.md", *DOCS.rglob("*.md")]
+    counts = {page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8").count("```python") for page in pages}
+    assert {name: count for name, count in counts.items() if count} == PYTHON
+    assert {name: len(blocks(name)) for name in PYTHON} == PYTHON
+
+
+def test_what_pages_do_with_a_run_does(checkout: Path) -> None:
+    """The slope of recovered values, the median step of a run, and a loss of one's own."""
+    slope, edges = blocks("docs/method.md")
+    (steps,) = blocks("docs/benchmarks.md")
+    (checkout / "my_loss.py").write_text(edges, encoding="utf-8")
+    settings = ("scene.options={resx: 32, resy: 32}", "run.iterations=8", "run.final_spp=8", "target.render.spp=16",
+                "run.measuring=0", f"loss={{type: custom, file: {checkout / 'my_loss.py'}:edges}}",
+                f"run.output={checkout / 'runs'}")  # fmt: skip
+    words = [word for each in settings for word in ("--set", each)]
+    command = [sys.executable, "-m", "reslrb_cli", "optimize", "configs/cornell_floor.yaml", "--allow-code", *words]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=checkout, env=environment(checkout), timeout=300)
+    assert done.returncode == 0, done.stderr
+    (checkout / "runs/ours").symlink_to("cornell_floor")
+    (found,) = run(slope, checkout)
+    assert np.isfinite(float(found))
+    step_ms, peak = map(float, run(steps, checkout)[0].split())
+    records = [json.loads(line) for line in (checkout / "runs/ours/metrics.jsonl").read_text().splitlines()]
+    assert step_ms == sorted(record["step_ms"] for record in records[5:])[1]
+    assert peak > 0
 
 
 def test_the_reference_is_that_of_the_docstrings() -> None:
@@ -79,23 +118,7 @@ def test_what_the_page_links_to_is_there() -> None:
         assert (DOCS / name).exists(), name
 
 
-# --- notebooks --------------------------------------------------------------------------------------------------------
-
-
-def execute(path: Path, folder: Path) -> Any:
-    """The notebook, executed in `folder`."""
-    nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
-    notebook = nbformat.read(path, as_version=4)
-    client = nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(folder)}})
-    client.execute(env=environment(folder))
-    return notebook
-
-
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs(path: Path, checkout: Path) -> None:
-    notebook = execute(path, checkout)
-    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
-    assert any("image/png" in output.get("data", {}) for output in outputs)
+# --- notebooks: tests/test_wheel.py runs them -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -106,32 +129,6 @@ def test_a_notebook_is_valid_and_has_no_outputs(path: Path) -> None:
     assert content["nbformat"] == 4
     assert not any(cell.get("outputs") or cell.get("execution_count") for cell in content["cells"])
     assert path.read_text(encoding="utf-8").endswith("}\n")
-
-
-#: Cells of a notebook whose stop button is pressed in the midst of the first loop.
-CELLS = [
-    'import reslrb_cli as rl\nconfig = rl.load("configs/cornell_floor.yaml", {"run.iterations": 100000, '
-    '"scene.options": {"resx": 16, "resy": 16}, "run.final_spp": 16, "run.measuring": 0})\n'
-    'run = rl.optimize(config, folder="runs/stopped")',
-    "import threading, os, signal\nfor record in run.live():\n    if record.iteration == 3:\n"
-    "        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()",
-    'print(run.status, run.iteration > 3, sorted(run.parameters), (run.folder / "report.html").exists())\n'
-    "again = iter(run)\nprint(next(again).iteration == run.iteration - 1)\nagain.close()",
-]
-
-
-def test_a_notebooks_stop_button_keeps_the_result(checkout: Path) -> None:
-    nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
-    cells = [nbformat.v4.new_code_cell(source) for source in CELLS]
-    cells[1].metadata["tags"] = ["raises-exception"]
-    notebook = nbformat.v4.new_notebook(cells=cells)
-    client = nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(checkout)}})
-    client.execute(env=environment(checkout))
-    [error] = [output for output in cells[1].outputs if output.output_type == "error"]
-    assert error.ename == "KeyboardInterrupt"
-    assert any("image/png" in output.get("data", {}) for output in cells[1].outputs)
-    text = "".join(output.text for output in cells[2].outputs if output.get("name") == "stdout")
-    assert text == "interrupted True ['floor.reflectance.data'] True\nTrue\n"
 
 
 @pytest.mark.long

@@ -421,6 +421,43 @@ def test_killed_five_times(llvm, tmp_path):
         assert first == second
 
 
+OWN = "import drjit as dr\n\n\ndef own(image, target):\n    return dr.mean(dr.square(image - target), axis=None)\n"
+
+
+def test_code_of_the_users_own_is_asked_for_and_stays_the_same(folder):
+    Path("own.py").write_text(OWN)
+    loss = "loss={type: custom, file: own.py:own}"
+    words = (
+        "sweep",
+        "tiny.yaml",
+        *tiny.settings(*QUICK, "run.iterations=2", loss),
+        "--vary",
+        "run.spp=[4, 8]",
+        "-o",
+        "s",
+    )
+    result = reslrb(*words)
+    assert (result.exit_code, Path("s").exists()) == (2, False)
+    assert result.output == (f"tiny.yaml: loss.file: would run the code of {folder / 'own.py'}, with all your rights; "
+                             "--allow-code has it run\n")  # fmt: skip
+    assert "finished, 2 of 2 runs done" in tiny.done(*words, "--allow-code").output
+    more = ("sweep", "--resume", "s", "--seeds", "2")
+    asked = reslrb(*more)
+    assert (asked.exit_code, "--allow-code has it run" in asked.output) == (2, True)
+    Path("own.py").write_text(OWN + "# another\n")
+    for again in ((*more, "--allow-code"), (*words, "--allow-code", "--seeds", "2")):
+        changed = reslrb(*again)
+        assert changed.exit_code == 2
+        assert changed.output.startswith(f"{folder / 'own.py'}: has changed since the sweep in s began; put it back")
+    Path("own.py").write_text(OWN)
+    assert "finished, 4 of 4 runs done" in tiny.done(*more, "--allow-code").output
+    Path("own.py").write_text("raise RuntimeError('it was run')\n")
+    assert "table.html" in tiny.done("report", "s", "-o", "table.html").output
+    plain = table("s")[0]
+    tiny.done(*words[:-6], "--vary", "run.spp=[4, 8]", "-o", "l2", "--seeds", "2")
+    assert [run["loss"] for run in plain] == pytest.approx([run["loss"] for run in table("l2")[0]], rel=1e-5)
+
+
 # --- what it comes to -------------------------------------------------------------------------------------------------
 
 

@@ -126,6 +126,27 @@ def test_a_fault_is_found_and_the_sentence_points_at_it(capsys: pytest.CaptureFi
         assert words in lines[1], lines[1]
 
 
+#: Mitsuba's own, as users' files name them, and what they are checked on.
+MITSUBAS = """from mitsuba.ad.integrators.direct_projective import DirectProjectiveIntegrator
+from mitsuba.ad.integrators.prb_basic import BasicPRBIntegrator
+"""
+FURNACE = str(Path(__file__).parents[2] / "configs/furnace.yaml")
+
+
+@pytest.mark.long
+def test_mitsubas_own_hold_where_they_are_right(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("mine.py").write_text(MITSUBAS)
+
+    def check(config: str, name: str, *settings: str) -> int:
+        sets = [word for each in settings for word in ("--set", each)]
+        words = ["gradcheck", config, "--integrators", f"mine.py:{name}", "--allow-code", *sets]
+        return call([*words, "--seeds", "24", "--spp", "64"])
+
+    assert check(FURNACE, "BasicPRBIntegrator") == 0
+    assert "analytic" in capsys.readouterr().out
+    assert check("room.yaml", "DirectProjectiveIntegrator", "integrator.max_depth=2") == 0
+
+
 @pytest.mark.parametrize(
     ("name", "said"),
     [

@@ -7,12 +7,14 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from cli.tiny import KEY, lines, read_metrics, reslrb
 from runs.going_on import begin_alone, optimize
 
+import reslrb_cli as rl
 from reslrb_cli.config.loader import load, told, with_integrator
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.methods import Sweep
@@ -227,8 +229,6 @@ def test_a_function_that_is_handed_over(experiment: Path) -> None:
     seen: list[tuple[int, ...]] = []
 
     def loss(image: mi.TensorXf, target: mi.TensorXf) -> mi.Float:
-        import drjit as dr
-
         seen.append(tuple(image.shape))
         return dr.mean(dr.abs(image - target), axis=None).array
 
@@ -240,6 +240,49 @@ def test_a_function_that_is_handed_over(experiment: Path) -> None:
     by_name = assemble(load("tiny.yaml", ["loss.type=l1", "run.measuring=0", "run.spp=4"])).views[0]
     image = np.full((8, 8, 3), 0.3, np.float32)
     assert float(view.compare(mi.TensorXf(image))[0]) == float(by_name.compare(mi.TensorXf(image))[0])
+
+
+def test_what_is_wrong_with_a_function_is_located_by_its_name_and_line(experiment: Path) -> None:
+    def nan(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
+        return dr.mean(dr.sqrt(image - image - 1), axis=None)
+
+    def raises(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
+        raise ValueError("no such thing")
+
+    def wide(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
+        return image - target
+
+    def detached(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
+        return dr.mean(dr.detach(image), axis=None)
+
+    line = raises.__code__.co_firstlineno + 1
+    cases = [
+        (nan, "loss: nan: returns nan of"), (wide, "loss: wide: returns 192 numbers, not one"),
+        (detached, "loss: detached: returns what has no derivative by the image"),
+        (raises, f"loss: raises: it raises in line {line} ValueError: no such thing"),
+        ("own.py:own", "loss: is no function; a file's is named by the setting"),
+    ]  # fmt: skip
+    for loss, words in cases:
+        with pytest.raises(ConfigError) as error:
+            rl.optimize("tiny.yaml", loss=loss, overrides={"run.measuring": 0, "run.spp": 4})  # type: ignore[arg-type]
+        assert str(error.value).startswith(words)
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("adjoint", ["batched", "independent", "correlated"])
+def test_what_a_function_changes_in_place_is_its_own(experiment: Path, adjoint: str) -> None:
+    def plain(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
+        return dr.mean(dr.square(2 * image - 3 * target), axis=None)
+
+    def in_place(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
+        image *= 2
+        target *= 3
+        return dr.mean(dr.square(image - target), axis=None)
+
+    settings = {"run.measuring": 0, "run.certainty": False, "run.spp": 4, "run.iterations": 3, "run.adjoint": adjoint}
+    found = [[record.loss for record in rl.optimize("tiny.yaml", loss=loss, overrides=settings)]
+             for loss in (plain, in_place)]  # fmt: skip
+    assert found[0] == found[1]
 
 
 def test_weights_are_handed_to_a_function_that_takes_them(experiment: Path) -> None:

@@ -25,6 +25,7 @@ from runs.hosts import hosts, make_certificates, missing
 from reslrb_cli.cluster import bundle
 from reslrb_cli.cluster.connection import Place
 from reslrb_cli.config.loader import load
+from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.state import guiding_of
@@ -69,7 +70,7 @@ def one_thread():
 
 def make(folder: Path, *sets: str) -> Course:
     views = [VIEWS] if "passes" not in sets else []
-    config = load(folder / "tiny.yaml", [*SETS, *views, *sets])
+    config = load(folder / "tiny.yaml", [*SETS, *views, *sets]).with_code()
     return prepare(config, "llvm_ad_rgb", lambda line: None, lambda line: None)[0]
 
 
@@ -93,10 +94,36 @@ def test_any_number_of_workers_comes_to_the_same(experiment: Path, case: str, wo
     check(experiment, case, workers)
 
 
+OWN = """import drjit as dr
+from mitsuba.ad.integrators.prb_basic import BasicPRBIntegrator
+
+
+def own(image, target):
+    return dr.mean(dr.abs(image - target), axis=None)
+"""
+
+#: Both run on workers: of `batched` shards each takes dL/dI by itself.
+OWN_SETS = ["run.shards=3", "run.adjoint=batched", "loss={type: custom, file: own.py:own}",
+            "integrator={type: custom, file: own.py:BasicPRBIntegrator, max_depth: 3}"]  # fmt: skip
+
+
+def test_workers_run_a_users_code_where_the_run_may(experiment: Path) -> None:
+    (experiment / "own.py").write_text(OWN)
+    compare(experiment, OWN_SETS, 2)
+    course = make(experiment, *OWN_SETS)
+    (experiment / "own.py").write_text(OWN + "# another\n")
+    with pytest.raises(ConfigError, match="has changed since"), engine.engine_at(course, Place(1), threads=1):
+        pass
+
+
 def check(folder: Path, case: str, workers: int) -> None:
+    compare(folder, CASES[case], workers)
+
+
+def compare(folder: Path, sets: list[str], workers: int) -> None:
     """Bit by bit, with one thread each."""
-    alone = end(make(folder, *CASES[case]))
-    course = make(folder, *CASES[case])
+    alone = end(make(folder, *sets))
+    course = make(folder, *sets)
     with engine.engine_at(course, Place(workers), threads=1) as local:
         course.compute_with(local)
         together = end(course)
