@@ -15,8 +15,9 @@ import argparse
 
 from reslrb_cli.cluster.bundle import Bundle
 from reslrb_cli.cluster.connection import Place, connected
-from reslrb_cli.cluster.crew import Crew, Opening
+from reslrb_cli.cluster.crew import Crew
 from reslrb_cli.cluster.forecast import idle, measure_rounds, round_seconds
+from reslrb_cli.cluster.worker import Opening
 
 
 def measure(workers: int, shards: int, rounds: int) -> str:

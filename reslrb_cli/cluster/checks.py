@@ -20,7 +20,8 @@ import numpy as np
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.cluster.bundle import CONFIG_FILE, Bundle, bundle_of, read_bundle
 from reslrb_cli.cluster.connection import Place, connected
-from reslrb_cli.cluster.crew import Anywhere, Crew, Opening
+from reslrb_cli.cluster.crew import Crew
+from reslrb_cli.cluster.worker import Anywhere, Opening
 from reslrb_cli.config.loader import dump, loads
 from reslrb_cli.config.parameters import RunValue, TransportValue
 from reslrb_cli.config.schema import Config
@@ -38,11 +39,8 @@ class Steps:
     """The steps that finite differences take, by parameter and way (`sampling.steps_of`)."""
 
     steps: Mapping[str, Sequence[Step]]
-
-    @property
-    def digest(self) -> str:
-        """All of them."""
-        return repr(self.steps)
+    #: Of them all, as they were written here: elsewhere NumPy may write numbers otherwise.
+    digest: str
 
     def take(self, participants: Participants) -> None:
         """Have finite differences take them."""
@@ -114,7 +112,8 @@ def samples_at(
             participants: Participants, function: Callable[..., Any], work: Sequence[tuple[Any, ...]]
         ) -> Iterator[tuple[int, Any]]:
             kind, of, _ = work[0]
-            steps = Steps(steps_of(participants, participants.directions))
+            chosen = steps_of(participants, participants.directions)
+            steps = Steps(chosen, repr(chosen))
             return crew.run(function, work, steps, cold=f"{kind} {of}")
 
         yield take

@@ -17,7 +17,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from reslrb_cli.errors import ConfigError, MachineError, one_line
 
@@ -140,8 +140,9 @@ def _started(workers: int, folder: Path) -> Iterator[tuple[object, object]]:
     try:
         cluster = LocalCluster(
             n_workers=workers, threads_per_worker=1, processes=True, security=True, protocol="tls://",
-            dashboard_address="127.0.0.1:0", scheduler_kwargs={"dashboard": False}, silence_logs=logging.CRITICAL,
-            local_directory=str(folder), memory_limit=free_bytes("llvm") // workers,
+            dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL,
+            scheduler_kwargs={"dashboard": False, "extensions": _extensions()}, local_directory=str(folder),
+            memory_limit=free_bytes("llvm") // workers,
         )  # fmt: skip
     except (OSError, RuntimeError, TimeoutError) as error:
         raise MachineError(f"--cluster: no workers could be started: {error}") from None
@@ -150,6 +151,21 @@ def _started(workers: int, folder: Path) -> Iterator[tuple[object, object]]:
     finally:
         with contextlib.suppress(OSError, RuntimeError, TimeoutError):
             cluster.close(timeout=10)
+
+
+def _extensions() -> dict[str, Any]:
+    """dask's extensions of a scheduler; the one that keeps a record of every call until the end keeps none."""
+    from distributed.scheduler import DEFAULT_EXTENSIONS
+    from distributed.spans import SpansSchedulerExtension
+
+    class Forgetting(SpansSchedulerExtension):
+        def observe_tasks(self, *_: object, **__: object) -> dict[Any, Any]:
+            return {}
+
+        def heartbeat(self, *_: object, **__: object) -> None:
+            pass
+
+    return {**DEFAULT_EXTENSIONS, "spans": Forgetting}
 
 
 def _certificates() -> object:

@@ -23,7 +23,8 @@ import numpy as np
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.cluster.bundle import Bundle, bundle_of, read_bundle
 from reslrb_cli.cluster.connection import Place, connected
-from reslrb_cli.cluster.crew import Crew, Opening
+from reslrb_cli.cluster.crew import Crew
+from reslrb_cli.cluster.worker import Opening
 from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.autotune.estimators import find_options

@@ -291,7 +291,7 @@ def round_seconds(crew: Crew, counts: Sequence[int], rounds: int = ROUNDS) -> li
 
 
 def _seconds_of(crew: Crew, function: Callable[..., Any], work: Sequence[tuple[Any, ...]]) -> float:
-    from reslrb_cli.cluster.crew import Anywhere
+    from reslrb_cli.cluster.worker import Anywhere
 
     begin = time.perf_counter()
     for _ in crew.run(function, work, Anywhere()):

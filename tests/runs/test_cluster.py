@@ -31,7 +31,7 @@ from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.runs.prepare import Course, prepare
 
-crew = pytest.importorskip("reslrb_cli.cluster.crew", reason="pip install reslrb[cluster]", exc_type=ImportError)
+worker = pytest.importorskip("reslrb_cli.cluster.worker", reason="pip install reslrb[cluster]", exc_type=ImportError)
 engine = pytest.importorskip("reslrb_cli.cluster.engine", reason="pip install reslrb[cluster]", exc_type=ImportError)
 
 SETS = ["run.iterations=3", "run.spp=8", "run.measuring=0", "run.certainty=false"]
@@ -193,43 +193,43 @@ def test_a_bundle_has_all_that_an_experiment_reads(llvm: str, tmp_path: Path, mo
 
 
 @pytest.fixture
-def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def as_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """This process as a worker."""
     me = SimpleNamespace(address="tls://here:1", local_directory=str(tmp_path), name=1)
-    monkeypatch.setattr(crew, "get_worker", lambda: me)
-    monkeypatch.setattr(crew, "_state", None)
+    monkeypatch.setattr(worker, "get_worker", lambda: me)
+    monkeypatch.setattr(worker, "_state", None)
 
 
 def reads(folder: Path, threads: int) -> tuple[str, dict[str, float]]:
     return (folder / "a").read_text(), {"reads": 0.5}
 
 
-def test_a_worker_says_what_it_lacks(worker: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_says_what_it_lacks(as_worker: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another version and code that is not asked for stand against it for good; files are sent once."""
-    opening = crew.Opening("1", reads)
-    other = crew.Opening("1", reads, versions={"mitsuba": "0.1"})
-    said = crew.open_state(other, None, 1)
+    opening = worker.Opening("1", reads)
+    other = worker.Opening("1", reads, versions={"mitsuba": "0.1"})
+    said = worker.open_state(other, None, 1)
     assert said.stays
     assert said.text.startswith("has mitsuba ")
     assert said.text.endswith("and the run 0.1: install the same")
-    asking = crew.Opening("1", reads, asks_for_code=True)
-    assert crew.open_state(asking, None, 1).stays
-    monkeypatch.setenv(crew.ALLOW_CODE, "1")
-    assert crew.open_state(asking, None, 1) == crew.Lacks("tls://here:1", "files")
-    assert crew.perform("1", "", reads, ()) == crew.Lacks("tls://here:1", "opening")
-    assert crew.open_state(opening, {"a": b"one"}, 1).value == {"reads": 0.5}
-    assert crew.open_state(opening, None, 1).value == {"reads": 0.5}
-    assert crew.perform("1", "elsewhere", reads, ()) == crew.Lacks("tls://here:1", "context")
-    assert crew.perform("1", "", str.upper, ()).value == "ONE"
-    broken = crew.open_state(crew.Opening("2", reads), {"b": b""}, 1)
+    asking = worker.Opening("1", reads, asks_for_code=True)
+    assert worker.open_state(asking, None, 1).stays
+    monkeypatch.setenv(worker.ALLOW_CODE, "1")
+    assert worker.open_state(asking, None, 1) == worker.Lacks("tls://here:1", "files")
+    assert worker.perform("1", "", reads, ()) == worker.Lacks("tls://here:1", "opening")
+    assert worker.open_state(opening, {"a": b"one"}, 1).value == {"reads": 0.5}
+    assert worker.open_state(opening, None, 1).value == {"reads": 0.5}
+    assert worker.perform("1", "elsewhere", reads, ()) == worker.Lacks("tls://here:1", "context")
+    assert worker.perform("1", "", str.upper, ()).value == "ONE"
+    broken = worker.open_state(worker.Opening("2", reads), {"b": b""}, 1)
     assert not broken.stays
     assert "No such file" in broken.text
 
 
 @pytest.mark.parametrize(("shown", "seen"), [("3,5", "5"), ("7", "7"), ("0,1,2", "1")])
-def test_workers_see_a_gpu_each(worker: None, monkeypatch: pytest.MonkeyPatch, shown: str, seen: str) -> None:
+def test_workers_see_a_gpu_each(as_worker: None, monkeypatch: pytest.MonkeyPatch, shown: str, seen: str) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", shown)
-    crew.open_state(crew.Opening("1", reads), {"a": b""}, 1)
+    worker.open_state(worker.Opening("1", reads), {"a": b""}, 1)
     assert os.environ["CUDA_VISIBLE_DEVICES"] == seen
 
 
@@ -281,7 +281,7 @@ def spoil(act: Callable[[], object]) -> None:
         def __getattr__(self, name: str) -> None:
             act()
 
-    found = crew._state
+    found = worker._state
     if found is not None:
         found.value = Spoilt()
 
@@ -327,8 +327,7 @@ def test_who_takes_twenty_times_as_long_is_not_waited_for(experiment: Path) -> N
             before = time.monotonic()
             course.state = state
             if state.iteration == 6:
-                worker = found.ready[0]
-                pid = found.client.run(os.getpid)[worker]
+                pid = found.client.run(os.getpid)[found.ready[0]]
                 threading.Thread(target=slow, args=(pid,), daemon=True).start()
             if state.iteration == 24:
                 break

@@ -1,0 +1,191 @@
+"""What a worker does: it comes to what it works on, stands where a round of calls has it stand, and performs calls.
+
+A worker first comes to what it works on (`Opening`): it is sent files, once, and a function makes a state of them,
+which it keeps. A call is a function of that state, and of where it stands (`Context`), to a value that can be sent.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from distributed import get_worker
+
+from reslrb_cli.cluster.bundle import unpack
+from reslrb_cli.errors import (
+    ConfigError,
+    MachineError,
+    ReslrbError,
+    describe,
+    is_machine_fault,
+    is_out_of_memory,
+    one_line,
+)
+from reslrb_cli.records.manifest import versions
+
+
+class Context(Protocol):
+    """Where the state of all workers is to stand for a call; `digest` tells one from another."""
+
+    @property
+    def digest(self) -> str:
+        """What tells it from others."""
+
+    def take(self, state: Any) -> None:
+        """Bring a worker's state there."""
+
+
+@dataclass(frozen=True)
+class Anywhere:
+    """Where workers stand whose calls are functions of their arguments alone (`Context`)."""
+
+    digest: str = "anywhere"
+
+    def take(self, state: Any) -> None:
+        """Leave the state as it is."""
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What workers work on: `function(folder, threads, *arguments)` makes the state of the files in a folder.
+
+    It returns that, and the seconds that a call of each function takes whose kernels it has warmed, by name. `digest`
+    is of the files. `asks_for_code`: whether users' own code is to run, and the workers are not this run's own.
+    """
+
+    digest: str
+    function: Callable[..., tuple[Any, dict[str, float]]]
+    arguments: tuple[Any, ...] = ()
+    asks_for_code: bool = False
+    versions: Mapping[str, str] = field(default_factory=versions)
+
+
+@dataclass
+class _State:
+    """What a worker works on, and the digest of where it stands."""
+
+    opening: str
+    value: Any
+    stands: str = ""
+
+
+_state: _State | None = None
+
+#: In a worker's environment: 1 where users' own code may run there, if whoever runs the experiment allows it, too.
+ALLOW_CODE = "RESLRB_ALLOW_CODE"
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What a worker says; `worker` is its address."""
+
+    worker: str
+
+
+@dataclass(frozen=True)
+class Answer(Reply):
+    """The value of a call, and the seconds that it took to compute."""
+
+    value: Any
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Lacks(Reply):
+    """What a worker needs first: the opening's `files`, the `opening` itself, or the `context`."""
+
+    what: str
+
+
+@dataclass(frozen=True)
+class Fault(Reply):
+    """What is wrong with a worker's machine, and not with what was asked; `memory`: that is out; `stays`: also where
+    the worker is started anew."""
+
+    text: str
+    memory: bool = False
+    stays: bool = False
+
+
+def open_state(opening: Opening, files: Mapping[str, bytes] | None, threads: int) -> Reply:
+    """Have this worker come to what it works on."""
+    global _state
+    begin, me = time.perf_counter(), get_worker().address
+    here = versions()
+    for name, version in opening.versions.items():
+        if here.get(name) != version:
+            return Fault(me, f"has {name} {here.get(name)}, and the run {version}: install the same", stays=True)
+    if opening.asks_for_code and os.environ.get(ALLOW_CODE) != "1":
+        return Fault(me, f"runs no code of users' own: start it with {ALLOW_CODE}=1 in its environment", stays=True)
+    folder = Path(get_worker().local_directory) / f"reslrb-{opening.digest}"  # dask removes it with the worker
+    if files is None and not folder.is_dir():
+        return Lacks(me, "files")
+    _state = None
+    _take_device(get_worker().name)
+    logging.getLogger("reslrb_cli").addHandler(logging.NullHandler())  # the run has said what there is to say
+    try:
+        unpack(files or {}, folder)
+        value, seconds = opening.function(folder, threads, *opening.arguments)
+    except Exception as error:  # the run could load it: it is this machine that cannot
+        return Fault(me, f"cannot: {describe(error)}", is_out_of_memory(error))
+    _state = _State(opening.digest, value)
+    return Answer(me, seconds, time.perf_counter() - begin)
+
+
+def _take_device(name: object) -> None:
+    """Of the GPUs that this machine shows have a worker that is known by its number see one alone, in turn."""
+    listed = os.environ.get("CUDA_VISIBLE_DEVICES")
+    found = listed.split(",") if listed else [str(k) for k, _ in enumerate(Path("/proc/driver/nvidia/gpus").glob("*"))]
+    if isinstance(name, int) and len(found) > 1:
+        os.environ["CUDA_VISIBLE_DEVICES"] = found[name % len(found)]
+
+
+def stand(opening: str, context: Context) -> Reply:
+    """Bring the state to `context`."""
+    begin, me = time.perf_counter(), get_worker().address
+    if _state is None or _state.opening != opening:
+        return Lacks(me, "opening")
+    if _state.stands != context.digest:
+        _state.stands = ""
+        try:
+            context.take(_state.value)
+        except Exception as error:
+            return _fault(error)
+        _state.stands = context.digest
+    return Answer(me, None, time.perf_counter() - begin)
+
+
+def perform(opening: str, context: str, function: Callable[..., Any], arguments: Sequence[Any]) -> Reply:
+    """What `function` says of the state, which stands at `context`, and of `arguments`."""
+    begin, me = time.perf_counter(), get_worker().address
+    if _state is None or _state.opening != opening:
+        return Lacks(me, "opening")
+    if _state.stands != context:
+        return Lacks(me, "context")
+    try:
+        return Answer(me, function(_state.value, *arguments), time.perf_counter() - begin)
+    except Exception as error:
+        return _fault(error)
+
+
+def _fault(error: Exception) -> Fault:
+    """What a worker's machine failed in. Raises what is the call's own fault, as an error that can be sent."""
+    me = get_worker().address
+    if is_out_of_memory(error):
+        return Fault(me, one_line(str(error)), memory=True)
+    if isinstance(error, MachineError | OSError) or is_machine_fault(error):
+        return Fault(me, one_line(str(error)))
+    if isinstance(error, ConfigError):
+        raise ReslrbError(str(error)) from None
+    raise error
+
+
+def whereabouts() -> tuple[str, tuple[int, ...]]:
+    """This process's machine, and the cores that it may use."""
+    cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+    return os.uname().nodename, tuple(sorted(cores))
