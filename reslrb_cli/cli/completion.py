@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import click
-from click.shell_completion import BashComplete, CompletionItem, get_completion_class
+from click.shell_completion import BashComplete, CompletionItem, ShellComplete, ZshComplete, get_completion_class
 
 from reslrb_cli.errors import ExitCode
 
@@ -33,6 +33,17 @@ class Bash(BashComplete):
         return str(self.source_template % self.source_vars())
 
 
+class Zsh(ZshComplete):
+    """As click has it, with the same exception."""
+
+    source_template = ZshComplete.source_template.replace(
+        "        compadd -U -V unsorted -a completions\n",
+        "        local -a goes_on=(${(M)completions:#*[.=]}) ends=(${completions:#*[.=]})\n"
+        "        (( $#goes_on )) && compadd -U -S '' -V unsorted -a goes_on\n"
+        "        (( $#ends )) && compadd -U -V unsorted -a ends\n",
+    )
+
+
 @click.command("completion")
 @click.argument("shell", type=click.Choice(SHELLS))
 def command(shell: str) -> int:
@@ -43,7 +54,8 @@ def command(shell: str) -> int:
     """
     from reslrb_cli.cli import COMPLETE_VARIABLE, main
 
-    kind = Bash if shell == "bash" else get_completion_class(shell)
+    ours: dict[str, type[ShellComplete]] = {"bash": Bash, "zsh": Zsh}
+    kind = ours.get(shell) or get_completion_class(shell)
     assert kind is not None
     click.echo(kind(main, {}, "reslrb", COMPLETE_VARIABLE).source())
     return ExitCode.DONE

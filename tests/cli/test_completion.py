@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 
@@ -107,3 +108,17 @@ def test_completing_loads_nothing_heavy(words):
     assert offered
     assert heavy == "[]"
     assert told.stderr == ""
+
+
+@pytest.mark.skipif(shutil.which("zsh") is None, reason="needs a zsh")
+def test_a_zsh_completes():
+    """The same."""
+    script = done("completion", "zsh").stdout
+    program = 'compdef() { : }\ncompadd() { print -r -- "$@" = ${(P)@[-1]} }\n' + script + (
+        "words=(reslrb optimize a.yaml --set run.sp) CURRENT=5\n_reslrb_completion\n"
+        "words=(reslrb swe) CURRENT=2\n_reslrb_completion\n"
+    )  # fmt: skip
+    path = os.pathsep.join([os.path.dirname(sys.executable), os.environ["PATH"]])
+    told = subprocess.run(["zsh", "-f", "-c", program], capture_output=True, text=True, check=False, cwd=ROOT,
+                          env={**os.environ, "PATH": path})  # fmt: skip
+    assert told.stdout.splitlines()[0] == "-U -S  -V unsorted -a goes_on = run.spp=", told.stdout + told.stderr
