@@ -29,6 +29,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.state import guiding_of
+from reslrb_cli.optimization.views import set_targets, target_arrays
 from reslrb_cli.runs.prepare import Course, prepare
 
 worker = pytest.importorskip("reslrb_cli.cluster.worker", reason="pip install reslrb[cluster]", exc_type=ImportError)
@@ -72,6 +73,18 @@ def make(folder: Path, *sets: str) -> Course:
     views = [VIEWS] if "passes" not in sets else []
     config = load(folder / "tiny.yaml", [*SETS, *views, *sets]).with_code()
     return prepare(config, "llvm_ad_rgb", lambda line: None, lambda line: None)[0]
+
+
+def both(folder: Path, *sets: str) -> tuple[dict[str, np.ndarray], Course]:
+    """What a course comes to in this process, and another with the same targets: these are rendered on all threads, so
+    that now and then two renderings differ in their last bits."""
+    first = make(folder, *sets)
+    targets = target_arrays(first.problem.views)
+    alone = end(first)
+    del first
+    course = make(folder, *sets)
+    set_targets(course.problem.views, targets)
+    return alone, course
 
 
 def end(course: Course, after: Callable[[int], object] = lambda iteration: None) -> dict[str, np.ndarray]:
@@ -122,8 +135,7 @@ def check(folder: Path, case: str, workers: int) -> None:
 
 def compare(folder: Path, sets: list[str], workers: int) -> None:
     """Bit by bit, with one thread each."""
-    alone = end(make(folder, *sets))
-    course = make(folder, *sets)
+    alone, course = both(folder, *sets)
     with engine.engine_at(course, Place(workers), threads=1) as local:
         course.compute_with(local)
         together = end(course)
@@ -240,8 +252,7 @@ def test_workers_see_a_gpu_each(as_worker: None, monkeypatch: pytest.MonkeyPatch
 def beside(folder: Path, workers: int, iterations: int, *sets: str):
     """A course with so many workers, and what it should come to."""
     sets = ("run.shards=4", f"run.iterations={iterations}", "views=[{sensor: 0}]", *sets)
-    alone = end(make(folder, *sets))
-    course = make(folder, *sets)
+    alone, course = both(folder, *sets)
     with engine.engine_at(course, Place(workers), threads=1) as local:
         course.compute_with(local)
         yield course, local.crew
