@@ -355,18 +355,20 @@ def test_thirty_kills_lose_nothing(experiment: Path) -> None:
     moments = sorted(rng.sample(range(2, 199), 30))
     killed: list[int] = []
 
-    def kill(pid: int, wait: float) -> None:
+    def kill(pids: list[int], wait: float) -> None:
         time.sleep(wait)
-        with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
-            killed.append(pid)
+        for pid in pids:  # one may have just been replaced
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+                killed.append(pid)
+                return
 
     with beside(experiment, 3, 200) as (course, found):
         for state, _ in iterate(course.stages, course.state):
             course.state = state
             if state.iteration in moments:
                 pids = sorted(found.client.run(os.getpid, on_error="ignore").values())
-                threading.Thread(target=kill, args=(rng.choice(pids), rng.uniform(0, 0.1))).start()
+                threading.Thread(target=kill, args=(rng.sample(pids, len(pids)), rng.uniform(0, 0.1))).start()
             if state.iteration == 199:
                 break
     assert len(killed) == 30
