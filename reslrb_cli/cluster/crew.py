@@ -100,15 +100,13 @@ class _Round:
 class Crew:
     """The workers of a client that have come to what `opening` says; `files` are sent to those that have none.
 
-    `threads` is the number of each worker's, None: its share of the cores that it may use. `say` is told what becomes
-    of them.
+    `threads` is the number of each worker's, None: its share of the cores that it may use.
     """
 
     def __init__(
-        self, client: Client, opening: Opening, files: Mapping[str, bytes] | None = None, threads: int | None = None,
-        say: Callable[[str], None] = logger.info,
+        self, client: Client, opening: Opening, files: Mapping[str, bytes] | None = None, threads: int | None = None
     ) -> None:  # fmt: skip
-        self.client, self.opening, self._files, self._threads, self._say = client, opening, files, threads, say
+        self.client, self.opening, self._files, self._threads = client, opening, files, threads
         self._done: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self._opening: dict[str, tuple[Future, float]] = {}
         self._own_threads: dict[str, int] = {}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 from agreement import compare
 from cli.tiny import KEY, SCENE, write_experiment
+from runs.going_on import one_thread
 
 from reslrb_cli.config.loader import dump, load, loads
 from reslrb_cli.errors import ConfigError
@@ -60,19 +60,6 @@ def independent(problem: Problem, rounds: int, spp: int) -> np.ndarray:
         sample_gradient(problem, problem.integrator, round, "reference", spp)
         found.append(np.concatenate(list(take_gradient(problem).values())))
     return np.array(found, np.float64)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Sums of a kernel have one order then."""
-    dr.sync_thread()
-    before = dr.thread_count()
-    dr.set_thread_count(1)
-    try:
-        yield
-    finally:
-        dr.sync_thread()
-        dr.set_thread_count(before)
 
 
 # --- unbiased ---------------------------------------------------------------------------------------------------------

@@ -14,12 +14,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from cli import tiny
-from runs.going_on import MOTION, optimize, write_experiment
+from runs.going_on import MOTION, one_thread, optimize, write_experiment
 from runs.hosts import hosts, make_certificates, missing
 
 from reslrb_cli.cluster import bundle
@@ -54,19 +53,6 @@ def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
     return tmp_path
-
-
-@contextmanager
-def one_thread():
-    """Sums of a kernel have one order then."""
-    dr.sync_thread()
-    before = dr.thread_count()
-    dr.set_thread_count(1)
-    try:
-        yield
-    finally:
-        dr.sync_thread()
-        dr.set_thread_count(before)
 
 
 def make(folder: Path, *sets: str) -> Course:
