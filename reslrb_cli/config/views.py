@@ -43,7 +43,8 @@ class Mask(Section):
     """Leave out pixels within the reconstruction filter's radius of the film's border, where light tracing is
     darker."""
     clipped: bool = True
-    """Leave out pixels of 8 and 16 bit files that are at the greatest value in any channel."""
+    """Leave out pixels of 8 and 16 bit files that are at the greatest value in any channel, and those that the film's
+    reconstruction filter mixes with them."""
     alpha: bool = Field(default=True, description="Leave out pixels whose alpha is 0.")
     nonfinite: bool = True
     """Leave out pixels that are not finite; false: a file that has any is refused."""

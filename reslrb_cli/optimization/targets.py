@@ -28,7 +28,7 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import Array, Masked, View, Wanted, color_channels
 from reslrb_cli.scene.images import Photo, read_photo, read_weights, turned_line
 from reslrb_cli.scene.parameters import Selection, set_values
-from reslrb_cli.scene.visibility import interior, sees_specular
+from reslrb_cli.scene.visibility import interior, sees_specular, spread
 
 #: What pixels of each kind are said to do.
 WORDS = {
@@ -36,6 +36,7 @@ WORDS = {
     "mixed": "see coats, blends or thin panes",
     "border": "lie at the film's border",
     "clipped": "are clipped",
+    "beside": "are reached by the film's filter from clipped ones",
     "alpha": "have alpha 0",
     "nonfinite": "are not finite",
     "file": "have weight 0 in the mask's file",
@@ -62,7 +63,12 @@ def mask_of(config: Config, wanted: Wanted, scene: mi.Scene, photo: Photo | None
         if mask.border:
             found.left_out["border"] = ~interior((height, width), sensor)
     if photo is not None:
-        kinds = {"clipped": photo.clipped, "alpha": photo.transparent, "nonfinite": photo.nonfinite}
+        if mask.clipped:
+            # The image has there what the filter spreads of a lamp; the file, what it spread of a lamp of the greatest
+            # value. Beside one that is 45 times as bright as white they are half as bright as they should be.
+            found.left_out["clipped"] = photo.clipped
+            found.left_out["beside"] = spread(photo.clipped, sensor) & ~photo.clipped
+        kinds = {"alpha": photo.transparent, "nonfinite": photo.nonfinite}
         found.left_out |= {kind: pixels for kind, pixels in kinds.items() if getattr(mask, kind)}
     if mask.file is not None:
         try:

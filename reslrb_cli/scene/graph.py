@@ -238,7 +238,12 @@ def _is_in_view(scene: mi.Scene, sensor: mi.Sensor, shape: mi.Shape) -> bool:
 def bounds(item: Any) -> tuple[np.ndarray, np.ndarray]:
     """The least and the greatest corner of the bounding box of a shape or a scene, (3,) float64 each."""
     box = item.bbox()
-    return np.ravel(box.min).astype(np.float64), np.ravel(box.max).astype(np.float64)
+    low, high = np.ravel(box.min).astype(np.float64), np.ravel(box.max).astype(np.float64)
+    if (low > high).any() and isinstance(item, mi.Mesh) and item.vertex_count():
+        # Mitsuba does not measure the mesh that it merges several shapes of one material into.
+        corners = triangles(item)
+        low, high = corners.min((0, 1)), corners.max((0, 1))
+    return low, high
 
 
 def interpolates_normals(shape: mi.Shape) -> bool:

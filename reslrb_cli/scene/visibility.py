@@ -43,6 +43,13 @@ def interior(shape: tuple[int, ...], sensor: mi.Sensor) -> np.ndarray:
     return inside
 
 
+def spread(pixels: np.ndarray, sensor: mi.Sensor) -> np.ndarray:
+    """The pixels whose reconstruction filter reaches some of `pixels`, which are among them; boolean (H, W) each."""
+    from scipy.ndimage import maximum_filter  # here: a run that is refused, or needs none, does not wait for it
+
+    return np.asarray(maximum_filter(pixels, 2 * _margin(sensor) + 1))
+
+
 @dataclass(frozen=True)
 class SeenSpecular:
     """Pixels (H, W) of a sensor's crop window that smooth specular lobes reach, by way of the reconstruction filter.
@@ -76,10 +83,8 @@ def sees_specular(scene: mi.Scene, sensor: mi.Sensor) -> SeenSpecular:
         only, beside = _first_surfaces(scene, ray, count)
         alone, mixed = alone | only, mixed | beside
         dr.eval(alone, mixed, random)
-    from scipy.ndimage import maximum_filter  # here: a run that is refused does not wait for it
-
     masks = (np.array(mask, dtype=bool).reshape(height, width) for mask in (alone, mixed))
-    return SeenSpecular(*(np.asarray(maximum_filter(mask, 2 * _margin(sensor) + 1)) for mask in masks))
+    return SeenSpecular(*(spread(mask, sensor) for mask in masks))
 
 
 def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
@@ -99,7 +104,7 @@ def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
     for axis, size in enumerate((height, width)):
         first = np.arange(size) * LOOK // size
         cells = np.maximum.reduceat(cells, first, axis=axis) if size < LOOK else np.take(cells, first, axis=axis)
-    return np.asarray(maximum_filter(cells, 2 * _margin(sensor) + 1))
+    return spread(cells, sensor)
 
 
 def _first_surfaces(scene: mi.Scene, ray: mi.Ray3f, count: int) -> tuple[mi.Bool, mi.Bool]:

@@ -427,6 +427,18 @@ def test_kinds_of_a_file(masked_folder):
     assert (left_out(problem), lines) == ([], [])
 
 
+def test_what_the_filter_mixes_with_a_clipped_pixel_is_left_out_with_it(masked_folder):
+    scene = masked_folder / "scene.xml"
+    scene.write_text(scene.read_text().replace('rfilter type="box"', 'rfilter type="gaussian"'))  # of radius 2
+    problem, lines = make_masked(masked_folder, "target.file=photo.png", "target.mask={border: false}")
+    y, x = CLIPPED
+    near = {(v, u) for v in range(max(y - 2, 0), min(y + 3, 8)) for u in range(max(x - 2, 0), min(x + 3, 8))}
+    assert set(left_out(problem)) == near | {CLEAR}
+    assert f"1 are clipped, {len(near) - 1} are reached by the film's filter from clipped ones, 1 have" in lines[0]
+    off = "target.mask={border: false, clipped: false}"
+    assert left_out(make_masked(masked_folder, "target.file=photo.png", off)[0]) == [CLEAR]
+
+
 def test_a_file_may_show_the_values_of_the_scene(masked_folder):
     """As pictures of other renderers do; the parameters' errors are then those from the scene's own values."""
     assert not make_masked(masked_folder, "target.file=photo.png")[0].truth
