@@ -85,7 +85,8 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
         if tolerances:
             off = measure_tolerances(config, scene, selection.params, sheets, integrator, say)
         light = tell_light(config, plan, scene, scene.sensors()[sensors[0]])
-        beside = solid_files(plan, sheets, solid, light, off)
+        loss = measure_loss(config, scene, sensors[0], integrator)
+        beside = solid_files(plan, sheets, solid, light, loss, off)
     with writing("--output", output):
         export_scene(described[0], selection.params, selection.scene_keys, integrator, output, run, beside)
     say(f"{output / 'scene.xml'}: {', '.join(selection.keys)}; rendered by {integrator['type']}{why}")
@@ -101,6 +102,9 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
             inside, aside, beyond = (100 * light[name] for name in ("inside", "beside", "beyond"))
             say(f"of the light that leaves it {inside:.4g} % goes into the picture, {aside:.2g} % beside it on the "
                 f"film, {beyond:.2g} % beyond")  # fmt: skip
+        if loss:
+            how = f"{loss['integrator']} ({loss['spp']} samples per pixel, seed {loss['seed']})"
+            say(f"mean squared difference from the target is {loss['l2']:.4g}: that of the solid, too, by {how}")
         if f"{plan.kind}.3mf" not in beside:
             say(f"{plan.kind}.3mf is left out, since lib3mf is missing: pip install 'reslrb[fabrication]'")
     if off:
@@ -258,6 +262,23 @@ def measure_tolerances(
     return measure(bench, sheets, target, config.run.final_spp, say)
 
 
+def measure_loss(config: Config, scene: mi.Scene, sensor: int, integrator: dict[str, object]) -> dict[str, Any]:
+    """The mean squared difference of the scene's image from target.file, as who has the exported scene finds it.
+
+    By Mitsuba's own `integrator` and independent samples: a run's own images may be of low-discrepancy ones, which have
+    less noise, and so a lower loss of the same face. Empty where the target is not one image of the film's size.
+    """
+    files, spp, seed = config.target.file, config.run.final_spp, 0
+    if files is None or len(files) != 1:
+        return {}
+    target = read_photo(files[0]).image[:, :, :3]
+    image = np.array(mi.render(scene, integrator=mi.load_dict(dict(integrator)), sensor=sensor, spp=spp, seed=seed))
+    if image.shape[:2] != target.shape[:2]:
+        return {}
+    difference = image[:, :, :3].astype(np.float64) - target
+    return {"l2": float(np.mean(difference**2)), "spp": spp, "seed": seed, "integrator": integrator["type"]}
+
+
 def tell_light(config: Config, plan: Fabrication, scene: mi.Scene, sensor: mi.Sensor) -> dict[str, float]:
     """Where the light of a finished face goes; empty where the scene or its target does not tell."""
     if not is_there(scene, plan):
@@ -274,11 +295,12 @@ def solid_files(
     sheets: Sequence[Sheet],
     solid: Solid,
     light: dict[str, float],
+    loss: dict[str, Any],
     off: dict[str, dict[str, Any]],
 ) -> dict[str, Callable[[Path], object]]:
     """Who writes what an exported folder holds of a solid, by the file's name; without 3MF where lib3mf is missing.
 
-    `light`: where it goes, `off`: what was measured of tolerances.
+    `light`: where it goes, `loss`: of `measure_loss`, `off`: what was measured of tolerances.
     """
 
     files: dict[str, Callable[[Path], object]] = {}
@@ -304,6 +326,8 @@ def solid_files(
         }
     if light:
         numbers["light"] = light
+    if loss:
+        numbers["loss"] = loss
     if off:
         numbers["tolerances"] = off
     files["fabrication.json"] = lambda path: path.write_text(json.dumps(numbers, indent=2) + "\n")

@@ -93,6 +93,23 @@ BAD = {
     "one colour": ([], "p.exr: is of one colour"),
     "dithered": ([], "p.exr: is of one colour"),
     "one pixel": ([], "p.exr: is 1 x 1"),
+    "no picture": ([], "p.exr: "),
+    "no image": ([], "p.exr: "),
+    "not finite": ([], "p.exr: "),
+    "no distance": (["--distance", "0"], "--distance: is 0; it must be above 0"),
+    "behind": (["--distance", "-5"], "--distance: is -5; it must be above 0"),
+    "not a number": (["--distance", "nan"], "--distance: is nan; it must be above 0"),
+    "far too large": (["--size", "1e7"], "--size: is 1e+07; it must be above 0"),
+    "no picture size": (["--picture-size", "0"], "--picture-size: is 0; it must be above 0"),
+    "no glass": (["--ior", "9"], "--ior: is 9; glass and plastics"),
+    "floor": (["--floor", "1"], "--floor: is 1; it must be from 0 to below 1"),
+    "tilt": (["--tilt", "0", "85"], "--tilt: is 0 and 85 degrees; both must be between"),
+    "incidence of a lens": (["--incidence", "10"], "--incidence: goes with --mirror"),
+    "grazing": (["--mirror", "--incidence", "85"], "--incidence: is 85 degrees; it must be between"),
+    "total reflection": (
+        ["--ior", "1.1", "--distance", "60", "--picture-size", "200"],
+        "bends light by at most 25 degrees before it is totally",
+    ),
 }
 
 
@@ -102,11 +119,17 @@ def test_what_cannot_be_is_refused_in_one_line_and_nothing_is_written(name: str,
     noise = 1 - 0.01 * np.random.default_rng(0).integers(0, 2, (16, 16))
     flat = {"one colour": np.ones((16, 16)), "one pixel": np.ones((1, 1)), "dithered": noise}
     wanted = flat.get(name, picture(16, 16))
-    write_file(tmp_path / "p.exr", np.repeat(wanted[:, :, None], 3, 2).astype(np.float32), linear=True)
+    if name == "not finite":
+        wanted = np.where(wanted > 0.9, np.inf, wanted)
+    if name == "no image":
+        (tmp_path / "p.exr").write_text("a picture")
+    elif name != "no picture":
+        write_file(tmp_path / "p.exr", np.repeat(wanted[:, :, None], 3, 2).astype(np.float32), linear=True)
     args = [str(tmp_path / "p.exr"), "-o", str(tmp_path / "lens"), "--pixels", "16", *options]
     error = CliRunner().invoke(command, args).exception
     assert isinstance(error, ConfigError)
     assert line in str(error)
+    assert "\n" not in str(error)
     assert not (tmp_path / "lens").exists()
 
 

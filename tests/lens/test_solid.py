@@ -229,8 +229,9 @@ def run(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
     image = np.repeat(picture(16, 12)[:, :, None], 3, 2).astype(np.float32)
     write_file(folder / "p.exr", image, linear=True)
     done("lens", folder / "p.exr", "-o", folder / "lens", "--pixels", "16")
-    done("optimize", folder / "lens/lens.yaml", "--set", f"run.output={folder}/runs", "--set", "run.iterations=1",
-         "--set", "run.spp=4", "--set", "run.final_spp=4", "--set", "run.certainty=false")  # fmt: skip
+    sets = [f"run.output={folder}/runs", "run.iterations=1", "run.spp=4", "run.final_spp=4", "run.certainty=false"]
+    said = done("optimize", folder / "lens/lens.yaml", *(word for line in sets for word in ("--set", line))).output
+    assert "runs/lens -o FOLDER` makes the solid" in said  # what comes next
     return folder / "runs/lens"
 
 
@@ -308,6 +309,12 @@ def test_the_solid_that_is_read_back_throws_what_the_run_s_scene_shows(kind: str
     target = np.array(mi.Bitmap(str(run.parents[1] / "lens/target.exr")))
     losses = [float(np.mean((image - target) ** 2)) for image in images]
     assert losses[1] == pytest.approx(losses[0], rel=0.02)
+    # As told: of as many samples as it says.
+    loss = told["loss"]
+    assert loss["integrator"] == "ptracer"
+    assert f"difference from the target is {loss['l2']:.4g}: that of the solid, too" in said
+    again = np.array(mi.render(solid, spp=loss["spp"], seed=loss["seed"]))
+    assert loss["l2"] == pytest.approx(float(np.mean((again - target) ** 2)), rel=0.02)
     # Light goes in once and out once wherever it passes: nothing crosses.
     x, y = (np.random.default_rng(3).uniform(-0.49, 0.49, (2, 4096)) * [[75], [100]]).astype(np.float32)
     ray, count = mi.Ray3f(mi.Point3f(x, y, 99), mi.Vector3f(0, 0, -1)), 0
