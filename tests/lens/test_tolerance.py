@@ -27,6 +27,7 @@ from reslrb_cli.measure.tolerance import (
     where_light_goes,
 )
 from reslrb_cli.records.images import write_file
+from reslrb_cli.report.page import write_report
 
 PTRACER = {"type": "ptracer", "max_depth": 4}
 FLAT = Fabrication(thickness=25.0)
@@ -278,6 +279,7 @@ def test_the_page_of_a_run_has_what_a_maker_wants_to_know(tmp_path: Path, llvm: 
     assert "<h2>Fabrication</h2>" in page
     assert f"{100 * numbers['light']['inside']:.4g} % of what leaves the face" in page
     assert "the solid of the lens" in page
+    assert "with the picture before its dark parts were lifted" in page
     assert "where it is off" not in page
     result = done("export", run, "-o", tmp_path / "made", "--tolerances", *settings("run.final_spp=8"))
     assert "has them, too" in result.output
@@ -285,6 +287,10 @@ def test_the_page_of_a_run_has_what_a_maker_wants_to_know(tmp_path: Path, llvm: 
     assert found.pop("tolerances").keys() >= {"as planned", "distance +2 %", "index -0.005"}
     assert found == numbers
     assert "distance +2 %" in (run / "report.html").read_text()
+    found["thrown"]["ssim_of_picture"] = found["thrown"]["ssim"]  # as where nothing was lifted
+    (run / "fabrication.json").write_text(json.dumps(found))
+    write_report(run)
+    assert "dark parts were lifted" not in (run / "report.html").read_text()
     shutil.rmtree(run / "images")
     (run / "fabrication.json").unlink()  # a run of before
     result = done("export", run, "-o", tmp_path / "again", "--tolerances", *settings("run.final_spp=8"))
