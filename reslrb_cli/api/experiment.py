@@ -27,7 +27,7 @@ from reslrb_cli.backend.variant import keep_variant
 from reslrb_cli.config import loader
 from reslrb_cli.config.loader import Override
 from reslrb_cli.config.schema import Config
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.errors import ConfigError, one_line
 from reslrb_cli.records.measurement_files import Line
 from reslrb_cli.records.measurements import GradcheckRecord
 from reslrb_cli.records.run_folder import recovered
@@ -99,7 +99,7 @@ def load(
     Raises ConfigError, located by file and key, for what is unknown, missing or of a wrong kind; an override that is at
     fault is located by `overrides`.
     """
-    return load_with(experiment, [loader.override(key, value) for key, value in (overrides or {}).items()], base)
+    return load_with(experiment, loader.overrides_of(overrides), base)
 
 
 def load_with(experiment: Experiment, put_in: Sequence[Override], base: str | os.PathLike[str] | None = None) -> Config:
@@ -112,10 +112,17 @@ def load_with(experiment: Experiment, put_in: Sequence[Override], base: str | os
         run = {} if data.get("run") is None else data["run"]
         data["run"] = {"name": "run", **run} if isinstance(run, dict) else run
         return loader.resolve(data, path, put_in)
-    path = Path(experiment)
+    path = as_path(experiment, "experiment", "a file, a mapping or a run's folder")
     if path.is_dir():
         return recovered(path, put_in)
     return loader.load(path, put_in)
+
+
+def as_path(given: object, name: str, what: str) -> Path:
+    """The path that the argument `name` is. Raises ConfigError where it is none, with `what` is wanted."""
+    if isinstance(given, (str, os.PathLike)):
+        return Path(given)
+    raise ConfigError(name, "", f"is {one_line(repr(given), 60)}, not {what}")
 
 
 def render(
@@ -280,10 +287,12 @@ def export(run: str | os.PathLike[str], folder: str | os.PathLike[str], toleranc
     Sets the Mitsuba variant of the run's experiment where none is set. Raises ConfigError, UnsupportedScene.
     """
     with called():
-        config = recovered(Path(run), ())
+        begun = "the folder of a run, which `optimize(..., folder=...)` makes as its loop begins"
+        path, out = as_path(run, "run", begun), as_path(folder, "folder", "the path of a folder")
+        config = recovered(path, ())
         from reslrb_cli.runs.export import check_export, write_export
 
-        check_export(config, Path(folder), tolerances)
+        check_export(config, out, tolerances)
         keep_variant(config.variant, config.source)
-        write_export(config, Path(run), Path(folder), tolerances, logger.info)
-        return Path(folder) / "scene.xml"
+        write_export(config, path, out, tolerances, logger.info)
+        return out / "scene.xml"

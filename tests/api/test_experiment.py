@@ -61,6 +61,7 @@ def test_a_mapping_is_what_yaml_would_have_been(folder: Path) -> None:
     assert dump(rl.load(experiment(), overrides)) == dump(expected)
     assert dump(rl.load("tiny.yaml", overrides)) == dump(expected)
     assert dump(rl.load(rl.load("tiny.yaml"), overrides)) == dump(expected)
+    assert rl.load("tiny.yaml", {"run": {"iterations": 6, "spp": 2}, "run.spp": 8}).run.spp == 8
     assert rl.load(experiment(spp=8), {"parameters[0].bounds": [0, 0.9]}) == expected
     unnamed = experiment()
     del unnamed["run"]
@@ -94,6 +95,17 @@ def itself() -> dict[str, Any]:
         (lambda: rl.load("tiny.yaml", {"run.spq": 3}), "overrides: run.spq: unknown key; did you mean `spp`?"),
         (lambda: rl.load("tiny.yaml", {"run..spp": 3}), "overrides: `run..spp` is no key"),
         (lambda: rl.load("tiny.yaml", {"run.spp": {1, 2}}), "overrides: run.spp: is {1, 2}; YAML has no such value"),
+        (lambda: rl.load("tiny.yaml", {3: 4}), "overrides: has the key 3; keys are text"),  # type: ignore[dict-item]
+        (lambda: rl.load("tiny.yaml", {"": 4}), "overrides: has the key ''; keys are text"),
+        (lambda: rl.load("tiny.yaml", ["run.spp=4"]), "overrides: is ['run.spp=4'], not values by key"),  # type: ignore[arg-type]
+        (
+            lambda: rl.load("tiny.yaml", {"run.spp": 4, "run": {"iterations": 6}}),
+            "overrides: run: replaces what run.spp sets; give it first",
+        ),
+        (lambda: rl.load(None), "experiment: is None, not a file, a mapping or a run's folder"),  # type: ignore[arg-type]
+        (lambda: rl.export(None, "made"), "run: is None, not the folder of a run, which `optimize"),  # type: ignore[arg-type]
+        (lambda: rl.optimize("tiny.yaml", folder=3), "folder: is 3, not the path of a folder"),  # type: ignore[arg-type]
+        (lambda: rl.optimize(resume=3), "resume: is 3, not the folder of a run"),  # type: ignore[arg-type]
         (lambda: rl.load("none.yaml"), "none.yaml: no such file"),
         (lambda: rl.load("."), ".: is no run's folder"),
     ],
