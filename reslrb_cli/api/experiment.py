@@ -75,11 +75,11 @@ def called() -> Iterator[None]:
         try:
             yield
         except ConfigError as error:
-            if not error.source.startswith("--"):
-                raise
-            name = error.source.removeprefix("--").replace("-", "_")
-            name = {"output": "folder"}.get(name, name)
-            raise ConfigError(name, error.key, error.message.replace("--output", "folder")) from None
+            name, message = error.source, error.message.replace("add --set run.output=FOLDER", "give folder=FOLDER")
+            if name.startswith("--"):
+                name = name.removeprefix("--").replace("-", "_")
+                name, message = {"output": "folder"}.get(name, name), message.replace("--output", "folder")
+            raise ConfigError(name, error.key, message) from None
 
 
 def load(

@@ -299,7 +299,10 @@ def optimize(
             raise ConfigError("experiment", "", "is missing; give a configuration, or resume=RUN")
         config = _with_own(load_with(experiment, put_in), loss, allow_code)
         if folder is not None:
-            check_output(config.source, config.run.output, config.run.folder_name, False)
+            try:
+                check_output(config.source, config.run.output, config.run.folder_name, False)
+            except ConfigError as error:
+                raise ConfigError("folder", "", error.message) from None
         variant = keep_variant(config.variant, config.source)
         begun = begin(config, variant, False, logger.info, logger.warning)
         return Run(contextlib.ExitStack(), begun, folder is not None)
