@@ -379,7 +379,10 @@ def _segments(depth: int, hides: bool, before: bool = True) -> str:
 
 
 def _over(own: Array, reference: Array) -> Ratio:
-    """The ratio of two means, with its standard error."""
+    """The ratio of two means, with its standard error; 1 where there is nothing in either, infinite where there should
+    be nothing."""
+    if not reference.any():
+        return Ratio(np.inf if own.any() else 1.0, 0.0)
     value = own.mean() / reference.mean()
     return Ratio(float(value), float(np.hypot(_error(own), value * _error(reference)) / abs(reference.mean())))
 

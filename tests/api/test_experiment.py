@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
+import shutil
+import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +109,10 @@ def itself() -> dict[str, Any]:
         (lambda: rl.export(None, "made"), "run: is None, not the folder of a run, which `optimize"),  # type: ignore[arg-type]
         (lambda: rl.optimize("tiny.yaml", folder=3), "folder: is 3, not the path of a folder"),  # type: ignore[arg-type]
         (lambda: rl.optimize(resume=3), "resume: is 3, not the folder of a run"),  # type: ignore[arg-type]
+        (
+            lambda: rl.gradcheck("tiny.yaml", integrators="own.py:A"),
+            "integrators own.py:A: would be run, with all your rights; allow_code=True has it run",
+        ),
         (lambda: rl.load("none.yaml"), "none.yaml: no such file"),
         (lambda: rl.load("."), ".: is no run's folder"),
     ],
@@ -238,6 +245,54 @@ def test_convergence_has_the_records_of_the_command(folder: Path, monkeypatch: p
     found = [json.loads(record.to_json()) for record in records]
     assert found == lines_of("c.jsonl")
     assert {"point", "method", "reference", "summary"} <= {each["kind"] for each in found}
+
+    class Interrupted(Played):
+        def run(self) -> Iterator[int]:
+            os.kill(os.getpid(), signal.SIGINT)
+            yield from super().run()
+            assert self.rounds < 8
+
+    monkeypatch.setattr(session, "Session", Interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        rl.convergence("tiny.yaml", "reslrb:stack,ptracer", rounds=8, spps=[4, 8], reference="reslrb:stack")
+
+
+class Interrupting(logging.Handler):
+    """Has an interrupt come once something is said that has these words, and keeps what is said."""
+
+    def __init__(self, words: str) -> None:
+        super().__init__(logging.DEBUG)
+        self.words, self.said = words, list[str]()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.said.append(record.getMessage())
+        if self.words in self.said[-1]:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.parametrize(
+    ("call", "words", "later"),
+    [
+        (lambda: rl.gradcheck("tiny.yaml", "stack", seeds=3, spp=4), "gradient reslrb:stack", "differences"),
+        (lambda: rl.gradcheck("tiny.yaml", seeds=12, spp=4, integrators="own_replay.py:Replay(fault=kept)",
+                              allow_code=True), "looking into", "gradients, max_depth 1"),
+    ],
+)  # fmt: skip
+def test_an_interrupt_ends_what_takes_long(
+    folder: Path, caplog: pytest.LogCaptureFixture, call: Callable[[], Any], words: str, later: str
+) -> None:
+    """It is not kept waiting until all is measured."""
+    shutil.copy(Path(__file__).parents[1] / "measure/own_replay.py", folder)
+    handler = Interrupting(words)
+    with caplog.at_level(logging.DEBUG, "reslrb_cli"):
+        logging.getLogger("reslrb_cli").addHandler(handler)
+        try:
+            with pytest.raises(KeyboardInterrupt):
+                call()
+        finally:
+            logging.getLogger("reslrb_cli").removeHandler(handler)
+    assert [line for line in handler.said if words in line]
+    assert not [line for line in handler.said if later in line]
 
 
 @pytest.mark.long

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from reslrb_cli.cli import main
 from reslrb_cli.errors import ExitCode
+from reslrb_cli.measure.own import _over
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -208,6 +210,15 @@ def test_silhouettes_are_judged_by_differences(
         line.partition(":")[2] for line in said if ": wrong where light moves: look at derivatives of silh" in line
     ]
     assert [line.partition(":")[0] for line in pointed] == [each.partition(":")[2] for each in names if not holds[each]]
+
+
+def test_where_there_is_nothing_in_either_image_they_agree() -> None:
+    """As of paths of one segment, where the sensor sees no lamp."""
+    nothing, something = np.zeros(4), np.array([1.0, 1.1, 0.9, 1.0])
+    assert not _over(nothing, nothing).wrong
+    assert _over(something, nothing).wrong
+    assert _over(nothing, something).wrong
+    assert not _over(something, something).wrong
 
 
 @pytest.mark.parametrize(
