@@ -172,8 +172,8 @@ STOPPED = [
     "    if record.iteration == 3:\n        threading.Timer(0.3, press).start()",
     'print(run.status, run.iteration > 3, sorted(run.parameters), (run.folder / "report.html").exists())\n'
     "again = iter(run)\nprint(next(again).iteration == run.iteration - 1)\nagain.close()",
-    "import drjit as dr\nseen = []\ndef late(image, target):\n    seen.append(0)\n    value = dr.mean(dr.square(image - "
-    "target), axis=None)\n    return value * dr.nan if len(seen) > 4 else value\n"
+    "import drjit as dr\nseen = []\ndef late(image, target):\n    seen.append(0)\n    value = dr.mean(dr.square("
+    "image - target), axis=None)\n    return value * dr.nan if len(seen) > 4 else value\n"
     'run = rl.optimize(config, folder="runs/nan", loss=late)\nfor record in run.live():\n    pass',
     'print(run.status, sorted(run.parameters), (run.folder / "report.html").exists())',
 ]
