@@ -127,6 +127,27 @@ def test_a_fault_is_found_and_the_sentence_points_at_it(capsys: pytest.CaptureFi
     assert len(lines) == 2, lines
     for words in FOUND[fault]:
         assert words in lines[1], lines[1]
+    assert "limit from above" not in lines[1], lines[1]
+
+
+#: A Cornell box, all of it diffuse.
+DIFFUSE = ["--set", "scene.options.size=16", "--set", "integrator.max_depth=5", "--set",
+           "integrator.hide_emitters=false"]  # fmt: skip
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("options", ["primal_fault=clamp", "fault=clamp", "primal_fault=bright", "fault=bright"])
+def test_what_is_limited_from_above_is_told_by_darker_scenes(capsys: pytest.CaptureFixture[str], options: str) -> None:
+    """A throughput, and light, in both passes and in that which differentiates."""
+    words = DIFFUSE if options.endswith("clamp") else ["room.yaml"]
+    name = f"own_replay.py:Replay({options})"
+    words = ["gradcheck", *words, "--integrators", name, "--allow-code", "--seeds", "24", "--spp", "64"]
+    assert call(words) == ExitCode.CHECK_FAILED
+    said = capsys.readouterr().out.splitlines()[-1]
+    darker, meant = ("surfaces", "the throughput") if options.endswith("clamp") else ("lamps", "light")
+    assert f"with all {darker} 16 times darker the light of these paths is" in said, said
+    assert f"look for a limit from above of {meant}" in said, said
+    assert f"wrong from paths of {3 if options.endswith('clamp') else 2} segments on" in said, said
 
 
 #: Mitsuba's own, as users' files name them, and what they are checked on.
