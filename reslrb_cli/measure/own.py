@@ -243,6 +243,8 @@ class Looking:
     def _limited(self, at: int, sums: Callable[..., tuple[Array, Array]], before: Ratio) -> str:
         """A word on what is limited from above: with darker lamps, or surfaces, paths of `at` segments are less wrong
         than they were `before`."""
+        if not np.isfinite(before.value):
+            return ""
         scene, sensor = self.parts.case.scene, self.parts.case.sensor
         for what, keys, meant in (("lamps", self._lamps(), "of light, as against fireflies"),
                                   ("surfaces", self._surfaces(), "of the throughput")):  # fmt: skip

@@ -65,6 +65,9 @@ integrator: {type: reslrb, max_depth: 5, rr_depth: 1, paths: camera, estimator: 
 run: {iterations: 2, spp: 64}
 """
 
+#: What finds large faults.
+FEW = ["--seeds", "12", "--spp", "32", "--set", "integrator.max_depth=4"]
+
 #: Both parameters.
 TWO = "parameters=[{key: floor.bsdf.weight.color0.value, initial: 0.3}, {key: wall.bsdf.reflectance.value}]"
 
@@ -95,7 +98,7 @@ def checked(capsys: pytest.CaptureFixture[str], options: str, *more: str) -> tup
 
 
 def test_one_that_is_right_holds_and_its_cost_is_told(capsys: pytest.CaptureFixture[str]) -> None:
-    code, lines = checked(capsys, "", "--set", TWO)
+    code, lines = checked(capsys, "", "--set", TWO, *FEW)
     assert code == 0
     assert len(lines) == 1
     assert "times the variance and" in lines[0]
@@ -122,7 +125,8 @@ QUICK = ("fault=cosine", "fault=roulette")
     "fault", [name if name in QUICK else pytest.param(name, marks=pytest.mark.long) for name in FOUND]
 )
 def test_a_fault_is_found_and_the_sentence_points_at_it(capsys: pytest.CaptureFixture[str], fault: str) -> None:
-    code, lines = checked(capsys, fault, *(["--set", TWO] if fault == "fault=lobe" else []))
+    more = ["--set", TWO] if fault == "fault=lobe" else FEW if fault in QUICK else []
+    code, lines = checked(capsys, fault, *more)
     assert code == ExitCode.CHECK_FAILED
     assert len(lines) == 2, lines
     for words in FOUND[fault]:
@@ -271,7 +275,7 @@ def test_what_is_no_integrator_is_one_line(capsys: pytest.CaptureFixture[str], n
 
 def test_an_image_that_is_no_number_fails(capsys: pytest.CaptureFixture[str]) -> None:
     code = call(["gradcheck", "room.yaml", "--integrators", "own_replay.py:Replay(primal_fault=nan)", "--allow-code",
-                 "--seeds", "8", "--spp", "4"])  # fmt: skip
+                 "--seeds", "3", "--spp", "4", "--set", "integrator.max_depth=2"])  # fmt: skip
     said = capsys.readouterr().out
     assert code == ExitCode.CHECK_FAILED
     assert "image: own_replay.py:Replay(primal_fault=nan)" in said
@@ -299,12 +303,12 @@ def test_a_run_by_one_is_that_of_prb(capsys: pytest.CaptureFixture[str]) -> None
 def test_bench_and_convergence_take_one(capsys: pytest.CaptureFixture[str]) -> None:
     name = "own_replay.py:Replay"
     code = call(
-        ["bench", "room.yaml", "--integrators", f"prb,{name}", "--values", "3", "--rounds", "3", "--allow-code"]
+        ["bench", "room.yaml", "--integrators", f"prb,{name}", "--values", "3", "--rounds", "2", "--allow-code"]
     )
     said = capsys.readouterr().out
     assert code == 0, said
     assert said.count(name) >= 1
-    code = call(["convergence", "room.yaml", "--integrators", f"prb,{name}", "--rounds", "8", "--allow-code",
+    code = call(["convergence", "room.yaml", "--integrators", f"prb,{name}", "--rounds", "4", "--allow-code",
                  "--set", "run.spp=8"])  # fmt: skip
     said = capsys.readouterr().out
     assert code == 0, said
