@@ -18,7 +18,6 @@ import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before any test 
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.errors import BackendError
 
-
 #: What most tests come to import.
 HEAVY = ("colour", "matplotlib.pyplot", "reslrb_cli.cli.optimize", "reslrb_cli.report.page", "reslrb_cli.runs.recorder")
 
