@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import importlib
 import os
 import signal
 import subprocess
@@ -17,9 +18,16 @@ import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before any test 
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.errors import BackendError
 
+#: What most tests come to import.
+HEAVY = ("colour", "matplotlib.pyplot", "reslrb_cli.cli.optimize", "reslrb_cli.report.page", "reslrb_cli.runs.recorder")
+
 
 def pytest_collection_finish() -> None:
-    """What is there until the last test is not looked through again and again for what has become free."""
+    """What is there until the last test is not looked through again and again for what has become free: each recording
+    of a step has Python do that."""
+    if "PYTEST_XDIST_WORKER" in os.environ:  # which has many tests before it
+        for name in HEAVY:
+            importlib.import_module(name)
     gc.collect()
     gc.freeze()
 

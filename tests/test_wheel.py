@@ -161,15 +161,21 @@ def test_an_example_runs_from_another_folder(python: Path, tmp_path: Path, llvm:
 
 NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
 
-#: Cells of a notebook whose stop button is pressed in the midst of the first loop.
+#: Cells of a notebook whose stop button is pressed in the midst of the first loop, twice while the folder is completed,
+#: and whose loss then returns NaN.
 STOPPED = [
     'import reslrb_cli as rl\nconfig = rl.load("configs/cornell_floor.yaml", {"run.iterations": 100000, '
     '"scene.options": {"resx": 16, "resy": 16}, "run.final_spp": 16, "run.measuring": 0})\n'
     'run = rl.optimize(config, folder="runs/stopped")',
-    "import threading, os, signal\nfor record in run.live():\n    if record.iteration == 3:\n"
-    "        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()",
+    "import threading, os, signal, time\ndef press():\n    for _ in range(2):\n"
+    "        os.kill(os.getpid(), signal.SIGINT)\n        time.sleep(0.02)\nfor record in run.live():\n"
+    "    if record.iteration == 3:\n        threading.Timer(0.3, press).start()",
     'print(run.status, run.iteration > 3, sorted(run.parameters), (run.folder / "report.html").exists())\n'
     "again = iter(run)\nprint(next(again).iteration == run.iteration - 1)\nagain.close()",
+    "import drjit as dr\nseen = []\ndef late(image, target):\n    seen.append(0)\n    value = dr.mean(dr.square("
+    "image - target), axis=None)\n    return value * dr.nan if len(seen) > 4 else value\n"
+    'run = rl.optimize(config, folder="runs/nan", loss=late)\nfor record in run.live():\n    pass',
+    'print(run.status, sorted(run.parameters), (run.folder / "report.html").exists())',
 ]
 
 
@@ -205,15 +211,23 @@ def test_a_notebook_runs(
     assert any(output.get("text", "").startswith("finished ") for output in outputs)
 
 
-def test_a_notebooks_stop_button_keeps_the_result(
+def test_a_notebooks_stop_button_and_a_loss_of_nan_keep_the_result(
     python: Path, tmp_path: Path, llvm: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nbformat = pytest.importorskip("nbformat")
     cells = [nbformat.v4.new_code_cell(source) for source in STOPPED]
-    cells[1].metadata["tags"] = ["raises-exception"]
+    for place in (1, 3):
+        cells[place].metadata["tags"] = ["raises-exception"]
     execute(nbformat.v4.new_notebook(cells=cells), python, tmp_path, monkeypatch)
     [error] = [output for output in cells[1].outputs if output.output_type == "error"]
     assert error.ename == "KeyboardInterrupt"
     assert any("image/png" in output.get("data", {}) for output in cells[1].outputs)
-    text = "".join(output.text for output in cells[2].outputs if output.get("name") == "stdout")
-    assert text == "interrupted True ['floor.reflectance.data'] True\nTrue\n"
+    assert said(cells[2]) == "interrupted True ['floor.reflectance.data'] True\nTrue\n"
+    [error] = [output for output in cells[3].outputs if output.output_type == "error"]
+    assert (error.ename, error.evalue.partition(" was")[0]) == ("NonFinite", "the loss (your own `late`)")
+    assert said(cells[4]) == "failed ['floor.reflectance.data'] True\n"
+
+
+def said(cell: Any) -> str:
+    """What a cell printed."""
+    return "".join(output.text for output in cell.outputs if output.get("name") == "stdout")

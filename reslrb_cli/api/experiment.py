@@ -15,7 +15,7 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
@@ -27,7 +27,7 @@ from reslrb_cli.backend.variant import keep_variant
 from reslrb_cli.config import loader
 from reslrb_cli.config.loader import Override
 from reslrb_cli.config.schema import Config
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.errors import ConfigError, one_line
 from reslrb_cli.records.measurement_files import Line
 from reslrb_cli.records.measurements import GradcheckRecord
 from reslrb_cli.records.run_folder import recovered
@@ -39,19 +39,26 @@ Experiment: TypeAlias = "Config | str | os.PathLike[str] | Mapping[str, Any]"
 #: What errors say of an experiment that was no file.
 NAMELESS = "<dict>"
 
+#: What errors advise on the command line, and what that is in a script.
+ARGUMENTS = {
+    "add --set run.output=FOLDER": "give folder=FOLDER",
+    "--allow-code has it run": "allow_code=True has it run",
+}
+
 logger = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
-def held() -> Iterator[None]:
+def held() -> Iterator[Callable[[], bool]]:
     """Have Ctrl-C, and a notebook's interrupt, wait until the block is done, which then raises KeyboardInterrupt.
 
     In the midst of what Mitsuba and Dr.Jit are doing it would end in a crash, or in an error that names something else.
-    In another thread than the main one, and within another such block, nothing is done.
+    Yields what says whether one waits, for blocks that take long. In another thread than the main one, and within
+    another such block, nothing is done.
     """
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or before is not signal.default_int_handler:
-        yield
+        yield lambda: False
         return
     came = False
 
@@ -61,7 +68,7 @@ def held() -> Iterator[None]:
 
     signal.signal(signal.SIGINT, mark)
     try:
-        yield
+        yield lambda: came
     finally:
         signal.signal(signal.SIGINT, before)
     if came:
@@ -69,17 +76,19 @@ def held() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def called() -> Iterator[None]:
+def called() -> Iterator[Callable[[], bool]]:
     """The same, with errors of what is a command's option located by the argument, which has its name."""
-    with held():
+    with held() as stop:
         try:
-            yield
+            yield stop
         except ConfigError as error:
-            if not error.source.startswith("--"):
-                raise
-            name = error.source.removeprefix("--").replace("-", "_")
-            name = {"output": "folder"}.get(name, name)
-            raise ConfigError(name, error.key, error.message.replace("--output", "folder")) from None
+            name, message = error.source, error.message
+            for option, argument in ARGUMENTS.items():
+                message = message.replace(option, argument)
+            if name.startswith("--"):
+                name = name.removeprefix("--").replace("-", "_")
+                name, message = {"output": "folder"}.get(name, name), message.replace("--output", "folder")
+            raise ConfigError(name, error.key, message) from None
 
 
 def load(
@@ -99,7 +108,7 @@ def load(
     Raises ConfigError, located by file and key, for what is unknown, missing or of a wrong kind; an override that is at
     fault is located by `overrides`.
     """
-    return load_with(experiment, [loader.override(key, value) for key, value in (overrides or {}).items()], base)
+    return load_with(experiment, loader.overrides_of(overrides), base)
 
 
 def load_with(experiment: Experiment, put_in: Sequence[Override], base: str | os.PathLike[str] | None = None) -> Config:
@@ -112,10 +121,17 @@ def load_with(experiment: Experiment, put_in: Sequence[Override], base: str | os
         run = {} if data.get("run") is None else data["run"]
         data["run"] = {"name": "run", **run} if isinstance(run, dict) else run
         return loader.resolve(data, path, put_in)
-    path = Path(experiment)
+    path = as_path(experiment, "experiment", "a file, a mapping or a run's folder")
     if path.is_dir():
         return recovered(path, put_in)
     return loader.load(path, put_in)
+
+
+def as_path(given: object, name: str, what: str) -> Path:
+    """The path that the argument `name` is. Raises ConfigError where it is none, with `what` is wanted."""
+    if isinstance(given, (str, os.PathLike)):
+        return Path(given)
+    raise ConfigError(name, "", f"is {one_line(repr(given), 60)}, not {what}")
 
 
 def render(
@@ -199,12 +215,13 @@ def gradcheck(
     whole, `seeds` their number whatever time they take, at least 3, `spp` the samples per pixel of one gradient.
     `record.holds` is False where a comparison fails. `integrators` are Mitsuba integrators of your own,
     `FILE.py:CLASS[(OPTION=VALUE,...)]`, in place of ours; `allow_code` has their files run (docs/your_integrator.md).
-    How noisy and dear they are, and where to look in one that is wrong, is logged (`logging.INFO`).
+    How noisy and dear they are, and where to look in one that is wrong, is logged (`logging.INFO`). An interrupt ends
+    it after the gradient that is at work, in KeyboardInterrupt.
 
     Sets the Mitsuba variant of the experiment where none is set. Raises ConfigError, UnsupportedScene.
     """
     began = time.monotonic()
-    with called():
+    with called() as stop:
         config = load(experiment).with_code(allow_code)
         for name, value, least in (("seeds", seeds, 3), ("spp", spp, 1)):
             if value is not None and value < least:
@@ -216,11 +233,11 @@ def gradcheck(
         gc.collect()  # scenes that are done with would take part, and their parameters' gradients be in the way
         checked = settings_of(config, estimators, budget, seeds, spp, time.monotonic() - began, integrators)
         check = Gradcheck(checked)
-        records = [result.record for result in check.run(lambda: False, logger.info)]
+        records = [result.record for result in check.run(stop, logger.info)]
         if integrators is not None:
             from reslrb_cli.measure.own import look_into
 
-            for line in look_into(check, records, lambda: False, logger.debug):
+            for line in look_into(check, records, stop, logger.debug):
                 logger.info(line)
         return records
 
@@ -240,12 +257,13 @@ def convergence(
     The arguments are the command's options: `integrators` and `reference` as `--integrators` and `--reference` take
     them, `budget` the seconds for the whole, `rounds` the number of turns whatever time they take, `spps` samples per
     pixel that are compared; `allow_code` has the files of integrators of your own run. Each method computes in a
-    process of its own, under the experiment's variant; none is set in this one.
+    process of its own, under the experiment's variant; none is set in this one. An interrupt ends it soon, in
+    KeyboardInterrupt.
 
     Raises ConfigError.
     """
     began = time.monotonic()
-    with called():
+    with called() as stop:
         config = load(experiment).with_code(allow_code)
         from reslrb_cli.measure.convergence.judgement import Judgement
         from reslrb_cli.measure.convergence.session import Session
@@ -264,9 +282,11 @@ def convergence(
         plan.check()
         with tempfile.TemporaryDirectory(prefix="reslrb-measuring-") as name:
             spent_s = time.monotonic() - began
-            session = Session(plan, Path(name), lambda: False, logger.info, spent_s=spent_s)
+            session = Session(plan, Path(name), stop, logger.info, spent_s=spent_s)
             for _ in session.run():
                 pass
+            if stop():
+                raise KeyboardInterrupt
             return result_lines(Judgement(session).results())
 
 
@@ -280,10 +300,12 @@ def export(run: str | os.PathLike[str], folder: str | os.PathLike[str], toleranc
     Sets the Mitsuba variant of the run's experiment where none is set. Raises ConfigError, UnsupportedScene.
     """
     with called():
-        config = recovered(Path(run), ())
+        begun = "the folder of a run, which `optimize(..., folder=...)` makes as its loop begins"
+        path, out = as_path(run, "run", begun), as_path(folder, "folder", "the path of a folder")
+        config = recovered(path, ())
         from reslrb_cli.runs.export import check_export, write_export
 
-        check_export(config, Path(folder), tolerances)
+        check_export(config, out, tolerances)
         keep_variant(config.variant, config.source)
-        write_export(config, Path(run), Path(folder), tolerances, logger.info)
-        return Path(folder) / "scene.xml"
+        write_export(config, path, out, tolerances, logger.info)
+        return out / "scene.xml"

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from reslrb_cli.api.experiment import Experiment, called, held, load, load_with
+from reslrb_cli.api.experiment import Experiment, as_path, called, held, load, load_with
 from reslrb_cli.backend.variant import keep_variant
-from reslrb_cli.config.loader import Override, override
+from reslrb_cli.config.loader import Override, overrides_of
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, describe
 from reslrb_cli.optimization.loop import iterate
@@ -283,22 +283,26 @@ def optimize(
     the target, and measures what is left to measurement, before it returns. Raises ConfigError, located by file and
     key, UnsupportedScene, BackendError, MachineError; iterating raises NonFinite, OutOfMemory and MachineError too.
     """
-    put_in = [override(key, value) for key, value in (overrides or {}).items()]
+    put_in = overrides_of(overrides)
     if folder is not None:
-        path = Path(os.path.abspath(folder))
+        path = Path(os.path.abspath(as_path(folder, "folder", "the path of a folder")))
         put_in += [Override("folder", ("run", "output"), str(path.parent))]
         put_in += [Override("folder", ("run", "name"), path.name)]
     with called():
         if resume is not None:
             wanted = None if experiment is None else load(experiment)
-            run = Run(*_reopened(Path(resume), wanted, put_in, loss, allow_code))
-            run._folder = Path(resume)
+            earlier = as_path(resume, "resume", "the folder of a run")
+            run = Run(*_reopened(earlier, wanted, put_in, loss, allow_code))
+            run._folder = earlier
             return run
         if experiment is None:
             raise ConfigError("experiment", "", "is missing; give a configuration, or resume=RUN")
         config = _with_own(load_with(experiment, put_in), loss, allow_code)
         if folder is not None:
-            check_output(config.source, config.run.output, config.run.folder_name, False)
+            try:
+                check_output(config.source, config.run.output, config.run.folder_name, False)
+            except ConfigError as error:
+                raise ConfigError("folder", "", error.message) from None
         variant = keep_variant(config.variant, config.source)
         begun = begin(config, variant, False, logger.info, logger.warning)
         return Run(contextlib.ExitStack(), begun, folder is not None)

@@ -62,6 +62,8 @@ def load_replay(config: Config) -> Replay:
     saved = load_nonfinite(folder.checkpoint)
     if saved is None:
         raise ConfigError(config.source, OPTION, "this run met no value that was not finite")
+    if config.codes:
+        raise ConfigError(config.source, OPTION, f"runs no code of your own, which {next(iter(config.codes))} names")
     iteration, values = saved.iteration, saved.parameters
     archive, written = folder.checkpoint / NONFINITE_FILE_NAME, path / MANIFEST
     guided = _guided(config, manifest, written)

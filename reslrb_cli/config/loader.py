@@ -123,9 +123,24 @@ def loads(text: str, path: Path | str, overrides: Sequence[str | Override] = ())
     return resolve(parse(text, str(path)), path, parsed)
 
 
-def override(key: str, value: object) -> Override:
-    """The override of a script: `key` as `--set` has it, `value` as YAML would have made it. Raises ConfigError."""
-    return Override(OVERRIDDEN, _parse_location(key, OVERRIDDEN), plain(value, OVERRIDDEN, key))
+def overrides_of(given: Mapping[str, object] | None) -> list[Override]:
+    """The overrides of a script: keys as `--set` has them, values as YAML would have made them. Raises ConfigError,
+    also for one that leaves nothing of another before it."""
+    if given is not None and not isinstance(given, Mapping):
+        reason = f'is {one_line(repr(given), 60)}, not values by key, such as {{"run.iterations": 5}}'
+        raise ConfigError(OVERRIDDEN, "", reason)
+    found: dict[str, Override] = {}
+    for key, value in (given or {}).items():
+        if not isinstance(key, str) or not key:
+            raise ConfigError(OVERRIDDEN, "", f"has the key {one_line(repr(key), 40)}; keys are text, as run.spp")
+        location = _parse_location(key, OVERRIDDEN)
+        for earlier, other in found.items():
+            if other.location[: len(location)] == location:
+                raise ConfigError(
+                    OVERRIDDEN, key, f"replaces what {earlier} sets; give it first, or leave one of them out"
+                )
+        found[key] = Override(OVERRIDDEN, location, plain(value, OVERRIDDEN, key))
+    return list(found.values())
 
 
 def plain(value: Any, source: object, key: str = "", depth: int = 0) -> Any:

@@ -13,6 +13,7 @@ fault may be, and the sentence is made of those that are left. It says what was 
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from reslrb_cli.measure.gradients import Case, seeds
 from reslrb_cli.measure.participants import NEVER, Participants
 from reslrb_cli.records.measurements import GradcheckRecord, Verdict
 from reslrb_cli.scene.catalog import parameter_kind
+from reslrb_cli.scene.graph import SceneGraph
 
 Array = np.ndarray
 
@@ -48,6 +50,9 @@ LINEAR = (".value", "scale")
 
 #: Of the same paths, sums taken in another order scatter by less.
 SAME_PATHS = 1e-3
+
+#: BSDFs whose values are linear in the reflectances in them, and by how much these, or lamps, are made darker.
+SCALING, DARKER = {"SmoothDiffuse", "TwoSidedBRDF", "BlendBSDF"}, 16.0
 
 #: Constants that slip in, with how they are written.
 CONSTANTS = {"2": 2.0, "1/2": 0.5, "pi": np.pi, "1/pi": 1 / np.pi, "2 pi": 2 * np.pi, "1/(2 pi)": 0.5 / np.pi,
@@ -151,12 +156,15 @@ class Looking:
 
     def images(self, **other: int) -> Ratio:
         """Of images, weighted alike in all pixels."""
+        return _over(*self._sums(**other))
+
+    def _sums(self, **other: int) -> tuple[Array, Array]:
         self._measure("images", other)
-        sums = [
+        mine, ours = (
             np.array([self.parts.case.image(one, seed, self.parts.spp).sum() for seed in self._each(SEEDS, block)])
             for block, one in zip((5, 6), self._pair(**other), strict=True)
-        ]
-        return _over(*sums)
+        )
+        return mine, ours
 
     def gradients(self, **other: int) -> dict[str, Ratio]:
         """Of each parameter that the reference has a gradient of."""
@@ -177,29 +185,83 @@ class Looking:
 
     def emission(
         self, depth: int | None = None, seen: int | None = None, even: bool = False
-    ) -> tuple[Ratio, float] | None:  # fmt: skip
+    ) -> tuple[Ratio, float] | None:
         """The derivative by all emission, times emission, over the image, which it has to equal: images are linear in
         it. And by how much that scatters between seeds, at each of which both are of the same paths; None where some
         light is not a number (`.value`, `scale`). Of paths of `depth` segments, over an image of `seen`; `even`: with
         dL/dI of 1 in all pixels and channels."""
-        scene = self.parts.case.scene
         depth = self.depth if depth is None else depth
-        own, image = (self.parts.own_with(self.label, max_depth=n) for n in (depth, depth if seen is None else seen))
-        params = mi.traverse(scene)
-        keys = [key for key, _ in params if parameter_kind(params, key) == "emitter" and key.endswith(LINEAR)]
-        if len(keys) != len(scene.emitters()):
+        keys = self._lamps()
+        if not keys:
             return None
-        case = Case(scene, keys, self.parts.case.sensor)
+        derivatives, images = self._by_emission(keys, depth, seen, even)
+        found = derivatives / images
+        return Ratio(float(found.mean()), _error(found)), float(found.std(ddof=1))
+
+    def _by_emission(
+        self, keys: list[str], max_depth: int, seen: int | None = None, even: bool = False, **other: int
+    ) -> tuple[Array, Array]:
+        """The derivative by emission, times emission, and the image that it has to equal, at each seed."""
+        depths = max_depth, max_depth if seen is None else seen
+        own, image = (self.parts.own_with(self.label, max_depth=n, **other) for n in depths)
+        case = Case(self.parts.case.scene, keys, self.parts.case.sensor)
         weights = np.array(self.parts.case.weights)
         case.weigh(np.ones_like(weights) if even else weights)
-        self._measure("derivatives by emission", {"max_depth": depth})
+        self._measure("derivatives by emission", {"max_depth": max_depth} | other)
         emitted = np.concatenate([case.initial[key] for key in keys])
-        rows = []
-        for seed in self._each(SEEDS, 7):
-            gradient = case.gradient(own, seed, self.parts.spp, step=case.known_step)
-            rows.append(gradient @ emitted / case.weighted(case.image(image, seed, self.parts.spp)))
-        found = np.array(rows)
-        return Ratio(float(found.mean()), _error(found)), float(found.std(ddof=1))
+        rows = [
+            (case.gradient(own, seed, self.parts.spp, step=case.known_step) @ emitted,
+             case.weighted(case.image(image, seed, self.parts.spp)))
+            for seed in self._each(SEEDS, 7)
+        ]  # fmt: skip
+        derivatives, images = np.transpose(rows)
+        return derivatives, images
+
+    def _lamps(self) -> list[str]:
+        """What all light is linear in; nothing where some is not a number (`.value`, `scale`)."""
+        params = mi.traverse(self.parts.case.scene)
+        keys = [key for key, _ in params if parameter_kind(params, key) == "emitter" and key.endswith(LINEAR)]
+        return keys if len(keys) == len(self.parts.case.scene.emitters()) else []
+
+    def _surfaces(self) -> list[str]:
+        """What light that is scattered once is linear in, all of it; nothing where a BSDF is not."""
+        params = mi.traverse(self.parts.case.scene)
+        graph = SceneGraph.of(self.parts.case.scene)
+        bsdfs = dict.fromkeys(each for bsdf in graph.surface_bsdfs() for each in graph.nested_bsdfs(bsdf))
+        kinds = [bsdf.class_name() for bsdf in bsdfs]
+        keys = [key for key, _ in params if key.endswith((".reflectance.value", ".reflectance.data"))]
+        return keys if set(kinds) <= SCALING and len(keys) == kinds.count("SmoothDiffuse") else []
+
+    def _of_length(self, at: int, sums: Callable[..., tuple[Array, Array]]) -> Ratio:
+        """Of the light of paths of `at` segments, and of no others; `sums`: both sides of a ratio, by depths."""
+        own, reference = sums(max_depth=at, rr_depth=NEVER)
+        if at > 1:
+            shorter = sums(max_depth=at - 1, rr_depth=NEVER)
+            own, reference = own - shorter[0], reference - shorter[1]
+        return _over(own, reference)
+
+    def _limited(self, at: int, sums: Callable[..., tuple[Array, Array]], before: Ratio) -> str:
+        """A word on what is limited from above: with darker lamps, or surfaces, paths of `at` segments are less wrong
+        than they were `before`."""
+        if not np.isfinite(before.value):
+            return ""
+        scene, sensor = self.parts.case.scene, self.parts.case.sensor
+        for what, keys, meant in (("lamps", self._lamps(), "of light, as against fireflies"),
+                                  ("surfaces", self._surfaces(), "of the throughput")):  # fmt: skip
+            if not keys:
+                continue
+            case = Case(scene, keys, sensor)
+            try:
+                case.set({key: value / DARKER for key, value in case.initial.items()})
+                darker = self._of_length(at, sums)
+            finally:
+                case.set(case.initial)
+            if not darker.same(before) and abs(darker.value - 1) < abs(before.value - 1) / 2:
+                return (
+                    f"with all {what} {DARKER:g} times darker the light of these paths is {darker} what it should be, "
+                    f"and {before} as they are: look for a limit from above {meant} (dr.minimum, a clamp)"
+                )
+        return ""
 
     def _measure(self, what: str, options: Mapping[str, int]) -> None:
         """Tell what is being measured."""
@@ -246,7 +308,9 @@ class Looking:
             parts.append(_segments(where, self._options["hide_emitters"]))
         if self._roulette() and not self.images(rr_depth=NEVER).wrong:
             parts.append("without roulette it is right: the weight 1/p of a path that goes on")
-        return "; ".join(parts)
+        elif where is not None:
+            parts.append(self._limited(where, self._sums, self._of_length(where, self._sums)))
+        return "; ".join(filter(None, parts))
 
     def _of_gradient(self, found: dict[str, Ratio], wrong: dict[str, Ratio]) -> str:
         zero = [key for key, ratio in wrong.items() if ratio.value == 0 and ratio.error == 0]
@@ -281,7 +345,13 @@ class Looking:
                         "weight stands in one of the two passes alone"]  # fmt: skip
         said = []
         at, before = self._from_depth(lambda depth: self.gradients(max_depth=depth).get(worst))
-        if at is not None:
+        if at is not None and (alone := self._of_length(at, self._sums)).wrong:
+            said.append(
+                f"{_segments(at, self._options['hide_emitters'], before)}; the light of these alone is {alone} what it "
+                "should be in its image, which has little of it"
+            )
+            said.append(self._limited(at, self._sums, alone))
+        elif at is not None:
             said.append(
                 f"{_from(at, before)}, though its derivative by emission is right, and so are its paths and what "
                 "their vertices add: look at what is differentiated there (the BSDF's value over its detached self), "
@@ -289,7 +359,7 @@ class Looking:
             )
         if lobes := self._lobes(worst):
             said.append(lobes)
-        return said
+        return [each for each in said if each]
 
     def _of_passes(self, wrong: dict[str, Ratio]) -> str | None:
         """Why the pass that differentiates is not that of the image: what it adds, or its paths; None where it is."""
@@ -315,8 +385,12 @@ class Looking:
         if self._too_short():
             return f"{begin}the pass that differentiates ends paths a segment too soon"
         at, before = self._from_depth(lambda depth: (self.emission(depth) or (None,))[0])
-        where = "" if at is None else f"; {_segments(at, self._options['hide_emitters'], before)}"
-        return f"{begin}what a vertex adds in the pass that differentiates is not what it adds in the first{where}"
+        said = [f"{begin}what a vertex adds in the pass that differentiates is not what it adds in the first"]
+        if at is not None:
+            sums = functools.partial(self._by_emission, self._lamps())
+            said.append(_segments(at, self._options["hide_emitters"], before))
+            said.append(self._limited(at, sums, self._of_length(at, sums)))
+        return "; ".join(filter(None, said))
 
     def _right_if_even(self) -> bool:
         """Whether it is dL/dI alone that is wrong in the pass that differentiates: where that is even, all is right."""
@@ -379,7 +453,10 @@ def _segments(depth: int, hides: bool, before: bool = True) -> str:
 
 
 def _over(own: Array, reference: Array) -> Ratio:
-    """The ratio of two means, with its standard error."""
+    """The ratio of two means, with its standard error; 1 where there is nothing in either, infinite where there should
+    be nothing."""
+    if not reference.any():
+        return Ratio(np.inf if own.any() else 1.0, 0.0)
     value = own.mean() / reference.mean()
     return Ratio(float(value), float(np.hypot(_error(own), value * _error(reference)) / abs(reference.mean())))
 

@@ -26,6 +26,7 @@ from reslrb_cli.optimization.nonfinite import (
     zero_nonfinite,
 )
 from reslrb_cli.optimization.optimizers import clamp_gradients
+from reslrb_cli.optimization.own_code import own_losses
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import measure_curvatures, rescale
 from reslrb_cli.optimization.shards import add_gradient, scaled
@@ -192,7 +193,7 @@ def _findings(
     problem: Problem, iteration: int, loss: float, counts: dict[str, Any], refused: list[tuple[int, Refused]]
 ) -> Findings:
     """What of a step was not finite; `refused` are the steps' counts, by sensor."""
-    found = Findings(iteration, loss=not math.isfinite(loss))
+    found = Findings(iteration, loss=not math.isfinite(loss), own=own_losses(problem.config))
     found.gradients = {key: int(count[0]) for key, count in counts.items() if count[0]}
     found.lost = [key for key, bad in found.gradients.items() if bad == dr.prod(dr.shape(problem.optimizer[key]))]
     for sensor, view in refused:

@@ -32,7 +32,8 @@ class RefusedAt:
 @dataclass
 class Findings:
     """What of one iteration was not finite: its loss, entries of dL/dI by sensor, and entries of gradients and of
-    updates by parameter, of those that had any. `lost` are the gradients without one finite entry."""
+    updates by parameter, of those that had any. `lost` are the gradients without one finite entry, `own` the losses
+    that the user has written."""
 
     iteration: int
     loss: bool = False
@@ -40,6 +41,7 @@ class Findings:
     gradients: dict[str, int] = field(default_factory=dict)
     lost: list[str] = field(default_factory=list)
     updates: dict[str, int] = field(default_factory=dict)
+    own: str = ""
 
     def __bool__(self) -> bool:
         return bool(self.loss or self.refused or self.gradients or self.updates)
@@ -54,8 +56,13 @@ class Findings:
         """What belongs to a parameter: its gradient's entries, or its update's."""
         return {**self.gradients, **self.updates}  # what has no finite gradient is not updated
 
+    @property
+    def whose_loss(self) -> str:
+        """The loss in words, by the user's own name."""
+        return f"the loss (your own {self.own})" if self.own else "the loss"
+
     def __str__(self) -> str:
-        parts = ["the loss"] if self.loss else []
+        parts = [self.whose_loss] if self.loss else []
         for sensor, at in self.refused.items():
             x, y, channel = at.first
             place = f"the first at pixel ({x}, {y}), channel {channel}, of sensor {sensor}"
@@ -83,7 +90,7 @@ def why_end(kind: OnNonFinite, found: Findings, standstill: int) -> str:
         return f"{found}; run.on_nonfinite: stop"
     if standstill < PATIENCE:
         return ""
-    where = "the loss" if found.loss else "dL/dI" if found.refused else ", ".join(found.by_parameter)
+    where = found.whose_loss if found.loss else "dL/dI" if found.refused else ", ".join(found.by_parameter)
     return (
         f"{where} was not finite in {standstill} iterations in a row (up to iteration {found.iteration}); "
         "no parameter was given such a value; check the scene for extreme values, or lower the learning rate"

@@ -34,7 +34,7 @@ class OwnLoss:
         self._place, self._file = key, spec.path
         self._function = None if spec.file is not None else config.own_loss
         if self._function is not None:
-            self.source, self.key = "loss", getattr(self._function, "__name__", type(self._function).__name__)
+            self.source, self.key = "loss", _name_of(self._function)
             code = getattr(self._function, "__code__", None)
             self._file = None if code is None else Path(code.co_filename)
         self._takes_weights: bool | None = None
@@ -106,6 +106,17 @@ class OwnLoss:
 
     def _wrong(self, reason: str) -> ConfigError:
         return ConfigError(self.source, self.key, reason)
+
+
+def own_losses(config: Config) -> str:
+    """The losses of an experiment that its user has written, in words; "" without any."""
+    own = dict.fromkeys(one.file for one in config.losses if isinstance(one, Custom))
+    handed = "function" if config.own_loss is None else _name_of(config.own_loss)
+    return ", ".join(f"`{file or handed}`" for file in own)
+
+
+def _name_of(function: Callable[..., Any]) -> str:
+    return str(getattr(function, "__name__", type(function).__name__))
 
 
 def _takes(function: Callable[..., Any], count: int) -> bool:

@@ -25,6 +25,9 @@ WAIT_SECONDS, READER_WAIT_SECONDS = 1.0, 0.25
 _POLL_SECONDS = 0.01
 _HELD = {errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES}
 
+#: The folders that this process has locked for itself, by device and inode: who reads its own need not wait for them.
+_own: set[tuple[int, int]] = set()
+
 
 class InUse(Exception):
     """Another process, or another part of this one, has the lock."""
@@ -40,8 +43,12 @@ class FolderLock:
 
     def __init__(self, folder: Path, wait_s: float = WAIT_SECONDS, shared: bool = False) -> None:
         self._descriptor: int | None = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        self._place: tuple[int, int] | None = None
         try:
             self.real = self._take(self._descriptor, wait_s, shared)
+            if self.real and not shared:
+                self._place = _place(os.fstat(self._descriptor))
+                _own.add(self._place)
         except BaseException:
             self.release()
             raise
@@ -69,6 +76,9 @@ class FolderLock:
 
     def release(self) -> None:
         """Let others have it."""
+        if self._place is not None:
+            _own.discard(self._place)
+            self._place = None
         if self._descriptor is not None:
             os.close(self._descriptor)
             self._descriptor = None
@@ -115,6 +125,8 @@ class Holder:
         same_kernel = self.host == here.host or (self.boot is not None and self.boot == here.boot)
         if self.locked:
             try:
+                if _place(os.stat(folder)) in _own:
+                    return False
                 with FolderLock(folder, READER_WAIT_SECONDS, shared=True) as lock:
                     if lock.real:
                         # Not everywhere do machines share locks of network disks, which have no block device.
@@ -127,6 +139,10 @@ class Holder:
 
     def __str__(self) -> str:
         return f"process {self.pid} on {self.host}"
+
+
+def _place(status: os.stat_result) -> tuple[int, int]:
+    return status.st_dev, status.st_ino
 
 
 def _boot() -> str | None:

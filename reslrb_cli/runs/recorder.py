@@ -238,7 +238,7 @@ class Recording:
             self.course.stand()
             status = Status.INTERRUPTED
         except NonFinite as error:
-            failure = NonFinite(f"{error}; where: {self._inspection()}") if self._saved_nonfinite else error
+            failure = NonFinite(f"{error}; {self._where()}") if self._saved_nonfinite else error
         except BaseException as error:
             failure = error
         reserve.release()
@@ -327,10 +327,13 @@ class Recording:
         save_nonfinite(self.folder.checkpoint, step)
         self._saved_nonfinite = True
         if self.problem.config.run.on_nonfinite != "stop":  # which says so when it ends
-            logger.warning(f"{found}; where: {self._inspection()}")
+            logger.warning(f"{found}; {self._where()}")
 
-    def _inspection(self) -> str:
-        return f"reslrb inspect {shlex.quote(os.path.relpath(self.folder.path / 'config.yaml'))} --nonfinite"
+    def _where(self) -> str:
+        """How to look into a value that is not finite."""
+        if self.problem.config.codes:
+            return "look at what your own code returns, which `reslrb inspect --nonfinite` does not run"
+        return f"where: reslrb inspect {shlex.quote(os.path.relpath(self.folder.path / 'config.yaml'))} --nonfinite"
 
     def _end(self, status: Status, failure: BaseException | None) -> Status:
         ending = Ending(self.folder.path, self.manifest, status, failure, self._kept)

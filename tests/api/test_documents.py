@@ -46,15 +46,29 @@ def run(script: str, folder: Path) -> list[str]:
     return done.stdout.splitlines()
 
 
-def test_the_pages_script_runs(checkout: Path) -> None:
-    lines = run(script_of(PAGE.read_text(encoding="utf-8")), checkout)
+@pytest.fixture
+def quick_checkout(llvm: str, tmp_path: Path) -> Path:
+    """The same, with the one experiment of the page, which measures nothing, and whose target has few samples."""
+    (tmp_path / "scenes").symlink_to(ROOT / "scenes")
+    (tmp_path / "configs").mkdir()
+    text = (ROOT / "configs/cornell_floor.yaml").read_text(encoding="utf-8")
+    assert text.count("\nrun:\n") == text.count("{spp: 1024}") == 1
+    text = text.replace("\nrun:\n", "\nrun:\n  measuring: 0\n").replace("{spp: 1024}", "{spp: 64}")
+    (tmp_path / "configs/cornell_floor.yaml").write_text(text, encoding="utf-8")
+    return tmp_path
+
+
+@pytest.mark.parametrize("where", ["quick_checkout", pytest.param("checkout", marks=pytest.mark.long)])
+def test_the_pages_script_runs(where: str, request: pytest.FixtureRequest) -> None:
+    folder: Path = request.getfixturevalue(where)
+    lines = run(script_of(PAGE.read_text(encoding="utf-8")), folder)
     assert [line.split()[0] for line in lines[:6]] == ["0", "1", "2", "3", "4", "5"]
     assert lines[6].startswith("finished ")
     assert lines[7] == "interrupted 3"
     assert [line.split()[0] for line in lines[8:13]] == ["3", "4", "5", "6", "7"]
     assert "overrides: run.iteration: unknown key; did you mean `iterations`?" in lines
     assert lines[-1] == "made/scene.xml"
-    assert {path.name for path in (checkout / "runs").iterdir()} == {"carpet", "stopped"}
+    assert {path.name for path in (folder / "runs").iterdir()} == {"carpet", "stopped"}
 
 
 @pytest.mark.long  # its target has many samples

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
+import shutil
+import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +64,7 @@ def test_a_mapping_is_what_yaml_would_have_been(folder: Path) -> None:
     assert dump(rl.load(experiment(), overrides)) == dump(expected)
     assert dump(rl.load("tiny.yaml", overrides)) == dump(expected)
     assert dump(rl.load(rl.load("tiny.yaml"), overrides)) == dump(expected)
+    assert rl.load("tiny.yaml", {"run": {"iterations": 6, "spp": 2}, "run.spp": 8}).run.spp == 8
     assert rl.load(experiment(spp=8), {"parameters[0].bounds": [0, 0.9]}) == expected
     unnamed = experiment()
     del unnamed["run"]
@@ -94,6 +98,21 @@ def itself() -> dict[str, Any]:
         (lambda: rl.load("tiny.yaml", {"run.spq": 3}), "overrides: run.spq: unknown key; did you mean `spp`?"),
         (lambda: rl.load("tiny.yaml", {"run..spp": 3}), "overrides: `run..spp` is no key"),
         (lambda: rl.load("tiny.yaml", {"run.spp": {1, 2}}), "overrides: run.spp: is {1, 2}; YAML has no such value"),
+        (lambda: rl.load("tiny.yaml", {3: 4}), "overrides: has the key 3; keys are text"),  # type: ignore[dict-item]
+        (lambda: rl.load("tiny.yaml", {"": 4}), "overrides: has the key ''; keys are text"),
+        (lambda: rl.load("tiny.yaml", ["run.spp=4"]), "overrides: is ['run.spp=4'], not values by key"),  # type: ignore[arg-type]
+        (
+            lambda: rl.load("tiny.yaml", {"run.spp": 4, "run": {"iterations": 6}}),
+            "overrides: run: replaces what run.spp sets; give it first",
+        ),
+        (lambda: rl.load(None), "experiment: is None, not a file, a mapping or a run's folder"),  # type: ignore[arg-type]
+        (lambda: rl.export(None, "made"), "run: is None, not the folder of a run, which `optimize"),  # type: ignore[arg-type]
+        (lambda: rl.optimize("tiny.yaml", folder=3), "folder: is 3, not the path of a folder"),  # type: ignore[arg-type]
+        (lambda: rl.optimize(resume=3), "resume: is 3, not the folder of a run"),  # type: ignore[arg-type]
+        (
+            lambda: rl.gradcheck("tiny.yaml", integrators="own.py:A"),
+            "integrators own.py:A: would be run, with all your rights; allow_code=True has it run",
+        ),
         (lambda: rl.load("none.yaml"), "none.yaml: no such file"),
         (lambda: rl.load("."), ".: is no run's folder"),
     ],
@@ -226,6 +245,54 @@ def test_convergence_has_the_records_of_the_command(folder: Path, monkeypatch: p
     found = [json.loads(record.to_json()) for record in records]
     assert found == lines_of("c.jsonl")
     assert {"point", "method", "reference", "summary"} <= {each["kind"] for each in found}
+
+    class Interrupted(Played):
+        def run(self) -> Iterator[int]:
+            os.kill(os.getpid(), signal.SIGINT)
+            yield from super().run()
+            assert self.rounds < 8
+
+    monkeypatch.setattr(session, "Session", Interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        rl.convergence("tiny.yaml", "reslrb:stack,ptracer", rounds=8, spps=[4, 8], reference="reslrb:stack")
+
+
+class Interrupting(logging.Handler):
+    """Has an interrupt come once something is said that has these words, and keeps what is said."""
+
+    def __init__(self, words: str) -> None:
+        super().__init__(logging.DEBUG)
+        self.words, self.said = words, list[str]()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.said.append(record.getMessage())
+        if self.words in self.said[-1]:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.parametrize(
+    ("call", "words", "later"),
+    [
+        (lambda: rl.gradcheck("tiny.yaml", "stack", seeds=3, spp=4), "gradient reslrb:stack", "differences"),
+        (lambda: rl.gradcheck("tiny.yaml", seeds=12, spp=4, integrators="own_replay.py:Replay(fault=kept)",
+                              allow_code=True), "looking into", "gradients, max_depth 1"),
+    ],
+)  # fmt: skip
+def test_an_interrupt_ends_what_takes_long(
+    folder: Path, caplog: pytest.LogCaptureFixture, call: Callable[[], Any], words: str, later: str
+) -> None:
+    """It is not kept waiting until all is measured."""
+    shutil.copy(Path(__file__).parents[1] / "measure/own_replay.py", folder)
+    handler = Interrupting(words)
+    with caplog.at_level(logging.DEBUG, "reslrb_cli"):
+        logging.getLogger("reslrb_cli").addHandler(handler)
+        try:
+            with pytest.raises(KeyboardInterrupt):
+                call()
+        finally:
+            logging.getLogger("reslrb_cli").removeHandler(handler)
+    assert [line for line in handler.said if words in line]
+    assert not [line for line in handler.said if later in line]
 
 
 @pytest.mark.long

@@ -238,7 +238,8 @@ def test_errors_are_located(experiment: Path) -> None:
     cases: list[tuple[Callable[[], Any], str]] = [
         (lambda: rl.optimize(), "experiment: is missing; give a configuration, or resume=RUN"),
         (lambda: rl.optimize("none.yaml"), "none.yaml: no such file"),
-        (lambda: rl.optimize("tiny.yaml", folder="scene.xml/runs"), "tiny.yaml: run.output:"),
+        (lambda: rl.optimize("tiny.yaml", folder="scene.xml/runs"), f"folder: {experiment}/scene.xml is not"),
+        (lambda: rl.optimize("tiny.yaml", folder="/proc/runs"), "folder: cannot write to /proc"),
         (lambda: rl.optimize("tiny.yaml", folder="runs/CON"), "folder: run.name:"),
         (lambda: rl.optimize("tiny.yaml", overrides={"run.iterations": 0}), "overrides: run.iterations:"),
         (lambda: rl.optimize("tiny.yaml", overrides={"variant": "cuda_ad_rgb"}), "variant: is cuda_ad_rgb, but llvm"),
@@ -255,6 +256,11 @@ def test_errors_are_located(experiment: Path) -> None:
         del loop
     with pytest.raises(rl.ConfigError, match=r"overrides: run.seed: is 5, 0 in the run; mine goes on as it began"):
         rl.optimize(resume="mine", overrides={"run.seed": 5})
+    metrics = Path("mine/metrics.jsonl")
+    metrics.rename("elsewhere")
+    metrics.symlink_to("../elsewhere")
+    with pytest.raises(rl.ConfigError, match=r"mine/metrics.jsonl: is a link, .*, or give folder=FOLDER$"):
+        rl.optimize(resume="mine")
 
 
 def test_what_a_run_fails_of_is_raised(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,12 +11,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cli import tiny
 from cli.tiny import KEY, lines, read_metrics, reslrb
 from runs.going_on import begin_alone, optimize
 
 import reslrb_cli as rl
+from reslrb_cli.cli import main
 from reslrb_cli.config.loader import load, told, with_integrator
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.errors import ConfigError, NonFinite
 from reslrb_cli.measure.methods import Sweep
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.views import View
@@ -223,6 +225,32 @@ def test_a_later_nan_is_a_run_s_own_affair(experiment: Path, capsys: pytest.Capt
     )
     assert run(own("own"), "run.on_nonfinite=stop", "--allow-code") == 5
     assert json.loads(Path("runs/a/manifest.json").read_text())["status"] == "failed"
+    [line] = [each for each in lines(capsys.readouterr().err) if "not finite" in each]
+    assert f"the loss (your own `{experiment}/own.py:own`); dL/dI" in line
+    assert "look at what your own code returns, which `reslrb inspect --nonfinite` does not run" in line
+    with pytest.raises(SystemExit) as ended:
+        main(["inspect", "runs/a/config.yaml", "--nonfinite"])
+    assert ended.value.code == 2
+    assert "--nonfinite: runs no code of your own, which loss.file names" in capsys.readouterr().err
+
+
+def test_a_later_nan_of_a_function_names_it_and_leaves_the_folder_whole(experiment: Path) -> None:
+    calls: list[int] = []
+
+    def later(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
+        calls.append(1)
+        return dr.mean(dr.square(image - target), axis=None) * (np.nan if len(calls) > 3 else 1)
+
+    settings = {"run.measuring": 0, "run.certainty": False, "run.spp": 4, "run.iterations": 30}
+    for folder in ("mine", None):
+        calls.clear()
+        run = rl.optimize("tiny.yaml", folder=folder, loss=later, overrides=settings)
+        with pytest.raises(NonFinite, match=r"the loss \(your own `later`\) was not finite in 10 iterations in a row"):
+            list(run)
+        assert run.status == "failed"
+        assert all(np.isfinite(value).all() for value in run.parameters.values())
+    assert tiny.files(Path("mine")) >= tiny.COMPLETE - {"images/final.exr", "images/final.png"}
+    assert json.loads(Path("mine/manifest.json").read_text())["status"] == "failed"
 
 
 def test_a_function_that_is_handed_over(experiment: Path) -> None:

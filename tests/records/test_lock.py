@@ -109,6 +109,20 @@ def test_who_is_gone_where_there_are_locks(tmp_path: Path) -> None:
     assert replace(here, host="elsewhere").is_gone(tmp_path)
 
 
+def test_a_process_does_not_wait_for_what_it_has_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run draws its own page; by another process's lock it is told apart from an instant's."""
+    here = Holder.here(locked=True)
+    with monkeypatch.context() as patch, FolderLock(tmp_path):
+        patch.setattr(locks.time, "sleep", lambda seconds: pytest.fail("it waits"))
+        assert not here.is_gone(tmp_path)
+        with pytest.raises(InUse):
+            FolderLock(tmp_path, wait_s=0)
+        assert not here.is_gone(tmp_path), "who was refused has let go of nothing"
+    assert here.is_gone(tmp_path)
+    with FolderLock(tmp_path, shared=True):
+        assert here.is_gone(tmp_path), "who reads is no run"
+
+
 def test_another_machine_may_have_a_lock_that_is_not_seen_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     elsewhere = Holder("elsewhere", 1, "its own boot", locked=True)
     assert elsewhere.is_gone(tmp_path) == (os.major(os.stat(tmp_path).st_dev) != 0)

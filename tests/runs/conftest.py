@@ -7,9 +7,18 @@ from pathlib import Path
 
 import pytest
 from cli import tiny
-from runs.going_on import optimize
+from runs.going_on import optimize, write_experiment
 
 from reslrb_cli.runs import recorder as recording
+
+
+@pytest.fixture
+def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working directory, with `tiny.yaml` of two parameters; nothing is cached before."""
+    write_experiment(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
+    return tmp_path
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cli import tiny
-from runs.going_on import MOTION, one_thread, optimize, write_experiment
+from runs.going_on import MOTION, one_thread, optimize
 from runs.hosts import hosts, make_certificates, missing
 
 from reslrb_cli.cluster import bundle
@@ -45,14 +45,6 @@ CASES = {
     "halves": ["run.shards=6", "loss.scale=fitted"],
 }
 VIEWS = "views=[{sensor: 0}, {sensor: 1, weight: 2}, {sensor: 2}]"
-
-
-@pytest.fixture
-def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    write_experiment(tmp_path)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
-    return tmp_path
 
 
 def make(folder: Path, *sets: str) -> Course:

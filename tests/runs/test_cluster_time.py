@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from runs.going_on import optimize, write_experiment
+from runs.going_on import optimize
 
 from reslrb_cli.cluster import forecast as model
 from reslrb_cli.cluster.connection import Place
@@ -24,14 +24,6 @@ engine = pytest.importorskip("reslrb_cli.cluster.engine", reason="pip install re
 
 SETS = ["run.spp=8", "run.measuring=0", "run.certainty=false", "run.shards=4", "views=[{sensor: 0}]"]
 QUICK = [word for text in SETS for word in ("--set", text)]
-
-
-@pytest.fixture
-def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    write_experiment(tmp_path)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
-    return tmp_path
 
 
 def shared(run: str = "runs/tiny") -> SharedTime | None:
