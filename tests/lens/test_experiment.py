@@ -93,9 +93,10 @@ BAD = {
     "one colour": ([], "p.exr: is of one colour"),
     "dithered": ([], "p.exr: is of one colour"),
     "one pixel": ([], "p.exr: is 1 x 1"),
-    "no picture": ([], "p.exr: "),
-    "no image": ([], "p.exr: "),
-    "not finite": ([], "p.exr: "),
+    "no picture": ([], "p.exr: no such file"),
+    "no image": ([], "p.exr: is not an image that can be read"),
+    "too large": ([], "p.exr: is 40000x30000 pixels; more than 134217728 are not read"),
+    "not finite": ([], "p.exr: pixel ("),
     "no distance": (["--distance", "0"], "--distance: is 0; it must be above 0"),
     "behind": (["--distance", "-5"], "--distance: is -5; it must be above 0"),
     "not a number": (["--distance", "nan"], "--distance: is nan; it must be above 0"),
@@ -123,6 +124,8 @@ def test_what_cannot_be_is_refused_in_one_line_and_nothing_is_written(name: str,
         wanted = np.where(wanted > 0.9, np.inf, wanted)
     if name == "no image":
         (tmp_path / "p.exr").write_text("a picture")
+    elif name == "too large":  # by what the file says of itself
+        (tmp_path / "p.exr").write_bytes(b"P6 40000 30000 255\n" + bytes(range(256)))
     elif name != "no picture":
         write_file(tmp_path / "p.exr", np.repeat(wanted[:, :, None], 3, 2).astype(np.float32), linear=True)
     args = [str(tmp_path / "p.exr"), "-o", str(tmp_path / "lens"), "--pixels", "16", *options]
