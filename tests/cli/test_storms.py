@@ -112,7 +112,7 @@ def storm(experiment: Path, number: int, count: int, times: int = 1) -> Counter[
     for index in range(count):
         name = f"run-{index}"
         run = experiment / "runs" / name
-        process = start(experiment, "--set", f"run.name={name}", "--set", "run.iterations=30")
+        process = start(experiment, "-v", "--set", f"run.name={name}", "--set", "run.iterations=30")
         wait_for(process, run, stages[index % len(stages)])
         time.sleep(chance.uniform(0, 1))
         code, err = hit(process, number, times)
