@@ -75,6 +75,13 @@ def test_scripts(shell):
         assert subprocess.run(["bash", "-n"], input=script, text=True, check=False).returncode == 0
 
 
+def run_in(shell, program):
+    """What a shell says that runs `program`, with this environment's `reslrb` before others."""
+    path = os.pathsep.join([os.path.dirname(sys.executable), os.environ["PATH"]])
+    return subprocess.run([*shell, "-c", program], capture_output=True, text=True, check=False, cwd=ROOT,
+                          env={**os.environ, "PATH": path})  # fmt: skip
+
+
 def test_a_bash_completes():
     """By the script itself, as a shell calls it: no space comes behind a key that goes on."""
     script = done("completion", "bash").stdout
@@ -83,9 +90,7 @@ def test_a_bash_completes():
         "_reslrb_completion reslrb\necho ${COMPREPLY[*]}\n"
         "COMPREPLY=() COMP_WORDS=(reslrb swe) COMP_CWORD=1\n_reslrb_completion reslrb\necho ${COMPREPLY[*]}\n"
     )  # fmt: skip
-    path = os.pathsep.join([os.path.dirname(sys.executable), os.environ["PATH"]])
-    told = subprocess.run(["bash", "--norc", "-c", program], capture_output=True, text=True, check=False, cwd=ROOT,
-                          env={**os.environ, "PATH": path})  # fmt: skip
+    told = run_in(["bash", "--norc"], program)
     assert told.stdout.splitlines() == ["option -o nospace", "run.spp=", "sweep"], told.stderr
 
 
@@ -118,7 +123,5 @@ def test_a_zsh_completes():
         "words=(reslrb optimize a.yaml --set run.sp) CURRENT=5\n_reslrb_completion\n"
         "words=(reslrb swe) CURRENT=2\n_reslrb_completion\n"
     )  # fmt: skip
-    path = os.pathsep.join([os.path.dirname(sys.executable), os.environ["PATH"]])
-    told = subprocess.run(["zsh", "-f", "-c", program], capture_output=True, text=True, check=False, cwd=ROOT,
-                          env={**os.environ, "PATH": path})  # fmt: skip
+    told = run_in(["zsh", "-f"], program)
     assert told.stdout.splitlines()[0] == "-U -S  -V unsorted -a goes_on = run.spp=", told.stdout + told.stderr
