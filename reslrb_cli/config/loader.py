@@ -123,6 +123,15 @@ def loads(text: str, path: Path | str, overrides: Sequence[str | Override] = ())
     return resolve(parse(text, str(path)), path, parsed)
 
 
+#: What is wrong with a setting that comes after one that it takes in, which is put in.
+REPLACES = "replaces what {} sets; give it first, or leave one of them out"
+
+
+def replaced(location: Location, earlier: Mapping[str, Location]) -> str | None:
+    """The name of the first of `earlier` settings of which one at `location` leaves nothing; None without one."""
+    return next((name for name, other in earlier.items() if other[: len(location)] == location), None)
+
+
 def overrides_of(given: Mapping[str, object] | None) -> list[Override]:
     """The overrides of a script: keys as `--set` has them, values as YAML would have made them. Raises ConfigError,
     also for one that leaves nothing of another before it."""
@@ -134,11 +143,8 @@ def overrides_of(given: Mapping[str, object] | None) -> list[Override]:
         if not isinstance(key, str) or not key:
             raise ConfigError(OVERRIDDEN, "", f"has the key {one_line(repr(key), 40)}; keys are text, as run.spp")
         location = _parse_location(key, OVERRIDDEN)
-        for earlier, other in found.items():
-            if other.location[: len(location)] == location:
-                raise ConfigError(
-                    OVERRIDDEN, key, f"replaces what {earlier} sets; give it first, or leave one of them out"
-                )
+        if (earlier := replaced(location, {name: other.location for name, other in found.items()})) is not None:
+            raise ConfigError(OVERRIDDEN, key, REPLACES.format(earlier))
         found[key] = Override(OVERRIDDEN, location, plain(value, OVERRIDDEN, key))
     return list(found.values())
 

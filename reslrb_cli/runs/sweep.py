@@ -18,7 +18,7 @@ from typing import IO, Any
 from reslrb_cli.config.base import SEED_END
 from reslrb_cli.config.code import code_digest
 from reslrb_cli.config.files import NAME_BYTES
-from reslrb_cli.config.loader import Override, check_code, dump, loads, parse_override, read_text
+from reslrb_cli.config.loader import REPLACES, Override, check_code, dump, loads, parse_override, read_text, replaced
 from reslrb_cli.config.run import folder_name
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import Location, format_location
@@ -100,10 +100,9 @@ def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[s
     """
     varied = [parse_vary(text) for text in vary]
     for place, each in enumerate(varied):
-        for earlier in varied[:place]:
-            if earlier.location[: len(each.location)] == each.location:
-                reason = f"replaces what --vary {earlier.key} sets; give it first, or leave one of them out"
-                raise ConfigError(f"--vary {each.key}", "", reason)
+        earlier = replaced(each.location, {f"--vary {other.key}": other.location for other in varied[:place]})
+        if earlier is not None:
+            raise ConfigError(f"--vary {each.key}", "", REPLACES.format(earlier))
     sizes = [len(each.overrides) for each in varied]
     count = seeds
     for size in sizes:
