@@ -123,13 +123,10 @@ def loads(text: str, path: Path | str, overrides: Sequence[str | Override] = ())
     return resolve(parse(text, str(path)), path, parsed)
 
 
-#: What is wrong with a setting that comes after one that it takes in, which is put in.
-REPLACES = "replaces what {} sets; give it first, or leave one of them out"
-
-
-def replaced(location: Location, earlier: Mapping[str, Location]) -> str | None:
-    """The name of the first of `earlier` settings of which one at `location` leaves nothing; None without one."""
-    return next((name for name, other in earlier.items() if other[: len(location)] == location), None)
+def replaces(location: Location, earlier: Mapping[str, Location]) -> str | None:
+    """What is wrong with a setting at `location` that leaves nothing of one of the `earlier` ones; None without one."""
+    name = next((name for name, other in earlier.items() if other[: len(location)] == location), None)
+    return None if name is None else f"replaces what {name} sets; give it first, or leave one of them out"
 
 
 def overrides_of(given: Mapping[str, object] | None) -> list[Override]:
@@ -143,8 +140,8 @@ def overrides_of(given: Mapping[str, object] | None) -> list[Override]:
         if not isinstance(key, str) or not key:
             raise ConfigError(OVERRIDDEN, "", f"has the key {one_line(repr(key), 40)}; keys are text, as run.spp")
         location = _parse_location(key, OVERRIDDEN)
-        if (earlier := replaced(location, {name: other.location for name, other in found.items()})) is not None:
-            raise ConfigError(OVERRIDDEN, key, REPLACES.format(earlier))
+        if reason := replaces(location, {name: other.location for name, other in found.items()}):
+            raise ConfigError(OVERRIDDEN, key, reason)
         found[key] = Override(OVERRIDDEN, location, plain(value, OVERRIDDEN, key))
     return list(found.values())
 

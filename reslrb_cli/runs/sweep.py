@@ -18,7 +18,7 @@ from typing import IO, Any
 from reslrb_cli.config.base import SEED_END
 from reslrb_cli.config.code import code_digest
 from reslrb_cli.config.files import NAME_BYTES
-from reslrb_cli.config.loader import REPLACES, Override, check_code, dump, loads, parse_override, read_text, replaced
+from reslrb_cli.config.loader import Override, check_code, dump, loads, parse_override, read_text, replaces
 from reslrb_cli.config.run import folder_name
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import Location, format_location
@@ -100,9 +100,8 @@ def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[s
     """
     varied = [parse_vary(text) for text in vary]
     for place, each in enumerate(varied):
-        earlier = replaced(each.location, {f"--vary {other.key}": other.location for other in varied[:place]})
-        if earlier is not None:
-            raise ConfigError(f"--vary {each.key}", "", REPLACES.format(earlier))
+        if reason := replaces(each.location, {f"--vary {other.key}": other.location for other in varied[:place]}):
+            raise ConfigError(f"--vary {each.key}", "", reason)
     sizes = [len(each.overrides) for each in varied]
     count = seeds
     for size in sizes:
