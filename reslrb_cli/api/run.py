@@ -17,7 +17,7 @@ import numpy as np
 
 from reslrb_cli.api.experiment import Experiment, as_path, called, held, load, load_with
 from reslrb_cli.backend.variant import keep_variant
-from reslrb_cli.config.loader import Override, overrides_of
+from reslrb_cli.config.loader import OVERRIDDEN, Override, overrides_of
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, describe
 from reslrb_cli.optimization.loop import iterate
@@ -267,8 +267,9 @@ def optimize(
         texture = run.parameters["floor.reflectance.data"]
 
     `experiment` is what `load` takes, or what it returned, and `overrides` are as there. With `folder` the run is
-    written there as `reslrb optimize` does, or where that name is taken to `folder-2` and so on (`Run.folder`); without
-    one nothing is written but the caches of kernels and of what was measured.
+    written there as `reslrb optimize` does, or where that name is taken to `folder-2` and so on (`Run.folder`); what
+    `run.output` says is not used, which is told; without one nothing is written but the caches of kernels and of what
+    was measured.
 
     `resume` goes on with the run in that folder exactly where it was, in that folder, or with `folder` in a new one.
     `experiment` may then be left out, else it has to be that of the run; `overrides` may change iterations and learning
@@ -283,22 +284,30 @@ def optimize(
     the target, and measures what is left to measurement, before it returns. Raises ConfigError, located by file and
     key, UnsupportedScene, BackendError, MachineError; iterating raises NonFinite, OutOfMemory and MachineError too.
     """
-    put_in = overrides_of(overrides)
+    put_in, named = overrides_of(overrides), list[Override]()
     if folder is not None:
         path = Path(os.path.abspath(as_path(folder, "folder", "the path of a folder")))
-        put_in += [Override("folder", ("run", "output"), str(path.parent))]
-        put_in += [Override("folder", ("run", "name"), path.name)]
+        for key in ("output", "name"):
+            if any(one.location == ("run", key) for one in put_in):
+                raise ConfigError(OVERRIDDEN, f"run.{key}", "is what folder says; leave one of them out")
+        named = [
+            Override("folder", ("run", "output"), str(path.parent)),
+            Override("folder", ("run", "name"), path.name),
+        ]
     with called():
         if resume is not None:
             wanted = None if experiment is None else load(experiment)
             earlier = as_path(resume, "resume", "the folder of a run")
-            run = Run(*_reopened(earlier, wanted, put_in, loss, allow_code))
+            run = Run(*_reopened(earlier, wanted, [*put_in, *named], loss, allow_code))
             run._folder = earlier
             return run
         if experiment is None:
             raise ConfigError("experiment", "", "is missing; give a configuration, or resume=RUN")
-        config = _with_own(load_with(experiment, put_in), loss, allow_code)
+        config = _with_own(load_with(experiment, [*put_in, *named]), loss, allow_code)
         if folder is not None:
+            instead = load_with(experiment, put_in).run.output
+            if instead not in (Path.cwd() / "runs", config.run.output):
+                logger.warning("%s: run.output: %s is not used; folder says where the run is", config.source, instead)
             try:
                 check_output(config.source, config.run.output, config.run.folder_name, False)
             except ConfigError as error:

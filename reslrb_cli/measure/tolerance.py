@@ -245,14 +245,18 @@ class Bench:
 
 
 def tolerances(
-    bench: Bench, sheets: Sequence[Sheet], target: Array, spp: int, say: Callable[[str], None] = lambda _: None
+    bench: Bench,
+    sheets: Sequence[Sheet],
+    planned: Array,
+    target: Array,
+    spp: int,
+    say: Callable[[str], None] = lambda _: None,
 ) -> dict[str, dict[str, Any]]:
-    """`figures` against the luminance `target` (H, W) as planned and where that is off, by what is.
+    """`figures` against the luminance `target` (H, W) of the `planned` one, and where that is off, by what is.
 
     `shift` (columns, rows; pixels) is that of the whole picture where something was turned; it is taken out first.
     """
     plan, both = bench.plan, bench.solid_parts()
-    planned = bench.render(spp)
     found: dict[str, dict[str, Any]] = {}
 
     def tell(name: str, image: Array, turned: bool = False) -> None:

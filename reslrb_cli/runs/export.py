@@ -82,10 +82,15 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
     paths = paths_of(config.integrator, scene, sensors, moves)
     integrator, why = choose_integrator(config, scene, selection.params, paths)
     if plan is not None:
-        if tolerances:
-            off = measure_tolerances(config, scene, selection.params, sheets, integrator, say)
-        light = tell_light(config, plan, scene, scene.sensors()[sensors[0]])
-        loss = measure_loss(config, scene, sensors[0], integrator)
+        target = read_target(config, scene.sensors()[sensors[0]], needed=tolerances)
+        light, loss = dict[str, float](), dict[str, Any]()
+        if target is not None:
+            image, loss = measure_loss(config, scene, sensors[0], integrator, target)
+            if tolerances:
+                bench = bench_of(config, scene, selection.params, integrator, sensors[0])
+                off = measure(bench, sheets, luminance(image), luminance(target), config.run.final_spp, say)
+            if is_there(scene, plan):
+                light = where_light_goes(scene, scene.sensors()[sensors[0]], plan, luminance(target))
         beside = solid_files(plan, sheets, solid, light, loss, off)
     with writing("--output", output):
         export_scene(described[0], selection.params, selection.scene_keys, integrator, output, run, beside)
@@ -228,66 +233,47 @@ def read_solid(config: Config, plan: Fabrication, params: mi.SceneParameters) ->
         raise ConfigError(config.source, error.key, error.message) from None
 
 
-def read_target(config: Config, sensor: mi.Sensor) -> Array:
-    """The luminance (H, W) that the film of a sensor is to see. Raises ConfigError."""
+def read_target(config: Config, sensor: mi.Sensor, needed: bool) -> Array | None:
+    """The image (H, W, C) that a sensor is to see; None where `target.file` is not one image of its film's size, unless
+    it is `needed` for tolerances. Raises ConfigError."""
     files = config.target.file
     if files is None or len(files) != 1:
-        raise ConfigError("--tolerances", "", "what is thrown is compared with target.file, which has to be one image")
-    target = luminance(read_photo(files[0]).image)
-    width, height = (int(n) for n in sensor.film().crop_size())
-    if target.shape != (height, width):
-        raise ConfigError("--tolerances", "", f"target.file has {target.shape[1]}x{target.shape[0]} pixels, the film "
-                          f"{width}x{height}")  # fmt: skip
-    return target
+        reason = "what is thrown is compared with target.file, which has to be one image"
+    else:
+        target = read_photo(files[0]).image[:, :, :3]
+        width, height = (int(n) for n in sensor.film().crop_size())
+        if target.shape[:2] == (height, width):
+            return target
+        reason = f"target.file has {target.shape[1]}x{target.shape[0]} pixels, the film {width}x{height}"
+    if needed:
+        raise ConfigError("--tolerances", "", reason)
+    return None
 
 
-def measure_tolerances(
-    config: Config,
-    scene: mi.Scene,
-    params: mi.SceneParameters,
-    sheets: Sequence[Sheet],
-    integrator: dict[str, object],
-    say: Say,
-) -> dict[str, dict[str, Any]]:
-    """What the scene throws where something is not as planned, line by line (`measure/tolerance.py`). Raises
-    ConfigError."""
-
+def bench_of(
+    config: Config, scene: mi.Scene, params: mi.SceneParameters, integrator: dict[str, object], sensor: int
+) -> Bench:
+    """What moves the scene's parts, for its tolerances (`measure/tolerance.py`). Raises ConfigError."""
     assert config.fabrication is not None
-    sensor = choose_sensors(config, scene)[0]
-    target = read_target(config, scene.sensors()[sensor])
     try:
-        bench = Bench(scene, params, config.fabrication, mi.load_dict(dict(integrator)), sensor)
+        return Bench(scene, params, config.fabrication, mi.load_dict(dict(integrator)), sensor)
     except ConfigError as error:
         raise ConfigError(config.source, error.key, error.message) from None
-    return measure(bench, sheets, target, config.run.final_spp, say)
 
 
-def measure_loss(config: Config, scene: mi.Scene, sensor: int, integrator: dict[str, object]) -> dict[str, Any]:
-    """The mean squared difference of the scene's image from target.file, as who has the exported scene finds it.
+def measure_loss(
+    config: Config, scene: mi.Scene, sensor: int, integrator: dict[str, object], target: Array
+) -> tuple[Array, dict[str, Any]]:
+    """The scene's image, and its mean squared difference from `target`, as who has the exported scene finds it.
 
     By Mitsuba's own `integrator` and independent samples: a run's own images may be of low-discrepancy ones, which have
-    less noise, and so a lower loss of the same face. Empty where the target is not one image of the film's size.
+    less noise, and so a lower loss of the same face.
     """
-    files, spp, seed = config.target.file, config.run.final_spp, 0
-    if files is None or len(files) != 1:
-        return {}
-    target = read_photo(files[0]).image[:, :, :3]
+    spp, seed = config.run.final_spp, 0
     image = np.array(mi.render(scene, integrator=mi.load_dict(dict(integrator)), sensor=sensor, spp=spp, seed=seed))
-    if image.shape[:2] != target.shape[:2]:
-        return {}
     difference = image[:, :, :3].astype(np.float64) - target
-    return {"l2": float(np.mean(difference**2)), "spp": spp, "seed": seed, "integrator": integrator["type"]}
-
-
-def tell_light(config: Config, plan: Fabrication, scene: mi.Scene, sensor: mi.Sensor) -> dict[str, float]:
-    """Where the light of a finished face goes; empty where the scene or its target does not tell."""
-    if not is_there(scene, plan):
-        return {}
-    try:
-        target = read_target(config, sensor)
-    except ConfigError:
-        return {}
-    return where_light_goes(scene, sensor, plan, target)
+    l2 = float(np.mean(difference**2))
+    return image, {"l2": l2, "spp": spp, "seed": seed, "integrator": integrator["type"]}
 
 
 def solid_files(

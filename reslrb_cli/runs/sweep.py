@@ -17,7 +17,7 @@ from typing import IO, Any
 
 from reslrb_cli.config.base import SEED_END
 from reslrb_cli.config.code import code_digest
-from reslrb_cli.config.files import NAME_BYTES
+from reslrb_cli.config.files import NAME_BYTES, open_file
 from reslrb_cli.config.loader import Override, check_code, dump, loads, parse_override, read_text, replaces
 from reslrb_cli.config.run import folder_name
 from reslrb_cli.config.schema import Config
@@ -96,7 +96,8 @@ def parse_vary(text: str) -> Varied:
 def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[str], allow_code: bool = False) -> Plan:
     """Every combination of what is varied, checked as a configuration, with `seeds` seeds from its own on.
 
-    Raises ConfigError, located by the first setting that is wrong, or that names code where that is not to be run.
+    Raises ConfigError, located by the first setting that is wrong, or that names code where that is not to be run,
+    or by a scene's file that is missing.
     """
     varied = [parse_vary(text) for text in vary]
     for place, each in enumerate(varied):
@@ -118,6 +119,7 @@ def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[s
     for name, chosen in zip(names, itertools.product(*(each.overrides for each in varied)), strict=True):
         config = loads(text, path, [*overrides, *chosen]).with_code(allow_code)
         check_code(config)
+        open_file(config.scene.file).close()
         if config.run.seed != first:
             reason = f"is {config.run.seed}, and {first} in the first combination; {OWN['run', 'seed']}"
             raise ConfigError("--vary", "run.seed", reason)

@@ -216,6 +216,15 @@ def test_a_run_is_gone_on_with_from_its_folder(experiment: Path) -> None:
     assert len(records_of(Path("mine"))) == 6
 
 
+def test_a_folder_is_told_where_it_stands_in_for_another(experiment: Path, caplog: pytest.LogCaptureFixture) -> None:
+    rl.optimize("tiny.yaml", folder="mine", overrides=SET)
+    assert "run.output" not in caplog.text
+    config = rl.load("tiny.yaml", {**SET, "run.output": "elsewhere"})
+    assert rl.optimize(config, folder="mine").config.run.output == experiment
+    line = f"run.output: {experiment}/elsewhere is not used; folder says where the run is"
+    assert [record.levelname for record in caplog.records if line in record.message] == ["WARNING"]
+
+
 def test_a_folder_whose_name_is_taken_has_a_number(experiment: Path) -> None:
     for expected in ("mine", "mine-2"):
         run = rl.optimize("tiny.yaml", folder="mine", overrides=SET | {"run.iterations": 1})
@@ -242,6 +251,13 @@ def test_errors_are_located(experiment: Path) -> None:
         (lambda: rl.optimize("tiny.yaml", folder="/proc/runs"), "folder: cannot write to /proc"),
         (lambda: rl.optimize("tiny.yaml", folder="runs/CON"), "folder: run.name:"),
         (lambda: rl.optimize("tiny.yaml", overrides={"run.iterations": 0}), "overrides: run.iterations:"),
+        *(
+            (
+                lambda key=key: rl.optimize("tiny.yaml", "mine", overrides={key: "b"}),
+                f"overrides: {key}: is what folder",
+            )
+            for key in ("run.output", "run.name")
+        ),
         (lambda: rl.optimize("tiny.yaml", overrides={"variant": "cuda_ad_rgb"}), "variant: is cuda_ad_rgb, but llvm"),
         (lambda: rl.optimize(resume="."), ".: is no run's folder"),
     ]

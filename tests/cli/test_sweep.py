@@ -120,6 +120,8 @@ def test_names_are_short_safe_and_different(folder):
         (["--set", "run.spq=3"], "--set run.spq=3: run.spq: unknown key"),
         # two values of which each is right with the others
         (["--vary", "run.spp=[4, 6]", "--vary", "run.adjoint=[independent, batched]"], "run.adjoint"),
+        (["--set", "scene.file=gone.xml", "--vary", "run.spp=[4]"], "gone.xml: no such file"),
+        (["--vary", "scene.file=[scene.xml, gone.xml]"], "gone.xml: no such file"),
         (["--resume", "gone"], "gone: no such folder"),
         (["--resume", "."], ".: is no sweep's folder: it has no sweep.json"),
         (["-o", "tiny.yaml"], "-o: tiny.yaml is a file, not the folder of a sweep"),

@@ -28,6 +28,7 @@ from reslrb_cli.measure.tolerance import (
 )
 from reslrb_cli.records.images import write_file
 from reslrb_cli.report.page import write_report
+from reslrb_cli.runs import export
 
 PTRACER = {"type": "ptracer", "max_depth": 4}
 FLAT = Fabrication(thickness=25.0)
@@ -250,7 +251,9 @@ def test_the_command_tells_all_of_them(folder: Path) -> None:
     assert "goes with a folder" in f"{result.output}{result.exception}"
 
 
-def test_the_page_of_a_run_has_what_a_maker_wants_to_know(tmp_path: Path, llvm: str) -> None:
+def test_the_page_of_a_run_has_what_a_maker_wants_to_know(
+    tmp_path: Path, llvm: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """At its end, and what `export --tolerances` finds afterwards, with what was found at the end still there."""
     tones = np.kron(np.random.default_rng(2).uniform(0, 1, (4, 4)), np.ones((4, 4)))
     write_file(tmp_path / "p.exr", np.repeat(tones[:, :, None], 3, 2).astype(np.float32), linear=True)
@@ -281,10 +284,16 @@ def test_the_page_of_a_run_has_what_a_maker_wants_to_know(tmp_path: Path, llvm: 
     assert "the solid of the lens" in page
     assert "with the picture before its dark parts were lifted" in page
     assert "where it is off" not in page
+    read, render, called = export.read_photo, mi.render, []
+    monkeypatch.setattr(export, "read_photo", lambda file: (called.append(file), read(file))[1])
+    monkeypatch.setattr(mi, "render", lambda *given, **how: (called.append("image"), render(*given, **how))[1])
     result = done("export", run, "-o", tmp_path / "made", "--tolerances", *settings("run.final_spp=8"))
     assert "has them, too" in result.output
     found = json.loads((run / "fabrication.json").read_text())
-    assert found.pop("tolerances").keys() >= {"as planned", "distance +2 %", "index -0.005"}
+    off = found.pop("tolerances")
+    assert off.keys() >= {"as planned", "distance +2 %", "index -0.005"}
+    images = len(off) - 1 + len(tolerance._DIRECTIONS)  # a wide light is the mean of so many
+    assert called == [tmp_path / "l/target.exr", *["image"] * images]  # nothing is read or rendered twice
     assert found == numbers
     assert "distance +2 %" in (run / "report.html").read_text()
     found["thrown"]["ssim_of_picture"] = found["thrown"]["ssim"]  # as where nothing was lifted
