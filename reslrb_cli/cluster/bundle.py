@@ -69,7 +69,7 @@ def bundle_of(config: Config) -> Bundle:
     for parameter in data["parameters"]:
         initial = parameter.get("initial")
         if isinstance(initial, dict) and not initial.keys() <= {"file", "color_space"}:
-            del parameter["initial"]  # of a run, or by transport: its values are sent by themselves
+            del parameter["initial"]  # of a run, by transport, of a motion: all values are sent as arrays, too
     shown = {name: data.pop(name) for name in ("target", "views") if name in data}
     data = _packed(bundle, data) | _packed(None, shown)
     for key, code in config.codes.items():

@@ -23,7 +23,6 @@ from reslrb_cli.cluster.connection import Place, connected
 from reslrb_cli.cluster.crew import Crew
 from reslrb_cli.cluster.worker import Anywhere, Opening
 from reslrb_cli.config.loader import dump, loads
-from reslrb_cli.config.parameters import RunValue, TransportValue
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.methods import Case as Listed
@@ -125,15 +124,13 @@ def _opening_of(settings: Settings, participants: Participants, variant: str, ow
     built_in = config.scene.file == small.FILE
     bundle = Bundle({CONFIG_FILE: dump(config).encode()}) if built_in else bundle_of(config)
     selection = participants.selection
-    apart = [key for key in selection.keys if isinstance(selection.spec(key).initial, RunValue | TransportValue)]
-    apart += [key for key in selection.keys if selection.spec(key).word]  # which the bundle leaves out, too
     sent = {
         "integrators": [_with_file(case, lambda file: bundle.add(Path(file))) for case in settings.integrators],
         "budget_s": settings.budget_s,
         "seeds": settings.seeds,
         "spp": settings.spp,
         "named": settings.named,
-        "initial": {key: np.array(selection.array(key)) for key in apart},
+        "initial": {key: np.array(selection.array(key)) for key in selection.keys},
     }
     asks = config.allows_code and not own
     return Opening(bundle.digest(), participants_in, (variant, config.allows_code, sent), asks_for_code=asks), bundle
