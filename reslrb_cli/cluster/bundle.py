@@ -3,16 +3,20 @@ nothing left to include, and all that the two name, beside them.
 
     folder/config.yaml     as resolved, with the paths below
     folder/scene.xml       all includes and variables put in
+    folder/initial.npz     the values that parameters begin with, whatever they come from
     folder/files/N-NAME    whatever is read: meshes, textures, spectra, cameras, images, code
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from reslrb_cli.config.base import code_file
 from reslrb_cli.config.loader import loads
@@ -22,7 +26,9 @@ from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.records.atomic import unfinished_folder
 from reslrb_cli.scene.xml.read import read_description, tag_lines
 
-CONFIG_FILE, SCENE_FILE, FILES = "config.yaml", "scene.xml", "files"
+CONFIG_FILE, SCENE_FILE, INITIAL_FILE, FILES = "config.yaml", "scene.xml", "initial.npz", "files"
+
+Values = Mapping[str, np.ndarray[Any, Any]]
 
 
 @dataclass
@@ -52,10 +58,12 @@ class Bundle:
         return found.hexdigest()
 
 
-def bundle_of(config: Config) -> Bundle:
+def bundle_of(config: Config, values: Values) -> Bundle:
     """All files that a process without any needs to load what `config` names, but for targets, which are sent as
-    arrays. Raises ConfigError."""
-    bundle = Bundle()
+    arrays; `values` are those that its parameters begin with (`Selection.array`). Raises ConfigError."""
+    bundle, file = Bundle(), io.BytesIO()
+    np.savez(file, **dict[str, Any](values))
+    bundle.files[INITIAL_FILE] = file.getvalue()
     data = config.model_dump(exclude_none=True, exclude={"fabrication"})
     scene, cameras = data["scene"], config.scene.cameras
     if cameras is not None and cameras.suffix.lower() != ".json":  # COLMAP's, which are read in pairs
@@ -67,9 +75,7 @@ def bundle_of(config: Config) -> Bundle:
     scene |= {"file": SCENE_FILE, "options": {}}
     data["run"]["output"] = "runs"
     for parameter in data["parameters"]:
-        initial = parameter.get("initial")
-        if isinstance(initial, dict) and not initial.keys() <= {"file", "color_space"}:
-            del parameter["initial"]  # of a run, by transport, of a motion: all values are sent as arrays, too
+        parameter.pop("initial", None)
     shown = {name: data.pop(name) for name in ("target", "views") if name in data}
     data = _packed(bundle, data) | _packed(None, shown)
     for key, code in config.codes.items():
@@ -131,7 +137,8 @@ def unpack(files: Mapping[str, bytes], folder: Path) -> None:
         raise MachineError(f"{folder}: the experiment cannot be written there: {error.strerror}") from None
 
 
-def read_bundle(folder: Path) -> Config:
-    """The experiment whose files are in `folder`. Raises ConfigError."""
+def read_bundle(folder: Path) -> tuple[Config, Values]:
+    """The experiment whose files are in `folder`, and the values that its parameters begin with. Raises ConfigError."""
     text = (folder / CONFIG_FILE).read_text(encoding="utf-8")
-    return loads(text, folder / CONFIG_FILE)
+    with np.load(folder / INITIAL_FILE) as values:
+        return loads(text, folder / CONFIG_FILE), dict(values)

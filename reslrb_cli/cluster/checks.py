@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import drjit as dr
-import numpy as np
 
 from reslrb_cli.backend.variant import set_variant
-from reslrb_cli.cluster.bundle import CONFIG_FILE, Bundle, bundle_of, read_bundle
+from reslrb_cli.cluster.bundle import CONFIG_FILE, Bundle, Values, bundle_of, read_bundle
 from reslrb_cli.cluster.connection import Place, connected
 from reslrb_cli.cluster.crew import Crew
 from reslrb_cli.cluster.worker import Anywhere, Opening
@@ -55,7 +54,9 @@ def participants_in(
     """Who takes part, of the experiment in `folder`; no kernel is warm. `settings` are the others of `Settings`."""
     set_variant(variant)
     listed = [_with_file(case, lambda file: f"{folder / file}") for case in settings["integrators"]]
-    participants = Participants(Settings(_read(folder).with_code(allows_code), **{**settings, "integrators": listed}))
+    config, initial = _read(folder)
+    told = {**settings, "integrators": listed, "initial": initial}
+    participants = Participants(Settings(config.with_code(allows_code), **told))
     _with_threads(threads)
     return participants, {}
 
@@ -72,9 +73,9 @@ def _with_threads(threads: int) -> None:
     dr.set_thread_count(threads)
 
 
-def _read(folder: Path) -> Config:
+def _read(folder: Path) -> tuple[Config, Values | None]:
     text = (folder / CONFIG_FILE).read_text(encoding="utf-8")
-    return loads(text, small.CORNELL_BOX_SOURCE) if f"file: {small.FILE}" in text else read_bundle(folder)
+    return (loads(text, small.CORNELL_BOX_SOURCE), None) if f"file: {small.FILE}" in text else read_bundle(folder)
 
 
 def _with_file(case: Listed, put: Callable[[str], str]) -> Listed:
@@ -122,15 +123,14 @@ def _opening_of(settings: Settings, participants: Participants, variant: str, ow
     """What workers need to have the same participants, `own`: which are this command's."""
     config = settings.config
     built_in = config.scene.file == small.FILE
-    bundle = Bundle({CONFIG_FILE: dump(config).encode()}) if built_in else bundle_of(config)
-    selection = participants.selection
+    values = {key: participants.selection.array(key) for key in participants.selection.keys}
+    bundle = Bundle({CONFIG_FILE: dump(config).encode()}) if built_in else bundle_of(config, values)
     sent = {
         "integrators": [_with_file(case, lambda file: bundle.add(Path(file))) for case in settings.integrators],
         "budget_s": settings.budget_s,
         "seeds": settings.seeds,
         "spp": settings.spp,
         "named": settings.named,
-        "initial": {key: np.array(selection.array(key)) for key in selection.keys},
     }
     asks = config.allows_code and not own
     return Opening(bundle.digest(), participants_in, (variant, config.allows_code, sent), asks_for_code=asks), bundle

@@ -91,7 +91,8 @@ def assembled(folder: Path, threads: int, allows_code: bool) -> tuple[Problem, d
     with contextlib.closing(archive), np.load(folder / TARGETS_FILE) as targets:
         stored = Stored(archive, values)
         set_variant(stored.read(Settled).variant)
-        problem = assemble_scene(read_bundle(folder).with_code(allows_code))
+        config, initial = read_bundle(folder)
+        problem = assemble_scene(config.with_code(allows_code), values=initial)
         begin_as(problem, stored)
         problem = decide_as(problem, stored, find_options(problem))
         set_targets(problem.views, dict(targets))
@@ -124,8 +125,8 @@ def opening_of(course: Course, folder: Path, own: bool) -> tuple[Opening, Bundle
 
     Raises OSError, and ConfigError where users' own code is another than when the run began.
     """
-    config = course.problem.config
-    bundle, here = bundle_of(config), digests(config)
+    config, selection = course.problem.config, course.problem.selection
+    bundle, here = bundle_of(config, {key: selection.array(key) for key in selection.keys}), digests(config)
     for key in config.codes:
         if here.get(key) != course.files.get(key):
             raise ConfigError(config.source, key, "has changed since the run began; put it back, or begin anew")

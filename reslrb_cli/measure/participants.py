@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mitsuba as mi
@@ -72,7 +72,8 @@ class Settings:
     """What is checked. `seeds` and `spp` are None where they are to be chosen.
 
     `named`: the user named the integrators; otherwise those that cannot take part are left out. Of the budget `spent_s`
-    have gone before. `initial` are values of parameters that `config` does not say, as `Selection.array` has them.
+    have gone before. `initial` are the values of parameters, as `Selection.array` has them, in place of those of
+    `config`.
     """
 
     config: Config
@@ -82,7 +83,7 @@ class Settings:
     spp: int | None = None
     named: bool = True
     spent_s: float = 0.0
-    initial: Mapping[str, np.ndarray] = field(default_factory=dict)
+    initial: Mapping[str, np.ndarray[Any, Any]] | None = None
 
     @property
     def known(self) -> bool:
@@ -159,10 +160,9 @@ class Participants:
         able = [case.label for case in settings.integrators if _attaches(case)]
         first = (configs[able[0]] if able else next(iter(configs.values()))).with_exposures_fixed()
         built_in = config.scene.file == small.FILE
-        problem = assemble_scene(first, small.build(config.scene.options) if built_in else None)
+        box = small.build(config.scene.options) if built_in else None
+        problem = assemble_scene(first, box, settings.initial)
         self.selection = problem.selection
-        if settings.initial:
-            self.selection.set_arrays(settings.initial)
         scene, sensor = problem.scene, problem.sensors[0]
         shrink(scene, sensor, PATHS)
         self.case = Case(scene, problem.selection.keys, sensor, problem.selection)

@@ -159,7 +159,7 @@ def assemble_scene(
     views = make_views(config, scene)
     check_films(config, scene, [view.sensor for view in views])
     sensors = [view.sensor for view in views]
-    selection = select_parameters(scene, config.parameters, config.source)
+    selection = select_parameters(scene, config.parameters, config.source, values)
     moves = moves_anything(config, selection)
     check_integrator(config, config.integrator, scene, sensors, moves)
     paths = paths_of(config.integrator, scene, sensors, moves)

@@ -175,8 +175,13 @@ class Selection:
         return self.deformation.values if key in self.deformation.values else self.params
 
 
-def select_parameters(scene: mi.Scene, specs: Sequence[ParameterSpec], source: object) -> Selection:
-    """Select the parameters of `scene` that `specs` name, and set their initial values in the scene.
+def select_parameters(
+    scene: mi.Scene,
+    specs: Sequence[ParameterSpec],
+    source: object,
+    values: Mapping[str, np.ndarray[Any, Any]] | None = None,
+) -> Selection:
+    """Select the parameters of `scene` that `specs` name, and set their initial values, or `values`, in the scene.
 
     A glob selects what it matches and can be recovered. `source` names the configuration in errors. Raises ConfigError
     where a key matches nothing, or nothing that can be recovered, or what another spec has already; where what is to
@@ -188,7 +193,9 @@ def select_parameters(scene: mi.Scene, specs: Sequence[ParameterSpec], source: o
         at = functools.partial(specs[origin[key]].at, word=settings.word)
         place = Place(source, f"parameters[{origin[key]}]", at)
         slot = selection.slot(key)
-        value = initial_array(slot, settings.initial, settings.resolution, place)
+        value = initial_array(slot, settings.initial if values is None else "scene", settings.resolution, place)
+        if values is not None and key in values and values[key].shape == value.shape:
+            value = values[key]
         if settings.bounds is not None:
             plate = any(isinstance(each, Thickness) and each.opposite is None for each in settings.regularizers)
             held = Place(place.source, place.key, lambda _: "regularizers") if plate else place
@@ -197,7 +204,7 @@ def select_parameters(scene: mi.Scene, specs: Sequence[ParameterSpec], source: o
         if settings.smoothing is not None and not (selection.is_map(key) or selection.faces(key) is not None):
             raise place.fail("precondition", f"smooths textures, heightmaps and vertices; `{key}` is none of them")
         selection.check_regularizers(key, place)
-        if settings.initial != "scene" or settings.resolution is not None:
+        if values is not None or settings.initial != "scene" or settings.resolution is not None:
             slot.set(value)
     selection.update()
     return selection
