@@ -38,7 +38,6 @@ def forecast_run(config: Config) -> tuple[Forecast, list[tuple[str, float, bool]
     that it took now (0: nothing was to be measured) and whether a run finds that where it is kept; and the seconds of
     the whole run. A variant must be set, and nothing is written but the caches of kernels and pilots."""
     from reslrb_cli.measure.prb_comparison import RIVAL, measure_rival
-    from reslrb_cli.optimization.correlated_bias import measure_correlated_bias
     from reslrb_cli.optimization.forecast import make_forecast
     from reslrb_cli.records.cache import PilotCache
 
@@ -46,9 +45,6 @@ def forecast_run(config: Config) -> tuple[Forecast, list[tuple[str, float, bool]
     measured: list[tuple[str, float, bool]] = []
 
     def measure_before(problem: Problem) -> None:
-        begin = time.perf_counter()
-        if measure_correlated_bias(problem) is not None:
-            measured.append(("bias of correlated", time.perf_counter() - begin, False))
         begin = time.perf_counter()
         rival = measure_rival(problem, cache, say)
         rival_s = 0.0 if rival is None or rival.cached else time.perf_counter() - begin

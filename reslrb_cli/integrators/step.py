@@ -272,23 +272,6 @@ def known_step(
     return StepResult(image, dr.sum((image * gradient).array), refused)
 
 
-def cross_step(
-    integrator: StepIntegrator | mi.Integrator, scene: mi.Scene, sensor: mi.Sensor | int, objective: Objective, *,
-    image_seed: int, seed: int, spp: int, params: mi.SceneParameters | None = None, on_samples: OnSamples | None = None,
-    halves: bool = False,
-) -> None:  # fmt: skip
-    """Add the gradient by the samples of `seed`, with dL/dI from the image of those of `image_seed`.
-
-    Equal seeds are what `correlated` does, others `independent`. The rest is as in `gradient_step`.
-    """
-    work, job = interface_of(integrator), _job(scene, sensor, seed, spp, params)
-    if halves:
-        work = Halves(work)
-    image = work.image(replace(job, seed=dr.opaque(mi.UInt32, image_seed)))
-    _, gradient = derivative_of(objective, image, Refused())
-    _differentiate(work, job, gradient, on_samples)
-
-
 def given_step(
     integrator: StepIntegrator | mi.Integrator, scene: mi.Scene, sensor: mi.Sensor | int, gradient: mi.TensorXf, *,
     seed: int, spp: int, params: mi.SceneParameters | None = None, on_samples: OnSamples | None = None,

@@ -30,7 +30,6 @@ from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, SEQUENCE, pla
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.measure.prb_comparison import measure_rival
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.correlated_bias import measure_correlated_bias
 from reslrb_cli.optimization.loading import paths_of
 from reslrb_cli.optimization.moving import warn_of_border
 from reslrb_cli.optimization.problem import Problem
@@ -152,17 +151,12 @@ def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[Course, 
     """
     cache = PilotCache()
     problem = assemble(config, say, cache, to_run=True)
-    bias = measure_correlated_bias(problem)
-    line = None if bias is None else bias.line()
-    if line is not None:
-        warn(line)
     warn_of_border(problem, warn)
     rival = measure_rival(problem, cache, say)
     if rival is not None and rival.is_better:
         warn(f"{rival.line()}; --set {_other_way(problem, rival)}")
     manifest = manifest_of(problem, variant, config.source)
     manifest.rival = None if rival is None else rival.to_json()
-    manifest.correlated_bias = None if bias is None else bias.to_json()
     return Course(problem, variant), manifest
 
 

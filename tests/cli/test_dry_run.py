@@ -89,11 +89,6 @@ def test_long_steps_are_measured_by_shorter_ones(experiment: Path, monkeypatch: 
     assert taken == [4, 12, 24, 400]  # whole steps of 8.1 s are no long wait
 
 
-def test_the_bias_of_correlated_is_counted(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    call("--dry-run", "--set", "scene.size=[8, 8]", "--set", "run.iterations=60", "--set", "run.adjoint=correlated")
-    assert re.search(r"^ +[\d.]+ s  bias of correlated$", capsys.readouterr().out, re.MULTILINE)
-
-
 def test_each_trial_begins_where_the_run_does(experiment: Path) -> None:
     """Else texels that a trial has moved to 0 would have the next one trace, and keep, what the run does not need."""
     problem = assemble(load(experiment / "tiny.yaml", [*SETS, "optimizer.learning_rate=0.4"]))

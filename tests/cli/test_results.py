@@ -42,19 +42,6 @@ def read(path):
     return np.array(mi.Bitmap(str(path)), dtype=np.float64)
 
 
-def test_correlated_samples_tell_of_their_bias(capsys, monkeypatch):
-    from reslrb_cli.optimization.correlated_bias import Bias, CorrelatedBias
-    from reslrb_cli.runs import prepare
-
-    bias = CorrelatedBias(8, 4, [Bias(KEY, -0.38, 0.06, along=True, exceeds=False)])
-    monkeypatch.setattr(prepare, "measure_correlated_bias", lambda problem: bias)
-    code, _, err = reslrb(capsys, "optimize", "box.yaml", "--quiet", "--set", "run.iterations=2")
-    assert code == 0
-    assert err.strip() == bias.line()
-    assert read_manifest("runs/box")["correlated_bias"] == bias.to_json()
-    assert "-38 % ± 6 %" in Path("runs/box/report.html").read_text()
-
-
 def test_values_and_errors_stand_above_the_last_line(capsys):
     both = f"parameters=[{{key: {KEY}, initial: 0.5, bounds: [0, 1]}}, {{key: {WALL}, initial: [0.2, 0.3, 0.4]}}]"
     last, out, results = optimize(capsys, both, "run.iterations=3", "run.adjoint=independent")

@@ -273,21 +273,6 @@ def test_paths_alone_are_told(tmp_path):
         assert title not in page_of(make_run(tmp_path / f"{number}", iterations=0, paths=unread)).sections
 
 
-def test_the_bias_of_correlated_samples_is_a_table(tmp_path):
-    rows = [
-        {"key": LAMP, "share": -0.38, "error": 0.06, "along": True, "exceeds": False},
-        {"key": FLOOR, "share": None, "error": None, "along": False, "exceeds": False},
-    ]
-    bias = {"rounds": 8, "spp": 4, "parameters": rows}
-    page = page_of(make_run(tmp_path / "lamp", correlated_bias=bias))
-    assert f"its bias is -38 % +- 6 % of the gradient of `{LAMP}`" in page.sections["Bias of correlated samples"]
-    assert page.row("Bias of correlated samples", LAMP)[1:] == ["-38 % ± 6 %", "of the gradient"]
-    assert page.row("Bias of correlated samples", FLOOR)[1:] == ["", "not seen"]
-    for damaged in (None, {"rounds": 8}):
-        other = page_of(make_run(tmp_path / f"other {damaged}", correlated_bias=damaged))
-        assert "Bias of correlated samples" not in other.sections
-
-
 def test_what_went_wrong_stands_first(tmp_path):
     trend = {"start": {"mean": 0.0131, "error": 0.0004}, "end": {"mean": 0.0133, "error": 0.0004}, "change": "flat"}
     page = page_of(make_run(tmp_path / "lamp", results={"loss_trend": trend, "worse": [LAMP]}))

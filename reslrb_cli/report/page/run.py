@@ -14,7 +14,6 @@ from markupsafe import Markup
 from pydantic import TypeAdapter
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.optimization.correlated_bias import CorrelatedBias, share_words
 from reslrb_cli.records.clock import SharedTime
 from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, PathsRecord, RivalRecord, SequenceRecord
 from reslrb_cli.records.images import load_image
@@ -107,15 +106,6 @@ def pilot_table(pilot: Mapping[str, Any] | None) -> Markup:
     rows = sorted(outcome.rows, key=lambda row: -(row.efficiency or 0.0))
     best = rows[0].efficiency or 1.0 if rows else 1.0
     return lay_out("run.pilot", outcome.line(cost=True), rows, best)
-
-
-def correlated_bias_table(measured: Mapping[str, Any] | None) -> Markup:
-    """What was measured of the bias of `adjoint: correlated`, by parameter."""
-    try:
-        bias = CorrelatedBias.from_json(dict(measured or {}))
-    except (TypeError, KeyError):  # there was none, or another version's
-        return Markup()
-    return lay_out("run.correlated_bias", bias, {row.key: share_words(row, "±") for row in bias.parameters})
 
 
 def workers(shared: Mapping[str, Any] | None, elapsed_s: float | None) -> Markup:
@@ -211,7 +201,6 @@ def record_parts(run: Run) -> dict[str, Markup]:
             + soft(measured_line(SequenceRecord, manifest.get("sequence")))
             + soft(measured_line(RivalRecord, manifest.get("rival")))
         ),
-        "Bias of correlated samples": lambda: correlated_bias_table(manifest.get("correlated_bias")),
         "Scale of the parameters": lambda: lay_out("run.scaling", manifest.get("scaling") or []),
         "Memory budget": lambda: lay_out("run.memory", kept) if (kept := manifest.get("memory")) else Markup(),
         "Workers": lambda: workers(manifest.get("shared"), run.last("elapsed_s")),
