@@ -30,7 +30,7 @@ from reslrb_cli.report.format import table
 
 if TYPE_CHECKING:
     from reslrb_cli.integrators.plan_report import PlanReport
-    from reslrb_cli.measure.conditioning import Conditioning
+    from reslrb_cli.optimization.sensitivity import Conditioning
     from reslrb_cli.scene.catalog import MovableSummary, ParameterInfo, SceneSummary, SensorSummary
     from reslrb_cli.scene.needs import SceneNeeds
     from reslrb_cli.scene.parameters import Selection
@@ -246,8 +246,7 @@ def command(
     --conditioning says how far apart the parameters' sensitivities lie, where they start: of each the root mean square
     of its values, its gradient and the noise of one step's gradient, the relative change of the image and the curvature
     of the loss per unit of the parameter, and the length by which it would have to change to make up the image where it
-    has an effect. `optimizer.scale: auto` makes up for what it shows. Where parameters move light, condition numbers of
-    the Jacobians along paths come with it.
+    has an effect. `optimizer.scale: auto` makes up for what it shows.
     """
     if samples is not None and not conditioning:
         raise click.UsageError("--samples has no effect without --conditioning")
@@ -279,7 +278,7 @@ def command(
         data = to_jsonable_python(known, inf_nan_mode="constants", fallback=lambda item: item.id())
         click.echo(json.dumps(finite(data, str), indent=2, allow_nan=False))
         return None
-    from reslrb_cli.report.tables import chain_lines, conditioning_lines
+    from reslrb_cli.report.tables import conditioning_lines
 
     wanted = [] if "parameters" in subject.missing else [key for spec in config.parameters for key in spec.keys]
     parameters = parameter_lines(summary.parameters, wanted, everything)
@@ -291,7 +290,6 @@ def command(
             "needed": _needed,
             "shares": lambda view: ", ".join(f"{name} {100 * share:.0f} %" for name, share in vars(view).items()),
             "conditioning": conditioning_lines,
-            "chains": chain_lines,
         },
         path=path,
         run=None if subject.run is None else run_words(subject.run),
@@ -333,8 +331,8 @@ def next_step(subject: Subject, summary: SceneSummary) -> str:
 
 def measure(subject: Subject, overrides: tuple[str, ...], samples: int) -> Conditioning:
     """The conditioning of the experiment; an estimator that is to be measured first makes no difference to it."""
-    from reslrb_cli.measure.conditioning import measure_conditioning
     from reslrb_cli.optimization.assemble import assemble
+    from reslrb_cli.optimization.sensitivity import measure_conditioning
 
     config = subject.config
     if config.integrator.options().get("estimator") == "auto":

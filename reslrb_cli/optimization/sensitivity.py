@@ -34,7 +34,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -104,6 +104,41 @@ _MOVED = {
     "sigmoid": " in its logit between the bounds",
     "softplus": " in log(exp(x) - 1)",
 }
+
+
+#: What a spread is taken of.
+QUANTITIES = ("gradient", "change", "curvature", "length")
+
+
+@dataclass(frozen=True)
+class Conditioning:
+    """What was measured of each parameter, from `samples` gradients of `spp` samples per pixel, of the run's `seed`."""
+
+    rows: list[Sensitivity]
+    samples: int
+    spp: int
+    seed: int
+
+    def spread(self, quantity: str) -> float | None:
+        """The largest value of one of QUANTITIES over its smallest, of those above 0; None of fewer than two.
+
+        That of `curvature` is the condition number of the Gauss-Newton matrix's diagonal, by parameters.
+        """
+        values = [getattr(row, quantity) for row in self.rows]
+        positive = [value for value in values if value is not None and value > 0]
+        return max(positive) / min(positive) if len(positive) > 1 else None
+
+    def to_json(self) -> dict[str, Any]:
+        """As a mapping for JSON."""
+        values = asdict(self)
+        rows, spread = values.pop("rows"), map(self.spread, QUANTITIES)
+        return values | {"parameters": rows, "spread": dict(zip(QUANTITIES, spread, strict=True))}
+
+
+def measure_conditioning(problem: Problem, samples: int) -> Conditioning:
+    """Measure every parameter of `problem`, which has its targets, where it stands; at least 2 `samples`."""
+    run = problem.config.run
+    return Conditioning(measure_sensitivities(problem, samples), samples, run.spp, run.seed)
 
 
 def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:

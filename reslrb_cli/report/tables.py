@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from reslrb_cli.measure.bench import Result
-from reslrb_cli.measure.conditioning import QUANTITIES, Conditioning
+from reslrb_cli.optimization.sensitivity import QUANTITIES, Conditioning
 from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Spread, Verdict
 from reslrb_cli.report.format import Columns, interval, number, table
 
@@ -47,15 +47,6 @@ def conditioning_lines(measured: Conditioning) -> list[str]:
         rows.append((row.key, str(row.entries), *map(_number, numbers)))
     gradient, change, curvature, length = (_number(measured.spread(quantity)) for quantity in QUANTITIES)
     rows.append(("largest / smallest", "", "", gradient, "", change, curvature, length))
-    return table(rows, "<>")
-
-
-def chain_lines(measured: Conditioning) -> list[str]:
-    """One line for each length of a chain of Jacobians: how many, and their condition numbers."""
-    rows: list[tuple[str, ...]] = [("vertices", "paths", "median", "99 %", "largest")]
-    for chain in measured.chains:
-        numbers = (chain.median, chain.percentile_99, chain.largest)
-        rows.append((str(chain.vertices), str(chain.paths), *map(_number, numbers)))
     return table(rows, "<>")
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from reslrb_cli.config.loader import load
-from reslrb_cli.measure.conditioning import measure_conditioning
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.identifiability import find_reached
 from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.sensitivity import measure_conditioning
 
 # The stiff experiments in `configs/stiff/`: they load, and are as stiff as they say.
 
