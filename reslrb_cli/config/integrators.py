@@ -94,7 +94,7 @@ class AttachingTracer(LightTracerOptions):
 #: The options of `reslrb` that belong to an estimator, by its name; the others have no use for them.
 ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
     "auto": (),
-    "reservoir": ("capacity", "weight", "image", "jacobian_damping"),
+    "reservoir": ("capacity", "weight", "jacobian_damping"),
     "gather": (),
     "event": ("capacity", "weight"),
     "stack": ("stack_size",),
@@ -132,9 +132,6 @@ class Reslrb(AttachingTracer):
     weight: Literal["luminance", "adjoint"] = "luminance"
     """What a connection is kept in proportion to: its `luminance`, or its share in the objective (`adjoint`: less
     variance; not with `run.adjoint: correlated`). Only with estimators `reservoir` and `event`."""
-    image: Literal["all", "retained"] = "all"
-    """Which connections the image shows: `all`, or the `retained` ones alone, weighted (noisier). Only with estimator
-    `reservoir`."""
     jacobian_damping: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.1
     """Where light is followed: by how much the ray behind a surface that is not specular is taken to turn with the one
     before it, to either side at random, so that its Jacobian has an inverse. It makes no bias; below 0.01 digits are
@@ -196,8 +193,6 @@ class Reslrb(AttachingTracer):
 
     @model_validator(mode="after")
     def _check_options(self) -> Self:
-        if self.image == "retained" and self.weight == "adjoint":
-            raise located("weight", "`adjoint` does not go with image: retained, which is made before dL/dI is known")
         if self.estimator == "stack" and self.max_depth == -1 and self.stack_size >= LOCAL_ENTRIES:
             raise located(
                 "stack_size",

@@ -76,7 +76,6 @@ class Estimator(ABC):
     exact: ClassVar[bool] = False  # every connection of a path counts, as under naive AD of the same paths
     attaches: ClassVar[bool] = False  # it has derivatives of what moves light
     stack_size: int = STACK_SIZE  # that of stacks of vertices, where there are any
-    splats_all: bool = True  # the image shows every connection, so that an image alone needs no estimator
 
     @abstractmethod
     def forward(self, p: Pass) -> Any:

@@ -143,12 +143,12 @@ class ChainSelection(VertexHooks):
     """Image pass: splat, chain Jacobians, and keep connections as `choose` says."""
 
     def __init__(
-        self, p: Pass, capacity: int, damping: float, splat: bool,
+        self, p: Pass, capacity: int, damping: float,
         weigh: Callable[[Connection, Product, mi.Float], mi.Float],
     ) -> None:  # fmt: skip
         """`weigh(connection, C, W)` is the selection weight w of a connection, W the sum before it."""
         super().__init__(p)
-        self.capacity, self.damping, self.splat = capacity, damping, splat
+        self.capacity, self.damping = capacity, damping
         self.numbers = capacity + len(Blocks.of(p.plan))
         self.weigh = weigh
 
@@ -173,8 +173,7 @@ class ChainSelection(VertexHooks):
     ) -> ChainState:
         p, plan = self.p, self.p.plan
         C = contribution(p, vertex, connection)
-        if self.splat:
-            p.splat(connection.u, C.value(), connection.active)
+        p.splat(connection.u, C.value(), connection.active)
         here = begins(plan, vertex)
         on = self.concerned(state) | here
         latest = dr.select(here & vertex.active, vertex.depth, state.latest[0])

@@ -87,9 +87,9 @@ class ReservoirState:
 class ReservoirSelection(VertexHooks):
     """Image pass: splat, and keep connections."""
 
-    def __init__(self, p: Pass, capacity: int, weight: str, splat: bool) -> None:
+    def __init__(self, p: Pass, capacity: int, weight: str) -> None:
         super().__init__(p)
-        self.numbers, self.weight, self.splat = capacity, weight, splat
+        self.numbers, self.weight = capacity, weight
 
     def start(self, product: Product) -> ReservoirState:
         return ReservoirState.empty(self.p.plan, self.numbers)
@@ -101,10 +101,9 @@ class ReservoirSelection(VertexHooks):
         self, state: ReservoirState, vertex: Vertex, connection: Connection, numbers: list[mi.Float]
     ) -> ReservoirState:
         C = contribution(self.p, vertex, connection)
-        if self.splat:
-            self.p.splat(connection.u, C.value(), connection.active)
+        self.p.splat(connection.u, C.value(), connection.active)
         plan, candidate = self.p.plan, connection.active
-        if self.splat and not plan.differentiate_emission:  # else every connection counts
+        if not plan.differentiate_emission:  # else every connection counts
             candidate = candidate & (self.concerned(state) | plan.concerns(vertex.bsdf))
         w = at_least_share(dr.select(candidate, selection_weight(self.p, self.weight, connection, C), 0), state.W)
         W = state.W + w
@@ -139,50 +138,33 @@ class ReservoirReplay(SlotReplay):
 
 
 class Reservoir(Estimator):
-    """Reservoir of `capacity` slots with selection weight `luminance` or `adjoint`.
-
-    `image` says which connections the image shows: `all`, or the `retained` ones alone, weighted by W / (m w_I).
-    """
+    """Reservoir of `capacity` slots with selection weight `luminance` or `adjoint`."""
 
     attaches = True
 
     OPTIONS: ClassVar[dict[str, Any]] = {
         "capacity": 1,
         "weight": "luminance",
-        "image": "all",
         "jacobian_damping": JACOBIAN_DAMPING,
     }
 
     def __init__(
-        self, capacity: int = 1, weight: str = "luminance", image: str = "all",
-        jacobian_damping: float = JACOBIAN_DAMPING,
-    ) -> None:  # fmt: skip
+        self, capacity: int = 1, weight: str = "luminance", jacobian_damping: float = JACOBIAN_DAMPING
+    ) -> None:
         one_of("weight", weight, ("luminance", "adjoint"))
-        one_of("image", image, ("all", "retained"))
         at_least_one("capacity", capacity, CAPACITY)
-        if image == "retained" and weight == "adjoint":
-            raise ValueError('image "retained" needs weight "luminance": an image is made before dL/dI is known')
         if not jacobian_damping > 0:
             raise ValueError(f'"jacobian_damping" must be positive, not {jacobian_damping}')
-        self.capacity, self.weight, self.image, self.damping = capacity, weight, image, jacobian_damping
-        self.splats_all = image == "all"
+        self.capacity, self.weight, self.damping = capacity, weight, jacobian_damping
 
     def forward(self, p: Pass) -> ReservoirState | chain.ChainState:
-        state: ReservoirState | chain.ChainState
         if p.plan.attached:
 
             def weigh(connection: Connection, C: Product, W: mi.Float) -> mi.Float:
                 return at_least_share(selection_weight(p, self.weight, connection, C), W)
 
-            splat = self.image == "all"
-            selection = chain.ChainSelection(p, self.capacity, self.damping, splat, weigh)
-            state = p.walk(selection).stored()
-        else:
-            state = replace(p.walk(ReservoirSelection(p, self.capacity, self.weight, self.image == "all")), latest=[])
-        if self.image == "retained":
-            for slot in state.slots:
-                p.splat(slot.u, slot.C.value() * inverse_probability(state.W, slot, self.capacity), slot.w != 0)
-        return state
+            return p.walk(chain.ChainSelection(p, self.capacity, self.damping, weigh)).stored()
+        return replace(p.walk(ReservoirSelection(p, self.capacity, self.weight)), latest=[])
 
     def backward(self, p: Pass, state: ReservoirState | chain.ChainState) -> None:
         if isinstance(state, chain.ChainState):

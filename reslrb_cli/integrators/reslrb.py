@@ -166,18 +166,13 @@ class LightTracer:
                 said = hear(samples, gradient)
             guiding.learn(sensor_number(job.scene, job.sensor), samples.width, said)
 
-    def image_estimator(self) -> Estimator | None:
-        """The estimator that makes images of its own; None where they show every connection."""
-        return None
-
     def image(self, job: Job, evaluate: bool = True) -> mi.TensorXf:
         """The image (H, W, C), without derivatives."""
-        work = partial(image_of, self.image_estimator())
         with dr.suspend_grad():
             parts = self.passes(replace(job, params=None))  # an image has no use for what derivatives ask of a walk
             if not evaluate:
-                return work(parts)
-            image = self.launch("image", parts, work)
+                return image_of(parts)
+            image = self.launch("image", parts, image_of)
             dr.eval(image)
             return image
 
@@ -278,9 +273,6 @@ class Reslrb(LightTracer):
         light = 0 if plan.paths == "camera" else self.estimator.scratch_bytes(plan)
         return light if plan.paths == "light" else max(light, camera_scratch_bytes(plan, self.estimator.stack_size))
 
-    def image_estimator(self) -> Estimator | None:
-        return None if self.estimator.splats_all else self.estimator
-
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
         """The image, and the gradient of the same samples with the dL/dI that `derivative(image)` returns."""
         with dr.suspend_grad():
@@ -331,8 +323,8 @@ def _splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
             splat_camera_tangents(side, block)
 
 
-def image_of(estimator: Estimator | None, samples: list[Samples]) -> mi.TensorXf:
-    """The image of all passes, as the estimator makes it where it makes one of its own (else None); nothing is kept."""
+def image_of(samples: list[Samples]) -> mi.TensorXf:
+    """The image of all passes; nothing is kept."""
     film = samples[0].film
     block = film.block()
 
@@ -341,8 +333,6 @@ def image_of(estimator: Estimator | None, samples: list[Samples]) -> mi.TensorXf
         for side in part.sides():
             if side.plan.camera:
                 splat_camera_paths(side, own)
-            elif estimator is not None:
-                estimator.forward(Pass(side, own, None))
             else:
                 walk(side, Splat(side, own))
 
@@ -385,7 +375,7 @@ def trace_image(estimator: Estimator, samples: list[Samples]) -> tuple[mi.Tensor
     """
     state = None
     if len(samples) > 1:
-        image = image_of(None if estimator.splats_all else estimator, samples)
+        image = image_of(samples)
     else:
         film = samples[0].film
         block = film.block()

@@ -327,10 +327,8 @@ class Sweep(Measurement):
                 self.at(case, value)
 
 
-#: What is estimated: the gradient with dL/dI held, the gradient of the configuration's loss, or the image.
-OBJECTIVES = ("fixed", "loss", "image")
-
-#: What is compared where the user names nothing, by objective.
+#: What is compared where the user names nothing, by what is estimated: the gradient with dL/dI held, the gradient of the
+#: configuration's loss, or the image.
 DEFAULTS = {
     "fixed": "ptracer,prb,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,reslrb:stack(guiding=on),"
     "reslrb:stack(paths=camera),reslrb:stack(paths=both)",

@@ -261,10 +261,6 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
         GOOD + "run: {adjoint: correlated, batches: 2}\n",
         "run.batches: has no effect with run.adjoint: correlated",
     ),
-    "retained before dL/dI": (
-        GOOD + "integrator: {weight: adjoint, image: retained}\nrun: {adjoint: independent}\n",
-        "integrator.weight: `adjoint` does not go with image: retained",
-    ),
     "adjoint": (
         GOOD + "run: {adjoint: correlate}\n",
         "run.adjoint: must be one of auto, correlated, independent, batched",

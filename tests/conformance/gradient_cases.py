@@ -117,7 +117,6 @@ CASES = [
     GradientCase("texture", _textured, (FLOOR, "wall.brdf_0.reflectance.value"), "ptracer"),
     GradientCase("texture_prb", _textured, (FLOOR,), "prb"),
     GradientCase("roulette", _textured, (FLOOR,), "ptracer", options={"rr_depth": 1}, both={"max_depth": 6}),
-    GradientCase("retained", _textured, (FLOOR,), "ptracer", options={"image": "retained"}),
     GradientCase("passes", _textured, (FLOOR,), "ptracer", options={"samples_per_pass": 16}),
     GradientCase("gaussian", lambda: _textured(camera=camera("gaussian")), (FLOOR,), "ptracer"),
     GradientCase("lanczos", lambda: _textured(camera=camera("lanczos")), (FLOOR,), "ptracer"),
@@ -233,5 +232,5 @@ CASES = [
 AT_EQUAL_SEEDS = ("texture", "roulette", "roughplastic", "bumpmap", "glass", "mesh_attribute", "mask_texture_in_view",
                   "visible_lamp")  # fmt: skip
 #: and the reservoir with stock integrators and with finite differences in these (test_gradient_reference.py).
-IN_EXPECTATION = ("texture", "retained", "roughconductor", "plastic", "blend", "mirror", "glass", "mask", "thin_glass",
+IN_EXPECTATION = ("texture", "roughconductor", "plastic", "blend", "mirror", "glass", "mask", "thin_glass",
                   "directional", "constant", "envmap")  # fmt: skip

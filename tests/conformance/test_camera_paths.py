@@ -147,7 +147,7 @@ def test_short_paths(depth: int):
 # --- gradients --------------------------------------------------------------------------------------------------------
 
 #: Those that both sides can find; camera paths do not know parallel lamps.
-BOTH = [case for case in CASES if case.name not in ("retained", "texture_prb", "directionalarea")]
+BOTH = [case for case in CASES if case.name not in ("texture_prb", "directionalarea")]
 SOME = ("texture", "mask_texture_in_view", "two_emitters", "visible_lamp", "glass")
 
 

@@ -35,7 +35,7 @@ KINDS = {
 def gradients(case: GradientCase, adjoint: str, **options: object) -> tuple[list[np.ndarray], list[dict[str, int]]]:
     """Gradients of four steps, between which seed and parameters change, and recordings after each."""
     scene = Case(case.scene(), case.keys)
-    own = {key: value for key, value in case.options.items() if key not in ("image", "samples_per_pass")}
+    own = {key: value for key, value in case.options.items() if key != "samples_per_pass"}
     chosen = integrator("reslrb", **{**case.both, **own, **options})
     found, counts = [], []
     for step in range(4):

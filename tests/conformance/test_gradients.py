@@ -46,21 +46,17 @@ BY_ADJOINT = {
     "reservoir_by_adjoint": {"estimator": "reservoir", "weight": "adjoint"},
     "event_by_adjoint": {"estimator": "event", "weight": "adjoint"},
 }
-#: Options that belong to the reservoir alone.
-OF_RESERVOIR = {"image"}
 
 
 def estimator(case: GradientCase, name: str, options: dict):
     """The integrator of a case with this estimator."""
-    own = {key: value for key, value in case.options.items() if key not in OF_RESERVOIR}
-    return integrator("reslrb", **case.both | own | {"estimator": name} | options)
+    return integrator("reslrb", **case.both | case.options | {"estimator": name} | options)
 
 
 @taking_turns("case", CASES, "adjoint", ("correlated", "independent"), AT_EQUAL_SEEDS)
 def test_exact_estimators_equal_naive_ad(case: GradientCase, adjoint: str):
     scene = Case(case.scene(), case.keys)
-    own = {key: value for key, value in case.options.items() if key not in OF_RESERVOIR}
-    reference = scene.gradient(integrator("walk_ad", **case.both | own), 5, case.spp, adjoint=adjoint)
+    reference = scene.gradient(integrator("walk_ad", **case.both | case.options), 5, case.spp, adjoint=adjoint)
     for name, options in EXACT.items():
         ours = scene.gradient(estimator(case, name, options), 5, case.spp, adjoint=adjoint)
         error = relative(ours, reference)
@@ -190,7 +186,7 @@ def forward(scene: Case, integrator: Any, seed: int, spp: int) -> np.ndarray:
 QUICK = ("texture", "roulette", "thin_lens", "glass", "mask_texture_in_view", "two_emitters", "visible_lamp")
 
 
-@pytest.mark.parametrize("name", a_few([n for n in BY_NAME if n not in ("texture_prb", "retained")], QUICK))
+@pytest.mark.parametrize("name", a_few([n for n in BY_NAME if n != "texture_prb"], QUICK))
 def test_forward_mode_is_walk_ad(name: str):
     case = BY_NAME[name]
     scene, options = Case(case.scene(), case.keys), case.both | case.options
@@ -358,7 +354,7 @@ NAMES = ("texture", "roulette", "passes", "gaussian", "thin_lens", "plastic", "g
 
 
 def options(case: GradientCase) -> dict:
-    return {name: value for name, value in {**case.options, **case.both}.items() if name != "image"}
+    return {**case.options, **case.both}
 
 
 @taking_turns("name", NAMES, "adjoint", ("correlated", "independent"), FEW_TRAJECTORIES)

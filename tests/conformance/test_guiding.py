@@ -37,7 +37,7 @@ def guided(name: str, steps: int, **options: Any) -> tuple[Case, Any, Any]:
     guided."""
     case = BY_NAME[name]
     scene = Case(case.scene(), case.keys)
-    own = {key: value for key, value in case.options.items() if key != "image"} | case.both | options
+    own = case.options | case.both | options
     ours = integrator("reslrb", **{"estimator": "stack", **own}, guiding="on")
     for seed in range(steps):
         learn(scene, ours, seed)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from agreement import compare, renders
 from conformance.scenes import (
     RED,
     SAME,
@@ -24,8 +22,6 @@ from conformance.scenes import (
     transform,
 )
 from turns import a_few, taking_turns
-
-from reslrb_cli.integrators.step import gradient_step, make_integrator
 
 pytestmark = pytest.mark.usefixtures("samples")
 
@@ -148,16 +144,6 @@ def test_passes_are_unbiased_and_independent():
 
 def test_first_pass_is_what_ptracer_traces():
     assert difference_from_ptracer(stage(large()), spp=8, reslrb={"samples_per_pass": 8}) < SAME
-
-
-def test_retained_image_is_unbiased():
-    scene = stage(visible())
-    integrator = make_integrator("reslrb", image="retained", max_depth=5, rr_depth=100)
-    ours = renders(lambda seed: gradient_step(integrator, scene, 0, dr.sum, seed=seed, spp=64).image, range(10))
-    result = compare(ours, images(scene, "path", range(1000, 1010), 64, max_depth=5, rr_depth=100))
-    assert result, result
-    # Another estimate of the same image, from the same paths.
-    assert (ours[0] != images(scene, "reslrb", range(1), 64, max_depth=5, rr_depth=100)[0]).any()
 
 
 def test_shapes():

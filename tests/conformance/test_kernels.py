@@ -81,7 +81,7 @@ INDEPENDENT = ("texture", "passes", "glass", "mask", "area_texture", "envmap", "
 #: Of these, by default.
 FEW = ("texture", "passes", "glass", "mask", "envmap")
 #: Of the others, those that the default suite runs: each has objects of a kind that the rest does not have.
-CORRELATED = ("retained", "thin_lens", "principled", "two_emitters")
+CORRELATED = ("thin_lens", "principled", "two_emitters")
 
 
 @taking_turns("name", INDEPENDENT, "adjoint", ("independent", "correlated"), FEW)

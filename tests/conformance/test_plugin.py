@@ -142,7 +142,6 @@ def test_defaults_are_ptracers():
         {"rr_depth": 0},
         {"samples_per_pass": 0},
         {"estimator": "rezervoir"},
-        {"image": "some"},
         {"max_dpth": 3},
         {"max_depth": "deep"},
         {"capacity": 0},
@@ -157,7 +156,7 @@ def test_wrong_options_raise(options: dict[str, Any]):
         mi.load_dict({"type": "reslrb", **options})
 
 
-@pytest.mark.parametrize("name", ["estimator", "image"])
+@pytest.mark.parametrize("name", ["estimator", "weight"])
 def test_walk_ad_knows_no_estimators(name: str):
     import mitsuba as mi
 
@@ -398,19 +397,6 @@ def test_samples_per_pass(case: Case):
     assert one.mean() == pytest.approx(several.mean(), rel=0.05)  # as many of them
     only = np.array(render_image(integrator("reslrb", samples_per_pass=64), case.scene, 0, 1, 64))
     assert relative(one, only) < 1e-5
-
-
-def test_retained_image_has_the_same_expectation(case: Case):
-    every, retained = (integrator("reslrb", image=image) for image in ("all", "retained"))
-    from reslrb_cli.integrators.step import gradient_step
-
-    def images(tracer: Any, block: int) -> np.ndarray:
-        steps = [gradient_step(tracer, case.scene, 0, case.objective, seed=s, spp=64) for s in seeds(16, block)]
-        return np.stack([np.array(step.image, np.float64) for step in steps])
-
-    a, b = images(every, 0), images(retained, 1)
-    assert compare(a, b, block=8)
-    assert b.std(0).mean() > 1.05 * a.std(0).mean()
 
 
 def test_a_plan_is_not_taken_from_another_scene(llvm: str):

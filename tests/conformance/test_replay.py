@@ -54,6 +54,11 @@ class Recording(ReservoirSelection):
 
         return mi.Bool(True)
 
+    def concerned(self, state: Any) -> Any:
+        import mitsuba as mi
+
+        return mi.Bool(True)
+
     def connection(self, state: Kept, vertex: Any, connection: Any, numbers: list[Any]) -> Kept:
         import drjit as dr
         import mitsuba as mi
@@ -108,7 +113,7 @@ def test_replay_meets_the_same_vertices(name: str):
     with dr.suspend_grad():
         [samples] = ours.passes(Job(scene.scene, scene.scene.sensors()[0], mi.UInt32(5), 64))
         context = Pass(samples, None, None)
-        kept = context.walk(Recording(context, 1, "luminance", False))
+        kept = context.walk(Recording(context, 1, "luminance"))
         dr.eval(kept)
         slot, active = kept.state.slots[0], kept.state.W > 0
         emission = sample_emission(samples, samples.sampler()).weight

@@ -39,7 +39,7 @@ LANES = 5
 def both(name: str, **options: Any) -> tuple[Case, Any, Any]:
     """A case, an integrator with such numbers, and one with independent ones."""
     case = BY_NAME[name]
-    own = {"estimator": "stack"} | {k: v for k, v in case.options.items() if k != "image"} | case.both | options
+    own = {"estimator": "stack"} | case.options | case.both | options
     return Case(case.scene(), case.keys), integrator("reslrb", **own, **ON), integrator("reslrb", **own)
 
 
