@@ -327,7 +327,7 @@ class Sweep(Measurement):
                 self.at(case, value)
 
 
-#: What is compared where the user names nothing, by what is estimated: the gradient with dL/dI held, the gradient of the
+#: What is compared where the user names nothing, by what is estimated: the gradient with dL/dI held, that of the
 #: configuration's loss, or the image.
 DEFAULTS = {
     "fixed": "ptracer,prb,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,reslrb:stack(guiding=on),"
