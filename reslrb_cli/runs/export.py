@@ -45,6 +45,9 @@ from reslrb_cli.scene.xml.read import Description
 
 Array = np.ndarray[Any, Any]
 
+#: Samples per pixel of the solid's picture.
+PICTURE_SPP = 128
+
 #: Told of what was written.
 Say = Callable[[str], None]
 
@@ -189,7 +192,9 @@ def picture_of(solid: Solid) -> Array:
                        "film": {"type": "hdrfilm", "width": 480, "height": 360, "pixel_format": "rgba",
                                 "rfilter": {"type": "box"}}},
         })  # fmt: skip
-        image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "direct", "hide_emitters": True}), spp=128))
+        image = np.array(
+            mi.render(scene, integrator=mi.load_dict({"type": "direct", "hide_emitters": True}), spp=PICTURE_SPP)
+        )
     return np.asarray(image[:, :, :3] + (1 - image[:, :, 3:4]) * 0.9, dtype=np.float32)
 
 

@@ -249,16 +249,16 @@ for number in range(count):
 """
 
 
-@pytest.mark.parametrize("each", [4, pytest.param(40, marks=pytest.mark.long)])
-def test_many_at_once_either_replace_or_are_refused(tmp_path, each):
+@pytest.mark.parametrize(("count", "each"), [(4, 6), pytest.param(8, 40, marks=pytest.mark.long)])
+def test_many_at_once_either_replace_or_are_refused(tmp_path, count, each):
     environment = {**os.environ, "PYTHONPATH": search_path(ROOT)}
     command = [sys.executable, "-c", CONTEND, str(tmp_path), str(each)]
     runs = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
-            for _ in range(8)]  # fmt: skip
+            for _ in range(count)]  # fmt: skip
     done = [run.communicate() for run in runs]
-    assert [err for _, err in done] == [""] * 8
+    assert [err for _, err in done] == [""] * count
     outcomes = [line for out, _ in done for line in out.splitlines()]
-    assert len(outcomes) == 8 * each
+    assert len(outcomes) == count * each
     assert set(outcomes) == {"ran", "refused"}  # who waits for more than a second
     assert names(tmp_path) == ["run"]
     [mark] = {path.read_text() for path in (tmp_path / "run").rglob("*") if path.is_file() and path.suffix != ".json"}

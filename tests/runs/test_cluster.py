@@ -100,7 +100,7 @@ OWN_SETS = ["run.shards=3", "run.adjoint=batched", "loss={type: custom, file: ow
 
 def test_workers_run_a_users_code_where_the_run_may(experiment: Path) -> None:
     (experiment / "own.py").write_text(OWN)
-    compare(experiment, OWN_SETS, 2)
+    compare(experiment, OWN_SETS, 1)
     course = make(experiment, *OWN_SETS)
     (experiment / "own.py").write_text(OWN + "# another\n")
     with pytest.raises(ConfigError, match="has changed since"), engine.engine_at(course, Place(1), threads=1):
