@@ -128,7 +128,7 @@ def test_verdicts_of_twenty_runs(folder, seed):
 
 #: A texture that its regularizer holds far from what the images alone would have it be.
 HELD = Toy("a texture that is held even", {POSTER: f"{COLOR}, regularizers: [{{type: laplacian, weight: 1.0e-5}}]"},
-           {POSTER: SETTLED}, ("run.spp=256", "run.iterations=80",
+           {POSTER: SETTLED}, ("run.spp=160", "run.iterations=80",
                                "optimizer={type: adam, learning_rate: 0.02, schedule: cosine}"))  # fmt: skip
 
 
