@@ -54,9 +54,8 @@ INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,
 @click.option("--integrators", metavar="LIST",
               help="What to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)], separated by commas; OPTION is one of the "
                    "integrator's, or adjoint; or FILE.py:CLASS, one of your own. Default: those of "
-                   f"{INTEGRATORS} that can do CONFIG.")  # fmt: skip
-@click.option("--baseline", metavar="NAME",
-              help="Entry of that list that times are divided by; default: ptracer, or else the first.")  # fmt: skip
+                   f"{INTEGRATORS} that can do CONFIG. Times are divided by those of ptracer, or else of the "
+                   "first.")  # fmt: skip
 @click.option("--objective", type=click.Choice(["fixed", "l2"]), default="fixed", show_default=True,
               help="fixed: dL/dI is given before the image; l2: it comes from the image, by run.adjoint.")  # fmt: skip
 @allow_code_option
@@ -71,7 +70,7 @@ INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,
               help="PNG of time and memory against what is varied; default: beside the JSON file.")  # fmt: skip
 def command(
     config_file: Path | None, overrides: tuple[str, ...], swept: str, values: tuple[int, ...] | None, max_depth: int,
-    integrators: str | None, baseline: str | None, objective: str, allow_code: bool, memory_limit: int | None,
+    integrators: str | None, objective: str, allow_code: bool, memory_limit: int | None,
     budget: float, rounds: int | None, resumed: Path | None, json_file: Path | None, plot_file: Path | None,
 ) -> int:  # fmt: skip
     """Measure time and peak memory of gradient steps against path depth, or what else --sweep names.
@@ -88,7 +87,6 @@ def command(
     from reslrb_cli.measure.methods import (
         SWEPT,
         Sweep,
-        choose_baseline,
         depths,
         machine_of,
         parse_cases,
@@ -106,7 +104,6 @@ def command(
         **machine_of(config, memory_limit),
         config=config,
         cases=cases,
-        baseline=choose_baseline(cases, baseline),
         values=sorted(values or (depths(max_depth) if swept == "depth" else usual_values(swept, config))),
         objective=objective,
         budget_s=budget,

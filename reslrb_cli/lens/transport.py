@@ -49,20 +49,6 @@ class Optics(Protocol):
         """mu (...): light that arrives, by area of the aperture, in any unit; 0 outside of the aperture."""
 
 
-@dataclass(frozen=True)
-class Gradient:
-    """Optimal transport for the squared distance: T = g; `mu` (ny, nx) is the light on the aperture of `size`."""
-
-    mu: Array
-    size: tuple[float, float]
-
-    def hit(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
-        return np.stack([gx, gy])
-
-    def arriving(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
-        return sample(self.mu, self.size, x, y)
-
-
 @dataclass
 class Transport:
     """A solution of (1).

@@ -211,20 +211,6 @@ def _split(text: str) -> list[str]:
     return [part.strip() for part in parts]
 
 
-def choose_baseline(cases: Sequence[Case], name: str | None) -> Case:
-    """The case that the others are compared with: that of this label, else `ptracer` where it is there, or the first.
-
-    Raises ConfigError where none has the label.
-    """
-    for case in cases:
-        if case.label == name or (name is None and case.type == "ptracer"):
-            return case
-    if name is not None:
-        labels = ", ".join(case.label for case in cases)
-        raise ConfigError("--baseline", "", f"`{name}` is none of {labels}")
-    return cases[0]
-
-
 def depths(max_depth: int) -> list[int]:
     """2, 4, 8, ... up to `max_depth`, which comes last."""
     powers = [2**k for k in range(1, max_depth.bit_length()) if 2**k < max_depth]
@@ -296,15 +282,18 @@ class Measurement:
 class Sweep(Measurement):
     """What is measured: at each of `values` of what is `swept`, times over those of the `baseline`."""
 
-    baseline: Case
     values: Sequence[int]
     swept: str = "depth"
 
     KIND = "bench"
 
+    @property
+    def baseline(self) -> Case:
+        """`ptracer` where it is there, or the first."""
+        return next((case for case in self.cases if case.type == "ptracer"), self.cases[0])
+
     def _options(self) -> dict[str, Any]:
-        values = {"values": list(self.values), "objective": self.objective, "sweep": self.swept}
-        return {"baseline": self.baseline.label} | values
+        return {"values": list(self.values), "objective": self.objective, "sweep": self.swept}
 
     def may_refuse(self, case: Case) -> bool:
         """Whether the rest goes on without this case, where it refuses the scene."""

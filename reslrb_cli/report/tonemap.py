@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.records.atomic import write_atomically
-from reslrb_cli.records.images import load_image, read_layers, write_layers
+from reslrb_cli.records.images import read_layers, write_layers
 
 Array = np.ndarray[Any, Any]
 
@@ -130,15 +130,11 @@ def write_error_map(folder: Path, suffix: str, image: Array, target: Array, grad
 
 
 def read_comparison(folder: Path, suffix: str) -> dict[str, Array]:
-    """The layers that `write_error_map` wrote; of what an older version wrote `difference` alone, without its sign.
-
-    Nothing where there are none, or they are damaged.
-    """
+    """The layers that `write_error_map` wrote; nothing where there are none, or they are damaged."""
     try:
         return read_layers(folder / f"comparison{suffix}.exr")
     except (OSError, ValueError):
-        error = load_image(folder / f"error{suffix}.exr")
-        return {} if error is None else {"difference": error}
+        return {}
 
 
 def scale_end(values: Array) -> float:

@@ -70,7 +70,6 @@ class SceneNeeds:
     emitters: tuple[str, ...]
     environment: int | None
     has_visible_emitters: bool
-    has_smooth: bool
     has_glossy: bool
     has_delta_lobes: bool
     has_null: bool
@@ -122,7 +121,6 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         emitters=tuple(emitter.class_name() for emitter in emitters),
         environment=None if environment is None else emitters.index(environment),
         has_visible_emitters=any(not int(emitter.flags()) & int(mi.EmitterFlags.Delta) for emitter in emitters),
-        has_smooth=flags & int(mi.BSDFFlags.Smooth) != 0,
         has_glossy=flags & int(mi.BSDFFlags.Glossy) != 0,
         has_delta_lobes=flags & delta != 0,
         has_null=flags & int(mi.BSDFFlags.Null) != 0,

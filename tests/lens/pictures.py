@@ -1,9 +1,13 @@
-"""Pictures to throw, all of them without symmetry."""
+"""Pictures to throw, all of them without symmetry; and optics of which the potential is known."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
+
+from reslrb_cli.lens import transport
 
 Array = NDArray[np.float64]
 
@@ -19,3 +23,17 @@ def sharp(n: int) -> Array:
     """A bar and a disc of 1 on black."""
     x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
     return 1.0 * (((x - 0.4) ** 2 + (y + 0.3) ** 2 < 0.1) | ((np.abs(y - 0.5) < 0.15) & (x < 0.5)))
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """Optimal transport for the squared distance: T = g; `mu` (ny, nx) is the light on the aperture of `size`."""
+
+    mu: Array
+    size: tuple[float, float]
+
+    def hit(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
+        return np.stack([gx, gy])
+
+    def arriving(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
+        return transport.sample(self.mu, self.size, x, y)

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from lens.pictures import smooth
+from lens.pictures import Gradient, smooth
 from lens.tracer import bent, caustic
 from skimage.metrics import structural_similarity
 from turns import a_few
@@ -91,7 +91,7 @@ def test_far_away_heights_are_those_of_the_paraxial_formula(
     found = shape_surface(smooth(64), setting, 64, floor=0.05).heights
     x, y = transport.grid((64, 64), LENS.size)
     start = np.array([0, 0, 0, 0.5, 0, 0.5])
-    even = transport.Gradient(np.ones((2, 2)), LENS.size)
+    even = Gradient(np.ones((2, 2)), LENS.size)
     phi = transport.solve(even, smooth(64)[::-1, ::-1], LENS.size, LENS.picture_size, (64, 64), start).h
     expected = (phi - (x * x + y * y) / 2) / (factor * distance)
     np.testing.assert_allclose(found - found.mean(), expected - expected.mean(), atol=0.01 * np.ptp(expected))

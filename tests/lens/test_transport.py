@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from lens.pictures import sharp, smooth
+from lens.pictures import Gradient, sharp, smooth
 
 from reslrb_cli.lens import transport
-from reslrb_cli.lens.transport import Gradient, grid, least_floor, resized, solve, splat, through_tent
+from reslrb_cli.lens.transport import grid, least_floor, resized, solve, splat, through_tent
 
 SIZE = (2.0, 1.0)
 

@@ -153,7 +153,6 @@ def test_what_ends_at_a_low_limit_ended_for_want_of_memory(limit: str, tmp_path:
         (["--memory-limit", "much"], "`much` is no size"),
         (["--max-depth", "1"], "--max-depth"),
         (["--integrators", "pt"], "--integrators pt: integrator.type"),
-        (["--baseline", "prb"], "--baseline: `prb` is none of"),
         (["--json", "no/such/folder.json"], "--json: cannot write"),
     ],
 )

@@ -15,7 +15,7 @@ from reslrb_cli.cli import main
 from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.bench import Bench, Result
-from reslrb_cli.measure.methods import Sweep, choose_baseline, depths, parse_cases, usual_values
+from reslrb_cli.measure.methods import Sweep, depths, parse_cases, usual_values
 from reslrb_cli.measure.processes import MAX_ROUNDS, MIN_ROUNDS, Pace, Refused, Stopped
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurements import BenchStatus, Spread
@@ -39,11 +39,11 @@ def _clean() -> None:
     Pretended.log, Pretended.ends, Pretended.refusing, Pretended.alive = [], {}, set(), 0
 
 
-def sweep(list_of: str = LIST, baseline: str | None = None, **changes: Any) -> Sweep:
+def sweep(list_of: str = LIST, **changes: Any) -> Sweep:
     cases = parse_cases(list_of)
     values: dict[str, Any] = {
         "config": loads(CONFIG, Path("x.yaml")), "variant": "llvm_ad_rgb", "cases": cases,
-        "baseline": choose_baseline(cases, baseline), "values": [2, 4], "objective": "fixed", "memory_limit": None,
+        "values": [2, 4], "objective": "fixed", "memory_limit": None,
         "memory": 2**40, "budget_s": 0.0, "rounds": MIN_ROUNDS,
     }  # fmt: skip
     return Sweep(**(values | changes))
@@ -110,10 +110,9 @@ def test_without_a_baseline_there_are_no_ratios() -> None:
     assert [row.step_ratio is None for row in rows] == [True, True, True, False, False, False]
 
 
-@pytest.mark.usefixtures("_clean")
-def test_another_baseline() -> None:
-    rows = run(sweep(baseline="reslrb:stack", values=[2]))
-    assert [row.step_ratio and row.step_ratio.median for row in rows] == [2.0, 1.0, 2.5]
+@pytest.mark.parametrize("cases", ["reslrb:stack,reslrb:event", "reslrb:event,ptracer"])
+def test_times_are_over_those_of_ptracer_or_of_the_first(cases: str) -> None:
+    assert sweep(cases).baseline.label == ("ptracer" if "ptracer" in cases else "reslrb:stack")
 
 
 @pytest.mark.usefixtures("_clean")
@@ -290,12 +289,6 @@ def test_wrong_lists_are_located(text: str, line: str) -> None:
 
 
 @pytest.mark.usefixtures("_clean")
-def test_an_unknown_baseline_is_located() -> None:
-    with pytest.raises(ConfigError, match=r"--baseline: `prb` is none of ptracer, reslrb:stack"):
-        sweep(baseline="prb")
-
-
-@pytest.mark.usefixtures("_clean")
 def test_what_nobody_named_is_left_out_where_it_refuses():
     Pretended.refusing = {"reslrb"}
     results, lines = play(sweep(default=True))
@@ -343,7 +336,7 @@ def run_swept(swept: str, values: list[int], **changes: Any) -> tuple[list[Resul
     cases = parse_cases(LIST, deep=False)
     settings: dict[str, Any] = {
         "config": loads(CONFIG, Path("x.yaml"), ["integrator.max_depth=5"]), "variant": "llvm_ad_rgb", "cases": cases,
-        "baseline": choose_baseline(cases, None), "values": values, "objective": "fixed", "memory_limit": None,
+        "values": values, "objective": "fixed", "memory_limit": None,
         "memory": 2**40, "budget_s": 0.0, "rounds": 3, "swept": swept,
     }  # fmt: skip
     what = Sweep(**(settings | changes))

@@ -43,7 +43,6 @@ def test_plain_scene(make_scene):
     needs = scene_needs(scene, scene.sensors()[0])
     assert needs.emitters == ("PointLight",)
     assert needs.environment is None
-    assert needs.has_smooth
     absent = ("has_delta_lobes", "has_null", "has_shading_normals", "has_visible_emitters", "thin_lens")
     assert [name for name in (*absent, "moving_shutter", "has_instances") if getattr(needs, name)] == []
     check_supported(scene, scene.sensors()[0])
