@@ -178,15 +178,22 @@ class Forecast(Steps):
         return self.elapsed_s + self.target_s + self.images_s + self.verdicts_s
 
 
-def make_forecast(config: Config, say: Callable[[str], None], cache: PilotCache | None = None) -> Forecast:
+def make_forecast(
+    config: Config,
+    say: Callable[[str], None],
+    cache: PilotCache | None = None,
+    before: Callable[[Problem], object] = lambda problem: None,
+) -> Forecast:
     """Measure a few steps of the run that `config` describes; a variant must be set.
 
-    `say` is told what takes long; what a pilot learns is kept in `cache`, for the run. Raises ConfigError and
-    UnsupportedScene as the run would, and what its steps raise.
+    `say` is told what takes long; what a pilot learns is kept in `cache`, for the run. `before` is called where a run
+    measures what it does before its first iteration: with its integrator settled, and its parameters where they begin.
+    Raises ConfigError and UnsupportedScene as the run would, and what its steps raise.
     """
     # Errors are no part of a step.
     problem = replace(assemble(with_short_target(config), say, cache), truth={})
     image_s, views = _image_seconds(problem), len(problem.views)
+    before(problem)
     say("measuring a few steps")
     steps, scratch, integrator = measure_steps(problem), 0, problem.integrator
     if isinstance(integrator, Reslrb):  # of all paths that are traced at a time

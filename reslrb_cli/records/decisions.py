@@ -3,6 +3,7 @@
 EstimatorRecord                the most efficient estimator, and how each that was tried did
 PathsRecord                    from which side paths are traced
 GuidedRecord, SequenceRecord   ways of drawing samples that were left to measurement: whether they pay
+RivalRecord                    another integrator that would have been the better choice
 """
 
 from __future__ import annotations
@@ -197,3 +198,26 @@ class SequenceRecord(PaidRecord):
     def decision(self) -> str:
         instead = ", guiding off" if self.alone and self.low_discrepancy else ""
         return f"sequence {self.setting}{instead}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RivalRecord(Finding):
+    """Of `integrator` beside the run's own: `advantage` is its efficiency over that one's, 1 / (variance * time), of
+    gradients with the run's own loss, between `low` and `high` with 95 % confidence, by `rounds` steps of each."""
+
+    integrator: str
+    rounds: int = 0
+    advantage: float | None = None
+    low: float | None = None
+    high: float | None = None
+
+    @property
+    def is_better(self) -> bool:
+        """Whether it is clearly the more efficient: by no accident of the samples."""
+        return self.low is not None and self.low > 1
+
+    def decision(self) -> str:
+        return self.integrator
+
+    def why(self) -> str:
+        return _times(self.advantage, self.low, self.high, self.note)

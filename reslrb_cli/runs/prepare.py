@@ -28,7 +28,9 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, SEQUENCE, plan_rows, with_reason
 from reslrb_cli.integrators.reslrb import Reslrb
+from reslrb_cli.measure.prb_comparison import measure_rival
 from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.loading import paths_of
 from reslrb_cli.optimization.moving import warn_of_border
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import WINDOW, Best, Images, Least, Results
@@ -40,6 +42,7 @@ from reslrb_cli.optimization.views import view_records
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.checkpoint import save_checkpoint
 from reslrb_cli.records.clock import SharedTime
+from reslrb_cli.records.decisions import RivalRecord
 from reslrb_cli.records.manifest import Manifest
 from reslrb_cli.records.metrics import ClampTally, NonFiniteTally, Record, RegularizedTally
 from reslrb_cli.records.run_folder import RunFolder
@@ -146,9 +149,15 @@ def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[Course, 
 
     `say` is told what takes long, `warn` what to look at. Raises ConfigError and UnsupportedScene.
     """
-    problem = assemble(config, say, PilotCache(), to_run=True)
+    cache = PilotCache()
+    problem = assemble(config, say, cache, to_run=True)
     warn_of_border(problem, warn)
-    return Course(problem, variant), manifest_of(problem, variant, config.source)
+    rival = measure_rival(problem, cache, say)
+    if rival is not None and rival.is_better:
+        warn(f"{rival.line()}; --set {_other_way(problem, rival)}")
+    manifest = manifest_of(problem, variant, config.source)
+    manifest.rival = None if rival is None else rival.to_json()
+    return Course(problem, variant), manifest
 
 
 def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
@@ -166,6 +175,16 @@ def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
     for name, decided in problem.decisions().items():
         setattr(manifest, name, decided)
     return manifest
+
+
+def _other_way(problem: Problem, rival: RivalRecord) -> str:
+    """The setting that has what `rival` is better by: camera paths beside light paths, where that is something new."""
+    integrator = problem.config.integrator
+    if problem.paths == "light" and isinstance(integrator, ReslrbConfig):
+        auto = integrator.model_copy(update={"paths": "auto"})
+        if paths_of(auto, problem.scene, problem.sensors, problem.moves) == "both":
+            return "integrator.paths=auto"
+    return f"integrator.type={rival.integrator}"
 
 
 def settled_of(problem: Problem, variant: str) -> Settled:

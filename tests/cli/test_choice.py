@@ -94,6 +94,7 @@ def test_a_short_run_measures_nothing_and_says_so(experiment, capsys, monkeypatc
     assert manifest["pilot"]["chosen"] == {"estimator": "stack"}
     assert manifest["pilot"]["rows"] == []
     assert manifest["sequence"]["low_discrepancy"]
+    assert manifest["rival"]["note"].startswith("not measured")
     page = Path("runs/box/report.html").read_text()
     assert f"estimator stack: {because}every connection, in one traversal" in page
     assert f"guiding off: {because}it pays in long runs" in page

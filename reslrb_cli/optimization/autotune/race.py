@@ -349,15 +349,19 @@ Learn = Callable[[int, int], Step]
 
 class Turns(Race, Generic[Record]):
     """One decision, by steps that `take` takes, and walks that `learn` does, where a table has yet to learn. `views` is
-    how many times the views of an iteration are those of a step here, `share` what of ITERATIONS this may cost."""
+    how many times the views of an iteration are those of a step here, `share` what of ITERATIONS this may cost, and
+    `most` what of them the least number of rounds may, where that is more."""
 
+    LEAST, LOOKS = LEAST_ROUNDS, LOOKS
     #: Whether it is decided apart for images that have samples of their own.
     APART = False
 
-    def __init__(self, take: Take, sizes: Sizes, views: float, share: float, learn: Learn | None = None) -> None:
+    def __init__(
+        self, take: Take, sizes: Sizes, views: float, share: float, most: float = 0.0, learn: Learn | None = None
+    ) -> None:
         super().__init__()
         self._take, self._learn, self._sizes, self._views = take, learn, sizes, views
-        self._share = share
+        self._share, self._most = share, max(share, most)
         self._apart = self.APART and sizes.alone
         self._plain: list[Step] = []  # all steps as they are whose times count
         self._steps: tuple[list[Step], list[Step]] = ([], [])  # of either kind
@@ -372,10 +376,10 @@ class Turns(Race, Generic[Record]):
         # What Python takes is the same for both.
         kernels = (1 + self._sizes.longer) * (plain.kernel_ms + plain.image_ms)
         if not self._learned(kernels + 2 * plain.beside_ms):
-            share = f"{100 * self._share:.2g} % of {ITERATIONS} iterations"
+            share = f"{100 * self._most:.2g} % of {ITERATIONS} iterations"
             return self._record(f"to measure it would cost more than {share}")
         self._spend(take(True, 0, spp), first=True)
-        for round in range(1, 1 + LOOKS * self._sizes.rounds):
+        for round in range(1, 1 + self.LOOKS * self._sizes.rounds):
             for other in (False, True):
                 self._steps[other].append(self._spend(take(other, round, spp)))
             self._plain.append(self._steps[False][-1])
@@ -388,14 +392,14 @@ class Turns(Race, Generic[Record]):
     def _learned(self, round_ms: float) -> bool:
         """Have the table learn, if it has not; False where that, and rounds of so long, cannot be afforded."""
         if self._learn is None:
-            return self._affords(LEAST_ROUNDS * round_ms)
+            return self._affords(self.LEAST * round_ms)
         walk = self._learn(0, self._sizes.learning)
-        if not self._affords(walk.wall_ms + LEAST_ROUNDS * round_ms):
+        if not self._affords(walk.wall_ms + self.LEAST * round_ms):
             self._spend(walk, first=True)
             return False
         self._walk = self._spend(walk)
         # What one walk more would gain is little beside what rounds that are too few leave open.
-        rounds = max(self._sizes.rounds // 2, LEAST_ROUNDS)
+        rounds = max(self._sizes.rounds // 2, self.LEAST)
         for number in range(1, LEARNINGS):
             if self._affords(self._walk.wall_ms + rounds * round_ms):
                 self._walk = self._spend(self._learn(number, self._sizes.learning))
@@ -414,7 +418,8 @@ class Turns(Race, Generic[Record]):
         return beside * self._sizes.trial / self._sizes.call
 
     def _affords(self, more_ms: float) -> bool:
-        return self._spent_ms + more_ms <= self._share * ITERATIONS * self._iteration_ms
+        share = self._share if len(self._steps[True]) >= self.LEAST else self._most
+        return self._spent_ms + more_ms <= share * ITERATIONS * self._iteration_ms
 
     def _more_ms(self) -> float:
         """What a step of the other kind, of `trial` samples, takes in a run beside its own kernels."""
@@ -456,7 +461,7 @@ class Turns(Race, Generic[Record]):
         return gain[2] is None or gain[2] >= LEAST_IMAGE
 
     def _decided(self) -> Record:
-        if len(self._steps[False]) < LEAST_ROUNDS:
+        if len(self._steps[False]) < self.LEAST:
             return self._record(f"{len(self._steps[False])} steps of both are too few to tell")
         picture = self._image_gain()
         images = self._images(picture)

@@ -15,7 +15,7 @@ from pydantic import TypeAdapter
 
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.clock import SharedTime
-from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, PathsRecord, SequenceRecord
+from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, PathsRecord, RivalRecord, SequenceRecord
 from reslrb_cli.records.images import load_image
 from reslrb_cli.records.run_folder import FABRICATION_FILE, SOLID_PICTURE
 from reslrb_cli.report.format import count, duration, number
@@ -199,6 +199,7 @@ def record_parts(run: Run) -> dict[str, Markup]:
             + soft(measured_line(PathsRecord, manifest.get("paths")))
             + soft(measured_line(GuidedRecord, manifest.get("guided")))
             + soft(measured_line(SequenceRecord, manifest.get("sequence")))
+            + soft(measured_line(RivalRecord, manifest.get("rival")))
         ),
         "Scale of the parameters": lambda: lay_out("run.scaling", manifest.get("scaling") or []),
         "Memory budget": lambda: lay_out("run.memory", kept) if (kept := manifest.get("memory")) else Markup(),
