@@ -55,9 +55,8 @@ SHARE, GUIDING_SHARE, SEQUENCE_SHARE, PATHS_SHARE = 0.05, 0.025, 0.005, 0.015
 #: learned from.
 ESTIMATOR_NEEDS, GUIDING_NEEDS, SEQUENCE_NEEDS, PATHS_NEEDS = (4.0, 4.0), (2.5, 3.0), (2.5, 1.0), (1.5, 2.0)
 #: The same of camera paths alone beside half of each kind: kernels are those of the run, whichever wins, and few steps
-#: of few samples tell. And what of a run of ITERATIONS rounds may cost at most where steps are so short that little of
-#: them is kernels.
-CAMERA_NEEDS, CAMERA_SHARE = (0.0, 3.0), 0.1
+#: of few samples tell.
+CAMERA_NEEDS = (0.0, 3.0)
 #: What is measured once the estimator is settled, by option: the time that is kept aside for it, all that is planned.
 #: What it takes at the least would be too little where kernels are there: first steps take their time all the same.
 LATER = {

@@ -53,8 +53,8 @@ ROUNDS, ROUNDS_OF_FEW, FEW_ENTRIES = 8, 16, 64
 #: A guided step, or one with low-discrepancy numbers, may take so many times as long as another.
 GUIDING_LONGER, SEQUENCE_LONGER = 3.0, 1.25
 #: The share of light paths that is begun with, and those that are tried then: fewer, as long as they are better, or,
-#: where none is better still, more again; else more. Steps of another share may take so many times as long. One is tried
-#: where so much of the time is left for it.
+#: where none at all are, a few after all; else more. Steps of another share may take so many times as long. A share is
+#: tried where so much of the time is left for it.
 FIRST_SHARE, FEWER, MORE, PATHS_LONGER, LEAST_TURNS = 0.5, (0.2, 0.05), (0.8, 0.95, 1.0), 2.0, 0.1
 #: What of the share the rounds of the sequence are planned for; the first step takes a part too, and is no round.
 ROUNDS_SHARE = 0.8
@@ -232,11 +232,19 @@ class PathsPilot(race.Turns[PathsRecord]):
 
 
 class CameraPilot(PathsPilot):
-    """The same, of camera paths alone, in a run however short: all rounds are taken that are planned for."""
+    """The same, of camera paths alone, in a run however short.
 
-    def __init__(self, take: race.Take, sizes: race.Sizes, *rest: Any) -> None:
-        super().__init__(take, sizes, *rest)
-        self.LEAST = sizes.rounds
+    As many rounds are taken as are planned for, or as there are samples for in what that may cost at least, whatever
+    Python takes: of steps of milliseconds times are not to decide whether anything is measured.
+    """
+
+    def __init__(self, take: race.Take, sizes: race.Sizes, *rest: Any, **more: Any) -> None:
+        super().__init__(take, sizes, *rest, **more)
+        fits = int(race.CAMERA_NEEDS[1] * sizes.step / ((1 + sizes.longer) * sizes.trial))
+        self.LEAST = max(min(sizes.rounds, fits), race.LEAST_ROUNDS)
+
+    def _affords(self, more_ms: float) -> bool:
+        return len(self._steps[True]) < self.LEAST or super()._affords(more_ms)
 
 
 def _paths(tuner: race.Tuner) -> PathsRecord:
@@ -258,8 +266,8 @@ def _paths(tuner: race.Tuner) -> PathsRecord:
                     return
                 own, other = (_of_share(problem, value) for value in (best, share))
                 trials.append(StepTrial(problem, f"paths {share:g}", own, other, *trials[-1:]))
-                kind, most = (PathsPilot, 0.0) if share else (CameraPilot, race.CAMERA_SHARE)
-                record = trials[-1].turns(kind, sizes(problem, PATHS_LONGER, planned(part)), part, most)
+                kind = PathsPilot if share else CameraPilot
+                record = trials[-1].turns(kind, sizes(problem, PATHS_LONGER, planned(part)), part)
                 words = f"over that of {100 * best:g} %" if record.paths == "other" else f"that of {100 * share:g} %"
                 records.append(replace(record, note=record.note or words))
                 if record.paths != "other":
@@ -410,12 +418,10 @@ class StepTrial:
         self._slopes = [self._slope(view) for view in self.views]
         take_gradient(problem)  # recovered exposures have some of these
 
-    def turns(
-        self, kind: type[race.Turns[race.Record]], sizes: race.Sizes, share: float, most: float = 0.0
-    ) -> race.Record:
+    def turns(self, kind: type[race.Turns[race.Record]], sizes: race.Sizes, share: float) -> race.Record:
         """What is found by these steps in turns."""
         part_of_views = len(self._problem.drawn(0)) / len(self.views)
-        return kind(self.take, sizes, part_of_views, share, most, self.learn if self._learns else None).run()
+        return kind(self.take, sizes, part_of_views, share, learn=self.learn if self._learns else None).run()
 
     @property
     def _learns(self) -> bool:
