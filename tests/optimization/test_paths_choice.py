@@ -163,6 +163,18 @@ def test_a_run_of_a_second_has_camera_paths_where_they_find_all():
     assert problem.sides.low > 10
 
 
+@pytest.mark.parametrize("paths", ["auto", "camera"])
+def test_camera_paths_of_a_guided_run_are_traced_as_they_are(paths: str, monkeypatch: pytest.MonkeyPatch):
+    """Whether they were found to pay or asked for: no table says where they begin."""
+    fix_times(monkeypatch, {f"paths {share:g}": 0.01 if share == 0 else 100.0 for share in OTHERS})
+    words = [*SMALL, "integrator.guiding=on", "integrator.estimator=stack", f"integrator.paths={paths}"]
+    assert optimize("tiny.yaml", *tiny.settings(*words)) == 0
+    rows = {row["feature"]: row for row in read_manifest(RUN)["plan"]["rows"]}
+    assert rows["camera paths"]["needed"]
+    assert not rows["guided emission"]["needed"]
+    assert optimize("--resume", str(RUN), "--set", "run.iterations=3") == 0
+
+
 def test_a_run_of_a_second_keeps_its_caustic():
     """Which no camera path finds, so that they seem to have hardly any noise."""
     _put_glass()
