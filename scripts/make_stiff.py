@@ -12,7 +12,7 @@ environment that `scripts/setup` makes: run it with `.venv/bin/python`, on a mac
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,6 @@ import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before Mitsuba
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization.assemble import assemble, assemble_scene
-from reslrb_cli.optimization.identifiability import find_reached
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.problem import Problem
 
@@ -68,8 +67,7 @@ class Experiment:
 
     def __init__(self, name: str) -> None:
         self.path = str(ROOT / "configs" / "stiff" / f"{name}.yaml")
-        self.model = assemble(load(self.path))
-        find_reached(self.model)
+        self.model = assemble(load(self.path), to_run=True)
         self.plain = ["optimizer.scale=none"]
         self.plain += [f"parameters[{i}].transform=none" for i in range(len(self.model.config.parameters))]
         for sets in (self.plain, []):
@@ -85,9 +83,9 @@ class Experiment:
         return Curve(label, points, errors(problem))
 
     def _problem(self, sets: tuple[str, ...]) -> Problem:
-        problem = assemble_scene(load(self.path, list(sets)))
-        problem.views, problem.truth, problem.masks = self.model.views, self.model.truth, self.model.masks
-        return problem
+        model, problem = self.model, assemble_scene(load(self.path, list(sets)))
+        integrator = model.integrator.afresh()  # of the paths that were found to pay
+        return replace(problem, integrator=integrator, views=model.views, truth=model.truth, masks=model.masks)
 
 
 def errors(problem: Problem) -> list[float]:
@@ -137,7 +135,9 @@ def compare(name: str) -> dict[str, Any]:
     tried = min(runs, key=lambda curve: curve.points[-1][2])
     best = min(grid, key=lambda curve: curve.points[-1][2])
     best.label = f"plain, rate {best.label}"
-    print(f"\n{name}: {TITLES[name]}; error at the start {auto.points[0][2]:.3f}")
+    sides = experiment.model.sides
+    paths = "" if sides is None else f"; {sides.decision()}"
+    print(f"\n{name}: {TITLES[name]}; error at the start {auto.points[0][2]:.3f}{paths}")
     for curve in (best, tried, *bare, auto):
         time = min(curve.end, auto.end)
         each = ", ".join(f"{part:.4f}" for part in curve.errors)

@@ -180,8 +180,9 @@ class RunConfig(Section):
     without its suffix; their loss is recorded every 10 iterations (`held_out`), and of the first and the last image."""
     measuring: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.1
     """What is `auto` in the integrator is measured before the first iteration. This is what all of that may take,
-    kernels that are compiled for it included, as a share of what the run itself is expected to take. What there is no
-    time for is decided by the scene's features; 0: all of it, and nothing is measured."""
+    kernels that are compiled for it included, as a share of what the run itself is expected to take; first steps of
+    camera paths, which most runs need anyway, may take more. What there is no time for is decided by the scene's
+    features; 0: all of it, and nothing is measured."""
     certainty: bool = True
     """After the last iteration, measure how certain the values are: their spread, and a verdict on each parameter.
     Takes as long as some iterations, ten or so where parameters are few; runs of fewer than 20 iterations, and

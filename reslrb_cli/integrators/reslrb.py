@@ -118,6 +118,8 @@ class LightTracer:
             paths = "light" if light_share else "camera"
         self.paths, self.light_share = paths, light_share
         self.preparation.paths, self.preparation.whole = paths, whole or paths != "light"
+        if paths == "camera":  # of which none begins where a table says
+            self.preparation.guiding = None
 
     def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
         """What a walk of this scene needs, with derivatives of `params`, if any. Raises UnsupportedScene."""

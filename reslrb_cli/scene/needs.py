@@ -179,11 +179,18 @@ def scaled_emitter(scene: Any) -> str | None:
     return None
 
 
-def camera_finds_all(scene: Any) -> bool:
-    """Whether paths from the sensor find all light, and none of it by rare accident: where no surface is specular or
-    glossy, and no emitter shines along its normal alone."""
+#: Segments of the longest path whose light comes straight from an emitter to what the sensor sees.
+DIRECT = 2
+
+
+def camera_finds_all(scene: Any, max_depth: int) -> bool:
+    """Whether paths from the sensor, of up to `max_depth` segments (-1: any number), find all light, and none of it by
+    rare accident: where no surface is specular or glossy, or light comes straight from the emitters, and no emitter
+    shines along its normal alone."""
     if any(emitter.class_name() == "DirectionalArea" for emitter in scene.emitters()):
         return False
+    if 0 <= max_depth <= DIRECT:
+        return True
     bundled = int(mi.BSDFFlags.Delta) & ~int(mi.BSDFFlags.Null) | int(mi.BSDFFlags.Glossy)
     return not any(int(bsdf.flags()) & bundled for bsdf in SceneGraph.of(scene).surface_bsdfs())
 

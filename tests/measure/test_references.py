@@ -73,7 +73,7 @@ def test_it_is_measured_once_and_remembered(experiment, capsys):
 
 def test_the_tables_of_a_guided_run_learn_nothing_from_it(experiment: None) -> None:
     """A run begins alike whether this was measured now or by an earlier one."""
-    problem = assemble(load("box.yaml", ["integrator.guiding=on"]))
+    problem = assemble(load("box.yaml", ["integrator.guiding=on", "integrator.paths=light"]))
     assert prb_comparison.measure_rival(problem, None, lambda line: None) is not None
     assert problem.integrator.preparation.guiding.learned == {}
 

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 import gc
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +27,7 @@ from reslrb_cli.measure.gradients import integrator
 from reslrb_cli.measure.scenes.small import load as load_scene
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.autotune.estimators import Candidate, find_options
-from reslrb_cli.optimization.autotune.race import SHARE, is_auto
+from reslrb_cli.optimization.autotune.race import NOTHING, SHARE, Gain, is_auto
 from reslrb_cli.optimization.autotune.sampling import GuidingPilot, SequencePilot, settle
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import make_targets
@@ -40,6 +42,8 @@ SMALLER = {
     "grey_room": ["scene.options.resx=120", "scene.options.resy=90"],
     "cornell_floor": ["scene.options.resx=128", "scene.options.resy=128"],
 }
+#: Whose target is a picture.
+PICTURED = ("mixed_room",)
 AUTO = ["integrator.guiding=auto", "integrator.sequence=auto", "run.measuring=1000"]
 #: Scenes in which gradients break, each with another reason to draw samples otherwise: a sun, a lamp that is a dot,
 #: parallel light that grazes a floor, glass in glass, texels that are black, a film of one column.
@@ -88,7 +92,8 @@ def config_of(name: str, case: ExtremeCase | None, folder: Path, *settings: str)
     """A shipped configuration by its name, or that of a case of the extreme suite."""
     if case is not None:
         return loads(extreme(case, folder), Path(f"{case.name}.yaml"), [*settings])
-    return load(FOLDER / f"{name}.yaml", ["target.render.spp=64", *SMALLER.get(name, ()), *settings])
+    target = ["target.render.spp=64"] if name not in PICTURED else []
+    return load(FOLDER / f"{name}.yaml", [*target, *SMALLER.get(name, ()), *settings])
 
 
 def judged(record: PaidRecord | None, on: bool, alone: bool) -> list[str]:
@@ -114,30 +119,48 @@ def test_no_scene_loses(name: str, tmp_path: Path) -> None:
     round_share = max(each.share / max(each.rounds, 1) for each in (guided, sequence) if each is not None)
     print(name, *(each.line() for each in (pilot, guided, sequence) if each is not None), f"{share:.2%}", sep="\n  ")
     assert guided is not None
-    assert sequence is not None
     alone = problem.config.adjoint == "independent"
     assert judged(guided, guided.guided, alone) == []
-    assert judged(sequence, sequence.low_discrepancy, False) == []
     assert share <= SHARE + OVERRUN * round_share
     if guided.guided:
         return
-    chosen = {} if pilot is None else pilot.chosen
+    camera = problem.integrator.paths == "camera"
+    chosen = {} if pilot is None else {"estimator": "stack"} if camera else pilot.chosen
     settings = [f"integrator.{option}={value}" for option, value in chosen.items()]
-    settings += [f"integrator.guiding={guided.setting}", f"integrator.sequence={sequence.setting}"]
+    settings += [f"integrator.guiding={guided.setting}"]
+    if problem.sides is not None:
+        both = [f"integrator.light_share={problem.sides.light_share}"] if problem.sides.paths == "both" else []
+        settings += [f"integrator.paths={problem.sides.paths}", *both]
+    if camera:  # of which none begins at a lamp
+        assert sequence is None
+    else:
+        assert sequence is not None
+        assert judged(sequence, sequence.low_discrepancy, False) == []
+        settings += [f"integrator.sequence={sequence.setting}"]
     found = operations(problem)
     del problem
     gc.collect()
     assert found == operations(decided(config_of(name, case, tmp_path, *settings), case))
 
 
+def forced(record: Callable[..., PaidRecord], on: bool) -> Callable[..., PaidRecord]:
+    """A pilot's way to its record, with another decision."""
+
+    def decided(pilot: Any, note: str, gain: Gain = NOTHING, picture: Gain = NOTHING, *decision: bool) -> PaidRecord:
+        return record(pilot, note, gain, picture, on, on)
+
+    return decided
+
+
 @pytest.mark.parametrize("fault", ["on whatever is found", "off with a grid"])
 def test_losses_are_seen(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a scene that guiding has a third of the efficiency in: it is on; and it is off, and paths start in cells."""
+    """In a scene that guided light paths have a third of the efficiency in: it is on; and it is off, and paths start in
+    cells."""
+    monkeypatch.setattr(sys.modules[__name__], "AUTO", [*AUTO, "integrator.paths=light"])
     if fault == "on whatever is found":
-        record, other = GuidingPilot._record, SequencePilot._record
-        monkeypatch.setattr(GuidingPilot, "_record", lambda self, on, images, *rest: record(self, True, True, *rest))
+        monkeypatch.setattr(GuidingPilot, "_record", forced(GuidingPilot._record, True))
         # What would take the place of guiding here.
-        monkeypatch.setattr(SequencePilot, "_record", lambda self, on, images, *rest: other(self, False, False, *rest))
+        monkeypatch.setattr(SequencePilot, "_record", forced(SequencePilot._record, False))
     else:
 
         def wrong(problem: Problem, options: Sequence[Candidate], say: Callable[[str], None]) -> Problem:

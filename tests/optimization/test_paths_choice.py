@@ -8,6 +8,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+from cli import tiny
 from optimization.deciding import SMALL, begin, fix_times
 from runs.going_on import optimize
 
@@ -15,17 +16,28 @@ from reslrb_cli.config.integrators import Reslrb
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble, assemble_scene
-from reslrb_cli.optimization.autotune.sampling import FEWER, FIRST_SHARE, MORE, with_sides
+from reslrb_cli.optimization.autotune import race, sampling
+from reslrb_cli.optimization.autotune.sampling import FEWER, FIRST_SHARE, MORE, CameraPilot, with_sides
 from reslrb_cli.optimization.loading import paths_of
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.decisions import PathsRecord
 from reslrb_cli.records.manifest import read_manifest
-from reslrb_cli.scene.needs import light_finds_all
+from reslrb_cli.scene.needs import camera_finds_all, light_finds_all
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
 AUTO = ["integrator.paths=auto", "integrator.estimator=stack", *SMALL]
+OTHERS = (0.0, *FEWER, *MORE)
+#: A run of a second: its measuring may take a tenth of that.
+SHORT = ["integrator.paths=auto", "integrator.estimator=stack", "scene.size=[32, 32]", "run.spp=16"]
+SHORT += ["run.iterations=100", "run.certainty=false"]
+#: A glass ball before the poster, and a lamp that is a point behind it.
+GLASS = """<shape type="sphere"><point name="center" value="0.4, 0.3, 1"/><float name="radius" value="0.3"/>
+        <bsdf type="dielectric"/></shape>
+    <emitter type="point"><point name="position" value="0.6, 0.45, 3"/><rgb name="intensity" value="40"/></emitter>
+</scene>
+"""
 RUN = Path("runs/tiny")
 ROOT = Path(__file__).parents[2]
 
@@ -36,24 +48,41 @@ def experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def decided(
-    monkeypatch: pytest.MonkeyPatch, other_ms: float, *settings: str, cache: PilotCache | None = None
-) -> Problem:
-    """The problem, where steps of another share take so many times as long as those of the best so far."""
-    fix_times(monkeypatch, {f"paths {share:g}": other_ms for share in (*FEWER, *MORE)})
+    monkeypatch: pytest.MonkeyPatch, other_ms: float, *settings: str, cache: PilotCache | None = None,
+    apart: dict[float, float] | None = None,
+) -> Problem:  # fmt: skip
+    """The problem, where steps of another share take so many times as long as those of the best so far; those of some
+    shares `apart`."""
+    fix_times(monkeypatch, {f"paths {share:g}": (apart or {}).get(share, other_ms) for share in OTHERS})
     return assemble(load("tiny.yaml", [*AUTO, *settings]), cache=cache)
+
+
+def _put_glass() -> None:
+    """A ball of glass, and a point in place of the lamp: of its light no camera path finds what the ball gathers."""
+    scene = Path("scene.xml")
+    scene.write_text(scene.read_text().split('<shape type="rectangle" id="lamp">')[0] + GLASS)
 
 
 def share_of(problem: Problem) -> tuple[str, float]:
     return problem.integrator.paths, problem.integrator.light_share
 
 
-def test_what_is_faster_is_taken_as_far_as_it_goes(monkeypatch: pytest.MonkeyPatch):
-    """All surfaces are diffuse: fewer light paths, until there are none."""
-    problem = decided(monkeypatch, 0.01)
+def test_camera_paths_alone_are_tried_first_where_they_find_all(monkeypatch: pytest.MonkeyPatch):
+    """All surfaces are diffuse."""
+    problem = decided(monkeypatch, 100.0, apart={0.0: 0.01})
     assert problem.sides is not None
     assert (problem.sides.paths, problem.sides.light_share) == ("camera", 0.0)
     assert share_of(problem)[0] == "camera"
     assert problem.sides.low > 1
+
+
+def test_what_is_faster_is_taken_as_far_as_it_goes(monkeypatch: pytest.MonkeyPatch):
+    """A few light paths after all, and then more; and from a half on fewer, where there have to be some."""
+    assert share_of(decided(monkeypatch, 0.01)) == ("both", FEWER[0])
+    assert share_of(decided(monkeypatch, 0.01, apart={FEWER[0]: 100.0})) == ("both", FEWER[1])
+    assert share_of(decided(monkeypatch, 0.01, apart={0.0: 100.0})) == ("both", FEWER[1])
+    monkeypatch.setattr(sampling, "camera_finds_all", lambda *scene: False)
+    assert share_of(decided(monkeypatch, 0.01)) == ("both", FEWER[1])
 
 
 def test_what_is_slower_is_left(monkeypatch: pytest.MonkeyPatch):
@@ -87,7 +116,7 @@ def test_it_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
 def test_light_paths_alone_are_what_is_guided_where_they_find_all(monkeypatch: pytest.MonkeyPatch):
     """With the border of both, which the target has; and that is what goes on from a checkpoint."""
-    fix_times(monkeypatch, {f"paths {share:g}": 100.0 for share in (*FEWER, *MORE)} | {"guiding": 1e-6})
+    fix_times(monkeypatch, {f"paths {share:g}": 100.0 for share in OTHERS} | {"guiding": 1e-6})
     problem = assemble(load("tiny.yaml", [*AUTO, "integrator.guiding=auto"]))
     assert problem.guided.guided
     assert (problem.sides.paths, problem.sides.light_share) == ("both", 1.0)
@@ -110,6 +139,65 @@ def test_light_paths_find_all_but_mirrors_and_what_hidden_lamps_cover():
     room["wall"]["bsdf"] = {"type": "conductor"}
     scene = mi.load_dict(room)
     assert not light_finds_all(scene, scene.sensors(), False)
+
+
+def test_camera_paths_find_all_but_what_gloss_and_glass_throw():
+    """Unless all light comes straight from the lamps."""
+    room: dict[str, Any] = {
+        "type": "scene", "wall": {"type": "rectangle", "bsdf": {"type": "roughconductor"}},
+        "lamp": {"type": "sphere", "center": [0, 0, 1], "radius": 0.2, "emitter": {"type": "area"}},
+    }  # fmt: skip
+    scene = mi.load_dict(room)
+    assert [camera_finds_all(scene, depth) for depth in (-1, 3, 2)] == [False, False, True]
+    room["wall"]["bsdf"] = {"type": "diffuse"}
+    assert camera_finds_all(mi.load_dict(room), -1)
+    room["beam"] = {"type": "rectangle", "emitter": {"type": "directionalarea"}}
+    assert not camera_finds_all(mi.load_dict(room), 2)
+
+
+def test_a_run_of_a_second_has_camera_paths_where_they_find_all():
+    """In the furnace they have a thousand times the efficiency, and more."""
+    problem = assemble(load(ROOT / "configs" / "furnace.yaml", ["target.render.spp=64"]))
+    assert problem.config.run.measuring == 0.1
+    assert (problem.sides.paths, problem.integrator.paths) == ("camera", "camera")
+    assert problem.sides.low > 10
+
+
+@pytest.mark.parametrize("paths", ["auto", "camera"])
+def test_camera_paths_of_a_guided_run_are_traced_as_they_are(paths: str, monkeypatch: pytest.MonkeyPatch):
+    """Whether they were found to pay or asked for: no table says where they begin."""
+    fix_times(monkeypatch, {f"paths {share:g}": 0.01 if share == 0 else 100.0 for share in OTHERS})
+    words = [*SMALL, "integrator.guiding=on", "integrator.estimator=stack", f"integrator.paths={paths}"]
+    assert optimize("tiny.yaml", *tiny.settings(*words)) == 0
+    rows = {row["feature"]: row for row in read_manifest(RUN)["plan"]["rows"]}
+    assert rows["camera paths"]["needed"]
+    assert not rows["guided emission"]["needed"]
+    assert optimize("--resume", str(RUN), "--set", "run.iterations=3") == 0
+
+
+def test_a_run_of_a_second_keeps_its_caustic():
+    """Which no camera path finds, so that they seem to have hardly any noise."""
+    _put_glass()
+    problem = assemble(load("tiny.yaml", [*SHORT, "integrator.max_depth=6"]))
+    assert problem.sides.paths == "both"
+    assert problem.integrator.light_share >= min(FEWER)
+
+
+@pytest.mark.parametrize(("spp", "rounds"), [(1, race.LEAST_ROUNDS), (8, 8), (16, 16), (1024, 16)])
+def test_camera_paths_alone_are_judged_by_all_rounds_whatever_python_takes(spp: int, rounds: int):
+    """In three iterations' worth of samples, or as near to that as the least that says anything comes."""
+    taken: list[race.Step] = []
+
+    def take(other: bool, round: int, samples: int) -> race.Step:
+        random = np.random.default_rng([round, other])
+        gradient = {"a": 1 + random.normal(size=3) * (0.1 if other else 1)}
+        taken.append(race.Step(gradient, {"0": gradient["a"]}, kernel_ms=0.01 * samples, wall_ms=100.0 * len(taken)))
+        return taken[-1]
+
+    sizes = race.Sizes(spp, spp, spp, False, 16, 0.0, 2.0, planned=1.2)
+    found = CameraPilot(take, sizes, 1.0, share=1e-9).run()
+    assert found.rounds == rounds
+    assert found.paths == "other"
 
 
 def test_beams_alone_and_scaled_ones_are_left_to_light_paths():
@@ -135,13 +223,22 @@ def test_what_moves_light_has_light_paths():
     assert (naive.paths, naive.integrator.paths) == ("light", "light")
 
 
-def test_a_run_goes_on_with_the_paths_that_it_had():
-    settings = [word for setting in AUTO for word in ("--set", setting)]
-    assert optimize("tiny.yaml", *settings) == 0
+@pytest.mark.parametrize("settings", [AUTO, SHORT], ids=["measured at length", "short"])
+def test_a_run_goes_on_with_the_paths_that_it_had(settings: list[str], monkeypatch: pytest.MonkeyPatch):
+    words = tiny.settings(*settings)
+    assert optimize("tiny.yaml", *words) == 0
     found = read_manifest(RUN)
     assert found["paths"]["paths"] in ("both", "camera")
+    assert "not measured" not in found["paths"]["note"]
     assert PathsRecord.from_json(found["paths"]).line() in (RUN / "report.html").read_text()
-    assert optimize("--resume", str(RUN), "--set", "run.iterations=4") == 0
+    for decision in ("decide", "allowance"):  # nothing is measured again
+
+        def refuse(*given: Any, **options: Any) -> Any:
+            raise AssertionError("measured")
+
+        monkeypatch.setattr(race.Tuner, decision, refuse)
+    iterations = load("tiny.yaml", settings).run.iterations + 2
+    assert optimize("--resume", str(RUN), "--set", f"run.iterations={iterations}") == 0
     again = read_manifest(RUN)
     assert again["paths"] == found["paths"]
     assert again["plan"] == found["plan"]

@@ -30,8 +30,8 @@ from reslrb_cli.optimization.sensitivity import (
 from reslrb_cli.optimization.state import standing
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
-TINY = ["scene.options={resx: 12, resy: 12}", "integrator.max_depth=2", "run.spp=32", "run.reach_spp=16",
-        "target.render.integrator.max_depth=2", "target.render.spp=256"]  # fmt: skip
+TINY = ["scene.options={resx: 12, resy: 12}", "integrator.max_depth=2", "integrator.paths=light", "run.spp=32",
+        "run.reach_spp=16", "target.render.integrator.max_depth=2", "target.render.spp=256"]  # fmt: skip
 FLOOR, LAMP = "floor.reflectance.value", "lamp.intensity.value"
 
 

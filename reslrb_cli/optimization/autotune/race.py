@@ -54,6 +54,9 @@ SHARE, GUIDING_SHARE, SEQUENCE_SHARE, PATHS_SHARE = 0.05, 0.025, 0.005, 0.015
 #: What measurements take at least that say anything. Compiling is that of both kinds of steps, and of walks that are
 #: learned from.
 ESTIMATOR_NEEDS, GUIDING_NEEDS, SEQUENCE_NEEDS, PATHS_NEEDS = (4.0, 4.0), (2.5, 3.0), (2.5, 1.0), (1.5, 2.0)
+#: The same of camera paths alone beside half of each kind: kernels are those of the run, whichever wins, and few steps
+#: of few samples tell.
+CAMERA_NEEDS = (0.0, 3.0)
 #: What is measured once the estimator is settled, by option: the time that is kept aside for it, all that is planned.
 #: What it takes at the least would be too little where kernels are there: first steps take their time all the same.
 LATER = {
@@ -117,7 +120,7 @@ class Tuner:
 
         `of` is what that depends on besides the situation, `needs` what measuring by steps of `integrator` and others
         takes at least that says anything (`Allowance.affords`), `unmeasured` the decision without, with a note. What is
-        to be measured `later` has its time kept aside.
+        to be measured `later` has its time kept aside, where there is enough for both.
         """
         key = ""
         if self._cache is not None:
@@ -135,7 +138,7 @@ class Tuner:
             return record
         if not allowance.spent_s:
             self.say("measuring what pays here, before the first iteration")
-        with allowance.spending(later):
+        with allowance.spending(later if allowance.affords(*needs, *later) else ()):
             record = measure(allowance)
         logger.debug(allowance.line())
         if self._cache is not None:

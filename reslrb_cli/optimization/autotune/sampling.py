@@ -5,7 +5,9 @@ way take turns with steps drawn the other (`race.Turns`), with dL/dI held at one
 
 - `PathsPilot`: another share of light paths, or paths of one side alone where that finds all light, unguided. One share
   after the other takes its turns with the best so far, from one half on to the side that was found to be the better, as
-  long as one is.
+  long as one is. Camera paths alone come first where they find all: they may have a thousand times the efficiency, so
+  that a run of a second is worth it, and a few small steps tell (`CameraPilot`), with kernels that the run needs anyway
+  if they win.
 - `GuidingPilot`: guided emission, from a table that is learned first, and held. To a guided step's time is added its
   part of what a run of that length learns: each time one more walk of one pass, with what Python does for a new table,
   often at first and then rarely. Short steps make the table less worth than a run's, which has learned from more, and
@@ -50,9 +52,10 @@ from reslrb_cli.statistics import Array
 ROUNDS, ROUNDS_OF_FEW, FEW_ENTRIES = 8, 16, 64
 #: A guided step, or one with low-discrepancy numbers, may take so many times as long as another.
 GUIDING_LONGER, SEQUENCE_LONGER = 3.0, 1.25
-#: The share of light paths that is begun with, and those that are tried then: fewer, as long as they are better; else
-#: more. Steps of another share may take so many times as long. One is tried where so much of the time is left for it.
-FIRST_SHARE, FEWER, MORE, PATHS_LONGER, LEAST_TURNS = 0.5, (0.2, 0.05, 0.0), (0.8, 0.95, 1.0), 2.0, 0.1
+#: The share of light paths that is begun with, and those that are tried then: fewer, as long as they are better, or,
+#: where none at all are, a few after all; else more. Steps of another share may take so many times as long. A share is
+#: tried where so much of the time is left for it.
+FIRST_SHARE, FEWER, MORE, PATHS_LONGER, LEAST_TURNS = 0.5, (0.2, 0.05), (0.8, 0.95, 1.0), 2.0, 0.1
 #: What of the share the rounds of the sequence are planned for; the first step takes a part too, and is no round.
 ROUNDS_SHARE = 0.8
 #: Views that are looked at, spread over those that are trained on, and values of each one's image.
@@ -228,13 +231,31 @@ class PathsPilot(race.Turns[PathsRecord]):
         return PathsRecord(paths="other" if other else "both", **found)
 
 
+class CameraPilot(PathsPilot):
+    """The same, of camera paths alone, in a run however short.
+
+    As many rounds are taken as are planned for, or as there are samples for in what that may cost at least, whatever
+    Python takes: of steps of milliseconds times are not to decide whether anything is measured.
+    """
+
+    def __init__(self, take: race.Take, sizes: race.Sizes, *rest: Any, **more: Any) -> None:
+        super().__init__(take, sizes, *rest, **more)
+        fits = int(race.CAMERA_NEEDS[1] * sizes.step / ((1 + sizes.longer) * sizes.trial))
+        self.LEAST = max(min(sizes.rounds, fits), race.LEAST_ROUNDS)
+
+    def _affords(self, more_ms: float) -> bool:
+        return len(self._steps[True]) < self.LEAST or super()._affords(more_ms)
+
+
 def _paths(tuner: race.Tuner) -> PathsRecord:
     """Which share of the paths are to be light paths."""
     problem = tuner.problem
+    alone = camera_finds_all(problem.scene, problem.integrator.max_depth)
+    needs = race.CAMERA_NEEDS if alone else race.PATHS_NEEDS
 
     def measure(allowance: Allowance) -> PathsRecord:
         best, records, trials = FIRST_SHARE, list[PathsRecord](), list[StepTrial]()
-        left = min(race.PATHS_SHARE, allowance.iterations_left(race.PATHS_NEEDS[0]) / race.ITERATIONS)
+        left = min(race.PATHS_SHARE, allowance.iterations_left(needs[0]) / race.ITERATIONS)
 
         def climb(shares: Sequence[float]) -> None:
             """Take these shares in turn, as long as each is better than what there is."""
@@ -245,14 +266,16 @@ def _paths(tuner: race.Tuner) -> PathsRecord:
                     return
                 own, other = (_of_share(problem, value) for value in (best, share))
                 trials.append(StepTrial(problem, f"paths {share:g}", own, other, *trials[-1:]))
-                record = trials[-1].turns(PathsPilot, sizes(problem, PATHS_LONGER, planned(part)), part)
+                kind = PathsPilot if share else CameraPilot
+                record = trials[-1].turns(kind, sizes(problem, PATHS_LONGER, planned(part)), part)
                 words = f"over that of {100 * best:g} %" if record.paths == "other" else f"that of {100 * share:g} %"
                 records.append(replace(record, note=record.note or words))
                 if record.paths != "other":
                     return
                 best = share
 
-        climb([share for share in FEWER if share or camera_finds_all(problem.scene)])
+        climb([0.0] if alone else [])
+        climb(FEWER if best else FEWER[::-1])
         if best == FIRST_SHARE:
             climb([share for share in MORE if share < 1 or _light_finds_all(problem)])
         gained = [record for record in records if record.paths == "other"]
@@ -263,8 +286,9 @@ def _paths(tuner: race.Tuner) -> PathsRecord:
     later = [race.LATER[option] for option in ("guiding", "sequence") if race.is_auto(problem.config, option)]
     return tuner.decide(
         PathsRecord,
-        of={"paths": 3, "of": problem.pilot and problem.pilot.chosen},
-        needs=[race.PATHS_NEEDS, *later],
+        of={"paths": 4, "of": problem.pilot and problem.pilot.chosen},
+        # What is measured later is of light paths: where camera paths may do without, it can wait.
+        needs=[needs] if alone else [needs, *later],
         integrator=problem.integrator,
         measure=measure,
         unmeasured=lambda note: PathsRecord(paths="both", note=f"{note}; half of them cost little anywhere"),
