@@ -80,7 +80,8 @@ class Measured:
     `response` is how far a step moves an entry per unit of gradient, at the factor 1, and `rates` are the schedule's
     factors of all iterations; `pace` is how far a step moved the parameter then, over how far it does at the end, by
     iteration (None: as far). `last` are its last iterations, where they are known, and `recent` is the mean square of
-    their gradients, (N,), where the optimiser kept it. `seen` (N,) says which entries of a texture some view shows; None of what is no texture.
+    their gradients, (N,), where the optimiser kept it. `seen` (N,) says which entries of a texture some view shows;
+    None of what is no texture.
 
     `mean` and `noise`, both (N,), are the gradients' mean and variance.
     """
