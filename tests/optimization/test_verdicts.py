@@ -213,7 +213,7 @@ CLOSE = 0.06
 
 
 def recover(random, iterations, start=START, tails=3.0):
-    """A run of Adam on it, and what is measured at its end; noise has heavy tails, and is more while the wall is off."""
+    """A run of Adam on it, as measured at its end: noise of heavy tails, and the more of it while the wall is off."""
 
     def gradient(x):
         size = 0.006 + 0.6 * np.abs(x[0])
