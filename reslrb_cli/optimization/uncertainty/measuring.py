@@ -40,8 +40,8 @@ STEP = 0.05
 #: Part of a run whose gradients, the last ones, are asked for their noise, and of small parameters for where they pull,
 #: those of at most so many iterations.
 RECENT, MOST_LAST = 0.2, 200
-#: So often in a run, and after 1, 2, 4 ... iterations, how far steps move a parameter is noted.
-LOOKS = 32
+#: So often in a run, and after 1, 2, 4 ... iterations, it is noted how far steps move a parameter.
+LOOKS = 8
 #: Where curvature takes longer than this share of the run's time in iterations, and than so many of them, the rest is
 #: left out.
 SHARE, MOST_STEPS = 0.25, 50
