@@ -39,8 +39,8 @@ have. With B the second moment of b, and D how far a constant gradient drives th
 take the places of C, C H and H C H + Sigma / K. Where the run has converged, D = H^-1, what b does is in no gradient,
 and H^-1 B H^-1 is left.
 
-Momentum is left out: over many steps it moves as far. P is that of the end. How much less a step moved
-before, as Adam's do until the large gradients of the start are forgotten, is in eta_t (`Measured.pace`).
+Momentum is left out: over many steps it moves as far. P is that of the end; how much less a step moved before, as
+Adam's do until the large gradients of the start are forgotten, is in eta_t (`Measured.pace`).
 """
 
 from __future__ import annotations
