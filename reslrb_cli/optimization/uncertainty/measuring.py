@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from reslrb_cli.optimization.loop import learning_rate_factor
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.state import Count, FromOne, Positive, State
-from reslrb_cli.optimization.uncertainty.curvature import MOST_ENTRIES, Curvature, plan_changes, row_of
+from reslrb_cli.optimization.uncertainty.curvature import MOST_ENTRIES, Curvature, Direction, plan_changes, row_of
 from reslrb_cli.optimization.uncertainty.posterior import LastSteps, Measured
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord, Gradients, ParameterCertainty, weigh
 from reslrb_cli.records.clock import StepClock
@@ -33,7 +33,7 @@ ITERATIONS_A_SAMPLE, LEAST_SAMPLES, MOST_SAMPLES = 40, 3, 16
 #: iterations.
 PROBES, LEAST_CHANGES, ITERATIONS_A_CHANGE = 4, 20, 10
 #: Share of the samples of a step that each of the two sets of samples has that curvature is measured with, and
-#: samples per pixel that are enough to have all of them.
+#: samples per pixel that are enough to have all of them; all, too, where noise hides the curvature of an entry.
 PART, FEW = 4, 4
 #: Directions are differentiated over this share of a parameter's scale.
 STEP = 0.05
@@ -171,7 +171,14 @@ class Certainty:
                 curvature = Curvature(problem, spp)
                 scales = {key: self.scale(key) for key in gradients}
                 most = max(LEAST_CHANGES, iterations // ITERATIONS_A_CHANGE)
-                directions, H, B = curvature.along(plan_changes(problem, scales, STEP, most), go_on)
+                plan = plan_changes(problem, scales, STEP, most)
+                directions, H, B = curvature.along(plan, go_on)
+                if spp < config.run.spp and hides(directions, H, gradients) and go_on():
+                    again = Curvature(problem, config.run.spp)
+                    found = again.along(plan, go_on)
+                    curvature.changes += again.changes
+                    if len(found[0]) == len(directions):
+                        directions, H, B = found
                 # By entry, where a parameter has no directions of its entries.
                 seen = {direction.key for direction in directions if direction.entry is not None}
                 left = any(np.any(rows) for key, rows in gradients.items() if key not in seen)
@@ -270,6 +277,12 @@ class Certainty:
             return None
         at, found = np.array(looks).T
         return np.asarray(np.interp(np.arange(1, iterations + 1), at, found) / found[-1])
+
+
+def hides(directions: Sequence[Direction], curvature: Array, gradients: Gradients) -> bool:
+    """Whether noise hides all curvature (M, M) along the direction of an entry that has gradients."""
+    flat = [d for d, h in zip(directions, np.diag(curvature), strict=True) if d.entry is not None and h <= 0]
+    return any(np.any(gradients[d.key][:, d.entry]) for d in flat)
 
 
 class _Budget:
