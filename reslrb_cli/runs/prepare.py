@@ -224,6 +224,7 @@ class Met:
     shared: SharedTime | None = None
     best_values: Arrays = field(default_factory=dict, metadata=entry("best", "finite"))
     squares: Arrays = field(default_factory=dict, metadata=entry("squares"))
+    last_steps: Arrays = field(default_factory=dict, metadata=entry("last steps", "finite"))
 
 
 class Course:
@@ -275,7 +276,7 @@ class Course:
             self.best.see(record, self.state.values)
         self._take(record)
         if self.stages.is_whole(state.stage):
-            self.certainty.see(state.iteration)
+            self.certainty.see(self.state, state)
         if state.iteration >= average_begins(self.problem.config):
             shown = {key: np.array(value) for key, value in self.stages.values(state).items()}
             self.average = self.average.add(self.problem.config, state.iteration, shown)
@@ -359,7 +360,7 @@ class Course:
         """Keep it in `folder` as it was after its last whole iteration; return how many it had. Raises OSError."""
         met = Met(
             self.results.images["initial"], self.certainty.noted, self.best.least, self.last, self.shared,
-            self.best_values(), self.certainty.squares,
+            self.best_values(), self.certainty.squares, self.certainty.last_steps(),
         )  # fmt: skip
         found, values = entries(self._settled, self.state.on_file(self.stages.at(self.state.stage)), met,
                                 self.average)  # fmt: skip
@@ -376,7 +377,8 @@ class Course:
         squares = {key: problem.optimizer.squares(key) for key in met.certainty.keys if key in problem.selection.keys}
         wanted = {key: expected(problem.selection.array(key).shape) for key in problem.selection.keys if met.best}
         kept = {key: each[0] for key, each in squares.items() if each is not None}
-        met = stored.fill(replace(met, best_values=wanted, squares=kept))
+        last = self.certainty.expects(met.certainty)
+        met = stored.fill(replace(met, best_values=wanted, squares=kept, last_steps=last))
         average = stored.read(Averaged)
         if average.average_count and average.average_first == average_begins(problem.config):
             shapes = {key: expected(problem.selection.array(key).shape, np.float64) for key in problem.selection.keys}
@@ -389,7 +391,7 @@ class Course:
             check_bounds(problem, stored, f"best/{key}", key, array)
         self.best.least, self.best.values = met.best, met.best_values
         self.results.images["initial"] = met.images
-        self.certainty.noted, self.certainty.squares = met.certainty, met.squares
+        self.certainty.restore(met.certainty, met.squares, met.last_steps)
         self._shared = met.shared
 
 

@@ -12,7 +12,9 @@ import numpy as np
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.loop import iterate
+from reslrb_cli.optimization.stages import Stages
+from reslrb_cli.optimization.state import standing
 from reslrb_cli.optimization.uncertainty.measuring import Certainty
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
 
@@ -113,8 +115,10 @@ def run(folder: Path, toy: Toy, seed: int = 0) -> Outcome:
     true = {key: np.asarray(value, dtype=np.float64) for key, value in problem.truth.items()}
     problem.truth.clear()  # nothing is judged by it
     certainty = Certainty(problem)
-    for last in optimize(problem):
-        certainty.see(last.iteration + 1)
+    state = standing(problem)
+    for after, record in iterate(Stages(problem), state):
+        certainty.see(state, after)
+        state, last = after, record
     before = {key: value.copy() for key, value in problem.values().items()}
     found = certainty.measure(last.iteration + 1, last.elapsed_s, lambda: False)
     assert found is not None

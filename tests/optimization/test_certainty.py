@@ -159,6 +159,25 @@ def test_what_regularizers_cost_is_in_gradients_and_curvature(folder, monkeypatc
     assert spreads[0] < 0.7 * spreads[1]
 
 
+def test_what_noise_hides_is_measured_again_with_all_samples(folder, monkeypatch):
+    """Where a first look finds no curvature of a colour, a second one does."""
+    asked, along = [], measuring.Curvature.along
+
+    def hidden(self, changes, go_on):
+        asked.append(self.spp)
+        directions, H, B = along(self, changes, go_on)
+        return directions, H * (self.spp > blind), B
+
+    monkeypatch.setattr(measuring.Curvature, "along", hidden)
+    toy = replace(WORK[2], settings=("run.spp=64", "run.iterations=60"))
+    found = {}
+    for blind in (0, 16, 64):
+        asked.clear()
+        found[blind] = run(folder, toy).certainty.parameters[WALL]
+        assert asked == ([16, 64] if blind else [16])
+    assert [each.verdict for each in found.values()] == [SETTLED, SETTLED, NOISE]
+
+
 #: Parameters, and the target's samples per pixel, whose noise is most of what is wrong with them.
 NOISY = {
     "a colour": ({WALL: COLOR}, 64), "a roughness": ({ALPHA: METAL}, 64), "a lamp": ({LEFT: FAST}, 64),

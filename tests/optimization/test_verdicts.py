@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import collections
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from reslrb_cli.optimization.results import Change, find_trend, got_worse, window
-from reslrb_cli.optimization.uncertainty.curvature import smooth
-from reslrb_cli.optimization.uncertainty.posterior import Measured, alone, joint
-from reslrb_cli.optimization.uncertainty.verdicts import Verdict, judge, noise_covariance, shares, summarise
+from reslrb_cli.optimization.uncertainty import posterior
+from reslrb_cli.optimization.uncertainty.curvature import Direction, smooth
+from reslrb_cli.optimization.uncertainty.posterior import LastSteps, Measured, alone, joint
+from reslrb_cli.optimization.uncertainty.verdicts import Verdict, judge, noise_covariance, shares, summarise, weigh
 
 # The rules of verdicts, one by one, and the posterior that they rest on, against runs of the model itself.
 
@@ -127,6 +129,44 @@ def test_offsets_of_the_model_are_as_wide_as_they_are_said_to_be(iterations, tar
     assert np.abs(np.sqrt(np.mean(np.square(offset), axis=0)) / spread - 1).max() < 0.05
 
 
+@pytest.mark.parametrize("last", [1, 30])
+def test_the_last_steps_measure_where_values_are(last):
+    """Coverage, where the last steps of a run are what is known of its end beside a few gradients there."""
+    random, runs = np.random.default_rng(8), 500
+    H, sd = np.array([[2.0, 1.2], [1.2, 1.0]]), np.array([0.5, 0.8])
+    response, scale, noise, rates, few = np.array([0.02, 0.1]), np.array([1.0, 3.0]), np.diag(sd**2), [1.0] * 60, 3
+    z = []
+    for _ in range(runs):
+        offset, _ = (each[0] for each in simulate(H, response, scale, noise, 1, rates[:-last], 1, random))
+        values, gradients = [], []
+        for rate in rates[-last:]:
+            values.append(offset)
+            gradients.append(H @ offset + random.normal(size=2) * sd)
+            offset = offset - rate * response * gradients[-1]
+        end = H @ offset + random.normal(size=2) * sd / np.sqrt(few)
+        pull = np.mean(gradients, axis=0) + H @ (offset - np.mean(values, axis=0))
+        mean = (few * end + last * pull) / (few + last)
+        given = mean, np.full(2, few + last), rates[:-last]
+        found = joint(H, response, scale, noise, *given, None, offset - values[0])
+        z.append((offset - found.to_go) / found.error)
+    assert np.abs(np.mean(z, axis=0)).max() * np.sqrt(runs) < 4, np.mean(z, axis=0)
+    assert np.abs(np.std(z, axis=0) - 1).max() * np.sqrt(2 * runs) < 4, np.std(z, axis=0)
+
+
+def test_gradients_that_the_model_has_not_foreseen_are_believed():
+    """By the model nothing of the start is left; a pull of ten standard errors says otherwise."""
+    H, few = np.diag([2.0, 3.0]), 4
+    given = np.full(2, 0.2), np.ones(2), np.diag([0.01, 0.01])
+    foreseen = joint(H, *given, np.array([0.02, 0.0]), few, [1.0] * 100)
+    assert np.abs(foreseen.to_go).max() < 0.02
+    found = joint(H, *given, np.array([0.5, 0.0]), few, [1.0] * 100)
+    assert found.to_go[0] == pytest.approx(0.25, rel=0.02)
+    assert found.error[0] == pytest.approx(0.05 / 2, rel=0.02)
+    assert found.error[1] == pytest.approx(foreseen.error[1], rel=1e-6)
+    far = joint(H, *given, np.array([50.0, 0.0]), few, [1.0] * 100)  # farther than anything was at the start
+    assert far.to_go[0] < 26
+
+
 def test_alone_is_joint_where_nothing_is_shared():
     H, rates = np.array([0.5, 2.0]), [1.0] * 40
     given = np.array([0.03, 0.05]), np.array([2.0, 0.3])
@@ -164,6 +204,84 @@ def test_an_entry_that_no_step_moves_is_as_far_as_it_was():
     )
     assert found.error[1] == pytest.approx(7, rel=1e-3)
     assert found.error[0] < 0.5
+
+
+#: A wall that most of the image shows, and a ceiling that it shows little of; both take light from one another.
+ROOM, START, RATE = np.array([[1.0, 0.11], [0.11, 0.075]]), np.array([0.3, -0.3]), 0.03
+#: A tenth of the scale of either.
+CLOSE = 0.06
+
+
+def recover(random, iterations, start=START, tails=3.0):
+    """A run of Adam on it, as measured at its end: noise of heavy tails, and the more of it while the wall is off."""
+
+    def gradient(x):
+        size = 0.006 + 0.6 * np.abs(x[0])
+        return ROOM @ x + size * random.standard_t(tails, size=2) / np.sqrt(tails / (tails - 2))
+
+    rates = 0.5 * (1 + np.cos(np.pi * np.arange(iterations) / (iterations - 1)))
+    x, m, v, seen = start.astype(float), np.zeros(2), np.zeros(2), int(0.8 * iterations)
+    values, gradients, responses = [], [], []
+    for i, rate in enumerate(rates):
+        values.append(x)
+        gradients.append(g := gradient(x))
+        m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g**2
+        responses.append(RATE / np.sqrt(v / (1 - 0.999 ** (i + 1))))
+        x = x - rate * responses[-1] * m / (1 - 0.9 ** (i + 1))
+    few = np.array([gradient(x) for _ in range(max(iterations // 40, 3))])
+    return x, {
+        name: Measured(
+            value=x[at : at + 1] + 0.6,
+            bounds=(0.0, 1.0),
+            scale=0.6,
+            gradients=few[:, at : at + 1],
+            response=responses[-1][at : at + 1],
+            rates=rates.tolist(),
+            is_small=True,
+            recent=np.mean(np.square(gradients[seen:]), axis=0)[at : at + 1],
+            last=LastSteps(*(np.array(each)[seen:, at : at + 1] + by for each, by in ((gradients, 0), (values, 0.6)))),
+            pace=np.array(responses)[:, at] / responses[-1][at],
+        )
+        for at, name in enumerate(("wall", "ceiling"))
+    }
+
+
+def told_of(measured):
+    """The verdicts on wall and ceiling, whose curvature is known."""
+    directions = [Direction(name, np.ones(1), None, 0) for name in measured]
+    return {name: each.verdict for name, each in
+            weigh(measured, directions, ROOM, {}, {}, np.zeros((2, 2)), {}).items()}  # fmt: skip
+
+
+def test_what_creeps_under_noise_of_heavy_tails_is_not_settled(monkeypatch):
+    """The wall, off at first, drives the ceiling the wrong way, and large gradients then make steps short; by the steps
+    of the end nothing would be left of it."""
+    random, off, told, before = np.random.default_rng(11), 0, [], 0
+    for _ in range(200):
+        x, measured = recover(random, 100)
+        if abs(x[1]) < 2 * CLOSE:
+            continue
+        off += 1
+        told.append(told_of(measured)["ceiling"])
+        with monkeypatch.context() as patch:  # as if nothing were known but what is measured at the end
+            patch.setattr(posterior, "SURPRISE", np.inf)
+            bare = {key: replace(own, last=None, pace=None) for key, own in measured.items()}
+            before += told_of(bare)["ceiling"] == "settled"
+    assert off > 25
+    assert before > 0.4 * off
+    assert told.count("settled") <= 0.03 * off
+    assert told.count("still moving") >= 0.5 * off
+
+
+@pytest.mark.parametrize("iterations", [100, 400])
+def test_what_has_come_to_rest_under_noise_of_heavy_tails_is_settled(iterations):
+    random, found, right = np.random.default_rng(12), collections.Counter(), 0
+    for _ in range(50):
+        x, measured = recover(random, iterations, np.array([0.01, -0.02]))
+        right += np.abs(x[1]) < CLOSE
+        found.update([told_of(measured)["ceiling"]])
+    assert right > 47
+    assert found["settled"] > 47
 
 
 def test_noise_takes_its_correlations_from_the_curvature():

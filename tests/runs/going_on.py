@@ -19,6 +19,7 @@ from cli import tiny
 from reslrb_cli.cli import main, progress
 from reslrb_cli.optimization import loop, optimizers, problem, sensitivity, targets
 from reslrb_cli.optimization.uncertainty import measuring
+from reslrb_cli.records.checkpoint import open_state
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.runs import recorder as recording
 
@@ -143,6 +144,13 @@ def found_of(run: Path) -> dict[str, Any]:
     return {key: value for key, value in results.items() if key not in ("elapsed_s", "certainty", "error_maps")}
 
 
+def noted_by(run: Path) -> Any:
+    """What the newest state says of what certainty has taken note of, but for arrays."""
+    archive, values = open_state(run / "checkpoint/state.npz")
+    archive.close()
+    return values["certainty"]
+
+
 def differences(first: Path, second: Path) -> list[str]:
     """Where two runs are not the same, bit by bit."""
     one, other = state_of(first), state_of(second)
@@ -152,7 +160,7 @@ def differences(first: Path, second: Path) -> list[str]:
         for name in sorted(set(one) & set(other))
         if one[name].dtype != other[name].dtype or one[name].tobytes() != other[name].tobytes()
     ]
-    for what in (records_of, found_of):
+    for what in (records_of, found_of, noted_by):
         if what(first) != what(second):
             found.append(what.__name__)
     for name in ("", "best"):

@@ -221,7 +221,10 @@ def _another_seed(run_seed, iteration, view, purpose):
 
 @pytest.mark.parametrize(
     "fault",
-    a_few(["no moments", "no clamp", "another seed", "no best", "no squares", "metrics not cut back"], ["no moments"]),
+    a_few(
+        ["no moments", "no clamp", "another seed", "no best", "no squares", "no last steps", "metrics not cut back"],
+        ["no moments"],
+    ),
 )
 def test_what_is_not_taken_up_is_missed(fault: str, experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Planted: each part of the state is left out in turn."""
@@ -233,15 +236,21 @@ def test_what_is_not_taken_up_is_missed(fault: str, experiment: Path, monkeypatc
         restore(self, stored, records)
         self.certainty.squares = {}
 
+    def without_steps(self, stored, records):
+        restore(self, stored, records)
+        self.certainty.last = {}
+
     # A state in the last fifth of the run has all parts; and losses that fall have the best of the run after it.
     sets = ["--set", "optimizer.clamp_gradient=1.5", "--set", "run.checkpoint_every={iterations: 15}"]
-    whole, left = run_and_kill(monkeypatch, 17, *ITERATIONS, *sets, *FALLING)
+    begun = FALLING if fault != "no last steps" else []  # of small parameters, such as the lamp's
+    whole, left = run_and_kill(monkeypatch, 17, *ITERATIONS, *sets, *begun)
     places = {
         "no moments": (optimizers.Optimizer, "restore", _without_moments),
         "no clamp": (prepare, "load", lambda *given: replace(load(*given), clamp={}, clamp_sums={})),
         "another seed": (loop, "seed", _another_seed),
         "no best": (prepare, "WINDOW", 1),
         "no squares": (prepare.Course, "restore", without_squares),
+        "no last steps": (prepare.Course, "restore", without_steps),
         "metrics not cut back": (resume, "cut_back", lambda folder, records, size: None),
     }
     monkeypatch.setattr(*places[fault])
@@ -426,7 +435,8 @@ def test_a_run_whose_disk_was_full_goes_on_when_there_is_room(tmp_path: Path, di
     assert end(start(tmp_path, "tiny.yaml", *SETS, *length)) == (0, "")
     # What certainty asks for is noted at four fifths of the iterations, which were 20000 before.
     found = differences(tmp_path / "runs/tiny", run)
-    assert [name for name in found if "squares/" not in name] == []
+    asked = ("squares/", "last steps/", "noted_by")
+    assert [name for name in found if not any(part in name for part in asked)] == []
 
 
 @pytest.mark.usefixtures("llvm")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import drjit as dr
@@ -14,11 +14,12 @@ from reslrb_cli.optimization.identifiability import shown_texels
 from reslrb_cli.optimization.loop import learning_rate_factor
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
-from reslrb_cli.optimization.state import Count
-from reslrb_cli.optimization.uncertainty.curvature import MOST_ENTRIES, Curvature, plan_changes, row_of
-from reslrb_cli.optimization.uncertainty.posterior import Measured
+from reslrb_cli.optimization.state import Count, FromOne, Positive, State
+from reslrb_cli.optimization.uncertainty.curvature import MOST_ENTRIES, Curvature, Direction, plan_changes, row_of
+from reslrb_cli.optimization.uncertainty.posterior import LastSteps, Measured
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord, Gradients, ParameterCertainty, weigh
 from reslrb_cli.records.clock import StepClock
+from reslrb_cli.records.tree import expected, to_array
 from reslrb_cli.statistics import Array, rms
 
 _PURPOSE = "certainty"
@@ -32,12 +33,15 @@ ITERATIONS_A_SAMPLE, LEAST_SAMPLES, MOST_SAMPLES = 40, 3, 16
 #: iterations.
 PROBES, LEAST_CHANGES, ITERATIONS_A_CHANGE = 4, 20, 10
 #: Share of the samples of a step that each of the two sets of samples has that curvature is measured with, and
-#: samples per pixel that are enough to have all of them.
+#: samples per pixel that are enough to have all of them; all, too, where noise hides the curvature of an entry.
 PART, FEW = 4, 4
 #: Directions are differentiated over this share of a parameter's scale.
 STEP = 0.05
-#: Part of a run whose gradients, the last ones, are asked for their noise.
-RECENT = 0.2
+#: Part of a run whose gradients, the last ones, are asked for their noise, and of small parameters for where they pull,
+#: those of at most so many iterations.
+RECENT, MOST_LAST = 0.2, 200
+#: So often in a run, and after 1, 2, 4 ... iterations, it is noted how far steps move a parameter.
+LOOKS = 8
 #: Where curvature takes longer than this share of the run's time in iterations, and than so many of them, the rest is
 #: left out.
 SHARE, MOST_STEPS = 0.25, 50
@@ -45,10 +49,14 @@ SHARE, MOST_STEPS = 0.25, 50
 
 @dataclass(frozen=True)
 class Noted:
-    """After how many iterations the squares of gradients were noted (0: not yet), and of which parameters."""
+    """After how many iterations the squares of gradients were noted (0: not yet), and of which parameters; how many
+    steps of small ones since; and after so many iterations how far a step moved each parameter, per unit of gradient.
+    """
 
     seen: Count
     keys: list[str]
+    steps: dict[str, FromOne] = field(default_factory=dict)
+    paces: dict[str, list[tuple[FromOne, Positive]]] = field(default_factory=dict)
 
 
 class Certainty:
@@ -58,26 +66,79 @@ class Certainty:
         self.problem = problem
         self._initial = {key: row_of(problem, key) for key in problem.selection.keys}
         #: What the optimiser kept of squares (`Optimizer.squares`) when that was noted, by key.
-        self.noted, self.squares = Noted(0, []), dict[str, Any]()
+        self._seen, self.squares = 0, dict[str, Any]()
+        #: Since then, by key of a small parameter: gradients of steps, and the values at which they were taken.
+        self.last: dict[str, LastSteps] = {}
+        self._paces: dict[str, list[tuple[int, float]]] = {key: [] for key in problem.selection.keys}
         #: The texels (H, W) of each texture that some view shows and light reaches, once that was asked.
         self.shown: dict[str, Array] = {}
         #: The factors of the learning rate so far, where no formula has them.
         self.rates: list[float] = []
 
-    def see(self, iterations: int) -> None:
-        """Take note of a run that has done so many iterations; it costs nothing."""
-        if iterations == int((1 - RECENT) * self.problem.config.run.iterations):
+    @property
+    def noted(self) -> Noted:
+        """What it has taken note of, but for arrays."""
+        return Noted(self._seen, list(self.squares), {key: len(each) for key, each in self.last.items()}, self._paces)
+
+    def last_steps(self) -> dict[str, dict[str, Array]]:
+        """The arrays of `last`, by their names and keys."""
+        names = [each.name for each in fields(LastSteps)]
+        return {name: {key: getattr(each, name) for key, each in self.last.items()} for name in names}
+
+    def restore(self, noted: Noted, squares: dict[str, Any], last: Mapping[str, Mapping[str, Array]]) -> None:
+        """Go on from what was noted; `last` are the arrays of `LastSteps`, by their names and keys."""
+        self._seen, self.squares = noted.seen, squares
+        names = [each.name for each in fields(LastSteps)]
+        known = [key for key in noted.steps if key in self._initial]
+        self.last = {key: LastSteps(*(last[name][key] for name in names)) for key in known}
+        self._paces |= {key: looks for key, looks in noted.paces.items() if key in self._initial}
+
+    def expects(self, noted: Noted) -> dict[str, dict[str, Array]]:
+        """What `restore` is to be given as `last`, by shape, of a run's own parameters."""
+        sizes = {key: (rows, self._initial[key].size) for key, rows in noted.steps.items() if key in self._initial}
+        shapes = {key: expected(size, np.float64) for key, size in sizes.items()}
+        return {each.name: shapes for each in fields(LastSteps)}
+
+    def see(self, before: State, state: State) -> None:
+        """Take note of an iteration, which led from `before` to `state`; it costs next to nothing."""
+        planned, iterations = self.problem.config.run.iterations, state.iteration
+        is_last = state.stage == before.stage == len(self.problem.config.run.stages)
+        if is_last and 0 < self._seen < iterations:
+            for key, initial in self._initial.items():
+                if initial.size <= MOST_ENTRIES:
+                    self._add_step(key, before, state)
+        if iterations == int((1 - RECENT) * planned):
             kept = {key: self.problem.optimizer.squares(key) for key in self._initial}
             self.squares = {key: each[0] for key, each in kept.items() if each is not None}
-            self.noted = Noted(iterations, list(self.squares))
+            self._seen, self.last = iterations, {}
+        if iterations % max(planned // LOOKS, 1) == 0 or (iterations & (iterations - 1)) == 0:
+            for key, looks in self._paces.items():
+                pace = self._pace(key)
+                if np.isfinite(pace) and pace > 0:
+                    looks.append((iterations, pace))
+
+    def _add_step(self, key: str, before: State, state: State) -> None:
+        gradient, value = (to_array(each[key]).astype(np.float64).ravel() for each in (state.gradients, before.values))
+        if not np.isfinite(gradient).all():
+            return
+        own = self.last.get(key) or LastSteps(*(np.zeros((0, gradient.size)) for _ in range(2)))
+        self.last[key] = LastSteps(
+            np.vstack([own.gradients, gradient])[-MOST_LAST:], np.vstack([own.values, value])[-MOST_LAST:]
+        )
+
+    def _pace(self, key: str) -> float:
+        """How far a step moves a parameter now, per unit of gradient, by its steepest entries."""
+        with np.errstate(divide="ignore"):  # of what has not been moved yet
+            steepness = rms(1 / self.problem.optimizer.response(key))
+        return 1 / max(steepness, 1e-300)
 
     def _recent(self, key: str, iterations: int) -> Array | None:
         """The mean square of the gradients since `see` took note, (N,); None where the optimiser keeps none."""
         before, now = self.squares.get(key), self.problem.optimizer.squares(key)
-        if before is None or now is None or iterations <= self.noted.seen:
+        if before is None or now is None or iterations <= self._seen:
             return None
         first, last = (np.array(mean, dtype=np.float64).ravel() for mean in (before, now[0]))
-        kept = now[1] ** (iterations - self.noted.seen)
+        kept = now[1] ** (iterations - self._seen)
         squares = np.maximum(last - kept * first, 0) / max(1 - kept, 1e-300)
         return np.asarray(squares / np.maximum(self.problem.optimizer.slope(key) ** 2, 1e-300))
 
@@ -110,7 +171,14 @@ class Certainty:
                 curvature = Curvature(problem, spp)
                 scales = {key: self.scale(key) for key in gradients}
                 most = max(LEAST_CHANGES, iterations // ITERATIONS_A_CHANGE)
-                directions, H, B = curvature.along(plan_changes(problem, scales, STEP, most), go_on)
+                plan = plan_changes(problem, scales, STEP, most)
+                directions, H, B = curvature.along(plan, go_on)
+                if spp < config.run.spp and hides(directions, H, gradients) and go_on():
+                    again = Curvature(problem, config.run.spp)
+                    found = again.along(plan, go_on)
+                    curvature.changes += again.changes
+                    if len(found[0]) == len(directions):
+                        directions, H, B = found
                 # By entry, where a parameter has no directions of its entries.
                 seen = {direction.key for direction in directions if direction.entry is not None}
                 left = any(np.any(rows) for key, rows in gradients.items() if key not in seen)
@@ -198,8 +266,23 @@ class Certainty:
                 is_small=value.size <= MOST_ENTRIES,
                 recent=self._recent(key, iterations),
                 seen=self._seen_entries(key, rows),
+                last=self.last.get(key),
+                pace=self._paces_of(key, iterations),
             )
         return found
+
+    def _paces_of(self, key: str, iterations: int) -> Array | None:
+        """How far a step moved a parameter in each iteration, over how far it does now; None where nobody looked."""
+        if not (looks := self._paces[key]):
+            return None
+        at, found = np.array(looks).T
+        return np.asarray(np.interp(np.arange(1, iterations + 1), at, found) / found[-1])
+
+
+def hides(directions: Sequence[Direction], curvature: Array, gradients: Gradients) -> bool:
+    """Whether noise hides all curvature (M, M) along the direction of an entry that has gradients."""
+    flat = [d for d, h in zip(directions, np.diag(curvature), strict=True) if d.entry is not None and h <= 0]
+    return any(np.any(gradients[d.key][:, d.entry]) for d in flat)
 
 
 class _Budget:

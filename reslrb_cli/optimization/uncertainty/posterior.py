@@ -17,6 +17,19 @@ and the start stays), and the noise of the steps. K gradients at the final value
 
     gain = C H (H C H + Sigma / K)^-1,   to go = gain g,   C <- C - gain H C
 
+The last iterations measure it as well (`LastSteps`). Their noise is part of C; but how far they took the values is
+known, m in all, so that C is that of the values before them, and d has the mean m in place of 0. A step's gradient
+where the values were y off the end is H (d + y) and noise: less H y it is one more at the end, and
+
+    to go = m + gain (g - H m)
+
+C is no better than the model. Where values that are off drove others the wrong way at first, or curvature was less on
+the way, C is too small by any factor, for what is left of the start falls exponentially. Gradients at the end tell:
+along an eigenvector u of H, of curvature h, u (g - H m) has by the model the variance h^2 c + s, c that of C and s that
+of noise. Where it is larger than `SURPRISE` standard deviations, c is what it is then found to be,
+
+    c <- ((u (g - H m))^2 - s) / h^2      at most that of the start
+
 Noise of the target is in every gradient alike: H d + b + noise, d now the offset from what a target without noise would
 have. With B the second moment of b, and D how far a constant gradient drives the steps,
 
@@ -26,7 +39,8 @@ have. With B the second moment of b, and D how far a constant gradient drives th
 take the places of C, C H and H C H + Sigma / K. Where the run has converged, D = H^-1, what b does is in no gradient,
 and H^-1 B H^-1 is left.
 
-Momentum is left out: over many steps it moves as far. P is that of the end.
+Momentum is left out: over many steps it moves as far. P is that of the end; how much less a step moved before, as
+Adam's do until the large gradients of the start are forgotten, is in eta_t (`Measured.pace`).
 """
 
 from __future__ import annotations
@@ -40,6 +54,8 @@ from reslrb_cli.statistics import Array
 
 #: A way to go of so many standard errors is no accident; and so are gradients.
 SURE = 2.0
+#: Gradients so many standard deviations off what the model has of them say that it is wrong.
+SURPRISE = 3.0
 #: A value within this share of its scale of a bound is at it, however small the steps are.
 AT_BOUND = 1e-3
 #: Steps that a value at its bound may have been driven off it by noise.
@@ -47,12 +63,25 @@ STEPS_OFF = 3.0
 
 
 @dataclass(frozen=True)
+class LastSteps:
+    """The last n iterations of a parameter of N entries: their gradients, and at which values, both (n, N)."""
+
+    gradients: Array
+    values: Array
+
+    def __len__(self) -> int:
+        return len(self.gradients)
+
+
+@dataclass(frozen=True)
 class Measured:
     """One parameter of N entries at the end of a run: its values (N,), bounds, scale, and K gradients (K, N).
 
     `response` is how far a step moves an entry per unit of gradient, at the factor 1, and `rates` are the schedule's
-    factors of all iterations. `recent` is the mean square of the gradients of the last iterations, (N,), where the
-    optimiser kept it. `seen` (N,) says which entries of a texture some view shows; None of what is no texture.
+    factors of all iterations; `pace` is how far a step moved the parameter then, over how far it does at the end, by
+    iteration (None: as far). `last` are its last iterations, where they are known, and `recent` is the mean square of
+    their gradients, (N,), where the optimiser kept it. `seen` (N,) says which entries of a texture some view shows;
+    None of what is no texture.
 
     `mean` and `noise`, both (N,), are the gradients' mean and variance.
     """
@@ -66,6 +95,8 @@ class Measured:
     is_small: bool
     recent: Array | None = None
     seen: Array | None = None
+    last: LastSteps | None = None
+    pace: Array | None = None
     mean: Array = field(init=False)
     noise: Array = field(init=False)
 
@@ -84,6 +115,12 @@ class Measured:
         """The standard deviation of the offset of an entry at the start: between bounds, at most that of any place."""
         low, high = self.bounds
         return min(self.scale, (high - low) / np.sqrt(12))
+
+    @property
+    def steps(self) -> Array:
+        """The eta of all iterations: the schedule's factors, by the pace."""
+        rates = np.asarray(self.rates, dtype=np.float64)
+        return rates if self.pace is None else rates * self.pace
 
     @property
     def touched(self) -> Array:
@@ -132,36 +169,55 @@ class Posterior:
 
 
 def joint(
-    curvature: Array, response: Array, scale: Array, noise: Array, gradient: Array, samples: int,
-    rates: Sequence[float], fixed: Array | None = None,
+    curvature: Array, response: Array, scale: Array, noise: Array, gradient: Array, samples: int | Array,
+    rates: Sequence[float] | Array, fixed: Array | None = None, came: Array | float = 0.0,
 ) -> Posterior:  # fmt: skip
     """The offset of M entries together.
 
     `curvature` is H (M, M), `noise` the covariance of one gradient (M, M), `gradient` the mean of `samples` of them,
-    `response` the diagonal of P, `scale` the standard deviation of the offset at the start, all (M,), `rates` the eta
-    of all iterations, `fixed` the B (M, M) of what all gradients share; None: nothing. Each entry is taken in units of
-    its scale, so that those of different units have well-conditioned matrices.
+    for all or for each of the M, where the fewer are among the more. `response` is the diagonal of P, `scale` the
+    standard deviation of the offset at the start, all (M,), `rates` the eta of all iterations, `fixed` the B (M, M) of
+    what all gradients share; None: nothing. `came` is the known way (M,) that they came after these iterations. Each
+    entry is taken in units of its scale, so that those of different units have well-conditioned matrices.
     """
     units = np.outer(scale, scale)
     H, Sigma = _positive(curvature * units), _positive(noise * units)
     C, D = _after(H, response / scale**2, Sigma, rates)
     B = np.zeros_like(H) if fixed is None else _positive(fixed * units)
-    driven = D @ B @ D.T
+    counts = np.broadcast_to(np.asarray(samples, dtype=np.float64), scale.shape)
+    m, driven = came / scale, D @ B @ D.T
     E, pulled = C + driven, H @ D @ B
-    seen = H @ E @ H - pulled - pulled.T + B + Sigma / samples
+    beside = B - pulled - pulled.T + Sigma / np.maximum.outer(counts, counts)
+    surprise = gradient * scale - H @ m
+    E = E + _unforeseen(H, E, beside, surprise)
+    seen = H @ E @ H + beside
     seen = seen + np.eye(len(scale)) * max(1e-9 * float(np.trace(seen)), 1e-30)
     shared = E @ H - D @ B
     gain = np.linalg.solve(seen, shared.T).T
     covariance = _positive(E - gain @ shared.T) * units
     of_target = np.sqrt(np.maximum(np.diag(driven), 0.0)) * scale
-    return Posterior(gain @ (gradient * scale) * scale, np.diag(covariance), of_target, covariance)
+    return Posterior((m + gain @ surprise) * scale, np.diag(covariance), of_target, covariance)
+
+
+def _unforeseen(H: Array, E: Array, beside: Array, surprise: Array) -> Array:
+    """What is to be added to the covariance E of offsets, in units of the start, where gradients contradict it.
+
+    `surprise` is by how much they differ from what was to be expected, and `beside` the part of that difference's
+    covariance that does not come from E.
+    """
+    values, vectors = np.linalg.eigh(H)
+    c, s = (np.einsum("me,mn,ne->e", vectors, each, vectors) for each in (E, beside))
+    square, h2 = (vectors.T @ surprise) ** 2, np.maximum(values, 0.0) ** 2
+    found = np.clip((square - s) / np.maximum(h2, 1e-300), 0.0, 1.0)
+    more = np.where(square > SURPRISE**2 * np.maximum(h2 * c + s, 1e-300), np.maximum(found - c, 0.0), 0.0)
+    return np.asarray((vectors * more) @ vectors.T)
 
 
 def alone(
-    curvature: Array, response: Array, scale: Array, noise: Array, gradient: Array, samples: int,
-    rates: Sequence[float], fixed: Array | float = 0.0,
+    curvature: Array, response: Array, scale: Array, noise: Array, gradient: Array, samples: int | Array,
+    rates: Sequence[float] | Array, fixed: Array | float = 0.0, came: Array | float = 0.0,
 ) -> Posterior:  # fmt: skip
-    """The offset of each entry as if all others were known; everything is (M,), as in `joint`."""
+    """The offset of each entry as if all others were known; everything is (M,), as in `joint`, and C the model's."""
     h = np.maximum(curvature, 0.0)
     C, D = scale**2, np.zeros_like(h)
     for rate in rates:
@@ -172,7 +228,7 @@ def alone(
     seen = h**2 * E - 2 * h * D * fixed + fixed + np.maximum(noise / samples, 1e-300)
     shared = E * h - D * fixed
     gain = shared / seen
-    return Posterior(gain * gradient, E - gain * shared, D * np.sqrt(fixed))
+    return Posterior(came + gain * (gradient - h * came), E - gain * shared, D * np.sqrt(fixed))
 
 
 def _driven(step: Array, curvature: Array) -> Array:
@@ -180,7 +236,7 @@ def _driven(step: Array, curvature: Array) -> Array:
     return np.asarray(np.minimum(step, 1 / np.maximum(curvature, 1e-300)))
 
 
-def _after(H: Array, response: Array, noise: Array, rates: Sequence[float]) -> tuple[Array, Array]:
+def _after(H: Array, response: Array, noise: Array, rates: Sequence[float] | Array) -> tuple[Array, Array]:
     """The covariance after all steps from a start of unit variances, and how far a constant gradient has driven them.
 
     An entry that no step moves stays where it was.

@@ -25,7 +25,7 @@ A parameter of several entries is what `SETTLED_SHARE` of those that are seen an
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -164,9 +164,11 @@ def judge_together(
 
     What stands at its bound, or has no effect, is taken for known: the others are judged without it.
     """
-    count = len(directions)
+    count, iterations = len(directions), len(next(iter(measured.values())).rates)
     scale = np.array([1.0 if d.entry is None else measured[d.key].prior for d in directions])
     response, noise, gradient, of_target, to_go, error = (np.zeros(count) for _ in range(6))
+    # Of the last iterations: how many, their mean gradient, and from where they came, at the mean and at the first.
+    steps, pull, mean, came = (np.zeros(count) for _ in range(4))
     free, rows = np.ones(count, dtype=bool), []
     for place, direction in enumerate(directions):
         own, v = measured[direction.key], direction.vector
@@ -176,17 +178,24 @@ def judge_together(
         if direction.entry is not None:
             noise[place] = own.noise[direction.entry]
             free[place] = not own.at_bound[direction.entry]
+            if own.last:
+                gradients, values = (each[:, direction.entry] for each in (own.last.gradients, own.last.values))
+                steps[place], pull[place] = len(own.last), gradients.mean()
+                mean[place], came[place] = own.value[direction.entry] - (values.mean(), values[0])
         free[place] = free[place] and np.any(along)
     result = Coordinates(scale.copy(), of_target, to_go, error, [None] * count, scale.copy())
     at = np.flatnonzero(free)
     if not at.size:
         return result
-    rates, samples = next(iter(measured.values())).rates, np.array([rows[place] for place in at])
+    samples = np.array([rows[place] for place in at])
     H, B = curvature[np.ix_(at, at)], fixed[np.ix_(at, at)]
     Sigma = noise_covariance(samples, noise[at], H)
-    given = gradient[at], samples.shape[1], rates
-    posterior, whole = (joint(H, response[at], scale[at], Sigma, *given, each) for each in (None, B))
-    single = alone(np.diag(H), response[at], scale[at], noise[at], *given, np.maximum(np.diag(B), 0.0))
+    few, rates = samples.shape[1], _eta(measured, {directions[place].key for place in at.tolist()})
+    counts = few + steps[at]
+    gradient[at] = (few * gradient[at] + steps[at] * (pull[at] + H @ mean[at])) / counts
+    given = gradient[at], counts, rates[: iterations - int(steps.max())]
+    posterior, whole = (joint(H, response[at], scale[at], Sigma, *given, each, came[at]) for each in (None, B))
+    single = alone(np.diag(H), response[at], scale[at], noise[at], *given, np.maximum(np.diag(B), 0.0), came[at])
     result.to_go[at], result.error[at], result.alone[at] = posterior.to_go, posterior.error, single.spread
     result.spread[at], result.of_target[at] = whole.spread, whole.of_target
     assert posterior.covariance is not None
@@ -194,6 +203,13 @@ def judge_together(
     for row, place in zip(correlation, at.tolist(), strict=True):
         result.partners[place] = _partner(row, place, at, directions)
     return result
+
+
+def _eta(measured: Mapping[str, Measured], keys: Collection[str]) -> Array:
+    """The eta of all iterations of these parameters together: the geometric mean of theirs."""
+    first, paces = next(iter(measured.values())), [measured[key].pace for key in keys]
+    found = [np.log(np.maximum(pace, 1e-300)) for pace in paces if pace is not None]
+    return np.asarray(first.rates, dtype=np.float64) * np.exp(np.sum(found, axis=0) / len(paces) if found else 0.0)
 
 
 def noise_covariance(samples: Array, variance: Array, curvature: Array) -> Array:
@@ -276,7 +292,7 @@ def _large(
         h[touched] = smooth(diagonal[touched], own.noise[touched])
         if fixed is not None:
             B[touched] = smooth(fixed[touched], own.noise[touched], MARGIN)
-        given = (h, own.response, prior, own.noise, own.mean, len(own.gradients), own.rates)
+        given = (h, own.response, prior, own.noise, own.mean, len(own.gradients), own.steps)
         known, whole = alone(*given), alone(*given, B)
         to_go, error, of_target = own.within(known.to_go), known.error, whole.of_target
         of_run = np.where(touched, np.hypot(to_go, error), prior)
