@@ -177,10 +177,10 @@ class Reslrb(AttachingTracer):
     before the first iteration, show that it pays here. Left out it is `auto` with estimator `auto`, and `independent`
     with one that is named."""
     pixels: Literal["auto", "even", "measured"] = "auto"
-    """How camera paths are shared out over the pixels. `even`: as many to each; `measured`: half of them so, and the
-    others to pixels whose noise weighs most in the gradient, such as those of a mirror that alone shows a wall, as a
-    few paths through each find before the first iteration, at the parameters' initial values. `auto`: `measured`, where
-    there are camera paths, and a run is long enough for that to take no share of it that counts. Left out it is `auto`
+    """How camera paths are shared out over the pixels. `even`: as many to each; `measured`: a quarter of them so, and
+    the others to pixels whose noise weighs most in the gradient, such as those of a mirror that alone shows a wall, as
+    a few paths through each find before the first iteration, at the parameters' initial values. `auto`: `measured`,
+    where there are camera paths, and a run is so long that this takes no share of it that counts. Left out it is `auto`
     with estimator `auto`, and `even` with one that is named."""
     freeze: bool = True
     """Record what a step launches and launch that again, so that its Python runs once, not in every iteration. Not with

@@ -12,8 +12,9 @@ with n_j paths each its variance has parts
 
     Var(I_j) (E G_j)^2 / n_j        which is least, at equal sums of n_j, for  n_j ~ sd(I_j) E|G_j|
 
-Both are estimated from few paths, a rare bright one among them would draw all others to its pixel: sd(I) is taken for
-E|I|, which it goes with, means are of blocks of pixels, and no pixel has more than MOST times the mean.
+Of several groups the variances are added up, each over the square of its whole gradient, sum_j E|G_j|, and times the
+number K of its entries: a texture's are each known from K times fewer pixels than a colour is. A rare bright path would
+draw all others to its pixel: means are over blocks of pixels, and none has more than MOST times the mean.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Vertex
 
 NOTED_SPP = 16  # camera paths through each pixel that are noted
-BLOCK = 3  # pixels, side of the blocks that means are taken over
+BLOCK = 9  # pixels, side of the blocks that means are taken over
 MOST = 8.0  # of the mean, that a pixel is given
 NOTING_STREAM = 0x9072E5  # seed of the samples that are noted
 
@@ -70,31 +71,32 @@ class Noting(CameraHooks):
 
 
 def note(samples: Samples) -> NDArray[np.float64]:
-    """Sums over camera paths, by pixel: |G| of each group and of emission, and |I|, last, (K, H, W); what is not finite
-    is left out."""
+    """Means over the camera paths of each pixel: |G| of each group and of emission, |I|, and |I|^2, last, (K, H, W);
+    what is not finite counts as 0."""
     first, noted = camera_walk(samples, Noting(samples))
     width, height = (int(n) for n in samples.film.size)
     pixel = mi.UInt32(first.u.y) * width + mi.UInt32(first.u.x)
-    sums = dr.zeros(mi.Float, len(noted.sums) * width * height)
-    for number, total in enumerate(noted.sums):
-        value = dr.norm(total * first.weight)
+    rows = [dr.norm(total * first.weight) for total in noted.sums]
+    rows.append(dr.square(rows[-1]))
+    sums = dr.zeros(mi.Float, len(rows) * width * height)
+    for number, value in enumerate(rows):
         dr.scatter_reduce(dr.ReduceOp.Add, sums, value, pixel + number * width * height, dr.isfinite(value))
     dr.eval(sums)
-    return np.array(sums, np.float64).reshape(len(noted.sums), height, width)
+    return np.array(sums, np.float64).reshape(len(rows), height, width) * (width * height / samples.width)
 
 
-def wanted(samples: Samples) -> NDArray[np.float32]:
-    """How camera paths are to be shared out over the pixels (H, W), a density with mean 1, by these, evenly spread."""
+def wanted(samples: Samples, entries: list[int]) -> NDArray[np.float32]:
+    """How camera paths are to be shared out over the pixels (H, W), a density with mean 1, by these, evenly spread;
+    `entries` are the numbers that each group of BSDFs, and emission, has derivatives of."""
     from scipy import ndimage  # here: few commands come here, and all import this module
 
-    *voices, radiance = (ndimage.uniform_filter(row, BLOCK, mode="nearest") for row in note(samples))
-    totals = [voice.sum() for voice in voices]
-    loud = sum((voice / total for voice, total in zip(voices, totals, strict=True) if total > 0), np.zeros(1))
-    density = np.asarray(loud * radiance)
+    *said, radiance, square = (ndimage.uniform_filter(row, BLOCK, mode="nearest") for row in note(samples))
+    weight = np.zeros_like(square)
+    for K, row in zip(entries, said, strict=True):
+        weight += K * np.square(row / row.sum()) if row.sum() > 0 else 0
+    density = np.sqrt(np.maximum(square - np.square(radiance), 0) * weight)
     if not density.sum() > 0:
-        return np.ones_like(radiance, np.float32)
-    density = density / density.mean()
+        return np.ones_like(square, np.float32)
     for _ in range(8):  # what is cut off raises all others
-        density = np.minimum(density, MOST)
-        density /= density.mean()
-    return density.astype(np.float32)
+        density = np.minimum(density / density.mean(), MOST)
+    return np.asarray(density / density.mean(), np.float32)

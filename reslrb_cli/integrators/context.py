@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from reslrb_cli.guiding.collect import bsdf_groups
 from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators.differentiated import Differentiated, Motion, attach, bounces, with_shading_normals
 from reslrb_cli.integrators.freezing import Recordings
@@ -189,6 +190,17 @@ class Preparation:
             return self._shares[number, paths]
 
         return shares
+
+    def entries(self, plan: Plan, params: mi.SceneParameters) -> list[int]:
+        """How many numbers are differentiated, of each group of BSDFs (`bsdf_groups`) and of emission, by a plan for
+        `params`."""
+        which = self._look_through(params)
+        nodes = [
+            [node for node in which.bsdf_nodes if not group or any(bsdf in group for bsdf in self._owners[node])]
+            for group in bsdf_groups(plan)
+        ]
+        nodes += [list(which.emission_nodes)] if plan.differentiate_emission else []
+        return [sum(which.entries[node] for node in each) for each in nodes]
 
     def emitters(self, scene: mi.Scene) -> EmitterDensities:
         """The densities of the scene's emitters, whose plans have been asked for."""

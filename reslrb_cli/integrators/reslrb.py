@@ -180,7 +180,7 @@ class LightTracer:
         seed = dr.opaque(mi.UInt32, NOTING_STREAM)
         with dr.suspend_grad():
             samples, *_ = passes(plan, job.scene, job.sensor, seed, spp, None, None, *sides)
-            return wanted(samples.sides()[-1])
+            return wanted(samples.sides()[-1], self.preparation.entries(plan, job.params))
 
     def learn(self, job: Job, gradient: mi.TensorXf) -> None:
         """Have the tables learn, where they are due to, from other samples than those of the job; dL/dI is known.

@@ -260,7 +260,7 @@ def film_blocks(sensor: mi.Sensor) -> Blocks:
     return Blocks.of((int(size[0]), int(size[1])))
 
 
-EVEN = 0.5  # of camera paths that are shared out, those that every pixel has alike, at least
+EVEN = 0.25  # of camera paths that are shared out, those that every pixel has alike, at least
 MOST_SLOTS = 4  # for each pixel
 
 
