@@ -81,6 +81,8 @@ def load_replay(config: Config) -> Replay:
     if manifest.get("paths"):
         integrator = with_sides(integrator, PathsRecord.from_json(manifest["paths"]))
     integrator = as_decided(integrator, guided, None)
+    if saved.shares:
+        integrator = integrator.shared_out(saved.shares)
     problem = replace(problem, guided=guided, integrator=integrator, samples_per_pass=size)
     for view in problem.views:
         suffix = "" if len(problem.views) == 1 else f"-{view.sensor}"

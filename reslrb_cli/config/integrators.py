@@ -106,10 +106,11 @@ UNDECIDED: dict[str, str | float] = {
     "light_share": 0.5,
     "guiding": "off",
     "sequence": "independent",
+    "pixels": "even",
 }
 
 #: What a run's own configuration, which holds every setting, always had; nobody writes all of these by hand.
-_WRITTEN_BEFORE_PATHS = frozenset(
+_WRITTEN_BEFORE = frozenset(
     {"max_depth", "rr_depth", "hide_emitters", "attached", "attached_sampling", "estimator"}
     | {"guiding", "sequence", "freeze"}
 )
@@ -172,6 +173,12 @@ class Reslrb(AttachingTracer):
     where light goes (a beam through glass), a little less elsewhere. `auto`: where a few steps with and without it,
     before the first iteration, show that it pays here. Left out it is `auto` with estimator `auto`, and `independent`
     with one that is named."""
+    pixels: Literal["auto", "even", "measured"] = "auto"
+    """How camera paths are shared out over the pixels. `even`: as many to each; `measured`: a quarter of them so, and
+    the others to pixels whose noise weighs most in the gradient, such as those of a mirror that alone shows a wall, as
+    a few paths through each find before the first iteration, at the parameters' initial values. `auto`: `measured`,
+    where there are camera paths, and a run is so long that this takes no share of it that counts. Left out it is `auto`
+    with estimator `auto`, and `even` with one that is named."""
     freeze: bool = True
     """Record what a step launches and launch that again, so that its Python runs once, not in every iteration. Not with
     passes, nor with more than 4 million paths, beside which Python does not show."""
@@ -179,9 +186,9 @@ class Reslrb(AttachingTracer):
     @model_validator(mode="before")
     @classmethod
     def _as_written(cls, values: Any) -> Any:
-        """What a run folder of before there were `paths` says goes on as it was."""
-        if isinstance(values, dict) and "paths" not in values and values.keys() >= _WRITTEN_BEFORE_PATHS:
-            return {**values, "paths": UNDECIDED["paths"]}
+        """What a run folder of before there were `paths`, or `pixels`, says goes on as it was."""
+        if isinstance(values, dict) and values.keys() >= _WRITTEN_BEFORE:
+            return {"paths": UNDECIDED["paths"], "pixels": UNDECIDED["pixels"], **values}
         return values
 
     @model_validator(mode="after")

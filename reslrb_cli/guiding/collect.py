@@ -253,6 +253,14 @@ def bsdf_groups(plan: Plan) -> list[tuple[mi.BSDF, ...]]:
     return [*((bsdf,) for bsdf in alone), *([others] if others else [])]
 
 
+def meets(group: tuple[mi.BSDF, ...], vertex: Vertex) -> mi.UInt32:
+    """1 where a vertex is on a surface with one of the group's BSDFs, of an empty group anywhere; else 0."""
+    met = mi.Bool(not group)
+    for bsdf in group:
+        met |= vertex.bsdf == mi.BSDFPtr(bsdf)
+    return dr.select(met, mi.UInt32(1), 0)
+
+
 def voices(plan: Plan) -> int:
     """How many things are heard apart: groups of BSDFs, emission, what moves, and last the image."""
     return len(bsdf_groups(plan)) + plan.differentiate_emission + plan.attached + 1
@@ -288,18 +296,12 @@ class Hearing(Hooks):
         counts, sums = [mi.UInt32(0) for _ in self.groups], [mi.Spectrum(0) for _ in range(number)]
         return Heard(counts, sums, mi.Float(0), dr.max(dr.abs(product.weight())), Trail.begin(number), factor)
 
-    def _met(self, group: tuple[mi.BSDF, ...], vertex: Vertex) -> mi.UInt32:
-        met = mi.Bool(not group)
-        for bsdf in group:
-            met |= vertex.bsdf == mi.BSDFPtr(bsdf)
-        return dr.select(met, mi.UInt32(1), 0)
-
     def connection(self, state: Heard, vertex: Vertex, connection: Connection, numbers: list[mi.Float]) -> Heard:
         plan, active = self.samples.plan, connection.active
         C = vertex.product.times(connection.c, vertex.depth)
         said = self.adjoint.lookup(connection.u, active) * self.loudness * C.weight()
         said = dr.select(active, said, 0)
-        counts = [count + self._met(group, vertex) for count, group in zip(state.counts, self.groups, strict=True)]
+        counts = [count + meets(group, vertex) for count, group in zip(state.counts, self.groups, strict=True)]
         parts = [said * mi.Float(count) for count in counts]
         if plan.differentiate_emission:
             parts.append(said)
@@ -318,7 +320,7 @@ class Hearing(Hooks):
 
     def scattering(self, state: Heard, vertex: Vertex, connection: Connection, scattering: Scattering) -> Heard:
         counts = [
-            count + dr.select(scattering.active, self._met(group, vertex), 0)
+            count + dr.select(scattering.active, meets(group, vertex), 0)
             for count, group in zip(state.counts, self.groups, strict=True)
         ]
         throughput = dr.max(dr.abs(vertex.product.times(scattering.weight, vertex.depth).weight()))

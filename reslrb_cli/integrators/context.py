@@ -10,7 +10,10 @@ from numbers import Integral
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
 
+from reslrb_cli.guiding.collect import bsdf_groups
 from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators.differentiated import Differentiated, Motion, attach, bounces, with_shading_normals
 from reslrb_cli.integrators.freezing import Recordings
@@ -21,9 +24,9 @@ from reslrb_cli.scene.needs import check_paths, scene_needs
 from reslrb_cli.transport.aim import worthwhile
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.emission import used_numbers
-from reslrb_cli.transport.film import film_blocks
+from reslrb_cli.transport.film import PixelShares, film_blocks
 from reslrb_cli.transport.plan import Plan, make_plan
-from reslrb_cli.transport.samples import Samples, passes
+from reslrb_cli.transport.samples import Samples, SharesOf, passes
 from reslrb_cli.transport.sobol import make_coordinates
 
 
@@ -94,8 +97,14 @@ class Preparation:
 
     def __init__(
         self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion, guided: bool = False,
-        low_discrepancy: bool = False,
+        low_discrepancy: bool = False, shares_out: bool = False,
     ) -> None:  # fmt: skip
+        #: Whether camera paths are shared out over the pixels, and how, by sensor, (H, W): as was `given`, which goes
+        #: on to other scenes with the same sensors, or as was `noted` of this one.
+        self.shares_out = shares_out
+        self.given: dict[int, NDArray[np.float32]] = {}
+        self.noted: dict[int, NDArray[np.float32]] = {}
+        self._shares: dict[tuple[int, int], PixelShares | None] = {}  # by sensor and number of paths
         self.guiding = Guiding() if guided else None
         #: Samples per pixel of the passes that tables learn from, where somebody said; else as passes come.
         self.expected: int | None = None
@@ -115,12 +124,16 @@ class Preparation:
         self._renewal: Renewal | None = None
         self.recordings = Recordings()
 
-    def afresh(self, guided: bool | None, images: bool | None, low_discrepancy: bool | None) -> Preparation:
+    def afresh(
+        self, guided: bool | None, images: bool | None, low_discrepancy: bool | None, shares_out: bool | None = None
+    ) -> Preparation:
         """A new one with the same options, guided or not; `images`: samples of images alone, too. None: as this is."""
         own = self.guiding
         guided = own is not None if guided is None else guided
         low_discrepancy = self._low_discrepancy if low_discrepancy is None else low_discrepancy
-        made = Preparation(*self._depths, self._hide_emitters, self._motion, guided, low_discrepancy)
+        shares_out = self.shares_out if shares_out is None else shares_out
+        made = Preparation(*self._depths, self._hide_emitters, self._motion, guided, low_discrepancy, shares_out)
+        made.given = self.given
         if made.guiding is not None:
             made.guiding.images = (own is None or own.images) if images is None else images
         made.expected, made.paths, made.whole = self.expected, self.paths, self.whole
@@ -162,6 +175,32 @@ class Preparation:
         if plan.stays and self._motion.sampling == "auto" and not self._bounces_in(plan, scene, sensor):
             return replace(plan, stays=False, glossy_follows=False)
         return plan
+
+    def shares(self, number: int, size: tuple[int, int]) -> SharesOf | None:
+        """How the camera paths of a sensor with a film (crop window) of this (width, height) are shared out; None where
+        it is evenly, or not known yet."""
+        known = self.given.get(number, self.noted.get(number))
+        if not self.shares_out or known is None:
+            return None
+
+        def shares(paths: int) -> PixelShares | None:
+            if (number, paths) not in self._shares:
+                rows, columns = (np.arange(n) * m // n for n, m in zip(size[::-1], known.shape, strict=True))
+                self._shares[number, paths] = PixelShares.of(known[np.ix_(rows, columns)].ravel(), paths)
+            return self._shares[number, paths]
+
+        return shares
+
+    def entries(self, plan: Plan, params: mi.SceneParameters) -> list[int]:
+        """How many numbers are differentiated, of each group of BSDFs (`bsdf_groups`) and of emission, by a plan for
+        `params`."""
+        which = self._look_through(params)
+        nodes = [
+            [node for node in which.bsdf_nodes if not group or any(bsdf in group for bsdf in self._owners[node])]
+            for group in bsdf_groups(plan)
+        ]
+        nodes += [list(which.emission_nodes)] if plan.differentiate_emission else []
+        return [sum(which.entries[node] for node in each) for each in nodes]
 
     def emitters(self, scene: mi.Scene) -> EmitterDensities:
         """The densities of the scene's emitters, whose plans have been asked for."""
@@ -244,6 +283,8 @@ class Preparation:
             self._renewal = None
             self._emitters = None
             self.recordings.clear()
+            self.noted.clear()
+            self._shares.clear()
             if self.guiding is not None:
                 self.guiding.clear()
 

@@ -8,6 +8,7 @@ it lands first.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -15,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.scene.catalog import parameter_kind
+from reslrb_cli.scene.catalog import entry_value, parameter_kind
 from reslrb_cli.scene.deformation import BEAMS, PLACES, moving_obstacle
 from reslrb_cli.scene.graph import SceneGraph, interpolates_normals
 from reslrb_cli.transport.bsdf import Scattering, stays_behind
@@ -40,7 +41,7 @@ class Differentiated:
     `bsdf_nodes` are the nodes of BSDFs that have such parameters: textures, nested BSDFs, and meshes whose attributes
     textures read. `emission_nodes` are those of what emitters emit: emitters, and their textures. `shapes` are those
     that move, `emitters` those whose rays do. `least` are the parameters that are factors of a path, and the value from
-    which on downwards each counts as zero.
+    which on downwards each counts as zero. `entries` are the numbers that track derivatives, by node.
     """
 
     bsdf_nodes: tuple[mi.Object, ...]
@@ -48,6 +49,7 @@ class Differentiated:
     shapes: tuple[mi.Shape, ...]
     emitters: tuple[mi.Emitter, ...]
     least: dict[str, float]
+    entries: dict[mi.Object, int]
 
     @staticmethod
     def of(params: mi.SceneParameters, keys: Iterable[str]) -> Differentiated:
@@ -61,8 +63,10 @@ class Differentiated:
         shapes: dict[mi.Shape, None] = {}
         emitters: dict[mi.Emitter, None] = {}
         least: dict[str, float] = {}
+        entries: dict[mi.Object, int] = {}
         for key in keys:
             kind, node, obstacle = parameter_kind(params, key), params.properties[key][2], None
+            entries[node] = entries.get(node, 0) + math.prod(dr.shape(entry_value(params, key)))
             if kind in ("bsdf", "attribute"):
                 nodes[node] = None
                 dims = kind == "attribute" or any(name in key for name in FACTORS)
@@ -82,7 +86,7 @@ class Differentiated:
                 obstacle = "light tracing has derivatives of what light meets and leaves from, not of the sensor"
             if obstacle is not None:
                 raise UnsupportedScene(f"{key}: {obstacle}")
-        return Differentiated(tuple(nodes), tuple(emitting), tuple(shapes), tuple(emitters), least)
+        return Differentiated(tuple(nodes), tuple(emitting), tuple(shapes), tuple(emitters), least, entries)
 
 
 @dataclass(frozen=True)

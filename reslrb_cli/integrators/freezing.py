@@ -157,4 +157,4 @@ def _on_samples(samples: Samples, function: Callable[..., Any]) -> Callable[...,
 def _arrays(samples: Samples) -> tuple[Any, ...]:
     """What of samples a recording has to see, in the order of their members."""
     s = samples
-    return s.seed, s.scale, s.fraction, s.guide, s.net, s.ratio, s.emitters
+    return s.seed, s.scale, s.fraction, s.guide, s.net, s.ratio, s.emitters, s.shares

@@ -7,6 +7,7 @@ and gradients by one of the estimators. They know nothing of Mitsuba's plugins; 
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,6 +15,8 @@ from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
 from typing_extensions import Self
 
 from reslrb_cli.errors import UnsupportedScene
@@ -26,6 +29,7 @@ from reslrb_cli.estimators.camera import (
     splat_camera_tangents,
 )
 from reslrb_cli.guiding.collect import hear
+from reslrb_cli.guiding.pixels import NOTED_SPP, NOTING_STREAM, wanted
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators import freezing
 from reslrb_cli.integrators.context import Preparation, sensor_number
@@ -34,7 +38,7 @@ from reslrb_cli.integrators.forward import splat_tangents
 from reslrb_cli.integrators.protocol import Derivative, Job
 from reslrb_cli.transport.film import AdjointImage
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.samples import Samples, finish_pass, in_passes, passes
+from reslrb_cli.transport.samples import Samples, SharesOf, finish_pass, in_passes, passes
 from reslrb_cli.transport.visible import differentiate_visible_emission, splat_visible_emission
 from reslrb_cli.transport.walk import Splat, walk
 
@@ -58,12 +62,14 @@ class LightTracer:
     def __init__(
         self, max_depth: int = -1, rr_depth: int = 5, hide_emitters: bool = False, samples_per_pass: int | None = None,
         freeze: bool = False, motion: Motion | None = None, guided: bool = False, low_discrepancy: bool = False,
+        shares_out: bool = False,
     ) -> None:  # fmt: skip
         """Raises ValueError, which names the option, where one has a value that it cannot have.
 
         `freeze` says whether launches are recorded (`freezing.py`), `motion` how derivatives of what moves are taken,
         `guided` whether emission is drawn from what earlier paths said (`tables.py`),
-        `low_discrepancy` whether the numbers of a path's beginning are (`sobol.py`).
+        `low_discrepancy` whether the numbers of a path's beginning are (`sobol.py`), `shares_out` whether camera paths
+        go to pixels as these need them (`pixels.py`).
         """
         if max_depth < -1:
             raise ValueError('"max_depth" must be -1 (no limit) or a value >= 0')
@@ -73,7 +79,8 @@ class LightTracer:
             raise ValueError('"samples_per_pass" must be greater than zero')
         self.max_depth, self.rr_depth, self.hide_emitters = max_depth, rr_depth, hide_emitters
         self.samples_per_pass, self.freeze = samples_per_pass, freeze
-        self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion or Motion(), guided, low_discrepancy)
+        drawn = guided, low_discrepancy, shares_out
+        self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion or Motion(), *drawn)
 
     def with_options(self, *, samples_per_pass: int | None, freeze: bool) -> Self:
         """The same with other passes, or without recordings; both share what they find out about a scene."""
@@ -83,17 +90,25 @@ class LightTracer:
 
     def afresh(
         self, *, guided: bool | None = None, images: bool | None = None, low_discrepancy: bool | None = None,
-        light_share: float | None = None,
+        light_share: float | None = None, shares_out: bool | None = None,
     ) -> Self:  # fmt: skip
         """The same, which knows nothing of any scene yet, with other ways of drawing samples; None: as it has it.
 
         Guided emission or none, `images`: of images too; low-discrepancy numbers or independent ones; paths from both
-        sides, of which `light_share` are light paths: images have the film's border of both, whatever that share is.
+        sides, of which `light_share` are light paths: images have the film's border of both, whatever that share is;
+        camera paths shared out over the pixels, or evenly spread.
         """
         other = copy.copy(self)
-        other.preparation = self.preparation.afresh(guided, images, low_discrepancy)
+        other.preparation = self.preparation.afresh(guided, images, low_discrepancy, shares_out)
         if light_share is not None:
             other.have_paths("both", light_share, whole=True)
+        return other
+
+    def shared_out(self, noted: Mapping[str, NDArray[np.float32]]) -> Self:
+        """The same, which knows nothing of any scene yet, with camera paths shared out over the pixels as was noted of
+        them, by the number of the sensor (`note_pixels`)."""
+        other = self.afresh(shares_out=True)
+        other.preparation.given = {int(number): density for number, density in noted.items()}
         return other
 
     def to_measure(self) -> Self:
@@ -144,8 +159,30 @@ class LightTracer:
             purpose = purpose or (Purpose.IMAGE if job.params is None else Purpose.GRADIENT)
             if guiding.serves(purpose):
                 table = guiding.table(sensor_number(job.scene, job.sensor), purpose, delta)
-        sides = (self.light_share, self.preparation.emitters(job.scene)) if plan.weighs else ()
+        sides = self.light_share, self.preparation.emitters(job.scene) if plan.weighs else None, self._shares(job, plan)
         return passes(plan, job.scene, job.sensor, job.seed, spp, self.samples_per_pass, table, *sides)
+
+    def _shares(self, job: Job, plan: Plan) -> SharesOf | None:
+        """How the job's camera paths are shared out; where nobody has said so before, the first derivatives are what it
+        is found out for."""
+        preparation = self.preparation
+        if plan.paths == "light" or not preparation.shares_out:
+            return None
+        number, size = sensor_number(job.scene, job.sensor), job.sensor.film().crop_size()
+        if job.params is not None and number not in preparation.given and number not in preparation.noted:
+            preparation.noted[number] = self.note_pixels(job)
+        return preparation.shares(number, (int(size[0]), int(size[1])))
+
+    def note_pixels(self, job: Job) -> NDArray[np.float32]:
+        """How the camera paths of a job's sensor are to be shared out over its pixels (H, W), a density with mean 1, as
+        the scene is now (`pixels.py`). Its own seed and samples play no part."""
+        plan = self.preparation.plan(job.scene, job.sensor, job.params)
+        sides = self.light_share, self.preparation.emitters(job.scene) if plan.weighs else None
+        spp = math.ceil(NOTED_SPP / (1 - self.light_share)) if plan.weighs else NOTED_SPP
+        seed = dr.opaque(mi.UInt32, NOTING_STREAM)
+        with dr.suspend_grad():
+            samples, *_ = passes(plan, job.scene, job.sensor, seed, spp, None, None, *sides)
+            return wanted(samples.sides()[-1], self.preparation.entries(plan, job.params))
 
     def learn(self, job: Job, gradient: mi.TensorXf) -> None:
         """Have the tables learn, where they are due to, from other samples than those of the job; dL/dI is known.
@@ -218,6 +255,7 @@ class Reslrb(LightTracer):
         "sequence": "independent",
         "paths": "light",
         "light_share": 0.5,
+        "pixels": "even",
     }
 
     def __init__(self, estimator: Estimator, **common: Any) -> None:
@@ -228,7 +266,7 @@ class Reslrb(LightTracer):
     def of(
         cls, estimator: str | None = None, attached: bool | str = "auto", filter_normalization: str = "attached",
         attached_sampling: str = "auto", guiding: str = "off", sequence: str = "independent", paths: str = "light",
-        light_share: float = 0.5, **options: Any,
+        light_share: float = 0.5, pixels: str = "even", **options: Any,
     ) -> Reslrb:  # fmt: skip
         """From the estimator's name and all options. Raises ValueError where one is wrong."""
         estimator = estimator or ("stack" if paths == "camera" else cls.OPTIONS["estimator"])
@@ -251,14 +289,15 @@ class Reslrb(LightTracer):
         for name, value, values in (
             ("guiding", guiding, ("on", "off")),
             ("sequence", sequence, ("independent", "low_discrepancy")),
+            ("pixels", pixels, ("even", "measured")),
         ):
             if value == "auto":
                 raise ValueError(
                     f'"{name}" auto needs an experiment to measure on (`reslrb optimize`); say {" or ".join(values)}'
                 )
             one_of(name, value, values)
-        low_discrepancy = sequence == "low_discrepancy"
-        made = cls(kind(**own), motion=motion, guided=guiding == "on", low_discrepancy=low_discrepancy, **options)
+        options |= {"guided": guiding == "on", "low_discrepancy": sequence == "low_discrepancy"}
+        made = cls(kind(**own), motion=motion, shares_out=pixels == "measured", **options)
         made.have_paths(paths, light_share)
         return made
 

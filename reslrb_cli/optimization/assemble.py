@@ -253,7 +253,8 @@ def at_stage(problem: Problem, number: int, values: Mapping[str, Array] | None =
     return replace(
         made, integrator=integrator, samples_per_pass=size, paths=problem.paths, truth=problem.truth,
         masks=problem.masks, guided=problem.guided, sequence=problem.sequence, sides=problem.sides,
-        pace=stage.learning_rate, regularizers=make_regularizers(made.selection, stage.regularizers),
+        pixels=problem.pixels, pace=stage.learning_rate,
+        regularizers=make_regularizers(made.selection, stage.regularizers),
     )  # fmt: skip
 
 

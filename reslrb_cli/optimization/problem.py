@@ -22,7 +22,14 @@ from reslrb_cli.optimization.optimizers import Optimizer, make_transform
 from reslrb_cli.optimization.precondition import make_smoother
 from reslrb_cli.optimization.regularizers import Cost, Plate, Span, make_cost, make_plate, mesh_cost, spans_of
 from reslrb_cli.optimization.views import View, slope, to_tensor
-from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, Jsonable, PathsRecord, SequenceRecord
+from reslrb_cli.records.decisions import (
+    EstimatorRecord,
+    GuidedRecord,
+    Jsonable,
+    PathsRecord,
+    PixelsRecord,
+    SequenceRecord,
+)
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.seeds import seed
 
@@ -73,6 +80,7 @@ class Problem:
     sides: PathsRecord | None = None
     guided: GuidedRecord | None = None
     sequence: SequenceRecord | None = None
+    pixels: PixelsRecord | None = None
     memory: MemoryPlan | None = None
     #: What values cost by themselves, by key and type.
     regularizers: dict[str, dict[str, Cost | Plate]] = field(default_factory=dict)
@@ -85,8 +93,7 @@ class Problem:
         """What was measured and planned before the first iteration, as manifests and checkpoints have it, by name."""
         made: dict[str, Jsonable | None] = {"pilot": self.pilot, "guided": self.guided, "sequence": self.sequence}
         made["memory"] = self.memory
-        if self.sides is not None:
-            made["paths"] = self.sides
+        made |= {name: own for name, own in (("paths", self.sides), ("pixels", self.pixels)) if own is not None}
         return {name: None if each is None else each.to_json() for name, each in made.items()}
 
     def apply(self, others: Mapping[str, Any] | None = None) -> None:

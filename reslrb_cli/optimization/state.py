@@ -30,7 +30,7 @@ from reslrb_cli.optimization.autotune.sampling import as_decided, with_sides
 from reslrb_cli.optimization.decisions import MemoryPlan, Scaled
 from reslrb_cli.optimization.optimizers import SUMS
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, PathsRecord, SequenceRecord
+from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, PathsRecord, PixelsRecord, SequenceRecord
 from reslrb_cli.records.tree import PASSING, Array, Arrays, Stored, entry, expected, like, to_array
 
 Count = Annotated[int, Field(ge=0, lt=2**31)]
@@ -142,6 +142,13 @@ def guiding_of(problem: Problem) -> Guiding | None:
     return problem.integrator.preparation.guiding if isinstance(problem.integrator, Reslrb) else None
 
 
+def noted_of(problem: Problem) -> dict[str, Array]:
+    """How the run's camera paths are shared out over the pixels, by the number of their sensor, (H, W), where that was
+    noted before the first iteration; as `LightTracer.shared_out` takes it."""
+    given = problem.integrator.preparation.given if isinstance(problem.integrator, Reslrb) else {}
+    return {str(number): density for number, density in given.items()}
+
+
 def restore_tables(problem: Problem, calls: Mapping[str, int], learned: Mapping[str, Array]) -> str | None:
     """Have the tables of the run's integrator, where it has any, go on from what is stored (`State`).
 
@@ -220,6 +227,9 @@ class Settled:
     initial: Arrays = field(default_factory=dict, metadata=entry("initial", "finite"))
     initial_halo: Arrays = field(default_factory=dict, metadata=entry("initial with halo", "finite"))
     masks: Arrays = field(default_factory=dict, metadata=entry("mask"))
+    pixels: PixelsRecord | None = None
+    #: How camera paths are shared out over the pixels, by the number of their sensor, (H, W).
+    shares: Arrays = field(default_factory=dict, metadata=entry("pixels", "finite"))
 
 
 def begin_as(problem: Problem, stored: Stored) -> None:
@@ -241,6 +251,7 @@ def decide_as(problem: Problem, stored: Stored, options: Sequence[Candidate]) ->
     guided = settled.guided if is_auto(problem.config, "guiding") else None
     sequence = settled.sequence if is_auto(problem.config, "sequence") else None
     sides = settled.paths if is_auto(problem.config, "paths") else None
+    pixels = settled.pixels if is_auto(problem.config, "pixels") else None
     chosen = options[0] if options else None
     if settled.pilot is not None:
         chosen = next((option for option in options if option.options == settled.pilot.chosen), None)
@@ -255,8 +266,10 @@ def decide_as(problem: Problem, stored: Stored, options: Sequence[Candidate]) ->
         kept = size if memory.passes > 1 else None
         integrator = integrator.with_options(samples_per_pass=kept, freeze=integrator.freeze)
     integrator = as_decided(with_sides(integrator, sides), guided, sequence)
+    if names := stored.archive.names("pixels/"):
+        integrator = integrator.shared_out({name: stored.take(f"pixels/{name}", None, "finite") for name in names})
     return replace(
-        problem, pilot=settled.pilot, sides=sides, guided=guided, sequence=sequence, memory=memory,
+        problem, pilot=settled.pilot, sides=sides, guided=guided, sequence=sequence, memory=memory, pixels=pixels,
         integrator=integrator, samples_per_pass=size,
     )  # fmt: skip
 

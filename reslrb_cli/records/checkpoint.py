@@ -270,19 +270,23 @@ class NonFiniteStep:
     """A step that met a value that is not finite: its `iteration`, from 0, and the parameters' values, finite or not.
 
     `calls` is, of each sensor that guided emission had learned of, by its number, how many gradients that had had, and
-    `learned` what it knew, by `<sensor>/<what>`; None of a run that is not guided.
+    `learned` what it knew, by `<sensor>/<what>`; None of a run that is not guided. `shares` (H, W) say by sensor how
+    camera paths were shared out over the pixels.
     """
 
     iteration: int
     parameters: Mapping[str, Array]
     calls: Mapping[str, int] | None = None
     learned: Mapping[str, Array] = field(default_factory=dict)
+    shares: Mapping[str, Array] = field(default_factory=dict)
 
 
 def save_nonfinite(folder: Path, step: NonFiniteStep) -> None:
-    """Write it into `folder`: `iteration`, `parameter/<key>`, and `calls` (N, 2) with `guiding/<sensor>/<what>`."""
+    """Write it into `folder`: `iteration`, `parameter/<key>`, `calls` (N, 2) with `guiding/<sensor>/<what>`, and
+    `pixels/<sensor>`."""
     arrays: dict[str, Any] = {"iteration": np.array(step.iteration)}
     arrays |= {f"parameter/{key}": value for key, value in step.parameters.items()}
+    arrays |= {f"pixels/{number}": density for number, density in step.shares.items()}
     if step.calls is not None:
         arrays["calls"] = np.array([[int(name), count] for name, count in step.calls.items()]).reshape(-1, 2)
         arrays["calls"] = arrays["calls"].astype(np.int64)
@@ -302,10 +306,12 @@ def load_nonfinite(folder: Path) -> NonFiniteStep | None:
         keys = archive.names("parameter/")
         iteration = int(archive.array("iteration", (), "i"))
         parameters = {key: archive.array(f"parameter/{key}", values="any") for key in keys}
+        shares = {number: archive.array(f"pixels/{number}", kind="f") for number in archive.names("pixels/")}
         if "calls" not in archive.heads:
-            return NonFiniteStep(iteration, parameters)
+            return NonFiniteStep(iteration, parameters, shares=shares)
         calls = archive.array("calls", kind="i")
         if calls.ndim != 2 or calls.shape[1] != 2 or (calls < 0).any():
             raise ConfigError(path, "calls", "is not the gradients of sensors by their numbers, as a run writes it")
         learned = {name: archive.array(f"guiding/{name}", kind="f") for name in archive.names("guiding/")}
-        return NonFiniteStep(iteration, parameters, {str(number): int(count) for number, count in calls}, learned)
+        counts = {str(number): int(count) for number, count in calls}
+        return NonFiniteStep(iteration, parameters, counts, learned, shares)

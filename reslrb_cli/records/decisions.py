@@ -3,6 +3,7 @@
 EstimatorRecord                the most efficient estimator, and how each that was tried did
 PathsRecord                    from which side paths are traced
 GuidedRecord, SequenceRecord   ways of drawing samples that were left to measurement: whether they pay
+PixelsRecord                   whether camera paths are shared out over the pixels
 RivalRecord                    another integrator that would have been the better choice
 """
 
@@ -198,6 +199,25 @@ class SequenceRecord(PaidRecord):
     def decision(self) -> str:
         instead = ", guiding off" if self.alone and self.low_discrepancy else ""
         return f"sequence {self.setting}{instead}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PixelsRecord(Finding):
+    """Of how camera paths are shared out over the pixels: as was `measured` that these need them, or evenly; `note`
+    says why."""
+
+    measured: bool
+
+    @property
+    def setting(self) -> str:
+        """What the option is by this."""
+        return "measured" if self.measured else "even"
+
+    def decision(self) -> str:
+        return f"pixels {self.setting}"
+
+    def why(self) -> str:
+        return self.note
 
 
 @dataclass(frozen=True, kw_only=True)

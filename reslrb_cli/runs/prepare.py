@@ -35,7 +35,7 @@ from reslrb_cli.optimization.moving import warn_of_border
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import WINDOW, Best, Images, Least, Results
 from reslrb_cli.optimization.stages import Stages
-from reslrb_cli.optimization.state import Settled, State, check_bounds, load, on_file, put, standing
+from reslrb_cli.optimization.state import Settled, State, check_bounds, load, noted_of, on_file, put, standing
 from reslrb_cli.optimization.stopping import Averaged, Watch, average_begins
 from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
 from reslrb_cli.optimization.views import view_records
@@ -193,7 +193,7 @@ def settled_of(problem: Problem, variant: str) -> Settled:
     initial, halo = on_file(problem, standing(problem).values)
     return Settled(
         dump(problem.config), variant, digests(problem.config), problem.pilot, problem.guided, problem.sequence,
-        problem.sides, problem.memory, initial, halo, problem.masks,
+        problem.sides, problem.memory, initial, halo, problem.masks, problem.pixels, noted_of(problem),
     )  # fmt: skip
 
 

@@ -24,7 +24,7 @@ from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.nonfinite import Findings
 from reslrb_cli.optimization.problem import Problem, saved_spp
 from reslrb_cli.optimization.sensitivity import curvature_line, step_line
-from reslrb_cli.optimization.state import State
+from reslrb_cli.optimization.state import State, noted_of
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
 from reslrb_cli.records.atomic import Reserve, remove_parts, size_of
@@ -323,7 +323,8 @@ class Recording:
         stages, state = self.course.stages, self.course.stages.begun
         assert state is not None, "an iteration is at work"
         # What guided emission knew before this iteration, which may have taught it more.
-        step = NonFiniteStep(found.iteration, stages.now.values(), state.guiding, state.learned)
+        noted = noted_of(stages.now)
+        step = NonFiniteStep(found.iteration, stages.now.values(), state.guiding, state.learned, noted)
         save_nonfinite(self.folder.checkpoint, step)
         self._saved_nonfinite = True
         if self.problem.config.run.on_nonfinite != "stop":  # which says so when it ends

@@ -39,8 +39,8 @@ class FilmRay:
 
 
 def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
-    """A ray for each lane: as many in each pixel of the crop window, or one more; of fewer rays than pixels, each in a
-    random pixel of its own share of them."""
+    """A ray for each lane: in each pixel of the crop window as many, or one more, or as they are shared out; of fewer
+    rays than pixels, each in a random pixel of its own share of them."""
     plan, sensor, size = samples.plan, samples.sensor, samples.film.size
     n_pixels = int(dr.prod(size))
     lane = dr.arange(mi.UInt32, samples.width)
@@ -49,10 +49,14 @@ def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
     if samples.width < n_pixels:
         per_pixel = mi.Float(count) / n_pixels
         pixel = dr.minimum(mi.UInt32((mi.Float(lane) + sampler.next_1d()) / per_pixel), n_pixels - 1)
+        number = lane // n_pixels
+    elif samples.shares is not None:
+        pixel, number = samples.shares.draw(lane)
+        per_pixel = samples.shares.count(pixel)
     else:
-        pixel = lane % n_pixels
+        pixel, number = lane % n_pixels, lane // n_pixels
         per_pixel = mi.Float(count // n_pixels + dr.select(pixel < count % n_pixels, mi.UInt32(1), 0))
-    u = mi.Point2f(pixel % int(size[0]), pixel // int(size[0])) + _within_pixel(samples, lane, pixel, per_pixel)
+    u = mi.Point2f(pixel % int(size[0]), pixel // int(size[0])) + _within_pixel(samples, number, pixel, per_pixel)
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     ray, weight = sensor_rays(sensor, time, u / mi.Vector2f(size), aperture)
     near = mi.Float(0)
@@ -62,10 +66,10 @@ def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
     return FilmRay(dr.detach(ray), u, dr.detach(weight), near, mi.Bool(True))
 
 
-def _within_pixel(samples: Samples, lane: mi.UInt32, pixel: mi.UInt32, per_pixel: mi.Float) -> mi.Point2f:
-    """Places within their pixel, [0, 1)^2, spread evenly over the samples of each: Hammersley's points, turned by a
-    random offset of the pixel's own. Unevenly spread, what the filter makes of them would be noise."""
-    number = lane // int(dr.prod(samples.film.size))
+def _within_pixel(samples: Samples, number: mi.UInt32, pixel: mi.UInt32, per_pixel: mi.Float) -> mi.Point2f:
+    """Places within their pixel, [0, 1)^2, spread evenly over the samples of each, which are numbered: Hammersley's
+    points, turned by a random offset of the pixel's own. Unevenly spread, what the filter makes of them would be
+    noise."""
     x, y = (mi.Float(word) * 2**-32 for word in mi.sample_tea_32(pixel, samples.seed))
     inverse = mi.Float(dr.brev(number)) * 2**-32
     place = mi.Point2f(x + mi.Float(number) / dr.maximum(per_pixel, 1), y + inverse)
@@ -194,7 +198,7 @@ def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = T
     M, rivals = [mi.Float(0)], []
     if plan.weighs:
         p_cam = film_density(samples.sensor, dr.dot(first.ray.d, axis_of(samples.sensor)))
-        M, rivals = [], [Rivals(samples.ratio / p_cam, mi.Float(0), mi.Float(first.near))]
+        M, rivals = [], [Rivals(samples.ratio_at(first.u) / p_cam, mi.Float(0), mi.Float(first.near))]
     path = CameraPath(
         active, mi.UInt32(1), first.ray, pi, Product.one(plan.track_zeros, hooks.tracked), mi.Float(1),
         mi.Point3f(first.ray.o), mi.UInt32(0), M, rivals,

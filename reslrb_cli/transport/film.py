@@ -5,7 +5,8 @@ The adjoint of a splat is looking up dL/dI where it lands:
 splat:   I_p += filter_p(u) C        filter_p(u): weight of pixel p for film position u, summing to 1 over pixels
 lookup:  delta = sum_p filter_p(u) dL/dI_p
 
-Into blocks of pixels a film is divided where what is said at a place of it is learned.
+Into blocks of pixels a film is divided where what is said at a place of it is learned; over its pixels camera paths are
+shared out.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.transport.factors import showing
 
 N_COLOR = 3  # a film's block holds R, G, B, perhaps alpha, and a weight that light tracing leaves at 0
@@ -256,3 +258,68 @@ def film_blocks(sensor: mi.Sensor) -> Blocks:
     """The blocks of a sensor's film."""
     size = sensor.film().crop_size()
     return Blocks.of((int(size[0]), int(size[1])))
+
+
+EVEN = 0.25  # of camera paths that are shared out, those that every pixel has alike, at least
+MOST_SLOTS = 4  # for each pixel
+
+
+@dataclass
+class PixelShares:
+    """How the camera paths of a pass are shared out over the n pixels of a film, each of which has some.
+
+    The first `even` of them (width 1) go to all pixels alike, as many to each or one more. The others go `rounds`
+    times (width 1) through all `slots` (S,), which hold the pixels in order, each in `each` (n,) of them from the one
+    numbered `first` (n,) on. So it is known of each pixel how many it has, and nothing of that is random: what they
+    find is divided by that number, and no noise comes of it.
+    """
+
+    slots: mi.UInt32
+    first: mi.UInt32
+    each: mi.UInt32
+    even: mi.UInt32
+    rounds: mi.UInt32
+
+    @staticmethod
+    def of(wanted: NDArray[np.floating], paths: int) -> PixelShares | None:
+        """So many paths in proportion to `wanted` (n,), as far as EVEN of them leave that; None where there are not
+        more than pixels."""
+        n = wanted.size
+        spare = min(int((1 - EVEN) * paths), paths - n)  # each pixel has one: what none finds would be lost
+        if spare <= 0 or not wanted.sum() > 0:
+            return None
+        slots = min(MOST_SLOTS * n, spare)
+        rounds = spare // slots
+        # Rounded along the pixels' order, so that what one loses its neighbour gains.
+        ends = np.rint(np.cumsum(wanted, dtype=np.float64) * (slots / wanted.sum(dtype=np.float64)))
+        each = np.diff(ends, prepend=0).astype(np.uint32)
+        first = np.cumsum(each, dtype=np.uint32) - each
+        made = PixelShares(
+            own_memory(mi.UInt32, np.repeat(np.arange(n, dtype=np.uint32), each)),
+            own_memory(mi.UInt32, first), own_memory(mi.UInt32, each),
+            mi.UInt32(paths - rounds * slots), mi.UInt32(rounds),
+        )  # fmt: skip
+        dr.make_opaque(made.even, made.rounds)
+        return made
+
+    def count(self, pixel: mi.UInt32, active: mi.Bool | bool = True) -> mi.Float:
+        """How many paths a pixel has."""
+        return mi.Float(self._of_even(pixel) + self.rounds * dr.gather(mi.UInt32, self.each, pixel, active))
+
+    def mean(self) -> mi.Float:
+        """How many a pixel has in the mean."""
+        return mi.Float(self.even + self.rounds * dr.width(self.slots)) / dr.width(self.each)
+
+    def draw(self, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+        """The pixel of each path, and its number among those of that pixel."""
+        n, slots = dr.width(self.each), dr.width(self.slots)
+        evenly, behind = lane < self.even, lane - self.even
+        slot = behind % slots
+        pixel = dr.select(evenly, lane % n, dr.gather(mi.UInt32, self.slots, slot, ~evenly))
+        each, first = (dr.gather(mi.UInt32, array, pixel, ~evenly) for array in (self.each, self.first))
+        later = self._of_even(pixel) + behind // slots * each + slot - first
+        return pixel, dr.select(evenly, lane // n, later)
+
+    def _of_even(self, pixel: mi.UInt32) -> mi.UInt32:
+        n = dr.width(self.each)
+        return self.even // n + dr.select(pixel < self.even % n, mi.UInt32(1), 0)

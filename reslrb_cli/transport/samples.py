@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -19,7 +20,7 @@ import mitsuba as mi
 from reslrb_cli.config.files import PASS_PATHS, PASS_SAMPLES, PASSES
 from reslrb_cli.scene.graph import Lamp
 from reslrb_cli.transport.densities import EmitterDensities
-from reslrb_cli.transport.film import Film
+from reslrb_cli.transport.film import Film, PixelShares
 from reslrb_cli.transport.guide import Drawn, Guide, Table
 from reslrb_cli.transport.lamps import sums_of_areas
 from reslrb_cli.transport.plan import Plan
@@ -148,6 +149,8 @@ class Samples:
     #: (width 1), and the emitters' densities.
     ratio: mi.Float | None = None
     emitters: EmitterDensities | None = None
+    #: How the camera paths are shared out over the pixels; None: evenly.
+    shares: PixelShares | None = None
     #: The camera paths of the same pass, beside light paths.
     camera: Samples | None = None
     _areas: list[mi.Float] = field(init=False)  # of the lamps that are reshaped: `sums_of_areas`
@@ -161,6 +164,18 @@ class Samples:
         """Sums of the areas of a lamp's faces, where these move; else None."""
         reshaped = self.plan.reshaped_lamps
         return self._areas[reshaped.index(lamp)] if lamp in reshaped else None
+
+    def ratio_at(self, u: mi.Point2f) -> mi.Float:
+        """All light paths over the camera paths of the pixel that film position `u` lies in; off the film over those of
+        one in the mean."""
+        assert self.ratio is not None
+        if self.shares is None:
+            return self.ratio
+        width, height = (int(n) for n in self.film.size)
+        inside = (u.x >= 0) & (u.x < width) & (u.y >= 0) & (u.y < height)
+        pixel = mi.UInt32(mi.Int32(u.y) * width + mi.Int32(u.x))
+        mean = self.shares.mean()
+        return self.ratio * dr.select(inside, mean / self.shares.count(pixel, inside), 1)
 
     def sampler(self) -> mi.Sampler:
         """A sampler at the beginning of these samples' stream."""
@@ -245,9 +260,14 @@ class NumberStream:
         return mi.Point2f(self.generator.next_float32(), self.generator.next_float32())
 
 
+#: How so many camera paths are shared out.
+SharesOf: TypeAlias = "Callable[[int], PixelShares | None]"
+
+
 def passes(
     plan: Plan, scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32, spp: int, spp_per_pass: int | None,
     table: Table | None = None, light_share: float = 1, emitters: EmitterDensities | None = None,
+    shares: SharesOf | None = None,
 ) -> list[Samples]:  # fmt: skip
     """All samples of an image, in passes of `spp_per_pass` samples per pixel, which must divide `spp`, or less.
 
@@ -275,9 +295,9 @@ def passes(
     def part(size: int) -> Samples:
         width, fraction = size * pixels, dr.opaque(mi.Float, size / spp)
         if plan.paths == "camera":
-            return _camera_samples(plan, scene, sensor, film, size, size * int(dr.prod(film.size)), fraction)
+            return _camera_samples(plan, scene, sensor, film, size, size * int(dr.prod(film.size)), fraction, shares)
         if plan.paths == "both":
-            return _of_both(plan, scene, sensor, film, size, fraction, light_share, table, emitters)
+            return _of_both(plan, scene, sensor, film, size, fraction, light_share, table, emitters, shares)
         if width > PASS_PATHS:
             raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {size}")
         guide, net = None if table is None else Guide.of(table, width), None if plan.sequence is None else Net.of(width)
@@ -299,6 +319,7 @@ def _seeded(samples: Samples, seed: mi.UInt32) -> Samples:
 
 def _camera_samples(
     plan: Plan, scene: mi.Scene, sensor: mi.Sensor, film: Film, spp: int, width: int, fraction: mi.Float,
+    shares: SharesOf | None,
 ) -> Samples:  # fmt: skip
     """So many camera paths, which are this `fraction` of an image's samples."""
     if width > PASS_PATHS:
@@ -306,24 +327,25 @@ def _camera_samples(
     scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / width) * fraction
     dr.make_opaque(scale)
     plan = replace(plan, camera=True)
-    return Samples(scene, sensor, plan, film, mi.UInt32(0), spp, width, scale, fraction)
+    own = None if shares is None else shares(width)
+    return Samples(scene, sensor, plan, film, mi.UInt32(0), spp, width, scale, fraction, shares=own)
 
 
 def _of_both(
     plan: Plan, scene: mi.Scene, sensor: mi.Sensor, film: Film, spp: int, fraction: mi.Float, light_share: float,
-    table: Table | None, emitters: EmitterDensities | None,
+    table: Table | None, emitters: EmitterDensities | None, shares: SharesOf | None,
 ) -> Samples:  # fmt: skip
     """Light paths and camera paths together as many as `spp` samples per pixel are; one of each at least."""
     pixels, crop = int(dr.prod(sensor.film().size())), int(dr.prod(film.size))
     width = max(round(light_share * spp * pixels), 1)
     n_camera = max(round((1 - light_share) * spp * crop), 1)
-    camera = _camera_samples(plan, scene, sensor, film, spp, n_camera, fraction)
+    camera = _camera_samples(plan, scene, sensor, film, spp, n_camera, fraction, shares)
     ratio = dr.opaque(mi.Float, width / (n_camera / crop))
     scale = dr.opaque(mi.Float, crop / width) * fraction
     dr.make_opaque(scale)
     guide, net = None if table is None else Guide.of(table, width), None if plan.sequence is None else Net.of(width)
     camera = replace(camera, ratio=ratio, emitters=emitters)
-    own = scale, fraction, guide, net, ratio, emitters, camera
+    own = scale, fraction, guide, net, ratio, emitters, camera.shares, camera
     return Samples(scene, sensor, plan, film, mi.UInt32(0), spp, width, *own)
 
 

@@ -250,7 +250,8 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         for before_here in path.rivals:  # one, or none
             arrived = before_here.arrive(si, path.ray)
             ways, cos = scattering.ways, cosine(si, scattering.d)
-            connection.weight *= weight_of_connection(arrived, connection.p_cam, samples.ratio, ways.ahead_back)
+            N = samples.ratio_at(connection.u)
+            connection.weight *= weight_of_connection(arrived, connection.p_cam, N, ways.ahead_back)
             behind = arrived.after(mi.Float(0), arrived.M + arrived.V * ways.back, scattering, cos)
             rivals = [dr.select(scattering.is_null, before_here.after_null(arrived), behind)]
         if hooks.connects:

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.transport.camera import CameraHooks
+from reslrb_cli.transport.camera import CameraHooks, film_ray
 from reslrb_cli.transport.connection import connect
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.walk import Hooks
@@ -276,6 +276,14 @@ class Densities:
         there = d / (d @ self.axis)[:, None]
         edges = (there[1:] - there[0]) / (np.array([0.5, 0.6]) * np.array(sensor.film().crop_size()))[:, None]
         self.pixel = length(np.cross(*edges))
+        size = np.array(sensor.film().crop_size(), np.int64)
+        self.size, self.corner = size, there[0] - edges.T @ (np.array([0.2, 0.3]) * size)
+        self.edges = edges
+        self.counts = None
+        if camera.shares is not None:  # as they were drawn
+            with dr.suspend_grad():
+                drawn = np.floor(np.array(film_ray(camera, camera.sampler()).u)).astype(int)
+            self.counts = np.bincount(drawn[1] * size[0] + drawn[0], minlength=crop)
         sphere = self.scene.bbox().bounding_sphere()
         self.disk = 1 / (np.pi * float(sphere.radius) ** 2)
         weights = np.array([float(np.ravel(e.sampling_weight())[0]) for e in self.scene.emitters()])
@@ -291,7 +299,16 @@ class Densities:
         begun = cos / d**2 / (self.pixel * cos_axis**3)
         least = STEADY * OFF * (1 + np.abs(paths.x).max(initial=0))
         fit = d * cos > least
-        from_camera, from_light, sides = self.camera * begun, np.full(len(rows), float(self.light)), paths.ok[:, 0]
+        camera = self.camera
+        if self.counts is not None:
+            # A direction's place on the film: the plane that `edges` span is met at a distance of 1.
+            there = (x_1 - self.origin) / d[:, None] / cos_axis[:, None] - self.corner
+            u = np.linalg.lstsq(self.edges.T, there.T, rcond=None)[0].T
+            inside = np.all((u >= 0) & (u < self.size), axis=1)
+            pixel = np.clip(np.floor(u).astype(int), 0, self.size - 1)
+            camera = self.counts[pixel[:, 1] * self.size[0] + pixel[:, 0]]
+            fit &= inside & np.all(np.abs(u - np.rint(u)) > 1e-3, axis=1)
+        from_camera, from_light, sides = camera * begun, np.full(len(rows), float(self.light)), paths.ok[:, 0]
         for i in range(1, DEPTH):
             here = i < paths.count
             d = np.where(here, length(paths.x[:, i] - paths.x[:, i - 1]), 1)

@@ -32,10 +32,12 @@ from conformance.test_gradients import forward
 from turns import a_few, taking_turns
 
 from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.guiding.pixels import MOST
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.step import interface_of, make_integrator, render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.records.clock import peak_mib, reset_peak
+from reslrb_cli.transport.film import EVEN, MOST_SLOTS, PixelShares
 
 pytestmark = pytest.mark.usefixtures("samples")
 
@@ -97,6 +99,101 @@ def test_images_are_those_of_path_in_every_pixel(name: str, way: int):
     result = agreement(scene, spp=128, seeds=12, reslrb={"estimator": "stack", **WAYS[way]}, **options)
     print(name, WAYS[way], result)
     assert result
+
+
+def unevenly(tracer: Any, scene: Any) -> Any:
+    """The same with camera paths that are shared out over the pixels at random."""
+    size = scene.sensors()[0].film().crop_size()
+    return tracer.shared_out({"0": np.random.default_rng(5).exponential(size=(size[1], size[0])).astype(np.float32)})
+
+
+@pytest.mark.parametrize("paths", [7, 20, 33, 100, 1003])
+def test_paths_that_are_shared_out_are_as_many_as_each_pixel_is_said_to_have(paths: int):
+    density = np.random.default_rng(paths).exponential(size=20)
+    density[:3] = 0
+    shares = PixelShares.of(density, paths)
+    if paths <= density.size:
+        assert shares is None
+        return
+    pixel, number = (np.array(x) for x in shares.draw(dr.arange(mi.UInt32, paths)))
+    counts = np.array(shares.count(dr.arange(mi.UInt32, density.size)))
+    assert np.array_equal(np.bincount(pixel, minlength=density.size), counts)
+    assert counts.sum() == paths
+    assert float(shares.mean()[0]) == pytest.approx(paths / density.size)
+    for one in range(density.size):
+        assert sorted(number[pixel == one]) == list(range(int(counts[one])))
+    if paths > 1000:  # as wanted, but for those that all have alike
+        even = int(shares.even[0])
+        assert EVEN <= even / paths < EVEN + MOST_SLOTS * density.size / paths
+        expected = even / density.size + (paths - even) * density / density.sum()
+        np.testing.assert_allclose(counts, expected, atol=int(shares.rounds[0]) + 1)
+
+
+UNEVEN = ["mirror", "gaussian", "crop", "sphere"]
+
+
+@taking_turns("name", UNEVEN, "way", [0, 1, 2, 3], UNEVEN)
+def test_images_are_those_of_path_however_paths_are_shared_out(name: str, way: int):
+    lights, sensor, things, _ = SCENES[name]()
+    scene = stage(lights, sensor, **things)
+    ours = unevenly(make_integrator("reslrb", max_depth=5, rr_depth=100, estimator="stack", **WAYS[way]), scene)
+    theirs = images(scene, "path", range(50, 62), 128, max_depth=5, rr_depth=100)
+    renders = np.stack([np.array(render_image(ours, scene, 0, seed, 128)) for seed in range(12)])
+    shares = ours.passes(Job(scene, scene.sensors()[0], mi.UInt32(0), 128))[0].sides()[-1].shares
+    assert shares is not None
+    assert compare(renders, theirs)
+
+
+@pytest.mark.parametrize("paths", ["camera", "both"])
+def test_gradients_are_what_they_are_however_paths_are_shared_out(paths: str):
+    case = next(case for case in CASES if case.name == "texture")
+    scene = Case(case.scene(), case.keys)
+    even = integrator("reslrb", **options_of(case, paths))
+    ours = unevenly(integrator("reslrb", **options_of(case, paths), freeze=True), scene.scene)
+    for step in ({}, {"step": scene.known_step}):
+        expected = scene.gradients(even, seeds(16), case.spp, **step)
+        assert compare(scene.gradients(ours, seeds(16, 1), case.spp, **step), expected, block=None)
+
+
+def test_what_is_noted_finds_the_pixels_that_a_mirror_alone_shows():
+    """A red wall behind the camera is seen in a mirror; its colour is known from the mirror's pixels alone, and all
+    else has few paths. Noted anew it is the same."""
+    size = {"width": 48, "height": 48, "pixel_format": "rgb", "rfilter": {"type": "box"}}
+    at = transform().look_at(origin=[0, 0, 0], target=[0, 0, -1], up=[0, 1, 0])
+    back = transform().translate([0, 0, -3]).scale(3)
+    scene = mi.load_dict({
+        "type": "scene",
+        "sensor": {"type": "perspective", "fov": 60.0, "to_world": at, "film": {"type": "hdrfilm", **size}},
+        "wall": rectangle({"type": "diffuse", "reflectance": rgb(0.5, 0.5, 0.5)}, back),
+        "glass": rectangle({"type": "conductor"}, transform().translate([0.6, 0, -2.9]).scale(0.5)),
+        "red": rectangle(RED, transform().translate([0, 0, 2]).rotate([0, 1, 0], 180).scale(3)),
+        "lamp": rectangle(RED, transform().translate([0, 2.5, -1]).rotate([1, 0, 0], 90).scale(0.3))
+        | {"emitter": {"type": "area", "radiance": rgb(9, 9, 9)}},
+    }, optimize=False)  # fmt: skip
+    params = mi.traverse(scene)
+    key = next(key for key in params.keys() if key.startswith("red.") and key.endswith("reflectance.value"))  # noqa: SIM118
+    dr.enable_grad(params[key])
+    params.update()
+    job = Job(scene, scene.sensors()[0], mi.UInt32(3), 32, params)
+    tracer = make_integrator("reslrb", estimator="stack", paths="both", max_depth=4, pixels="measured")
+    density = tracer.note_pixels(job)
+    assert np.array_equal(density, tracer.note_pixels(job))
+    show = density > 2
+    ray = scene.sensors()[0].sample_ray(0, 0, grid(48), mi.Point2f(0.5))[0]
+    mirror = np.array(mi.has_flag(scene.ray_intersect(ray).bsdf().flags(), mi.BSDFFlags.Delta)).reshape(48, 48)
+    assert density.mean() == pytest.approx(1)
+    assert density.max() <= MOST * (1 + 1e-5)
+    assert density[mirror].mean() > 6 * density[~mirror].mean()
+    assert show[mirror].mean() > 0.5
+    # The first gradient notes it; images before that are even.
+    assert tracer.passes(Job(scene, scene.sensors()[0], mi.UInt32(0), 32))[0].shares is None
+    assert tracer.passes(job)[0].shares is not None
+
+
+def grid(n: int) -> mi.Point2f:
+    """The middles of n x n pixels."""
+    pixel = dr.arange(mi.UInt32, n * n)
+    return mi.Point2f((pixel % n + 0.5) / n, (pixel // n + 0.5) / n)
 
 
 def test_light_paths_alone_may_have_the_border_that_both_have():

@@ -165,7 +165,8 @@ EVENED = ("light_textured.emitter.radiance.data", "light_textured_mesh.emitter.r
 
 @dataclass(frozen=True)
 class Case:
-    """A scene, what of it is differentiated, and options of the integrator; `guided` by what a random dL/dI says."""
+    """A scene, what of it is differentiated, and options of the integrator; `guided` by what a random dL/dI says, with
+    camera paths `shared` out over the pixels at random."""
 
     scene: Callable[[], Any]
     keys: tuple[str, ...] = ()
@@ -175,6 +176,7 @@ class Case:
     rr_depth: int = 100
     hide_emitters: bool = False
     guided: bool = False
+    shared: bool = False
     spp: int = 48
 
 
@@ -209,6 +211,8 @@ CASES = {
     "camera": Case(lambda: room(lights("sphere", "constant", "point", point=2), walls=HALF,
                                 shade=ball(VEIL, radius=0.9), core=ball(ROUGH_GLASS)), paths="camera"),
     "guided": Case(lambda: room(lights("rectangle", "spot"), walls=ROUGH, ball=ball(PLASTIC)), guided=True),
+    "shared": Case(lambda: room(lights("rectangle", "constant"), walls=HALF, ball=ball(GLASS), film=CROPPED,
+                                sensor=SHIFTED), shared=True),
 }  # fmt: skip
 
 
@@ -228,6 +232,10 @@ def prepared(case: Case) -> Any:
     options = {name: getattr(case, name) for name in names} | {"estimator": "stack"}
     scene, params = case.scene(), None
     tracer = Reslrb.of(**options, guiding="on" if case.guided else "off")
+    if case.shared:
+        size = scene.sensors()[0].film().crop_size()
+        density = np.random.default_rng(2).exponential(size=(size[1], size[0])).astype(np.float32)
+        tracer = tracer.shared_out({"0": density})
     if case.keys:
         params = mi.traverse(scene)
         for key in case.keys:
@@ -367,8 +375,12 @@ FAULTS = {
     "light_without_reverse": ("transport.weights:weight_of_connection", "arrived.V * back", "arrived.V", "L"),
     "met_without_reverse": ("transport.camera:_behind", "here.V * ways.back", "here.V", "HN"),
     "sampled_without_reverse": ("transport.camera:_weigh", "own.V * ways.ahead_back", "own.V", "N"),
-    "more_light_paths": ("transport.walk:walk", "samples.ratio, ways", "2 * samples.ratio, ways", "L"),
-    "fewer_camera_paths": ("transport.camera:camera_walk", "samples.ratio / p_cam", "2 * samples.ratio / p_cam", "HN"),
+    "more_light_paths": ("transport.walk:walk", "N = samples.ratio_at", "N = 2 * samples.ratio_at", "L"),
+    "fewer_camera_paths": ("transport.camera:camera_walk", "samples.ratio_at(first.u) / p_cam",
+                           "2 * samples.ratio_at(first.u) / p_cam", "HN"),
+    "shared_evenly_for_all": ("transport.samples:Samples.ratio_at", "mean / self.shares.count(pixel, inside)", "1",
+                              "HNL"),
+    "shared_evenly_for_light": ("transport.walk:walk", "N = samples.ratio_at(connection.u)", "N = samples.ratio", "L"),
     "emitted_without_choice": ("transport.densities:EmitterDensities.of", "= choice[number] * own",
                                "= own * (choice[number] if index else 1)", "HNL"),
     "sampled_without_choice": ("transport.weights:leave_emitter", "M = choice * own", "M = own", "L"),
@@ -386,7 +398,12 @@ FAULTS = {
     "crop_forgotten": ("transport.samples:_of_both", "width / (n_camera / crop)", "width / (n_camera / pixels)", "HNL"),
 }  # fmt: skip
 #: Cases that show them.
-SHOWN = {"sides_forgotten": "smooth", "crop_forgotten": "cropped"}
+SHOWN = {
+    "sides_forgotten": "smooth",
+    "crop_forgotten": "cropped",
+    "shared_evenly_for_all": "shared",
+    "shared_evenly_for_light": "shared",
+}
 CASES |= {
     "small": Case(lambda: room(lights("rectangle", "disk", disk=3), walls=HALF,
                                veil=plate(VEIL, 0, 1.5, 1.5, scale=1.5))),

@@ -1,7 +1,8 @@
 """The sampling of a run, settled before its first iteration: guided emission, and the sequence of numbers.
 
-Each is settled where it is left to measurement: which paths there are, guiding, and then the sequence. Steps drawn one
-way take turns with steps drawn the other (`race.Turns`), with dL/dI held at one image's (`StepTrial`):
+Each is settled where it is left to measurement: which paths there are, guiding, and then the sequence; and before
+guiding, without steps, how camera paths are shared out over the pixels (`guiding/pixels.py`). Steps drawn one way take
+turns with steps drawn the other (`race.Turns`), with dL/dI held at one image's (`StepTrial`):
 
 - `PathsPilot`: another share of light paths, or paths of one side alone where that finds all light, unguided. One share
   after the other takes its turns with the best so far, from one half on to the side that was found to be the better, as
@@ -30,6 +31,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config.files import in_words
+from reslrb_cli.guiding.pixels import NOTED_SPP
 from reslrb_cli.guiding.tables import Guiding, Purpose, learnings
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
@@ -43,7 +45,7 @@ from reslrb_cli.optimization.sensitivity import finite, take_gradient
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.clock import StepClock, StepTimes
-from reslrb_cli.records.decisions import GuidedRecord, PathsRecord, SequenceRecord
+from reslrb_cli.records.decisions import GuidedRecord, PathsRecord, PixelsRecord, SequenceRecord
 from reslrb_cli.scene.needs import camera_finds_all, light_finds_all
 from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array
@@ -56,6 +58,9 @@ GUIDING_LONGER, SEQUENCE_LONGER = 3.0, 1.25
 #: where none at all are, a few after all; else more. Steps of another share may take so many times as long. A share is
 #: tried where so much of the time is left for it.
 FIRST_SHARE, FEWER, MORE, PATHS_LONGER, LEAST_TURNS = 0.5, (0.2, 0.05), (0.8, 0.95, 1.0), 2.0, 0.1
+#: Paths of a run, at least, whose camera paths are shared out by what is noted first, and the share of them, at most,
+#: that is noted.
+PIXELS_PATHS, PIXELS_SHARE = 1e7, 0.02
 #: What of the share the rounds of the sequence are planned for; the first step takes a part too, and is no round.
 ROUNDS_SHARE = 0.8
 #: Views that are looked at, spread over those that are trained on, and values of each one's image.
@@ -73,9 +78,10 @@ def settle(problem: Problem, options: Sequence[Candidate], say: race.Say, cache:
     tuner = race.Tuner(problem, say, cache)
     settle_estimator(tuner, options)
     settle_paths(tuner)
+    settle_pixels(tuner)
     settle_sampling(tuner)
     problem = tuner.problem
-    tuner.tell(problem.pilot, problem.sides, problem.guided, problem.sequence)
+    tuner.tell(problem.pilot, problem.sides, problem.guided, problem.sequence, problem.pixels)
     return tuner.problem
 
 
@@ -87,6 +93,35 @@ def settle_paths(tuner: race.Tuner) -> None:
         return
     sides = _paths(tuner)
     tuner.take(sides=sides, integrator=with_sides(problem.integrator, sides))
+
+
+def settle_pixels(tuner: race.Tuner) -> None:
+    """Have the camera paths of an integrator whose paths are settled shared out over the pixels, where that is wanted,
+    or left to be decided and no share of the run that counts: by the parameters' values at the start."""
+    problem = tuner.problem
+    tracer, asked = problem.integrator, problem.config.integrator.options().get("pixels", "even")
+    if asked == "even" or not isinstance(tracer, Tracer) or tracer.paths == "light":
+        return
+    if asked == "auto":
+        record = _whether_pixels(problem)
+        tuner.take(pixels=record)
+        if not record.measured:
+            return
+    problem.apply()
+    scene, params = problem.scene, problem.selection.params
+    jobs = {view.sensor: Job(scene, scene.sensors()[view.sensor], mi.UInt32(0), 0, params) for view in problem.trained}
+    noted = {str(sensor): tracer.note_pixels(job) for sensor, job in jobs.items()}
+    tuner.take(integrator=tracer.shared_out(noted))
+
+
+def _whether_pixels(problem: Problem) -> PixelsRecord:
+    """Whether a run has so many paths that those which are noted are few beside them, and their kernel, too."""
+    run, films = problem.config.run, [problem.scene.sensors()[view.sensor].film().size() for view in problem.trained]
+    each = run.iterations * run.spp * len(problem.drawn(0)) / len(films)
+    paths, part = each * sum(int(dr.prod(size)) for size in films), NOTED_SPP / each
+    if paths < PIXELS_PATHS or part > PIXELS_SHARE:
+        return PixelsRecord(measured=False, note="a run as short as this has no time for it")
+    return PixelsRecord(measured=True, note=f"where noise weighs most, by {100 * part:.2g} % of this run's samples")
 
 
 def with_sides(integrator: Any, sides: PathsRecord | None) -> Any:

@@ -1,0 +1,102 @@
+"""Camera paths shared out over the pixels by what their noise does to the gradient.
+
+A pixel that a mirror fills may be all that shows a wall, and be known from camera paths alone, where others are known
+from light paths too; another shows nothing that is differentiated. So before the first iteration a few camera paths are
+traced through each pixel, and noted is of each what it would do to the gradient of a loss whose dL/dI were 1: of each
+BSDF that is differentiated, as in `collect.py`,
+
+    G = sum_i C_i n_i        n_i: how many factors of contribution C_i are this BSDF's;  n = 1 of emission
+
+Near the end of a run dL/dI is mostly noise, in proportion to that of the pixel, I, and so is the gradient: of pixels
+with n_j paths each its variance has parts
+
+    Var(I_j) (E G_j)^2 / n_j        which is least, at equal sums of n_j, for  n_j ~ sd(I_j) E|G_j|
+
+Of several groups the variances are added up, each over the square of its whole gradient, sum_j E|G_j|, and times the
+number K of its entries: a texture's are each known from K times fewer pixels than a colour is. A rare bright path would
+draw all others to its pixel: means are over blocks of pixels, and none has more than MOST times the mean.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from reslrb_cli.guiding.collect import bsdf_groups, meets
+from reslrb_cli.transport.bsdf import Scattering
+from reslrb_cli.transport.camera import CameraHooks, FilmRay, Met, NextEvent, camera_walk
+from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.walk import Vertex
+
+NOTED_SPP = 16  # camera paths through each pixel that are noted
+BLOCK = 9  # pixels, side of the blocks that means are taken over
+MOST = 8.0  # of the mean, that a pixel is given
+NOTING_STREAM = 0x9072E5  # seed of the samples that are noted
+
+
+@dataclass
+class Noted:
+    """Loop state. `counts` says how often each group's BSDFs were met, `sums` are G (C,) of the groups and of emission,
+    the radiance last."""
+
+    counts: list[mi.UInt32]
+    sums: list[mi.Spectrum]
+
+
+class Noting(CameraHooks):
+    """Sums what each camera path says; it adds no derivatives."""
+
+    def __init__(self, samples: Samples) -> None:
+        self.plan, self.groups = samples.plan, bsdf_groups(samples.plan)
+
+    def start(self, first: FilmRay) -> Noted:
+        number = len(self.groups) + self.plan.differentiate_emission + 1
+        return Noted([mi.UInt32(0) for _ in self.groups], [mi.Spectrum(0) for _ in range(number)])
+
+    def vertex(
+        self, state: Noted, vertex: Vertex, met: Met | None, event: NextEvent | None, scattering: Scattering
+    ) -> Noted:  # fmt: skip
+        P, zero = vertex.product.value(), mi.Spectrum(0)
+        H = zero if met is None else dr.select(met.active, P * met.Le * met.weight, 0)
+        N = zero if event is None else dr.select(event.active, P * event.c, 0)
+        here = [meets(group, vertex) for group in self.groups]
+        parts = [H * mi.Float(n) + N * mi.Float(n + own) for n, own in zip(state.counts, here, strict=True)]
+        parts += [H + N] * (1 + self.plan.differentiate_emission)
+        counts = [n + dr.select(scattering.active, own, 0) for n, own in zip(state.counts, here, strict=True)]
+        return Noted(counts, [total + part for total, part in zip(state.sums, parts, strict=True)])
+
+
+def note(samples: Samples) -> NDArray[np.float64]:
+    """Means over the camera paths of each pixel: |G| of each group and of emission, |I|, and |I|^2, last, (K, H, W);
+    what is not finite counts as 0."""
+    first, noted = camera_walk(samples, Noting(samples))
+    width, height = (int(n) for n in samples.film.size)
+    pixel = mi.UInt32(first.u.y) * width + mi.UInt32(first.u.x)
+    rows = [dr.norm(total * first.weight) for total in noted.sums]
+    rows.append(dr.square(rows[-1]))
+    sums = dr.zeros(mi.Float, len(rows) * width * height)
+    for number, value in enumerate(rows):
+        dr.scatter_reduce(dr.ReduceOp.Add, sums, value, pixel + number * width * height, dr.isfinite(value))
+    dr.eval(sums)
+    return np.array(sums, np.float64).reshape(len(rows), height, width) * (width * height / samples.width)
+
+
+def wanted(samples: Samples, entries: list[int]) -> NDArray[np.float32]:
+    """How camera paths are to be shared out over the pixels (H, W), a density with mean 1, by these, evenly spread;
+    `entries` are the numbers that each group of BSDFs, and emission, has derivatives of."""
+    from scipy import ndimage  # here: few commands come here, and all import this module
+
+    *said, radiance, square = (ndimage.uniform_filter(row, BLOCK, mode="nearest") for row in note(samples))
+    weight = np.zeros_like(square)
+    for K, row in zip(entries, said, strict=True):
+        weight += K * np.square(row / row.sum()) if row.sum() > 0 else 0
+    density = np.sqrt(np.maximum(square - np.square(radiance), 0) * weight)
+    if not density.sum() > 0:
+        return np.ones_like(square, np.float32)
+    for _ in range(8):  # what is cut off raises all others
+        density = np.minimum(density / density.mean(), MOST)
+    return np.asarray(density / density.mean(), np.float32)
