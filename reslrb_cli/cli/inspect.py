@@ -360,7 +360,7 @@ def edges_of(scene: Any, selection: Selection) -> list[str]:
 
 def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, counts: bool) -> PlanReport | str:
     """The plan of a step for the first sensor that is used, or why there is none."""
-    from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, SEQUENCE, report_plan, with_reason
+    from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, PIXELS, SEQUENCE, report_plan, with_reason
     from reslrb_cli.integrators.reslrb import Reslrb
     from reslrb_cli.optimization.loading import choose_sensors, pass_spp, paths_of
     from reslrb_cli.optimization.moving import moves_anything
@@ -374,7 +374,7 @@ def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, c
     if options.get("estimator") == "auto":
         options["estimator"] = "stack"  # `auto` is chosen by a run
     reasons = {}
-    for feature, option in ((GUIDED, "guiding"), (SEQUENCE, "sequence")):
+    for feature, option in ((GUIDED, "guiding"), (SEQUENCE, "sequence"), (PIXELS, "pixels")):
         options[option], reasons[feature] = sampling_of(subject, option)
     known = config.adjoint == "batched" or options.get("weight") == "adjoint"
     try:
@@ -388,7 +388,7 @@ def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, c
     except (ConfigError, UnsupportedScene) as error:
         return str(error)
     if integrator.paths == "camera":  # where nothing begins at a light, nothing is left to a run
-        reasons = {PATHS_FROM: reasons.get(PATHS_FROM, "")}
+        reasons = {feature: reasons.get(feature, "") for feature in (PATHS_FROM, PIXELS)}
     for feature, why in reasons.items():
         report = dataclasses.replace(report, rows=with_reason(report.rows, feature, why)) if why else report
     return report
@@ -413,16 +413,18 @@ def sides_of(subject: Subject, options: dict[str, Any], reasons: dict[str, str])
 
 
 def sampling_of(subject: Subject, option: str) -> tuple[str, str]:
-    """`integrator.guiding`, or `sequence`, as it is, and why, where that was or is left to a run (else empty)."""
+    """`integrator.guiding`, `sequence`, or `pixels`, as it is, and why, where that was or is left to a run (else
+    empty)."""
     from reslrb_cli.config.integrators import UNDECIDED
-    from reslrb_cli.records.decisions import GuidedRecord, PaidRecord, SequenceRecord
+    from reslrb_cli.records.decisions import GuidedRecord, PaidRecord, PixelsRecord, SequenceRecord
 
     asked = str(subject.config.integrator.options()[option])
     if asked != "auto":
         return asked, ""
-    kinds: dict[str, tuple[type[PaidRecord], str]] = {
+    kinds: dict[str, tuple[type[PaidRecord] | type[PixelsRecord], str]] = {
         "guiding": (GuidedRecord, "guided"),
         "sequence": (SequenceRecord, "sequence"),
+        "pixels": (PixelsRecord, "pixels"),
     }
     kind, name = kinds[option]
     try:

@@ -186,9 +186,11 @@ class Reslrb(AttachingTracer):
     @model_validator(mode="before")
     @classmethod
     def _as_written(cls, values: Any) -> Any:
-        """What a run folder of before there were `paths`, or `pixels`, says goes on as it was."""
+        """What a run folder of before there were `paths`, or `pixels`, says goes on as it was, and so does one of when
+        there was `image`, if that is what all have now."""
         if isinstance(values, dict) and values.keys() >= _WRITTEN_BEFORE:
-            return {"paths": UNDECIDED["paths"], "pixels": UNDECIDED["pixels"], **values}
+            kept = {name: value for name, value in values.items() if (name, value) != ("image", "all")}
+            return {"paths": UNDECIDED["paths"], "pixels": UNDECIDED["pixels"], **kept}
         return values
 
     @model_validator(mode="after")

@@ -215,7 +215,8 @@ class Preparation:
         self._renewal = self._renewal or Renewal(scene)
         settle(scene)
         plan = make_plan(needs, *self._depths, self._hide_emitters)
-        plan = replace(plan, paths=self.paths, whole=self.whole)
+        shares_out = self.shares_out and self.paths != "light"
+        plan = replace(plan, paths=self.paths, whole=self.whole, shares_out=shares_out)
         if plan.weighs:
             plan = self._renewal.renew(plan, scene)  # the horizon
         if plan.paths == "camera" or (self.guiding is None and not self._low_discrepancy):

@@ -25,10 +25,11 @@ from reslrb_cli.transport.plan import UNBOUNDED, Plan
 from reslrb_cli.transport.samples import passes
 from reslrb_cli.transport.sobol import make_coordinates
 
-#: The features that paths from the sensor, guiding, and evenly spread numbers are.
+#: The features that paths from the sensor, guiding, evenly spread numbers, and paths that are shared out are.
 PATHS_FROM = "camera paths"
 GUIDED = "guided emission"
 SEQUENCE = "low-discrepancy numbers"
+PIXELS = "camera paths by pixel"
 
 #: Why camera paths alone have no use for what says where paths start at the lights.
 NO_START = "no path begins at a light"
@@ -253,6 +254,9 @@ FEATURES = (
     Feature("black texels of lamps", lambda p: bool(p.evened_lamps), "drawn too, since their derivative counts",
             "no texture of a lamp is differentiated: texels are drawn by their radiance", _evened),
     Feature(PATHS_FROM, lambda p: p.paths != "light", lambda p: f"paths: {p.paths}", "paths: light", _paths),
+    Feature(PIXELS, lambda p: p.shares_out, "most where their noise weighs most in the gradient",
+            lambda p: "no camera paths" if p.paths == "light" else "pixels: even",
+            lambda p: "a run finds out which pixels need how many"),
     Feature(GUIDED, lambda p: p.grid is not None, _tables, lambda p: _of_lights(p, "guiding: off"), _guided),
     Feature("aimed scattering", lambda p: p.aimed, "a quarter of scattered paths go where the sensor looks",
             "only guided paths are, in scenes with glossy surfaces, where nothing moves", _aimed),

@@ -13,7 +13,7 @@ from textwrap import wrap
 from typing import Any, NamedTuple
 
 from reslrb_cli.optimization.errors import ErrorMeter
-from reslrb_cli.records.decisions import PaidRecord, RivalRecord
+from reslrb_cli.records.decisions import Finding
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.report.format import count, line, number, shorten, with_error
 
@@ -155,7 +155,7 @@ def noise_line(results: Mapping[str, Any]) -> str:
     return f"spread: by the noise of the run; noise and errors of targets{which} are not in it"
 
 
-def measured_line(kind: type[PaidRecord] | type[RivalRecord], measured: Mapping[str, Any] | None) -> str:
+def measured_line(kind: type[Finding], measured: Mapping[str, Any] | None) -> str:
     """What a measurement before the run came to, of another way of drawing samples or of another integrator; empty
     where there was none."""
     try:

@@ -26,7 +26,7 @@ from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, printable
-from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, SEQUENCE, plan_rows, with_reason
+from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, PIXELS, SEQUENCE, plan_rows, with_reason
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.measure.prb_comparison import measure_rival
 from reslrb_cli.optimization.assemble import assemble
@@ -66,6 +66,8 @@ def plan_record(problem: Problem) -> dict[str, Any]:
         found = with_reason(found, GUIDED, f"guiding: auto, {problem.guided.why()}")
     if problem.sequence is not None:
         found = with_reason(found, SEQUENCE, f"sequence: auto, {problem.sequence.why()}")
+    if problem.pixels is not None:
+        found = with_reason(found, PIXELS, f"pixels: auto, {problem.pixels.why()}")
     if problem.sides is not None:
         found = with_reason(found, PATHS_FROM, f"paths: auto, {problem.sides.why()}")
     rows = [{"feature": row.feature, "needed": row.needed, "reason": row.reason} for row in found]

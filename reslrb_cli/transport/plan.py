@@ -133,6 +133,8 @@ class Plan:
     # Whether the normalisation of the reconstruction filter's weights has its derivative, and the correction for
     # shading normals has none: so it matches finite differences, and otherwise `ptracer`.
     attached_normalization: bool = True
+    # Whether camera paths are shared out over the pixels as these need them.
+    shares_out: bool = False
     # The sphere that infinite emitters light.
     horizon: Horizon | None = None
     # The cells that emission is guided by, where it is.

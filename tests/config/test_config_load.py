@@ -70,7 +70,7 @@ def test_defaults(tmp_path: Path) -> None:
         "max_depth": 8, "rr_depth": 5, "hide_emitters": False, "estimator": "auto", "freeze": True,
         "attached": "auto", "attached_sampling": "auto", "filter_normalization": "attached", "guiding": "auto",
         "paths": "auto", "light_share": "auto",
-        "sequence": "auto",
+        "sequence": "auto", "pixels": "auto",
     }  # fmt: skip
     assert config.loss.type == "l2"
     assert config.loss.options() == {}
@@ -371,6 +371,7 @@ def test_options_and_defaults_are_the_estimators_own(name: str) -> None:
     options = Reslrb(estimator=name).options()  # type: ignore[arg-type]
     shared = {"max_depth", "rr_depth", "hide_emitters", "estimator", "freeze"}
     shared |= {"attached", "filter_normalization", "attached_sampling", "guiding", "sequence", "paths", "light_share"}
+    shared |= {"pixels"}
     assert {key: value for key, value in options.items() if key not in shared} == ESTIMATORS[name].OPTIONS
 
 
@@ -382,7 +383,7 @@ def test_paths_that_an_estimator_named_leaves_to_nobody() -> None:
     again = Reslrb(**Reslrb(paths="camera").model_dump())  # as a run's folder has it
     assert again.paths == "camera"
     written = Reslrb().model_dump(exclude_none=True)
-    assert Reslrb(**written).paths == "auto"
+    assert (Reslrb(**written).paths, Reslrb(**written).pixels) == ("auto", "auto")
     del written["paths"], written["light_share"]  # a run's folder of before there were any
     assert Reslrb(**written).paths == "light"
 

@@ -15,7 +15,14 @@ from pydantic import TypeAdapter
 
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.clock import SharedTime
-from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, PathsRecord, RivalRecord, SequenceRecord
+from reslrb_cli.records.decisions import (
+    EstimatorRecord,
+    GuidedRecord,
+    PathsRecord,
+    PixelsRecord,
+    RivalRecord,
+    SequenceRecord,
+)
 from reslrb_cli.records.images import load_image
 from reslrb_cli.records.run_folder import FABRICATION_FILE, SOLID_PICTURE
 from reslrb_cli.report.format import count, duration, number
@@ -199,6 +206,7 @@ def record_parts(run: Run) -> dict[str, Markup]:
             + soft(measured_line(PathsRecord, manifest.get("paths")))
             + soft(measured_line(GuidedRecord, manifest.get("guided")))
             + soft(measured_line(SequenceRecord, manifest.get("sequence")))
+            + soft(measured_line(PixelsRecord, manifest.get("pixels")))
             + soft(measured_line(RivalRecord, manifest.get("rival")))
         ),
         "Scale of the parameters": lambda: lay_out("run.scaling", manifest.get("scaling") or []),
