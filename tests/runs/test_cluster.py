@@ -41,6 +41,7 @@ CASES = {
     "views": ["run.shards=3", "run.adjoint=batched", "integrator.guiding=on"],
     "exposure": ["run.shards=6", f"parameters=[{{key: {tiny.KEY}, initial: 0.5}}]", "views.1.exposure=auto"],
     "motion": ["run.shards=6", f"parameters[2]={MOTION}"],
+    "pixels": ["run.shards=2", "run.spp=16", "integrator={estimator: stack, paths: both, pixels: measured}"],
     "passes": ["run.shards=2", "integrator.samples_per_pass=1", "run.spp=6"],
     "halves": ["run.shards=6", "loss.scale=fitted"],
 }

@@ -86,6 +86,7 @@ CASES: dict[str, list[str]] = {
     "event": [*BATCHED, "integrator.estimator=event"],
     "gather": [*BATCHED, "integrator.estimator=gather"],
     "guided": [*BATCHED, "integrator.guiding=on", "integrator.estimator=stack"],
+    "pixels": [*BATCHED, "run.spp=16", "integrator={estimator: stack, paths: both, pixels: measured}"],
     "pilot": ["integrator.estimator=auto", "parameters=[{key: poster.reflectance.data, initial: 0.5, bounds: [0, 1]}]"],
     "shards": ["run.spp=8", "run.adjoint=others", "run.shards=4", "integrator.guiding=on", "optimizer.scale=auto"],
     "shards of views": [*BATCHED, "scene.sensors=all", "run.shards=2"],
@@ -112,7 +113,7 @@ CASES: dict[str, list[str]] = {
     ],
     "prb": ["integrator={type: prb, max_depth: 3}", "parameters=[{key: poster.reflectance.data, initial: 0.5}]"],
 }
-FEW = ("scale auto, sigmoid, rmsprop", "held out", "shards", "stages", "plateau", "average")
+FEW = ("pixels", "scale auto, sigmoid, rmsprop", "held out", "shards", "stages", "plateau", "average")
 #: After how many iterations a run is killed, and how many its newest state has then; what certainty asks for is noted
 #: at four fifths of the iterations, which has to be before that.
 KILLED: dict[str, tuple[int, int]] = {"certainty": (23, 20), "held out, plateau, average": (63, 60)}
