@@ -40,8 +40,6 @@ STEP = 0.05
 #: Part of a run whose gradients, the last ones, are asked for their noise, and of small parameters for where they pull,
 #: those of at most so many iterations.
 RECENT, MOST_LAST = 0.2, 200
-#: So often in a run, and after 1, 2, 4 ... iterations, it is noted how far steps move a parameter.
-LOOKS = 8
 #: Where curvature takes longer than this share of the run's time in iterations, and than so many of them, the rest is
 #: left out.
 SHARE, MOST_STEPS = 0.25, 50
@@ -111,7 +109,8 @@ class Certainty:
             kept = {key: self.problem.optimizer.squares(key) for key in self._initial}
             self.squares = {key: each[0] for key, each in kept.items() if each is not None}
             self._seen, self.last = iterations, {}
-        if iterations % max(planned // LOOKS, 1) == 0 or (iterations & (iterations - 1)) == 0:
+        # Twice as an iteration's number doubles, however many are planned, which a run that goes on may change.
+        if iterations % max((1 << iterations.bit_length()) // 4, 1) == 0:
             for key, looks in self._paces.items():
                 pace = self._pace(key)
                 if np.isfinite(pace) and pace > 0:
