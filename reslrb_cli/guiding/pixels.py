@@ -19,6 +19,7 @@ draw all others to its pixel: means are over blocks of pixels, and none has more
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import drjit as dr
@@ -29,13 +30,16 @@ from numpy.typing import NDArray
 from reslrb_cli.guiding.collect import bsdf_groups, meets
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, Met, NextEvent, camera_walk
-from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.densities import EmitterDensities
+from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.samples import Samples, passes
 from reslrb_cli.transport.walk import Vertex
 
 NOTED_SPP = 16  # camera paths through each pixel that are noted
 BLOCK = 9  # pixels, side of the blocks that means are taken over
 MOST = 8.0  # of the mean, that a pixel is given
 NOTING_STREAM = 0x9072E5  # seed of the samples that are noted
+LEAST_PATHS, MOST_PART = 1e7, 0.02  # of a run that has time for it, and what may be noted beside its samples
 
 
 @dataclass
@@ -85,12 +89,29 @@ def note(samples: Samples) -> NDArray[np.float64]:
     return np.array(sums, np.float64).reshape(len(rows), height, width) * (width * height / samples.width)
 
 
-def wanted(samples: Samples, entries: list[int]) -> NDArray[np.float32]:
-    """How camera paths are to be shared out over the pixels (H, W), a density with mean 1, by these, evenly spread;
-    `entries` are the numbers that each group of BSDFs, and emission, has derivatives of."""
+def noted_part(paths: float, spp: float) -> float | None:
+    """What is noted, as a part of a run of so many paths, `spp` through each pixel in all its iterations; None where
+    the run has no time for it."""
+    part = NOTED_SPP / spp
+    return part if paths >= LEAST_PATHS and part <= MOST_PART else None
+
+
+def wanted(
+    plan: Plan, scene: mi.Scene, sensor: mi.Sensor, entries: list[int], light_share: float,
+    emitters: EmitterDensities | None,
+) -> NDArray[np.float32]:  # fmt: skip
+    """How camera paths are to be shared out over the pixels (H, W), a density with mean 1, as the scene is now.
+
+    `entries` are the numbers that each group of BSDFs, and emission, has derivatives of; the last two are as in
+    `samples.passes`.
+    """
     from scipy import ndimage  # here: few commands come here, and all import this module
 
-    *said, radiance, square = (ndimage.uniform_filter(row, BLOCK, mode="nearest") for row in note(samples))
+    spp = math.ceil(NOTED_SPP / (1 - light_share)) if plan.weighs else NOTED_SPP
+    seed = dr.opaque(mi.UInt32, NOTING_STREAM)
+    samples, *_ = passes(plan, scene, sensor, seed, spp, None, None, light_share, emitters)
+    rows = note(samples.sides()[-1])
+    *said, radiance, square = (ndimage.uniform_filter(row, BLOCK, mode="nearest") for row in rows)
     weight = np.zeros_like(square)
     for K, row in zip(entries, said, strict=True):
         weight += K * np.square(row / row.sum()) if row.sum() > 0 else 0

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from numbers import Integral
 
@@ -26,7 +27,7 @@ from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.emission import used_numbers
 from reslrb_cli.transport.film import PixelShares, film_blocks
 from reslrb_cli.transport.plan import Plan, make_plan
-from reslrb_cli.transport.samples import Samples, SharesOf, passes
+from reslrb_cli.transport.samples import Samples, passes
 from reslrb_cli.transport.sobol import make_coordinates
 
 
@@ -97,11 +98,11 @@ class Preparation:
 
     def __init__(
         self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion, guided: bool = False,
-        low_discrepancy: bool = False, shares_out: bool = False,
+        low_discrepancy: bool = False,
     ) -> None:  # fmt: skip
         #: Whether camera paths are shared out over the pixels, and how, by sensor, (H, W): as was `given`, which goes
         #: on to other scenes with the same sensors, or as was `noted` of this one.
-        self.shares_out = shares_out
+        self.shares_out = False
         self.given: dict[int, NDArray[np.float32]] = {}
         self.noted: dict[int, NDArray[np.float32]] = {}
         self._shares: dict[tuple[int, int], PixelShares | None] = {}  # by sensor and number of paths
@@ -124,16 +125,13 @@ class Preparation:
         self._renewal: Renewal | None = None
         self.recordings = Recordings()
 
-    def afresh(
-        self, guided: bool | None, images: bool | None, low_discrepancy: bool | None, shares_out: bool | None = None
-    ) -> Preparation:
+    def afresh(self, guided: bool | None, images: bool | None, low_discrepancy: bool | None) -> Preparation:
         """A new one with the same options, guided or not; `images`: samples of images alone, too. None: as this is."""
         own = self.guiding
         guided = own is not None if guided is None else guided
         low_discrepancy = self._low_discrepancy if low_discrepancy is None else low_discrepancy
-        shares_out = self.shares_out if shares_out is None else shares_out
-        made = Preparation(*self._depths, self._hide_emitters, self._motion, guided, low_discrepancy, shares_out)
-        made.given = self.given
+        made = Preparation(*self._depths, self._hide_emitters, self._motion, guided, low_discrepancy)
+        made.shares_out, made.given = self.shares_out, self.given
         if made.guiding is not None:
             made.guiding.images = (own is None or own.images) if images is None else images
         made.expected, made.paths, made.whole = self.expected, self.paths, self.whole
@@ -176,7 +174,7 @@ class Preparation:
             return replace(plan, stays=False, glossy_follows=False)
         return plan
 
-    def shares(self, number: int, size: tuple[int, int]) -> SharesOf | None:
+    def shares(self, number: int, size: tuple[int, int]) -> Callable[[int], PixelShares | None] | None:
         """How the camera paths of a sensor with a film (crop window) of this (width, height) are shared out; None where
         it is evenly, or not known yet."""
         known = self.given.get(number, self.noted.get(number))

@@ -7,7 +7,6 @@ and gradients by one of the estimators. They know nothing of Mitsuba's plugins; 
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -29,16 +28,17 @@ from reslrb_cli.estimators.camera import (
     splat_camera_tangents,
 )
 from reslrb_cli.guiding.collect import hear
-from reslrb_cli.guiding.pixels import NOTED_SPP, NOTING_STREAM, wanted
+from reslrb_cli.guiding.pixels import wanted
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators import freezing
 from reslrb_cli.integrators.context import Preparation, sensor_number
 from reslrb_cli.integrators.differentiated import Motion
 from reslrb_cli.integrators.forward import splat_tangents
 from reslrb_cli.integrators.protocol import Derivative, Job
-from reslrb_cli.transport.film import AdjointImage
+from reslrb_cli.transport.densities import EmitterDensities
+from reslrb_cli.transport.film import AdjointImage, PixelShares
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.samples import Samples, SharesOf, finish_pass, in_passes, passes
+from reslrb_cli.transport.samples import Samples, finish_pass, in_passes, passes
 from reslrb_cli.transport.visible import differentiate_visible_emission, splat_visible_emission
 from reslrb_cli.transport.walk import Splat, walk
 
@@ -62,14 +62,12 @@ class LightTracer:
     def __init__(
         self, max_depth: int = -1, rr_depth: int = 5, hide_emitters: bool = False, samples_per_pass: int | None = None,
         freeze: bool = False, motion: Motion | None = None, guided: bool = False, low_discrepancy: bool = False,
-        shares_out: bool = False,
     ) -> None:  # fmt: skip
         """Raises ValueError, which names the option, where one has a value that it cannot have.
 
         `freeze` says whether launches are recorded (`freezing.py`), `motion` how derivatives of what moves are taken,
         `guided` whether emission is drawn from what earlier paths said (`tables.py`),
-        `low_discrepancy` whether the numbers of a path's beginning are (`sobol.py`), `shares_out` whether camera paths
-        go to pixels as these need them (`pixels.py`).
+        `low_discrepancy` whether the numbers of a path's beginning are (`sobol.py`).
         """
         if max_depth < -1:
             raise ValueError('"max_depth" must be -1 (no limit) or a value >= 0')
@@ -79,8 +77,7 @@ class LightTracer:
             raise ValueError('"samples_per_pass" must be greater than zero')
         self.max_depth, self.rr_depth, self.hide_emitters = max_depth, rr_depth, hide_emitters
         self.samples_per_pass, self.freeze = samples_per_pass, freeze
-        drawn = guided, low_discrepancy, shares_out
-        self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion or Motion(), *drawn)
+        self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion or Motion(), guided, low_discrepancy)
 
     def with_options(self, *, samples_per_pass: int | None, freeze: bool) -> Self:
         """The same with other passes, or without recordings; both share what they find out about a scene."""
@@ -90,16 +87,15 @@ class LightTracer:
 
     def afresh(
         self, *, guided: bool | None = None, images: bool | None = None, low_discrepancy: bool | None = None,
-        light_share: float | None = None, shares_out: bool | None = None,
+        light_share: float | None = None,
     ) -> Self:  # fmt: skip
         """The same, which knows nothing of any scene yet, with other ways of drawing samples; None: as it has it.
 
         Guided emission or none, `images`: of images too; low-discrepancy numbers or independent ones; paths from both
-        sides, of which `light_share` are light paths: images have the film's border of both, whatever that share is;
-        camera paths shared out over the pixels, or evenly spread.
+        sides, of which `light_share` are light paths: images have the film's border of both, whatever that share is.
         """
         other = copy.copy(self)
-        other.preparation = self.preparation.afresh(guided, images, low_discrepancy, shares_out)
+        other.preparation = self.preparation.afresh(guided, images, low_discrepancy)
         if light_share is not None:
             other.have_paths("both", light_share, whole=True)
         return other
@@ -107,7 +103,8 @@ class LightTracer:
     def shared_out(self, noted: Mapping[str, NDArray[np.float32]]) -> Self:
         """The same, which knows nothing of any scene yet, with camera paths shared out over the pixels as was noted of
         them, by the number of the sensor (`note_pixels`)."""
-        other = self.afresh(shares_out=True)
+        other = self.afresh()
+        other.preparation.shares_out = True
         other.preparation.given = {int(number): density for number, density in noted.items()}
         return other
 
@@ -159,10 +156,14 @@ class LightTracer:
             purpose = purpose or (Purpose.IMAGE if job.params is None else Purpose.GRADIENT)
             if guiding.serves(purpose):
                 table = guiding.table(sensor_number(job.scene, job.sensor), purpose, delta)
-        sides = self.light_share, self.preparation.emitters(job.scene) if plan.weighs else None, self._shares(job, plan)
-        return passes(plan, job.scene, job.sensor, job.seed, spp, self.samples_per_pass, table, *sides)
+        given = job.scene, job.sensor, job.seed, spp, self.samples_per_pass, table
+        return passes(plan, *given, *self._sides(plan, job.scene), self._shares(job, plan))
 
-    def _shares(self, job: Job, plan: Plan) -> SharesOf | None:
+    def _sides(self, plan: Plan, scene: mi.Scene) -> tuple[float, EmitterDensities | None]:
+        """The share of light paths, and the emitters' densities, where paths from both sides are weighed."""
+        return self.light_share, self.preparation.emitters(scene) if plan.weighs else None
+
+    def _shares(self, job: Job, plan: Plan) -> Callable[[int], PixelShares | None] | None:
         """How the job's camera paths are shared out; where nobody has said so before, the first derivatives are what it
         is found out for."""
         preparation = self.preparation
@@ -177,12 +178,9 @@ class LightTracer:
         """How the camera paths of a job's sensor are to be shared out over its pixels (H, W), a density with mean 1, as
         the scene is now (`pixels.py`). Its own seed and samples play no part."""
         plan = self.preparation.plan(job.scene, job.sensor, job.params)
-        sides = self.light_share, self.preparation.emitters(job.scene) if plan.weighs else None
-        spp = math.ceil(NOTED_SPP / (1 - self.light_share)) if plan.weighs else NOTED_SPP
-        seed = dr.opaque(mi.UInt32, NOTING_STREAM)
+        entries = self.preparation.entries(plan, job.params)
         with dr.suspend_grad():
-            samples, *_ = passes(plan, job.scene, job.sensor, seed, spp, None, None, *sides)
-            return wanted(samples.sides()[-1], self.preparation.entries(plan, job.params))
+            return wanted(plan, job.scene, job.sensor, entries, *self._sides(plan, job.scene))
 
     def learn(self, job: Job, gradient: mi.TensorXf) -> None:
         """Have the tables learn, where they are due to, from other samples than those of the job; dL/dI is known.
@@ -297,8 +295,9 @@ class Reslrb(LightTracer):
                 )
             one_of(name, value, values)
         options |= {"guided": guiding == "on", "low_discrepancy": sequence == "low_discrepancy"}
-        made = cls(kind(**own), motion=motion, shares_out=pixels == "measured", **options)
+        made = cls(kind(**own), motion=motion, **options)
         made.have_paths(paths, light_share)
+        made.preparation.shares_out = pixels == "measured"
         return made
 
     def share_of_light(self, plan: Plan) -> float:

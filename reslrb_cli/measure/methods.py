@@ -103,8 +103,8 @@ class Case:
         values |= given
         if self.type == "reslrb" and values.setdefault("estimator", PLUGIN_ESTIMATOR) == "auto" and not auto:
             raise ConfigError(blame, "estimator", "`auto` measures which to take; name those to compare")
-        ways = {"guiding": "`on` with `off`", "sequence": "`independent` with `low_discrepancy`"}
-        ways["pixels"] = "`even` with `measured`"
+        ways = {"guiding": "`on` with `off`", "sequence": "`independent` with `low_discrepancy`",
+                "pixels": "`even` with `measured`"}  # fmt: skip
         for option, compared in (ways | {"paths": "`light`, `camera` and `both`"}).items():
             if values.get(option) == "auto" and not auto:
                 raise ConfigError(blame, option, f"`auto` measures whether it pays; compare {compared}")

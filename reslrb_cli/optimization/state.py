@@ -267,7 +267,14 @@ def decide_as(problem: Problem, stored: Stored, options: Sequence[Candidate]) ->
         integrator = integrator.with_options(samples_per_pass=kept, freeze=integrator.freeze)
     integrator = as_decided(with_sides(integrator, sides), guided, sequence)
     if names := stored.archive.names("pixels/"):
-        integrator = integrator.shared_out({name: stored.take(f"pixels/{name}", None, "finite") for name in names})
+        films = {str(k): sensor.film().crop_size() for k, sensor in enumerate(problem.scene.sensors())}
+        for name in names:
+            if name not in films:
+                raise stored.wrong(f"pixels/{name}", "is of a sensor that the scene does not have")
+        sizes = {name: expected((int(films[name][1]), int(films[name][0]))) for name in names}
+        integrator = integrator.shared_out(
+            {name: stored.take(f"pixels/{name}", size, "finite") for name, size in sizes.items()}
+        )
     return replace(
         problem, pilot=settled.pilot, sides=sides, guided=guided, sequence=sequence, memory=memory, pixels=pixels,
         integrator=integrator, samples_per_pass=size,

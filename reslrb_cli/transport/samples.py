@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -260,14 +259,10 @@ class NumberStream:
         return mi.Point2f(self.generator.next_float32(), self.generator.next_float32())
 
 
-#: How so many camera paths are shared out.
-SharesOf: TypeAlias = "Callable[[int], PixelShares | None]"
-
-
 def passes(
     plan: Plan, scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32, spp: int, spp_per_pass: int | None,
     table: Table | None = None, light_share: float = 1, emitters: EmitterDensities | None = None,
-    shares: SharesOf | None = None,
+    shares: Callable[[int], PixelShares | None] | None = None,
 ) -> list[Samples]:  # fmt: skip
     """All samples of an image, in passes of `spp_per_pass` samples per pixel, which must divide `spp`, or less.
 
@@ -319,7 +314,7 @@ def _seeded(samples: Samples, seed: mi.UInt32) -> Samples:
 
 def _camera_samples(
     plan: Plan, scene: mi.Scene, sensor: mi.Sensor, film: Film, spp: int, width: int, fraction: mi.Float,
-    shares: SharesOf | None,
+    shares: Callable[[int], PixelShares | None] | None,
 ) -> Samples:  # fmt: skip
     """So many camera paths, which are this `fraction` of an image's samples."""
     if width > PASS_PATHS:
@@ -333,7 +328,7 @@ def _camera_samples(
 
 def _of_both(
     plan: Plan, scene: mi.Scene, sensor: mi.Sensor, film: Film, spp: int, fraction: mi.Float, light_share: float,
-    table: Table | None, emitters: EmitterDensities | None, shares: SharesOf | None,
+    table: Table | None, emitters: EmitterDensities | None, shares: Callable[[int], PixelShares | None] | None,
 ) -> Samples:  # fmt: skip
     """Light paths and camera paths together as many as `spp` samples per pixel are; one of each at least."""
     pixels, crop = int(dr.prod(sensor.film().size())), int(dr.prod(film.size))

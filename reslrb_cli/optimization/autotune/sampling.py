@@ -31,7 +31,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config.files import in_words
-from reslrb_cli.guiding.pixels import NOTED_SPP
+from reslrb_cli.guiding.pixels import noted_part
 from reslrb_cli.guiding.tables import Guiding, Purpose, learnings
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
@@ -58,9 +58,6 @@ GUIDING_LONGER, SEQUENCE_LONGER = 3.0, 1.25
 #: where none at all are, a few after all; else more. Steps of another share may take so many times as long. A share is
 #: tried where so much of the time is left for it.
 FIRST_SHARE, FEWER, MORE, PATHS_LONGER, LEAST_TURNS = 0.5, (0.2, 0.05), (0.8, 0.95, 1.0), 2.0, 0.1
-#: Paths of a run, at least, whose camera paths are shared out by what is noted first, and the share of them, at most,
-#: that is noted.
-PIXELS_PATHS, PIXELS_SHARE = 1e7, 0.02
 #: What of the share the rounds of the sequence are planned for; the first step takes a part too, and is no round.
 ROUNDS_SHARE = 0.8
 #: Views that are looked at, spread over those that are trained on, and values of each one's image.
@@ -118,8 +115,8 @@ def _whether_pixels(problem: Problem) -> PixelsRecord:
     """Whether a run has so many paths that those which are noted are few beside them, and their kernel, too."""
     run, films = problem.config.run, [problem.scene.sensors()[view.sensor].film().size() for view in problem.trained]
     each = run.iterations * run.spp * len(problem.drawn(0)) / len(films)
-    paths, part = each * sum(int(dr.prod(size)) for size in films), NOTED_SPP / each
-    if paths < PIXELS_PATHS or part > PIXELS_SHARE:
+    part = noted_part(each * sum(int(dr.prod(size)) for size in films), each)
+    if part is None:
         return PixelsRecord(measured=False, note="a run as short as this has no time for it")
     return PixelsRecord(measured=True, note=f"where noise weighs most, by {100 * part:.2g} % of this run's samples")
 
