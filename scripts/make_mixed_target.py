@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Make `scenes/mixed_room/target.exr`, the picture that configs/mixed_room.yaml recovers from, by Mitsuba's `path`.
 
-    scripts/make_mixed_target.py [--spp 8192] [OUT.exr]
+    scripts/make_mixed_target.py [--spp 65536] [OUT.exr]
 
 Nothing of `reslrb` but its choice of libLLVM takes part. Parts of 256 samples have seeds 0, 1, ...; their mean is
 written in half floats. Needs the environment that `scripts/setup` makes: run it with `.venv/bin/python`.
@@ -25,7 +25,7 @@ PART = 256  # samples per pixel that are traced at once
 def main() -> None:
     """Parse the command line, render and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--spp", type=int, default=8192)
+    parser.add_argument("--spp", type=int, default=65536)
     parser.add_argument("out", type=Path, nargs="?", default=FOLDER / "target.exr")
     arguments = parser.parse_args()
     set_variant("llvm_ad_rgb")
