@@ -246,7 +246,7 @@ class Gradcheck:
 def _draws_plainly(config: Config) -> bool:
     """Whether paths are those of naive AD at equal seeds: it draws them by nothing that it learned, nor evenly."""
     options = config.integrator.options()
-    usual = {"guiding": "off", "sequence": "independent"}
+    usual = {"guiding": "off", "sequence": "independent", "pixels": "even"}
     return all(options.get(name, value) == value for name, value in usual.items())
 
 

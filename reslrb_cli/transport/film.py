@@ -302,6 +302,11 @@ class PixelShares:
         dr.make_opaque(made.even, made.rounds)
         return made
 
+    @staticmethod
+    def bytes(pixels: int) -> int:
+        """Bytes of those of one film and one number of paths."""
+        return (MOST_SLOTS + 2) * 4 * pixels
+
     def count(self, pixel: mi.UInt32, active: mi.Bool | bool = True) -> mi.Float:
         """How many paths a pixel has."""
         return mi.Float(self._of_even(pixel) + self.rounds * dr.gather(mi.UInt32, self.each, pixel, active))

@@ -92,9 +92,13 @@ def test_it_holds():
 
 
 @pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("drawn", a_few(["guiding=on", "sequence=low_discrepancy"], ["guiding=on"]))
+@pytest.mark.parametrize(
+    "drawn",
+    a_few(["guiding=on", "sequence=low_discrepancy", "paths=both,pixels=measured"],
+          ["guiding=on", "paths=both,pixels=measured"]),
+)  # fmt: skip
 def test_paths_that_are_drawn_otherwise_agree_with_naive_ad_in_expectation(drawn: str):
-    records = [result.record for result in check(f"integrator.{drawn}", estimators="stack", seeds=16)]
+    records = [result.record for result in check(estimators=f"stack({drawn})", seeds=16)]
     assert [(record.reference.value, record.verdict) for record in records if record.verdict is not Verdict.HOLDS] == []
     kinds = {record.kind for record in records if record.reference is Reference.WALK_AD}
     assert kinds == {Kind.EXPECTATION}

@@ -24,6 +24,7 @@ from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.decisions import PathsRecord
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.scene.needs import camera_finds_all, light_finds_all
+from reslrb_cli.transport.film import PixelShares
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -257,6 +258,17 @@ def test_targets_and_images_have_the_same_light(integrator: str):
     border[1:-1, 1:-1] = False
     assert image[border].mean() == pytest.approx(target[border].mean(), rel=0.05)
     assert not view.masked.left_out
+
+
+def test_a_memory_budget_knows_of_pixels_that_are_shared_out():
+    settings = ["integrator={estimator: stack, paths: both, pixels: %s}", "run.memory_budget=64", *SMALL]
+    expected = {}
+    for pixels in ("even", "measured"):
+        problem = assemble(load("tiny.yaml", [settings[0] % pixels, *settings[1:]]))
+        assert problem.memory is not None
+        expected[pixels] = problem.memory.expected_bytes.total
+    size = problem.scene.sensors()[0].film().size()
+    assert expected["measured"] - expected["even"] == PixelShares.bytes(int(size[0] * size[1]))
 
 
 def test_paths_that_cannot_be_are_located():

@@ -39,6 +39,7 @@ from reslrb_cli.integrators.step import render_image
 from reslrb_cli.optimization.autotune import race
 from reslrb_cli.optimization.autotune.estimators import Candidate, settle_estimator
 from reslrb_cli.optimization.decisions import Allowance
+from reslrb_cli.optimization.memory import pixels_of
 from reslrb_cli.optimization.moving import is_attached
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import finite, take_gradient
@@ -49,6 +50,7 @@ from reslrb_cli.records.decisions import GuidedRecord, PathsRecord, PixelsRecord
 from reslrb_cli.scene.needs import camera_finds_all, light_finds_all
 from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array
+from reslrb_cli.transport.film import PixelShares
 
 #: Rounds that are planned for, of gradients of many entries, and of few, which tell less each.
 ROUNDS, ROUNDS_OF_FEW, FEW_ENTRIES = 8, 16, 64
@@ -109,6 +111,15 @@ def settle_pixels(tuner: race.Tuner) -> None:
     jobs = {view.sensor: Job(scene, scene.sensors()[view.sensor], mi.UInt32(0), 0, params) for view in problem.trained}
     noted = {str(sensor): tracer.note_pixels(job) for sensor, job in jobs.items()}
     tuner.take(integrator=tracer.shared_out(noted))
+    films = pixels_of(scene, [view.sensor for view in problem.trained])
+    _set_aside(tuner, sum(PixelShares.bytes(pixels) for pixels in films))
+
+
+def _set_aside(tuner: race.Tuner, size: int) -> None:
+    """Expect so many more bytes in all steps."""
+    if (memory := tuner.problem.memory) is not None:
+        expected = replace(memory.expected_bytes, fixed=memory.expected_bytes.fixed + size)
+        tuner.take(memory=replace(memory, expected_bytes=expected))
 
 
 def _whether_pixels(problem: Problem) -> PixelsRecord:
@@ -137,9 +148,8 @@ def settle_sampling(tuner: race.Tuner) -> None:
             sides, plain = _light_alone(tuner.problem.sides, guided), plain.afresh(light_share=1.0)
             tuner.take(sides=sides)
         tuner.take(guided=guided, integrator=as_decided(plain, guided, None))
-        if guided.guided and memory is not None:
-            expected = replace(memory.expected_bytes, fixed=memory.expected_bytes.fixed + table_bytes(tuner.problem))
-            tuner.take(memory=replace(memory, expected_bytes=expected))
+        if guided.guided:
+            _set_aside(tuner, table_bytes(tuner.problem))
     if isinstance(plain, Tracer) and plain.paths == "camera":  # nothing begins at the emitters
         return
     if race.is_auto(config, "sequence"):
