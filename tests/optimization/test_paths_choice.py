@@ -260,6 +260,24 @@ def test_targets_and_images_have_the_same_light(integrator: str):
     assert not view.masked.left_out
 
 
+def test_paths_are_shared_out_where_dL_dI_is_as_noisy_as_the_pixel(monkeypatch: pytest.MonkeyPatch):
+    """By `l2` on a whole image, and not where the loss counts bright pixels less, or pixels are left out."""
+    monkeypatch.setattr(sampling, "noted_part", lambda paths, spp: 0.01)
+    weights = np.ones((32, 32, 3), np.float32)
+    weights[:4] = 0
+    mi.Bitmap(weights).write("weights.exr")
+    for settings, shared in (
+        ([], True), (["loss={type: relative_l2}"], False), (["loss=[{type: l2}, {type: ssim, weight: 0.1}]"], False),
+        (["target.mask={file: weights.exr}"], False),
+    ):  # fmt: skip
+        problem = assemble(
+            load("tiny.yaml", ["integrator={estimator: stack, paths: both, pixels: auto}", *SMALL, *settings])
+        )
+        assert problem.pixels is not None
+        assert problem.pixels.measured is shared
+        assert problem.integrator.preparation.shares_out is shared
+
+
 def test_a_memory_budget_knows_of_pixels_that_are_shared_out():
     """Of a film on which what else is allocated counts little."""
 

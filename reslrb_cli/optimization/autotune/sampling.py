@@ -123,7 +123,15 @@ def _set_aside(tuner: race.Tuner, size: int) -> None:
 
 
 def _whether_pixels(problem: Problem) -> PixelsRecord:
-    """Whether a run has so many paths that those which are noted are few beside them, and their kernel, too."""
+    """Whether a run has so many paths that those which are noted are few beside them, and their kernel, too.
+
+    What is noted takes dL/dI for as noisy as the pixel. By a loss that counts bright pixels less, or with a mask, too
+    many paths would go to what counts little: the bright surroundings of a lamp.
+    """
+    if any(loss.type != "l2" for loss in problem.config.losses):
+        return PixelsRecord(measured=False, note="left alone where the loss is not l2 alone")
+    if any(view.weights is not None for view in problem.trained):
+        return PixelsRecord(measured=False, note="left alone where pixels of the target are left out or weighed")
     run, films = problem.config.run, [problem.scene.sensors()[view.sensor].film().size() for view in problem.trained]
     each = run.iterations * run.spp * len(problem.drawn(0)) / len(films)
     part = noted_part(each * sum(int(dr.prod(size)) for size in films), each)
