@@ -177,8 +177,8 @@ class Reslrb(AttachingTracer):
     """How camera paths are shared out over the pixels. `even`: as many to each; `measured`: a quarter of them so, and
     the others to pixels whose noise weighs most in the gradient, such as those of a mirror that alone shows a wall, as
     a few paths through each find before the first iteration, at the parameters' initial values. `auto`: `measured`,
-    where there are camera paths, the loss is `l2`, no pixels are left out, and a run is so long that this takes no share
-    of it that counts. Left out it is `auto` with estimator `auto`, and `even` with one that is named."""
+    where there are camera paths, the loss is `l2`, no pixels are left out, and a run is so long that this takes no
+    share of it that counts. Left out it is `auto` with estimator `auto`, and `even` with one that is named."""
     freeze: bool = True
     """Record what a step launches and launch that again, so that its Python runs once, not in every iteration. Not with
     passes, nor with more than 4 million paths, beside which Python does not show."""
