@@ -22,8 +22,7 @@ from reslrb_cli.backend.memory import free_bytes
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.autotune.race import sets_of
-from reslrb_cli.optimization.autotune.sampling import lessons
+from reslrb_cli.optimization.autotune.race import lessons, sets_of
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.memory import plans
 from reslrb_cli.optimization.problem import Problem, saved_spp

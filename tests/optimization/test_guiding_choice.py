@@ -31,6 +31,7 @@ from reslrb_cli.optimization.autotune.race import (
     Sizes,
     Step,
     Turns,
+    lessons,
 )
 from reslrb_cli.optimization.autotune.sampling import (
     FEW_ENTRIES,
@@ -40,7 +41,6 @@ from reslrb_cli.optimization.autotune.sampling import (
     GuidingPilot,
     SequencePilot,
     StepTrial,
-    lessons,
     sizes,
     table_bytes,
 )

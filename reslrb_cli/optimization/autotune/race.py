@@ -35,6 +35,7 @@ import numpy as np
 
 from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.config.schema import Config
+from reslrb_cli.guiding.tables import learnings
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.optimization.decisions import Allowance, Need
 from reslrb_cli.optimization.problem import Problem
@@ -94,6 +95,12 @@ class Tuner:
     def take(self, **decided: Any) -> None:
         """Have fields of `problem` from now on."""
         self.problem = replace(self.problem, **decided)
+
+    def set_aside(self, size: int) -> None:
+        """Expect so many more bytes in all steps, where a memory budget is kept."""
+        if (memory := self.problem.memory) is not None:
+            expected = replace(memory.expected_bytes, fixed=memory.expected_bytes.fixed + size)
+            self.take(memory=replace(memory, expected_bytes=expected))
 
     def tell(self, *records: Finding | None) -> None:
         """Say what was decided, where something was: in one line all that there was no time to measure."""
@@ -314,6 +321,15 @@ PLANNED = 3.4
 #: Samples of each walk that a table learns from, as a share of a step's, and walks that it learns from before it is
 #: tried, where there is time for more than one.
 LEARNING_SHARE, LEARNINGS = 0.4, 2
+
+
+def lessons(problem: Problem) -> float:
+    """How often tables of guided emission learn in an iteration of the run, in the mean over all of it."""
+    run, sensors = problem.config.run, len(problem.trained)
+    each = run.batches - (run.first_batch == "image") if problem.config.adjoint == "batched" else 1
+    each = each * problem.config.halves if problem.config.shards == 1 else 1  # of shards, once a step
+    gradients = run.iterations * each * len(problem.drawn(0)) / sensors
+    return learnings(max(round(gradients), 1)) * sensors / run.iterations
 
 
 @dataclass(frozen=True)

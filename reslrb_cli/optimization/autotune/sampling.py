@@ -32,7 +32,7 @@ import numpy as np
 
 from reslrb_cli.config.files import in_words
 from reslrb_cli.guiding.pixels import noted_part
-from reslrb_cli.guiding.tables import Guiding, Purpose, learnings
+from reslrb_cli.guiding.tables import Guiding, Purpose
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.integrators.step import render_image
@@ -111,15 +111,7 @@ def settle_pixels(tuner: race.Tuner) -> None:
     jobs = {view.sensor: Job(scene, scene.sensors()[view.sensor], mi.UInt32(0), 0, params) for view in problem.trained}
     noted = {str(sensor): tracer.note_pixels(job) for sensor, job in jobs.items()}
     tuner.take(integrator=tracer.shared_out(noted))
-    films = pixels_of(scene, [view.sensor for view in problem.trained])
-    _set_aside(tuner, sum(PixelShares.bytes(pixels) for pixels in films))
-
-
-def _set_aside(tuner: race.Tuner, size: int) -> None:
-    """Expect so many more bytes in all steps."""
-    if (memory := tuner.problem.memory) is not None:
-        expected = replace(memory.expected_bytes, fixed=memory.expected_bytes.fixed + size)
-        tuner.take(memory=replace(memory, expected_bytes=expected))
+    tuner.set_aside(sum(map(PixelShares.bytes, pixels_of(scene, list(jobs)))))
 
 
 def _whether_pixels(problem: Problem) -> PixelsRecord:
@@ -132,9 +124,9 @@ def _whether_pixels(problem: Problem) -> PixelsRecord:
         return PixelsRecord(measured=False, note="left alone where the loss is not l2 alone")
     if any(view.weights is not None for view in problem.trained):
         return PixelsRecord(measured=False, note="left alone where pixels of the target are left out or weighed")
-    run, films = problem.config.run, [problem.scene.sensors()[view.sensor].film().size() for view in problem.trained]
+    run, films = problem.config.run, pixels_of(problem.scene, [view.sensor for view in problem.trained])
     each = run.iterations * run.spp * len(problem.drawn(0)) / len(films)
-    part = noted_part(each * sum(int(dr.prod(size)) for size in films), each)
+    part = noted_part(each * sum(films), each)
     if part is None:
         return PixelsRecord(measured=False, note="a run as short as this has no time for it")
     return PixelsRecord(measured=True, note=f"where noise weighs most, by {100 * part:.2g} % of this run's samples")
@@ -157,7 +149,7 @@ def settle_sampling(tuner: race.Tuner) -> None:
             tuner.take(sides=sides)
         tuner.take(guided=guided, integrator=as_decided(plain, guided, None))
         if guided.guided:
-            _set_aside(tuner, table_bytes(tuner.problem))
+            tuner.set_aside(table_bytes(tuner.problem))
     if isinstance(plain, Tracer) and plain.paths == "camera":  # nothing begins at the emitters
         return
     if race.is_auto(config, "sequence"):
@@ -217,24 +209,15 @@ def suits_even_numbers(problem: Problem) -> str | None:
     return "of light from points and beams, evenly spread numbers say most"
 
 
-def lessons(problem: Problem) -> float:
-    """How often tables of guided emission learn in an iteration of the run, in the mean over all of it."""
-    run, sensors = problem.config.run, len(problem.trained)
-    each = run.batches - (run.first_batch == "image") if problem.config.adjoint == "batched" else 1
-    each = each * problem.config.halves if problem.config.shards == 1 else 1  # of shards, once a step
-    gradients = run.iterations * each * len(problem.drawn(0)) / sensors
-    return learnings(max(round(gradients), 1)) * sensors / run.iterations
-
-
 def sizes(problem: Problem, longer: float, planned: float = race.PLANNED) -> race.Sizes:
     """The samples of the run's steps, and what is planned of those that are taken here."""
     run, adjoint = problem.config.run, problem.config.adjoint
     call = run.spp // race.sets_of(problem.config)
     part = min(problem.samples_per_pass or call, call)
     entries = sum(problem.selection.array(key).size for key in problem.selection.keys)
-    sets = run.spp / call * len(problem.drawn(0))
+    learned = race.lessons(problem) / (run.spp / call * len(problem.drawn(0)))
     rounds = ROUNDS_OF_FEW if entries < FEW_ENTRIES else ROUNDS
-    return race.Sizes(run.spp, call, part, adjoint == "independent", rounds, lessons(problem) / sets, longer, planned)
+    return race.Sizes(run.spp, call, part, adjoint == "independent", rounds, learned, longer, planned)
 
 
 def planned(share: float) -> float:
