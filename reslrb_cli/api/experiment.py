@@ -177,7 +177,7 @@ def gradient(
 
     It is that of the first iteration of a run: of the images that `run.adjoint` takes, at the parameters' initial
     values, or at `values`, as for `render`. `spp` stands in for `run.spp`, and `seed` for the `run.seed` of the
-    samples; the target, and what is measured before (`estimator: auto`, ...), stay those of the experiment.
+    samples; the target, and what is measured before (`guiding: auto`, ...), stay those of the experiment.
     Regularizers are in the gradient, and not in the loss. Entries that are not finite are left as they are.
 
     Sets the Mitsuba variant of the experiment where none is set. Raises ConfigError, UnsupportedScene.

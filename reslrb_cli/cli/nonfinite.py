@@ -16,7 +16,6 @@ import numpy as np
 
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.integrators import UNDECIDED
-from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import with_integrator
 from reslrb_cli.config.optimizers import AS_CONFIGURED
 from reslrb_cli.config.schema import Config
@@ -117,7 +116,7 @@ def _as_written(path: Path, place: str, what: str) -> Iterator[None]:
 
 
 def _settled(config: Config, manifest: dict[str, Any], path: Path) -> Config:
-    """The configuration with the sequence that was measured to pay, and the estimator that the run's pilot chose."""
+    """Return the configuration with the paths and the sequence that the run decided on."""
     options = config.integrator.options()
     if manifest.get("paths"):
         with _as_written(path, "paths", "which paths paid"):
@@ -127,10 +126,6 @@ def _settled(config: Config, manifest: dict[str, Any], path: Path) -> Config:
     if options.get("sequence") == "auto":
         with _as_written(path, "sequence", "whether a sequence paid"):
             options["sequence"] = SequenceRecord.from_json(manifest["sequence"]).setting
-        config = with_integrator(config, {"type": config.integrator.type} | options, str(path), {})
-    if manifest.get("pilot") and isinstance(config.integrator, ReslrbConfig):
-        with _as_written(path, "pilot.chosen", "an estimator with its options"):
-            options = config.integrator.chosen(**manifest["pilot"]["chosen"]).options()
         config = with_integrator(config, {"type": config.integrator.type} | options, str(path), {})
     return config
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import os
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,41 +27,22 @@ from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
-    from reslrb_cli.optimization.forecast import Forecast
-    from reslrb_cli.optimization.problem import Problem
     from reslrb_cli.runs.prepare import Begun
 
 
-def forecast_run(config: Config) -> tuple[Forecast, list[tuple[str, float, bool]], float]:
-    """What a run of `config` will take, measured: its forecast; what comes before its first iteration, with the seconds
-    that it took now (0: nothing was to be measured) and whether a run finds that where it is kept; and the seconds of
-    the whole run. A variant must be set, and nothing is written but the caches of kernels and pilots."""
-    from reslrb_cli.measure.prb_comparison import RIVAL, measure_rival
-    from reslrb_cli.optimization.forecast import make_forecast
-    from reslrb_cli.records.cache import PilotCache
-
-    cache, say = PilotCache(), logging.getLogger(__name__).info
-    measured: list[tuple[str, float, bool]] = []
-
-    def measure_before(problem: Problem) -> None:
-        begin = time.perf_counter()
-        rival = measure_rival(problem, cache, say)
-        rival_s = 0.0 if rival is None or rival.cached else time.perf_counter() - begin
-        measured.append((f"{RIVAL} beside it", rival_s, cache.keeps))
-
-    forecast = make_forecast(config, say, cache, measure_before)
-    before = [("pilot", forecast.pilot_s, cache.keeps), *measured]
-    return forecast, before, forecast.whole_s + sum(seconds for _, seconds, kept in before if not kept)
-
-
 def show_forecast(config: Config, variant: str, place: Place | None) -> None:
-    """Print what a run of `config` will take, as `forecast_run` measures it; where workers are at a place, what a step
-    would take on so many of them, as `cluster.forecast.measure` has it."""
+    """Print the expected time and memory of a run of `config`, by a few measured steps; with the workers at `place`,
+    also those of a step on them (`cluster.forecast.measure`).
+
+    A variant must be set. Writes nothing but the caches of kernels and decisions, which a run then finds.
+    """
     from reslrb_cli.backend.memory import resident_bytes
     from reslrb_cli.cluster import forecast as model  # which asks for dask where there is a place
+    from reslrb_cli.optimization.forecast import make_forecast
+    from reslrb_cli.records.cache import PilotCache
     from reslrb_cli.report.format import duration
 
-    forecast, before, whole_s = forecast_run(config)
+    forecast = make_forecast(config, logging.getLogger(__name__).info, PilotCache())
     sums = f"{forecast.iterations} x {1e3 * forecast.iteration_s:.3g} ms"
     sums += f" + {rough_duration(forecast.start_s)}" if forecast.start_s > 0.01 * forecast.elapsed_s else ""
     shared = None if place is None else model.measure(config, variant, place, logging.getLogger(__name__).info)
@@ -74,8 +54,6 @@ def show_forecast(config: Config, variant: str, place: Place | None) -> None:
         budget=config.run.budget_bytes,
         resident=resident_bytes(),
         sums=sums,
-        before=before,
-        whole_s=whole_s,
         place=place,
         shared=shared,
         model=model,

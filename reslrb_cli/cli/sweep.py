@@ -325,8 +325,9 @@ def _end_with_input() -> None:
 
 def _forecast(plan: Plan) -> int:
     """Print how many runs there are, and what those of each combination will take; nothing is written."""
-    from reslrb_cli.cli.optimize import forecast_run
     from reslrb_cli.config.files import in_words, rough_duration
+    from reslrb_cli.optimization.forecast import make_forecast
+    from reslrb_cli.records.cache import PilotCache
     from reslrb_cli.records.sweeps import label
     from reslrb_cli.report.format import count, table
 
@@ -342,14 +343,15 @@ def _forecast(plan: Plan) -> int:
             config: Config = plan.configs[combination.name]
             start_variant(config)
             try:
-                forecast, _, whole_s = forecast_run(config)
+                forecast = make_forecast(config, logger.info, PilotCache())
             except (ConfigError, UnsupportedScene) as error:
                 rows.append((shorten(label(combination.settings), 60), f"will fail: {error}"))
                 continue
-            total_s += seeds * whole_s
+            total_s += seeds * forecast.whole_s
             rows.append((
                 shorten(label(combination.settings), 60), in_words(forecast.peak),
-                f"{1e3 * forecast.iteration_s:.3g} ms", rough_duration(whole_s), rough_duration(seeds * whole_s),
+                f"{1e3 * forecast.iteration_s:.3g} ms", rough_duration(forecast.whole_s),
+                rough_duration(seeds * forecast.whole_s),
             ))  # fmt: skip
     for line in table(rows):
         echo(line)

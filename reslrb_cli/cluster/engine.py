@@ -27,7 +27,7 @@ from reslrb_cli.cluster.crew import Crew
 from reslrb_cli.cluster.worker import Opening
 from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.autotune.estimators import find_options
+from reslrb_cli.optimization.memory import fit_memory
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.shards import Task, make_tasks, shard_gradient, shard_image
 from reslrb_cli.optimization.state import Settled, begin_as, decide_as, guiding_of, restore_tables
@@ -94,7 +94,7 @@ def assembled(folder: Path, threads: int, allows_code: bool) -> tuple[Problem, d
         config, initial = read_bundle(folder)
         problem = assemble_scene(config.with_code(allows_code), values=initial)
         begin_as(problem, stored)
-        problem = decide_as(problem, stored, find_options(problem))
+        problem = decide_as(fit_memory(problem), stored)
         set_targets(problem.views, dict(targets))
     dr.sync_thread()
     dr.set_thread_count(threads)

@@ -109,6 +109,9 @@ UNDECIDED: dict[str, str | float] = {
     "pixels": "even",
 }
 
+#: The estimator of `auto`: the only one with derivatives of camera paths and of both `follow` and `stay`.
+AUTO_ESTIMATOR = "stack"
+
 #: What a run's own configuration, which holds every setting, always had; nobody writes all of these by hand.
 _WRITTEN_BEFORE = frozenset(
     {"max_depth", "rr_depth", "hide_emitters", "attached", "attached_sampling", "estimator"}
@@ -126,8 +129,8 @@ class Reslrb(AttachingTracer):
     """Light tracing, derivatives by a replay of each path."""
     estimator: Literal["auto", "reservoir", "gather", "event", "stack"] = "auto"
     """How a path's connections enter its gradient. `reservoir`: few of them, kept at random; `gather`: all, by a second
-    traversal; `event`: few scattering events, kept at random; `stack`: all, kept in thread-local memory; `auto`: the
-    one of these, with its options, that a short pilot measures to be the most efficient, 1 / (variance * time)."""
+    traversal; `event`: few scattering events, kept at random; `stack`: all, kept in thread-local memory; `auto`:
+    `stack`, which was the most efficient in every experiment that was measured."""
     capacity: Annotated[Count, _CAPACITY] = Field(default=1, json_schema_extra={"maximum": CAPACITY})
     """How many connections, or events, are kept of each path. Only with estimators `reservoir` and `event`."""
     weight: Literal["luminance", "adjoint"] = "luminance"
@@ -225,14 +228,11 @@ class Reslrb(AttachingTracer):
         values: dict[str, Any] = handler(self)
         return {name: value for name, value in values.items() if name not in self._foreign()}
 
-    def chosen(self, **options: Any) -> Reslrb:
-        """The same with an `estimator` and its options in place of those it has; what is undecided is off."""
-        kept = {name: getattr(self, name) for name in self.model_fields_set if name not in _ANY_ESTIMATORS}
-        return Reslrb(**{**kept, **options}).undecided_off()
-
     def undecided_off(self) -> Reslrb:
-        """The same, with nothing of what is left to measurement."""
+        """Return these options with estimator `stack` for `auto`, and with all that a run measures turned off."""
         undecided = {name: off for name, off in UNDECIDED.items() if getattr(self, name) == "auto"}
+        if self.estimator == "auto":
+            undecided["estimator"] = AUTO_ESTIMATOR
         return self.model_copy(update=undecided) if undecided else self
 
     def _foreign(self) -> set[str]:

@@ -80,8 +80,8 @@ class Case:
     def at(self, config: Config, max_depth: int, known: bool, auto: bool = False) -> Config:
         """The experiment with this integrator at this depth. Raises ConfigError where the integrator cannot be.
 
-        `known`: dL/dI is, before the image, so that `run.adjoint` has no part in it. `auto`: the estimator may be left
-        to a pilot, as what is measured has one.
+        `known`: dL/dI is, before the image, so that `run.adjoint` has no part in it. `auto`: options may be left to
+        measurement, which whole runs do.
         """
         blame = f"{self.source} {self.label}"
         adjoint = {name: value for name, value in self.options.items() if name in ADJOINT}
@@ -91,7 +91,7 @@ class Case:
             adjoint = {"adjoint": "independent"}  # which goes with any weight
         shared, own = config.integrator.options(), _TYPES[self.type].model_fields if self.type in _TYPES else {}
         values = {"type": self.type} | {name: shared[name] for name in SHARED if name in shared and name in own}
-        # Of the experiment, whose pilot decides it; what is named here has none.
+        # A run decides these by measurement; a method that is named here does not.
         values = {name: value for name, value in values.items() if name not in UNDECIDED or value != "auto"}
         if "paths" in self.options:  # a share is of the experiment's own paths
             values.pop("light_share", None)
@@ -102,7 +102,7 @@ class Case:
             given["arguments"] = {name: given.pop(name) for name in [*given] if name not in own}
         values |= given
         if self.type == "reslrb" and values.setdefault("estimator", PLUGIN_ESTIMATOR) == "auto" and not auto:
-            raise ConfigError(blame, "estimator", "`auto` measures which to take; name those to compare")
+            raise ConfigError(blame, "estimator", "`auto` is for whole runs; take `stack`")
         ways = {"guiding": "`on` with `off`", "sequence": "`independent` with `low_discrepancy`",
                 "pixels": "`even` with `measured`"}  # fmt: skip
         for option, compared in (ways | {"paths": "`light`, `camera` and `both`"}).items():

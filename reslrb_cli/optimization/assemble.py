@@ -22,7 +22,6 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.own import OwnIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.optimization import start
-from reslrb_cli.optimization.autotune.estimators import find_options
 from reslrb_cli.optimization.autotune.sampling import settle
 from reslrb_cli.optimization.errors import quantity
 from reslrb_cli.optimization.identifiability import check_exposures, find_reached
@@ -35,7 +34,7 @@ from reslrb_cli.optimization.loading import (
     paths_of,
     samples_per_pass,
 )
-from reslrb_cli.optimization.memory import check_announced, check_described, check_films, outlook
+from reslrb_cli.optimization.memory import check_announced, check_described, check_films, fit_memory, outlook
 from reslrb_cli.optimization.moving import check_moving, moves_anything
 from reslrb_cli.optimization.problem import Problem, make_optimizer, make_regularizers
 from reslrb_cli.optimization.state import begin_as, decide_as, reach_as
@@ -60,7 +59,7 @@ def assemble(
     """Load and check what `config` names, make the targets, and settle the integrator; a variant must be set.
 
     Everything that can be checked is, before anything is rendered. `say` is told what takes long, `cache` holds what
-    earlier pilots learned (None: nothing is kept). With `to_run` all that an optimisation needs is there: exposures
+    earlier runs measured (None: nothing is kept). With `to_run` all that an optimisation needs is there: exposures
     are checked, and what light and sensor reach is known. With `settled` nothing is measured anew: it is the problem of
     a run that goes on, as it was before its first iteration. Raises ConfigError and UnsupportedScene.
     """
@@ -71,7 +70,7 @@ def assemble(
         problem.integrator.ready()
     if settled is not None:
         begin_as(problem, settled)
-    options = find_options(problem)
+    problem = fit_memory(problem)
     line = outlook(config, problem.scene, problem.sensors) if to_run else None
     if line is not None:
         say(line)
@@ -82,8 +81,8 @@ def assemble(
             own.attempt(view.target, view.weights)
     problem = start.begin(problem, starts, say)
     if settled is not None:
-        return reach_as(decide_as(problem, settled, options), settled)
-    problem = settle(problem, options, say, cache)
+        return reach_as(decide_as(problem, settled), settled)
+    problem = settle(problem, say, cache)
     if to_run:
         check_exposures(problem)
         problem = find_reached(problem)

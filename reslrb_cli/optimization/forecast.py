@@ -155,13 +155,15 @@ VERDICTS = 30
 @dataclass(frozen=True)
 class Forecast(Steps):
     """Steps that were measured, and what they say of the run: bytes by part (`parts` add up to `peak`), and beside
-    them `scratch`, thread-local, and what is `free`; seconds of what comes before and after its `iterations`."""
+    them `scratch`, thread-local, and what is `free`; seconds of what comes before and after its `iterations`. `kept`: a
+    run finds the decisions by measurement, which took `measuring_s` now."""
 
     parts: dict[str, int]
     scratch: int
     free: int
     iterations: int
-    pilot_s: float
+    measuring_s: float
+    kept: bool
     target_s: float
     images_s: float
     verdicts_s: float
@@ -173,31 +175,29 @@ class Forecast(Steps):
 
     @property
     def whole_s(self) -> float:
-        """Seconds of the whole run, with kernels and pilot as they are kept now."""
-        return self.elapsed_s + self.target_s + self.images_s + self.verdicts_s
+        """Seconds of the whole run, with kernels and decisions as they are kept now."""
+        again = 0.0 if self.kept else self.measuring_s
+        return self.elapsed_s + again + self.target_s + self.images_s + self.verdicts_s
 
 
 def make_forecast(
     config: Config,
     say: Callable[[str], None],
     cache: PilotCache | None = None,
-    before: Callable[[Problem], object] = lambda problem: None,
 ) -> Forecast:
     """Measure a few steps of the run that `config` describes; a variant must be set.
 
-    `say` is told what takes long; what a pilot learns is kept in `cache`, for the run. `before` is called where a run
-    measures what it does before its first iteration: with its integrator settled, and its parameters where they begin.
-    Raises ConfigError and UnsupportedScene as the run would, and what its steps raise.
+    `say` is told what takes long. Decisions by measurement go to `cache`, for the run. Raises ConfigError and
+    UnsupportedScene as the run would, and the errors of its steps.
     """
     # Errors are no part of a step.
     problem = replace(assemble(with_short_target(config), say, cache), truth={})
     image_s, views = _image_seconds(problem), len(problem.views)
-    before(problem)
     say("measuring a few steps")
     steps, scratch, integrator = measure_steps(problem), 0, problem.integrator
     if isinstance(integrator, Reslrb):  # of all paths that are traced at a time
         scratch = max(integrator.scratch_bytes(plan) for plan in plans(problem, integrator)) * resident_paths()
-    run, measured = config.run, (problem.pilot, problem.guided, problem.sequence)
+    run, measured = config.run, (problem.sides, problem.guided, problem.sequence)
     parts = _parts(problem)
     rest = max(steps.peak - sum(parts.values()), 0)
     parts["images of a step, gradients, what is kept of paths (reservoir)"] = rest
@@ -210,7 +210,8 @@ def make_forecast(
         scratch=scratch,
         free=free_bytes(mi.variant()),
         iterations=run.iterations,
-        pilot_s=sum(each.measure_s + each.compile_s for each in measured if each and not each.cached),
+        measuring_s=sum(each.measure_s + each.compile_s for each in measured if each and not each.cached),
+        kept=cache is not None and cache.keeps,
         target_s=image_s * config.target.render.spp * views if config.target.render else 0.0,
         images_s=image_s * images * views,
         verdicts_s=VERDICTS * steps.iteration_s if has_verdicts else 0.0,

@@ -195,27 +195,18 @@ def _warn_of_clipping(config: Config, sensor: mi.Sensor, scene: mi.Scene) -> Non
 
 
 def make_configured(config: Config, integrator: Integrator, paths: str) -> StepIntegrator:
-    """The `integrator`, as `config` or its target has it, with these `paths` (`paths_of`); all estimators have the same
-    image, so for `auto` any will do.
+    """Make the `integrator` of `config`, or of its target, with these `paths` (`paths_of`).
 
-    What is not decided yet (`guiding`, `sequence`) is off.
+    Options that a run decides by measurement (`guiding`, `sequence`, ...) are off.
     """
     if isinstance(integrator, ReslrbConfig):
-        integrator = settled_config(integrator, {}, paths)
+        integrator = integrator.undecided_off().model_copy(update={"paths": paths})
     elif isinstance(integrator, WalkAd):
         integrator = integrator.model_copy(update={"paths": paths})
     options: dict[str, Any] = integrator.options()
     if isinstance(integrator, Own):
         options["allowed"] = config.allows_code
     return make_integrator(integrator.type, **options)
-
-
-def settled_config(integrator: ReslrbConfig, chosen: dict[str, Any], paths: str) -> ReslrbConfig:
-    """The same with the `chosen` estimator and its options, and these `paths`; what is undecided is off."""
-    if not chosen and integrator.estimator == "auto":
-        chosen = {"estimator": "stack" if paths == "camera" else "reservoir"}
-    made = integrator.chosen(**chosen) if chosen else integrator.undecided_off()
-    return made.model_copy(update={"paths": paths})
 
 
 def pass_spp(config: Config) -> int:

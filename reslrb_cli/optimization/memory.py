@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -22,7 +23,7 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators.base import entry_bytes
 from reslrb_cli.integrators.reslrb import LightTracer, Reslrb
-from reslrb_cli.optimization.decisions import Estimate
+from reslrb_cli.optimization.decisions import Estimate, MemoryPlan
 from reslrb_cli.optimization.loading import pass_spp
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.clock import MIB, peak_mib, reset_peak
@@ -122,6 +123,38 @@ def choose_samples(problem: Problem, integrator: Reslrb, samples: int, budget: i
         if expected.total <= budget:
             return size, expected
     return 0, expected
+
+
+def fit_memory(problem: Problem) -> Problem:
+    """Return `problem` with the passes that keep `run.memory_budget`, if there is one.
+
+    Needs no targets. Raises ConfigError if one sample per pixel exceeds the budget, or, without a budget, if a step
+    exceeds the memory that is free.
+    """
+    config, integrator, budget = problem.config, problem.integrator, problem.config.run.budget_bytes
+    if not isinstance(integrator, Reslrb):
+        check_baseline(problem)
+        return problem
+    check_memory(problem, integrator)
+    if budget is None:
+        return problem
+    samples = config.set_spp
+    size, expected = choose_samples(problem, integrator, samples, budget, standing())
+    if size == 0:
+        mib = -(-expected.total // MIB)
+        reason = f"one sample per pixel takes about {mib:.0f} MiB (scene, targets, images of a step, parameters, paths)"
+        reason += f"; allow at least {mib:.0f} MiB, beside which Python, libraries and kernels are not counted"
+        raise ConfigError(config.source, "run.memory_budget", reason)
+    return in_passes(problem, MemoryPlan(budget, size, samples // size, expected))
+
+
+def in_passes(problem: Problem, memory: MemoryPlan) -> Problem:
+    """Return `problem` with the passes of this plan."""
+    size = memory.samples_per_pass
+    integrator = problem.integrator.with_options(
+        samples_per_pass=size if memory.passes > 1 else None, freeze=problem.integrator.freeze
+    )
+    return replace(problem, memory=memory, integrator=integrator, samples_per_pass=size)
 
 
 def allocated(size: int) -> int:

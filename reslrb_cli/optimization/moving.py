@@ -13,13 +13,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import LightTracer
-from reslrb_cli.integrators.reslrb import Reslrb as Tracer
-from reslrb_cli.optimization.loading import settled_config
 from reslrb_cli.optimization.memory import plans
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.scene.deformation import where_moved
@@ -123,10 +120,6 @@ def warn_of_border(problem: Problem, warn: Callable[[str], None]) -> None:
             warn(f"{line}is cut off; a view in which all of it stays inside has none of that")
 
 
-#: The estimator of those that `auto` chooses from that has derivatives of what moves light.
-ATTACHED = "stack"
-
-
 def is_attached(problem: Problem) -> bool:
     """Whether the parameters of `problem` move anything that light leaves from or meets, or are to be taken so."""
     return moves_anything(problem.config, problem.selection)
@@ -147,8 +140,6 @@ def check_moving(problem: Problem) -> None:
     if moved and kind in ("prb", "trajectory"):
         reason = f"{kind} has no derivatives of what moves light, as `{moved[0].key}` does; take reslrb or ptracer"
         raise ConfigError(config.source, "integrator.type", reason)
-    if isinstance(config.integrator, ReslrbConfig) and config.integrator.estimator == "auto":
-        tracer = Tracer.of(**settled_config(config.integrator, {"estimator": ATTACHED}, "light").options())
     if isinstance(tracer, LightTracer):
         try:
             plans(problem, tracer)

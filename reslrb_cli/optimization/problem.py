@@ -23,7 +23,6 @@ from reslrb_cli.optimization.precondition import make_smoother
 from reslrb_cli.optimization.regularizers import Cost, Plate, Span, make_cost, make_plate, mesh_cost, spans_of
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.decisions import (
-    EstimatorRecord,
     GuidedRecord,
     Jsonable,
     PathsRecord,
@@ -76,7 +75,6 @@ class Problem:
     #: What measuring before the first iteration may take, where anything was left to it, and was not known already.
     allowance: Allowance | None = None
     #: What was measured and planned before the first iteration, where it was.
-    pilot: EstimatorRecord | None = None
     sides: PathsRecord | None = None
     guided: GuidedRecord | None = None
     sequence: SequenceRecord | None = None
@@ -91,7 +89,7 @@ class Problem:
 
     def decisions(self) -> dict[str, dict[str, Any] | None]:
         """What was measured and planned before the first iteration, as manifests and checkpoints have it, by name."""
-        made: dict[str, Jsonable | None] = {"pilot": self.pilot, "guided": self.guided, "sequence": self.sequence}
+        made: dict[str, Jsonable | None] = {"guided": self.guided, "sequence": self.sequence}
         made["memory"] = self.memory
         made |= {name: own for name, own in (("paths", self.sides), ("pixels", self.pixels)) if own is not None}
         return {name: None if each is None else each.to_json() for name, each in made.items()}

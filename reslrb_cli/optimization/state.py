@@ -13,7 +13,7 @@ which receive gradients, and the tables of guided emission. They follow from a s
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
@@ -24,13 +24,13 @@ from pydantic import Field
 from reslrb_cli.config.files import CONFIG_BYTES
 from reslrb_cli.guiding.tables import KNOWN, Guiding
 from reslrb_cli.integrators.reslrb import Reslrb
-from reslrb_cli.optimization.autotune.estimators import Candidate
 from reslrb_cli.optimization.autotune.race import is_auto
 from reslrb_cli.optimization.autotune.sampling import as_decided, with_sides
 from reslrb_cli.optimization.decisions import MemoryPlan, Scaled
+from reslrb_cli.optimization.memory import in_passes
 from reslrb_cli.optimization.optimizers import SUMS
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, PathsRecord, PixelsRecord, SequenceRecord
+from reslrb_cli.records.decisions import GuidedRecord, PathsRecord, PixelsRecord, SequenceRecord
 from reslrb_cli.records.tree import PASSING, Array, Arrays, Stored, entry, expected, like, to_array
 
 Count = Annotated[int, Field(ge=0, lt=2**31)]
@@ -219,7 +219,6 @@ class Settled:
     config: Annotated[str, Field(max_length=4 * CONFIG_BYTES)]
     variant: str
     files: dict[str, str] = field(default_factory=dict)
-    pilot: EstimatorRecord | None = None
     guided: GuidedRecord | None = None
     sequence: SequenceRecord | None = None
     paths: PathsRecord | None = None
@@ -245,27 +244,16 @@ def begin_as(problem: Problem, stored: Stored) -> None:
     problem.apply()
 
 
-def decide_as(problem: Problem, stored: Stored, options: Sequence[Candidate]) -> Problem:
-    """Choose what the run had chosen: the pilot's estimator, the samples of a pass, and how samples are drawn."""
+def decide_as(problem: Problem, stored: Stored) -> Problem:
+    """Return `problem` with the decisions of the run: the samples of a pass, and how samples are drawn."""
     settled = stored.read(Settled)
     guided = settled.guided if is_auto(problem.config, "guiding") else None
     sequence = settled.sequence if is_auto(problem.config, "sequence") else None
     sides = settled.paths if is_auto(problem.config, "paths") else None
     pixels = settled.pixels if is_auto(problem.config, "pixels") else None
-    chosen = options[0] if options else None
-    if settled.pilot is not None:
-        chosen = next((option for option in options if option.options == settled.pilot.chosen), None)
-        if chosen is None:
-            raise stored.wrong("pilot.chosen", "is nothing that this run can choose")
-    integrator, memory, size = problem.integrator, problem.memory, problem.samples_per_pass
-    if chosen is not None:
-        integrator, memory = chosen.integrator, chosen.memory
-    if memory is not None and chosen is not None:
-        memory = _as_planned(stored, settled.memory, memory)
-        size = memory.samples_per_pass
-        kept = size if memory.passes > 1 else None
-        integrator = integrator.with_options(samples_per_pass=kept, freeze=integrator.freeze)
-    integrator = as_decided(with_sides(integrator, sides), guided, sequence)
+    if problem.memory is not None:
+        problem = in_passes(problem, _as_planned(stored, settled.memory, problem.memory))
+    integrator = as_decided(with_sides(problem.integrator, sides), guided, sequence)
     if names := stored.archive.names("pixels/"):
         films = {str(k): sensor.film().crop_size() for k, sensor in enumerate(problem.scene.sensors())}
         for name in names:
@@ -275,10 +263,7 @@ def decide_as(problem: Problem, stored: Stored, options: Sequence[Candidate]) ->
         integrator = integrator.shared_out(
             {name: stored.take(f"pixels/{name}", size, "finite") for name, size in sizes.items()}
         )
-    return replace(
-        problem, pilot=settled.pilot, sides=sides, guided=guided, sequence=sequence, memory=memory, pixels=pixels,
-        integrator=integrator, samples_per_pass=size,
-    )  # fmt: skip
+    return replace(problem, sides=sides, guided=guided, sequence=sequence, pixels=pixels, integrator=integrator)
 
 
 def _as_planned(stored: Stored, before: MemoryPlan | None, now: MemoryPlan) -> MemoryPlan:

@@ -176,12 +176,12 @@ STATE_FILE, PREVIOUS_FILE_NAME = "state.npz", "previous.npz"
 NONFINITE_FILE_NAME = "nonfinite.npz"
 
 #: What the JSON of a state says that it is. Another number where the same words mean something else.
-FORMAT = 1
+FORMAT = 2
 
 #: What file systems say that have no second names of files.
 _NO_LINKS = {errno.EPERM, errno.EMLINK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EXDEV, errno.EACCES}
 
-#: Bytes of that JSON; the largest part is a configuration, or a pilot's table.
+#: Bytes of that JSON; the largest part is the configuration.
 _MOST_JSON = 2**24
 
 

@@ -1,16 +1,14 @@
 """The findings of a run: what it measured before its first iteration, as manifest, checkpoints and the cache have it.
 
-EstimatorRecord                the most efficient estimator, and how each that was tried did
 PathsRecord                    from which side paths are traced
 GuidedRecord, SequenceRecord   ways of drawing samples that were left to measurement: whether they pay
 PixelsRecord                   whether camera paths are shared out over the pixels
-RivalRecord                    another integrator that would have been the better choice
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
@@ -78,45 +76,6 @@ def _times(gain: float | None, low: float | None, high: float | None, note: str)
         return note
     found = f"{gain:.2g} times the efficiency here ({low:.2g} to {high:.2g})"
     return f"{found}; {note}" if note else found
-
-
-@dataclass(frozen=True)
-class TriedEstimator:
-    """One candidate. `rounds` is 0 where `note` says why it was not measured."""
-
-    __pydantic_config__ = ConfigDict(extra="forbid")
-
-    estimator: str
-    options: dict[str, Any]
-    rounds: int
-    kernel_ms: float | None = None
-    variance: float | None = None
-    efficiency: float | None = None
-    note: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class EstimatorRecord(Finding):
-    """Of the estimator. `chosen` are the options of the best candidate, `advantage` its efficiency over the next's.
-
-    `share` is what the measurement cost of 200 iterations of that candidate. Where nothing was measured `rows` is
-    empty.
-    """
-
-    chosen: dict[str, Any]
-    label: str
-    rows: list[TriedEstimator] = field(default_factory=list)
-    advantage: float | None = None
-    next_label: str | None = None
-    share: float = 0.0
-
-    def decision(self) -> str:
-        return f"estimator {self.label}"
-
-    def why(self) -> str:
-        if self.advantage is None:
-            return self.note or "nothing else applies"
-        return f"{self.advantage:.2f} times as efficient as the next, {self.next_label}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,26 +177,3 @@ class PixelsRecord(Finding):
 
     def why(self) -> str:
         return self.note
-
-
-@dataclass(frozen=True, kw_only=True)
-class RivalRecord(Finding):
-    """Of `integrator` beside the run's own: `advantage` is its efficiency over that one's, 1 / (variance * time), of
-    gradients with the run's own loss, between `low` and `high` with 95 % confidence, by `rounds` steps of each."""
-
-    integrator: str
-    rounds: int = 0
-    advantage: float | None = None
-    low: float | None = None
-    high: float | None = None
-
-    @property
-    def is_better(self) -> bool:
-        """Whether it is clearly the more efficient: by no accident of the samples."""
-        return self.low is not None and self.low > 1
-
-    def decision(self) -> str:
-        return self.integrator
-
-    def why(self) -> str:
-        return _times(self.advantage, self.low, self.high, self.note)

@@ -68,13 +68,12 @@ def is_complete(content: Mapping[str, Any]) -> bool:
 class Manifest:
     """Provenance and outcome of one run.
 
-    `process` is who works in the folder. `plan` is what a step consists of, `pilot` the table by which an estimator
-    was chosen, `paths` which paths paid, `guided` whether guided emission did, `sequence` whether low-discrepancy
-    numbers did, `pixels` whether camera paths are shared out over the pixels, `rival` how `prb` did beside that,
-    `memory` how a memory budget is kept, `scaling` what was measured of each parameter for `scale: auto`, `shared` the
-    time that workers took (`SharedTime`); each is None where that was not asked for. `views` has, of each view, its
-    share of the loss, how many of its pixels are left out, by kind, and what its images are multiplied by to be looked
-    at (`shown`).
+    `process` is who works in the folder. `plan` is what a step consists of, `paths` which paths paid, `guided` whether
+    guided emission did, `sequence` whether low-discrepancy numbers did, `pixels` whether camera paths are shared out
+    over the pixels, `memory` how a memory budget is kept, `scaling` what was measured of each parameter for `scale:
+    auto`, `shared` the time that workers took (`SharedTime`); each is None where that was not asked for. `views` has,
+    of each view, its share of the loss, how many of its pixels are left out, by kind, and what its images are
+    multiplied by to be looked at (`shown`).
     `results` is what the run found (`iterations`, values and errors by key,
     `certainty`, `warnings`, and `seen`, errors as people see them, ...); `error` is the line that the user saw where
     the run failed. `resumed` says of each time that the run was gone on with after how many iterations, when, by what
@@ -96,7 +95,6 @@ class Manifest:
     error: str | None = None
     missing: dict[str, str] = field(default_factory=dict)
     plan: dict[str, Any] | None = None
-    pilot: dict[str, Any] | None = None
     guided: dict[str, Any] | None = None
     sequence: dict[str, Any] | None = None
     paths: dict[str, Any] | None = None
@@ -104,7 +102,6 @@ class Manifest:
     memory: dict[str, Any] | None = None
     scaling: list[dict[str, Any]] | None = None
     views: list[dict[str, Any]] | None = None
-    rival: dict[str, Any] | None = None
     shared: dict[str, Any] | None = None
     resumed: list[dict[str, Any]] = field(default_factory=list)
     results: dict[str, Any] = field(default_factory=dict)
@@ -133,7 +130,7 @@ class Manifest:
 MANIFEST_FILE = "manifest.json"
 PROGRAM = "reslrb"
 
-#: Bytes of a manifest; the largest part of one is a pilot's table, of some kB.
+#: Bytes of a manifest; the largest part of one is the verdicts, of some kB.
 MOST_BYTES = 2**24
 
 

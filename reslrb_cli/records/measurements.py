@@ -95,8 +95,7 @@ class Method:
 
     `estimator` is None where the integrator has none, `capacity` where the estimator has none; `adjoint` is
     `run.adjoint`, None where dL/dI is held or nothing is differentiated. `label` is how the user wrote it, `spp` are
-    samples per pixel of a step. `paths` and `light_share` are as in a `BenchRecord`, `auto` and None where a pilot
-    decides.
+    samples per pixel of a step. `paths` and `light_share` are as in a `BenchRecord`; `auto` and None: the run decides.
     """
 
     label: str
@@ -333,7 +332,8 @@ class RunMethodRecord(Line):
     """What the runs of one method came to after `elapsed_s` seconds each.
 
     `runs` is the number of those that came so far, which the bands are over; `status` is not ok where one of them ended
-    before, as `message` says. `first_s` are the seconds until the first iteration was done: loading, pilot, compiling.
+    before, as `message` says. `first_s` are the seconds until the first iteration was done, with loading, measuring and
+    compiling.
     What was not measured is None.
     """
 

@@ -28,9 +28,7 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, PIXELS, SEQUENCE, plan_rows, with_reason
 from reslrb_cli.integrators.reslrb import Reslrb
-from reslrb_cli.measure.prb_comparison import measure_rival
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.loading import paths_of
 from reslrb_cli.optimization.moving import warn_of_border
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import WINDOW, Best, Images, Least, Results
@@ -42,7 +40,6 @@ from reslrb_cli.optimization.views import view_records
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.checkpoint import save_checkpoint
 from reslrb_cli.records.clock import SharedTime
-from reslrb_cli.records.decisions import RivalRecord
 from reslrb_cli.records.manifest import Manifest
 from reslrb_cli.records.metrics import ClampTally, NonFiniteTally, Record, RegularizedTally
 from reslrb_cli.records.run_folder import RunFolder
@@ -151,15 +148,9 @@ def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[Course, 
 
     `say` is told what takes long, `warn` what to look at. Raises ConfigError and UnsupportedScene.
     """
-    cache = PilotCache()
-    problem = assemble(config, say, cache, to_run=True)
+    problem = assemble(config, say, PilotCache(), to_run=True)
     warn_of_border(problem, warn)
-    rival = measure_rival(problem, cache, say)
-    if rival is not None and rival.is_better:
-        warn(f"{rival.line()}; --set {_other_way(problem, rival)}")
-    manifest = manifest_of(problem, variant, config.source)
-    manifest.rival = None if rival is None else rival.to_json()
-    return Course(problem, variant), manifest
+    return Course(problem, variant), manifest_of(problem, variant, config.source)
 
 
 def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
@@ -179,23 +170,13 @@ def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
     return manifest
 
 
-def _other_way(problem: Problem, rival: RivalRecord) -> str:
-    """The setting that has what `rival` is better by: camera paths beside light paths, where that is something new."""
-    integrator = problem.config.integrator
-    if problem.paths == "light" and isinstance(integrator, ReslrbConfig):
-        auto = integrator.model_copy(update={"paths": "auto"})
-        if paths_of(auto, problem.scene, problem.sensors, problem.moves) == "both":
-            return "integrator.paths=auto"
-    return f"integrator.type={rival.integrator}"
-
-
 def settled_of(problem: Problem, variant: str) -> Settled:
     """What every checkpoint says of the experiment, whose parameters stand at their initial values: by it another
     process assembles the same problem."""
     initial, halo = on_file(problem, standing(problem).values)
     return Settled(
-        dump(problem.config), variant, digests(problem.config), problem.pilot, problem.guided, problem.sequence,
-        problem.sides, problem.memory, initial, halo, problem.masks, problem.pixels, noted_of(problem),
+        dump(problem.config), variant, digests(problem.config), problem.guided, problem.sequence, problem.sides,
+        problem.memory, initial, halo, problem.masks, problem.pixels, noted_of(problem),
     )  # fmt: skip
 
 

@@ -97,8 +97,6 @@ class Earlier:
         started, resumed = before.get("started"), before.get("resumed")
         manifest.started = started if isinstance(started, str) else manifest.started
         manifest.resumed = [each for each in resumed if isinstance(each, dict)] if isinstance(resumed, list) else []
-        if isinstance(before.get("rival"), dict):
-            manifest.rival = before["rival"]
         earlier, here = before.get("versions"), versions()
         others = {name: [version, here.get(name)] for name, version in earlier.items() if version != here.get(name)} \
             if isinstance(earlier, dict) else {}  # fmt: skip

@@ -1,4 +1,4 @@
-"""`estimator: auto` and `memory_budget` in whole runs of a small scene, from the command line to the manifest."""
+"""Options that are `auto`, and `memory_budget`, in whole runs of a small scene: command line and manifest."""
 
 from __future__ import annotations
 
@@ -47,60 +47,28 @@ def wide(*settings: str) -> list[str]:
     return ["target.render.spp=16", *settings]
 
 
-def test_auto_measures_once_and_remembers(experiment, capsys):
-    code, err = optimize(capsys)
-    assert code == 0, err
-    assert sum(line.startswith("measuring ") for line in err.splitlines()) == 1
-    lines = [line for line in err.splitlines() if line.startswith("estimator ")]
-    assert len(lines) == 1, err
-    pilot = read_manifest(Path("runs/box"))["pilot"]
-    assert not pilot["cached"]
-    assert lines[0].startswith(f"estimator {pilot['label']}")
-    assert {row["estimator"] for row in pilot["rows"]} == {"stack", "gather", "reservoir", "event"}
-    measured = [row for row in pilot["rows"] if row["rounds"]]
-    best = max(measured, key=lambda row: row["efficiency"])
-    assert pilot["chosen"] == {"estimator": best["estimator"], **best["options"]}
-    for row in measured:
-        assert row["efficiency"] == pytest.approx(1 / (row["variance"] * row["kernel_ms"]))
-    assert all(row["note"].startswith("not measured") for row in pilot["rows"] if not row["rounds"])
-    assert "estimator: auto" in Path("runs/box/config.yaml").read_text()
-    first = [record["loss"] for record in read_metrics(Path("runs/box"))]
-
-    code, err = optimize(capsys)
-    assert code == 0, err
-    again = read_manifest(Path("runs/box"))["pilot"]
-    assert again == {**pilot, "cached": True}
-    assert "as an earlier run measured" in Path("runs/box/report.html").read_text()
-    assert "measuring" not in err
-    # The pilot changed neither parameters nor random numbers.
-    np.testing.assert_allclose([record["loss"] for record in read_metrics(Path("runs/box"))], first, rtol=1e-4)
-
-
 def test_a_short_run_measures_nothing_and_says_so(experiment, capsys, monkeypatch):
     """Where a tenth of the run has no room for it, what is `auto` is decided by the scene; with more room it is not."""
-    from reslrb_cli.optimization.autotune import estimators
+    from reslrb_cli.optimization.autotune.race import Turns
 
     options = ["integrator={max_depth: 4}", "run.measuring=0.1", "run.iterations=3"]
     with monkeypatch.context() as patch:
-        patch.setattr(estimators, "run_pilot", lambda *args: pytest.fail("measured"))
+        patch.setattr(Turns, "run", lambda *args: pytest.fail("measured"))
         code, err = optimize(capsys, *options)
     assert code == 0, err
     assert "measuring" not in err
     because = "not measured (over 10 % of this run); "
     paths = "paths both, 50 % light paths"
-    line = f"{because.replace('; ', ':')} estimator stack, {paths}, guiding off, sequence low_discrepancy"
+    line = f"{because.replace('; ', ':')} {paths}, guiding off, sequence low_discrepancy"
     assert line in err.splitlines()
     manifest = read_manifest(Path("runs/box"))
-    assert manifest["pilot"]["chosen"] == {"estimator": "stack"}
-    assert manifest["pilot"]["rows"] == []
+    assert manifest["plan"]["estimator"] == "stack"
     assert manifest["sequence"]["low_discrepancy"]
-    assert manifest["rival"]["note"].startswith("not measured")
     page = Path("runs/box/report.html").read_text()
-    assert f"estimator stack: {because}every connection, in one traversal" in page
     assert f"guiding off: {because}it pays in long runs" in page
     assert f"sequence low_discrepancy: {because}evenly spread ones" in page
     code, err = optimize(capsys, *options, verbose=True)
-    assert f"estimator stack: {because}every connection, in one traversal" in err.splitlines()
+    assert f"guiding off: {because}it pays in long runs" in err.splitlines()
     code, err = optimize(capsys, *options, "run.measuring=1000")
     assert code == 0, err
     assert "measuring what pays here" in err  # what was decided so is not remembered as measured
@@ -139,12 +107,12 @@ def test_other_settings_are_another_situation(experiment):
 @pytest.mark.long
 def test_auto_measures_anew_in_another_situation(experiment, capsys):
     for settings in ([], ["run.spp=8"]):
-        code, err = optimize(capsys, *settings)
+        code, err = optimize(capsys, "integrator.guiding=auto", *settings)
         assert code == 0, err
         assert "measuring" in err
 
 
-def test_the_pilot_leaves_the_run_as_it_was(experiment):
+def test_measuring_leaves_the_run_as_it_was(experiment):
     import drjit as dr
 
     from reslrb_cli.config.loader import load
@@ -157,18 +125,18 @@ def test_the_pilot_leaves_the_run_as_it_was(experiment):
         value = problem.selection.array(KEY).copy()
         loss, *_ = loop.gradient(problem, 0, loop.Split())
         dr.eval(loss)
-        return value, float(loss[0]), np.array(problem.optimizer.gradient(KEY)), problem.pilot
+        return value, float(loss[0]), problem
 
-    value, loss, _, pilot = first_step("integrator.paths=light")
-    assert pilot is not None
-    chosen = ", ".join(f"{key}: {entry}" for key, entry in pilot.chosen.items())
-    named = first_step(f"integrator={{max_depth: 4, {chosen}}}")
-    assert named[3] is None
+    value, loss, problem = first_step("integrator={max_depth: 4, paths: light, guiding: off}")
+    sequence = problem.sequence
+    assert sequence.rounds > 0
+    named = first_step(f"integrator={{max_depth: 4, estimator: stack, sequence: {sequence.setting}}}")
+    assert named[2].sequence is None
     np.testing.assert_array_equal(value, named[0])
     assert loss == pytest.approx(named[1], rel=1e-5)
 
 
-def test_the_pilot_has_seeds_of_its_own(experiment, monkeypatch):
+def test_measuring_has_seeds_of_its_own(experiment, monkeypatch):
     from reslrb_cli.config.loader import load
     from reslrb_cli.optimization import sensitivity
     from reslrb_cli.optimization.assemble import assemble_scene
@@ -191,21 +159,12 @@ def test_the_pilot_has_seeds_of_its_own(experiment, monkeypatch):
     assert drawn == [(7, 0, 0, "pilot"), (7, 1, 0, "pilot"), (7, 0, 0, "pilot")]
 
 
-@pytest.mark.parametrize("adjoint", ["auto", "independent", "batched"])
-def test_candidates_know_delta_where_it_is_known(experiment, adjoint):
-    from reslrb_cli.config.loader import load
-    from reslrb_cli.optimization.autotune.estimators import candidates
-
-    assert not any("weight" in options for options in candidates(load("box.yaml", ["run.adjoint=correlated"])))
-    options = candidates(load("box.yaml", [f"run.adjoint={adjoint}"]))
-    assert [entry["capacity"] for entry in options if entry.get("weight") == "adjoint"] == [1, 4]
-
-
 @pytest.mark.long
 def test_auto_works_with_batches_and_several_views(experiment, capsys):
-    code, err = optimize(capsys, "run.adjoint=batched", "scene.sensors=all", "run.spp=8", "run.iterations=1")
+    settings = ["run.adjoint=batched", "scene.sensors=all", "run.spp=8", "run.iterations=1"]
+    code, err = optimize(capsys, "integrator.guiding=auto", *settings)
     assert code == 0, err
-    assert read_manifest(Path("runs/box"))["pilot"]["spp"] in (4, 8)
+    assert read_manifest(Path("runs/box"))["guided"]["spp"] in (4, 8)
 
 
 def test_auto_is_no_option_of_the_plugin(llvm):
@@ -268,7 +227,7 @@ def test_auto_under_a_budget(experiment, capsys):
     manifest = read_manifest(Path("runs/box"))
     assert manifest["memory"]["passes"] >= 1
     assert manifest["memory"]["peak_mib"] < 2
-    assert manifest["pilot"]["chosen"]["estimator"] in ("stack", "gather", "reservoir", "event")
+    assert manifest["plan"]["estimator"] == "stack"
 
 
 def test_a_budget_that_is_exceeded_is_a_warning(experiment, capsys, monkeypatch):
@@ -344,7 +303,7 @@ def test_what_is_kept_of_a_path_is_what_is_counted(experiment, monkeypatch, esti
 
 @taking_turns("estimator", ["reservoir", "gather", "event", "stack"], "adjoint", ["batched", "correlated"])
 def test_all_sample_counts_have_the_same_kernels(experiment, estimator, adjoint):
-    """The pilot's would otherwise be compiled for nothing."""
+    """Kernels of a measurement would otherwise be compiled for nothing."""
     from reslrb_cli.config.loader import load
     from reslrb_cli.optimization.assemble import assemble
     from reslrb_cli.optimization.autotune import race

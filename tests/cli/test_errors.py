@@ -294,10 +294,9 @@ def test_what_needs_more_than_is_free(experiment: Path, little: int) -> None:
 @pytest.mark.usefixtures("llvm")
 def test_a_step_that_needs_more_than_is_free(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By the estimate that `memory_budget` goes by, of which a step takes a part at the least."""
-    from reslrb_cli.optimization.autotune.estimators import find_options
 
     def find(*sets: str) -> None:
-        find_options(assemble_scene(load(experiment / "tiny.yaml", ["scene.size=[512, 512]", "run.spp=64", *sets])))
+        room.fit_memory(assemble_scene(load(experiment / "tiny.yaml", ["scene.size=[512, 512]", "run.spp=64", *sets])))
 
     monkeypatch.setattr(room, "SMALL", 0)
     naive = "integrator={type: ptracer, max_depth: 3}"
@@ -375,12 +374,10 @@ def test_of_what_is_large_and_fits_a_line_is_said_before_it_is_built(
 
 @pytest.mark.usefixtures("llvm")
 def test_a_budget_chooses_passes_that_can_be(experiment: Path) -> None:
-    from reslrb_cli.optimization.autotune.estimators import find_options
-
     sets = ["scene.size=[256, 256]", "run.spp=1000000000", "run.memory_budget=640"]
-    [option] = find_options(assemble_scene(load(experiment / "tiny.yaml", sets)))
-    assert option.memory is not None
-    assert (option.memory.samples_per_pass, option.memory.passes) == (62500, 4000)
+    memory = room.fit_memory(assemble_scene(load(experiment / "tiny.yaml", sets))).memory
+    assert memory is not None
+    assert (memory.samples_per_pass, memory.passes) == (62500, 4000)
 
 
 @pytest.mark.usefixtures("llvm")
@@ -401,10 +398,8 @@ def test_what_fits_is_not_refused(experiment: Path, little: int) -> None:
 
 @pytest.mark.usefixtures("llvm")
 def test_a_stack_that_no_thread_has_room_for(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from reslrb_cli.optimization.autotune.estimators import find_options
-
     def find(*sets: str) -> None:
-        find_options(assemble_scene(load(experiment / "tiny.yaml", ["integrator.max_depth=-1", *sets])))
+        room.fit_memory(assemble_scene(load(experiment / "tiny.yaml", ["integrator.max_depth=-1", *sets])))
 
     monkeypatch.setattr(room, "local_bytes", lambda: 2**19)
     find("integrator.stack_size=4000")

@@ -250,11 +250,6 @@ MANIFESTS = {
     "memory is a list": ({"memory": [1]}, "memory.samples_per_pass: is not a number of samples"),
     "no samples": ({"memory": {"samples_per_pass": 0}}, "memory.samples_per_pass: is not a number of samples"),
     "samples are text": ({"memory": {"samples_per_pass": "4"}}, "memory.samples_per_pass: is not a number of samples"),
-    "pilot is a list": ({"pilot": [1]}, "pilot.chosen: is not an estimator"),
-    "nothing chosen": ({"pilot": {"x": 1}}, "pilot.chosen: is not an estimator"),
-    "an unknown estimator": ({"pilot": {"chosen": {"estimator": "x"}}}, "pilot.chosen: is not an estimator"),
-    "an unknown option": ({"pilot": {"chosen": {"estimator": "stack", "x": 1}}}, "pilot.chosen: is not an estimator"),
-    "chosen is text": ({"pilot": {"chosen": "stack"}}, "pilot.chosen: is not an estimator"),
 }
 
 

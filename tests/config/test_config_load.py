@@ -408,9 +408,8 @@ def test_naive_differentiation_has_the_paths_that_it_is_told() -> None:
         WalkAd(paths="camera", light_share=0.3)
 
 
-def test_a_chosen_estimator_keeps_the_shared_options_alone() -> None:
-    own = Reslrb(estimator="reservoir", capacity=3, max_depth=4)
-    assert own.chosen(estimator="stack") == Reslrb(estimator="stack", max_depth=4)
+def test_auto_is_stack() -> None:
+    assert Reslrb(max_depth=4).undecided_off().options() == Reslrb(estimator="stack", max_depth=4).options()
 
 
 @pytest.mark.parametrize(
@@ -440,9 +439,9 @@ def test_what_is_left_to_measurement_where_the_estimator_is(name: str, off: str,
     assert given(**{name: off}) == off
     # What is made before anything is measured has nothing of it.
     for own in (Reslrb(), Reslrb(**{name: "auto", "estimator": "reservoir"})):
-        assert getattr(own.chosen(estimator="stack"), name) == getattr(own.undecided_off(), name) == off
+        assert getattr(own.undecided_off(), name) == off
     asked = Reslrb(**{name: on})
-    assert getattr(asked.chosen(estimator="stack"), name) == getattr(asked.undecided_off(), name) == on
+    assert getattr(asked.undecided_off(), name) == on
 
 
 # The reference pages in docs/ say what the schema says.

@@ -1,8 +1,7 @@
-"""What is judged without the film's border, and `prb` beside the estimator of a run."""
+"""Comparisons of two methods, and losses without the film's border."""
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -10,98 +9,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from cli.test_optimize import CONFIG, KEY, SCENE
+from cli.test_optimize import KEY
 from measure import pretended_runs, pretended_steps
 from measure.test_convergence import GAUSSIAN, problem
 
-from reslrb_cli.cli import main
-from reslrb_cli.config.loader import dump, load
-from reslrb_cli.measure import prb_comparison
+from reslrb_cli.config.loader import dump
 from reslrb_cli.measure.convergence.setup import Role
 from reslrb_cli.measure.methods import REFERENCE, parse_cases
 from reslrb_cli.measure.optimization_benchmark import evaluate
 from reslrb_cli.measure.references import leave_out_border
-from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.autotune import race
 from reslrb_cli.optimization.views import set_targets
-from reslrb_cli.records.decisions import RivalRecord
-from reslrb_cli.records.manifest import read_manifest
-
-# `prb` beside the estimator of a run: when it is tried, what is said of it, and what its interval is worth.
-
-OWN = "{max_depth: 3, guiding: off, sequence: independent}"
-AUTO = CONFIG.replace("{type: ptracer, max_depth: 3}", OWN).replace("iterations: 25", "iterations: 2, measuring: 1000")
-POINT = """<emitter type="point" id="bulb"><point name="position" x="0" y="0" z="2"/>
-    <rgb name="intensity" value="3, 3, 3"/></emitter>"""
-GLASS = """<shape type="sphere"><float name="radius" value="0.2"/><point name="center" x="0" y="0" z="1"/>
-    <bsdf type="dielectric"/></shape>"""
-
-
-@pytest.fixture
-def experiment(llvm, tmp_path, monkeypatch):
-    import mitsuba as mi
-
-    mi.Bitmap(np.full((4, 4, 3), 0.6, dtype=np.float32)).write(str(tmp_path / "poster.exr"))
-    (tmp_path / "scene.xml").write_text(SCENE)
-    (tmp_path / "box.yaml").write_text(AUTO)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
-    logging.getLogger("reslrb_cli").setLevel(logging.INFO)
-
-
-def optimize(capsys, *settings):
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as end:
-        main(["optimize", "box.yaml", "--force", *(word for setting in settings for word in ("--set", setting))])
-    assert not end.value.code
-    return capsys.readouterr().err, read_manifest(Path("runs/box"))
-
-
-def test_it_is_measured_once_and_remembered(experiment, capsys):
-    err, manifest = optimize(capsys)
-    found = RivalRecord.from_json(manifest["rival"])
-    assert found.integrator == "prb"
-    if found.advantage is not None:
-        assert found.low < found.advantage < found.high
-        assert prb_comparison.LEAST_ROUNDS <= found.rounds <= prb_comparison.MOST_ROUNDS
-        assert (f"{found.line()}; --set" in err) == found.is_better
-        assert found.line(cost=True).replace("&", "&amp;") in Path("runs/box/report.html").read_text()
-    err, again = optimize(capsys)
-    assert again["rival"] == {**manifest["rival"], "cached": True}
-    assert "measuring" not in err
-
-
-def test_the_tables_of_a_guided_run_learn_nothing_from_it(experiment: None) -> None:
-    """A run begins alike whether this was measured now or by an earlier one."""
-    problem = assemble(load("box.yaml", ["integrator.guiding=on", "integrator.paths=light"]))
-    assert prb_comparison.measure_rival(problem, None, lambda line: None) is not None
-    assert problem.integrator.preparation.guiding.learned == {}
-
-
-def test_it_is_not_tried_where_nobody_chose_an_estimator(experiment, capsys, monkeypatch):
-    """And a better one is one line, one that may be no better none."""
-    from reslrb_cli.runs import prepare
-
-    err, manifest = optimize(capsys, "integrator.estimator=stack")
-    assert manifest["rival"] is None
-    assert "prb" not in err
-    better = RivalRecord(integrator="prb", rounds=8, spp=4, advantage=5.0, low=3.0, high=8.0, measure_s=1.5)
-    monkeypatch.setattr(prepare, "measure_rival", lambda problem, cache, say: better)
-    err, manifest = optimize(capsys, "integrator.estimator=stack")
-    assert f"{better.line()}; --set integrator.paths=auto" in err
-    assert better.line(cost=True).startswith("prb: 5 times the efficiency here (3 to 8) (measured in 1.5 s")
-    assert manifest["rival"] == better.to_json()
-    no_better = RivalRecord(integrator="prb", rounds=8, advantage=1.5, low=0.9, high=2.5)
-    monkeypatch.setattr(prepare, "measure_rival", lambda problem, cache, say: no_better)
-    assert "prb" not in optimize(capsys, "integrator.estimator=stack")[0]
-
-
-@pytest.mark.parametrize(("extra", "applies"), [("", True), (GLASS + POINT, False)])
-def test_it_is_tried_where_it_finds_the_light(experiment, extra, applies):
-    from reslrb_cli.optimization.assemble import assemble_scene
-
-    Path("scene.xml").write_text(SCENE.replace("</scene>", f"{extra}</scene>"))
-    assert (prb_comparison.why_not(assemble_scene(load("box.yaml", []))) is None) == applies
 
 
 def samples(sd, count, seed, entries=200):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import gc
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +26,9 @@ from reslrb_cli.measure.extreme.suite import ExtremeCase
 from reslrb_cli.measure.gradients import integrator
 from reslrb_cli.measure.scenes.small import load as load_scene
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.autotune.estimators import Candidate, find_options
 from reslrb_cli.optimization.autotune.race import NOTHING, SHARE, Gain, is_auto
 from reslrb_cli.optimization.autotune.sampling import GuidingPilot, SequencePilot, settle
+from reslrb_cli.optimization.memory import fit_memory
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.records.decisions import LEAST_IMAGE, PaidRecord
@@ -55,7 +55,7 @@ PATHS = 2**20
 #: take so many times as long as the mean of all: where steps take milliseconds, that is a part that counts.
 OVERRUN = 2
 #: What decides on the integrator.
-SETTLE: dict[str, Callable[[Problem, Sequence[Candidate], Callable[[str], None]], Problem]] = {"settle": settle}
+SETTLE: dict[str, Callable[[Problem, Callable[[str], None]], Problem]] = {"settle": settle}
 
 
 @pytest.fixture(autouse=True)
@@ -67,9 +67,8 @@ def alone() -> None:
 def decided(config: Config, case: ExtremeCase | None) -> Problem:
     """The problem, in the scene of a case if one is given, with all that is left to measurement decided now."""
     problem = assemble_scene(config, None if case is None else load_scene(case.scene()))
-    options = find_options(problem)
-    problem = make_targets(problem, lambda line: None)
-    return SETTLE["settle"](problem, options, lambda line: None)
+    problem = make_targets(fit_memory(problem), lambda line: None)
+    return SETTLE["settle"](problem, lambda line: None)
 
 
 def extreme(case: ExtremeCase, folder: Path) -> str:
@@ -114,10 +113,10 @@ def judged(record: PaidRecord | None, on: bool, alone: bool) -> list[str]:
 def test_no_scene_loses(name: str, tmp_path: Path) -> None:
     case = CASES[name.removeprefix(PREFIX)] if name.startswith(PREFIX) else None
     problem = decided(config_of(name, case, tmp_path, *AUTO), case)
-    guided, sequence, pilot = problem.guided, problem.sequence, problem.pilot
-    share = sum(each.share for each in (pilot, guided, sequence) if each is not None)
+    sides, guided, sequence = problem.sides, problem.guided, problem.sequence
+    share = sum(each.share for each in (sides, guided, sequence) if each is not None)
     round_share = max(each.share / max(each.rounds, 1) for each in (guided, sequence) if each is not None)
-    print(name, *(each.line() for each in (pilot, guided, sequence) if each is not None), f"{share:.2%}", sep="\n  ")
+    print(name, *(each.line() for each in (sides, guided, sequence) if each is not None), f"{share:.2%}", sep="\n  ")
     assert guided is not None
     alone = problem.config.adjoint == "independent"
     assert judged(guided, guided.guided, alone) == []
@@ -125,9 +124,7 @@ def test_no_scene_loses(name: str, tmp_path: Path) -> None:
     if guided.guided:
         return
     camera = problem.integrator.paths == "camera"
-    chosen = {} if pilot is None else {"estimator": "stack"} if camera else pilot.chosen
-    settings = [f"integrator.{option}={value}" for option, value in chosen.items()]
-    settings += [f"integrator.guiding={guided.setting}"]
+    settings = ["integrator.estimator=stack", f"integrator.guiding={guided.setting}"]
     if problem.sides is not None:
         both = [f"integrator.light_share={problem.sides.light_share}"] if problem.sides.paths == "both" else []
         settings += [f"integrator.paths={problem.sides.paths}", *both]
@@ -163,8 +160,8 @@ def test_losses_are_seen(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
         monkeypatch.setattr(SequencePilot, "_record", forced(SequencePilot._record, False))
     else:
 
-        def wrong(problem: Problem, options: Sequence[Candidate], say: Callable[[str], None]) -> Problem:
-            found = settle(problem, options, say)
+        def wrong(problem: Problem, say: Callable[[str], None]) -> Problem:
+            found = settle(problem, say)
             on = is_auto(found.config, "guiding")
             return dataclasses.replace(found, integrator=found.integrator.afresh(guided=True)) if on else found
 

@@ -20,7 +20,6 @@ from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.optimization import assemble as assembling
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.autotune import estimators, race
 from reslrb_cli.optimization.autotune.race import (
     GUIDING_SHARE,
     ITERATIONS,
@@ -44,12 +43,11 @@ from reslrb_cli.optimization.autotune.sampling import (
     sizes,
     table_bytes,
 )
-from reslrb_cli.optimization.decisions import Allowance
 from reslrb_cli.optimization.forecast import _with_learning
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.checkpoint import STATE_FILE, open_state
-from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, PaidRecord, SequenceRecord
+from reslrb_cli.records.decisions import GuidedRecord, PaidRecord, SequenceRecord
 from reslrb_cli.records.manifest import read_manifest
 
 # `guiding: auto` in whole runs of a small scene: what is decided, what is then traced, and what is kept of it.
@@ -281,30 +279,6 @@ def test_a_memory_budget_without_room_for_tables_leaves_it_off(
     assert tight.guided is not None
     assert tight.guided.note.startswith("run.memory_budget has no room for tables of ")
     assert tight.integrator.preparation.guiding is None
-
-
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("compile_s", [0.01, 0.5])
-def test_estimators_leave_guiding_its_time(experiment: Path, monkeypatch: pytest.MonkeyPatch, compile_s: float) -> None:
-    """In a run of a hundred iterations there is none for both, whether kernels are there or not."""
-
-    def allowed(self: race.Tuner, integrator: Any) -> Allowance:
-        self.take(allowance=self.problem.allowance or Allowance(0.1, 100.0, compile_s, 1.0))
-        assert self.problem.allowance is not None
-        return self.problem.allowance
-
-    def slow(problem: Problem, options: Any, allowance: Allowance) -> EstimatorRecord:
-        allowance.spent_s += 7.6
-        return EstimatorRecord(chosen=options[0].options, label=options[0].label)
-
-    monkeypatch.setattr(race.Tuner, "allowance", allowed)
-    monkeypatch.setattr(estimators, "run_pilot", slow)
-    fix_times(monkeypatch, {"guiding": 1.0, "sequence": 1.0, "sequence alone": 1000.0})
-    problem = assemble(load("tiny.yaml", [*AUTO, "integrator={max_depth: 3, paths: light}"]))
-    assert problem.pilot is not None
-    assert problem.pilot.note.startswith("not measured")
-    assert problem.guided is not None
-    assert problem.guided.rounds > 0
 
 
 @pytest.mark.usefixtures("llvm")

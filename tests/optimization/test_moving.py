@@ -142,7 +142,6 @@ def test_a_lamp_is_found(tmp_path):
     config = load(glass.write_experiment(tmp_path), ["run.iterations=25", "run.spp=32", "integrator.estimator=auto"])
     problem = assemble(config)
     assert type(problem.integrator.estimator).__name__ == "Stack"
-    assert problem.pilot is None  # there is one
     problem = find_reached(problem)
     records = list(optimize(problem))
     assert records[0].parameter_rmse == pytest.approx(np.sqrt(0.015 / 3), rel=1e-3)

@@ -25,9 +25,9 @@ from reslrb_cli.optimization.autotune.race import (
     LOOKS,
     PLANNED,
     SEQUENCE_SHARE,
+    SHARE,
     Sizes,
 )
-from reslrb_cli.optimization.autotune.race import SHARE as PILOT_SHARE
 from reslrb_cli.optimization.autotune.sampling import SEQUENCE_LONGER, SequencePilot, StepTrial, planned, share_left
 from reslrb_cli.optimization.decisions import Allowance
 from reslrb_cli.optimization.problem import Problem
@@ -245,7 +245,7 @@ def test_a_table_that_has_yet_to_learn_does_so_before_all_steps_that_count() -> 
     assert record.gain == pytest.approx(1 / (0.1 * 1.1), rel=0.2)
 
 
-@pytest.mark.parametrize("share", [0.0, SEQUENCE_SHARE, 0.01, 0.02, PILOT_SHARE])
+@pytest.mark.parametrize("share", [0.0, SEQUENCE_SHARE, 0.01, 0.02, SHARE])
 @pytest.mark.parametrize("step", [8, 64, 1024])
 @pytest.mark.parametrize("overhead", [0.0, 0.1, 10.0])
 @pytest.mark.parametrize("time", [0.9, 1.1, 3.0])
@@ -277,19 +277,18 @@ def test_the_more_is_left_the_longer_steps_are() -> None:
 class Spent:
     """The problem of a run of which measuring has taken these shares so far."""
 
-    def __init__(self, pilot: float | None, guided: float | None) -> None:
-        self.pilot = None if pilot is None else SimpleNamespace(share=pilot)
+    def __init__(self, paths: float | None, guided: float | None) -> None:
+        self.sides = None if paths is None else SimpleNamespace(share=paths)
         self.guided = None if guided is None else GuidedRecord(guided=True, share=guided)
-        self.sides = None
 
 
-@pytest.mark.parametrize("pilot", [None, 0.02, PILOT_SHARE - GUIDING_SHARE])
-def test_all_that_is_measured_takes_one_share(pilot: float | None) -> None:
-    """What guiding may take, then what the sequence may, and what both have, come what may."""
+@pytest.mark.parametrize("paths", [None, 0.02, SHARE - GUIDING_SHARE])
+def test_all_that_is_measured_takes_one_share(paths: float | None) -> None:
+    """Guiding leaves the sequence its part, and both keep within the share of all decisions."""
     ample = Allowance(1.0, 1e9, 0.0, 1.0)
-    for_guiding = share_left(Spent(pilot, None), ample, SEQUENCE_SHARE)  # type: ignore[arg-type]
-    assert for_guiding == pytest.approx(PILOT_SHARE - SEQUENCE_SHARE - (pilot or 0))
+    for_guiding = share_left(Spent(paths, None), ample, SEQUENCE_SHARE)  # type: ignore[arg-type]
+    assert for_guiding == pytest.approx(SHARE - SEQUENCE_SHARE - (paths or 0))
     assert for_guiding >= GUIDING_SHARE - SEQUENCE_SHARE - 1e-12
-    left = share_left(Spent(pilot, for_guiding), ample)  # type: ignore[arg-type]
+    left = share_left(Spent(paths, for_guiding), ample)  # type: ignore[arg-type]
     assert left == pytest.approx(SEQUENCE_SHARE)
-    assert share_left(Spent(pilot, 0.5), ample) == 0  # type: ignore[arg-type]
+    assert share_left(Spent(paths, 0.5), ample) == 0  # type: ignore[arg-type]

@@ -116,18 +116,6 @@ def write_maps(folder, name="floor-stack"):
 # A run folder as `reslrb optimize` leaves it, made without rendering anything.
 
 FLOOR, LAMP = "floor.reflectance.data", "lamp.intensity.value"
-PILOT = {
-    "chosen": {"estimator": "event", "capacity": 4}, "label": "event, capacity 4", "spp": 8, "advantage": 1.25,
-    "next_label": "stack", "measure_s": 2.5, "compile_s": 75.0, "share": 0.047, "cached": False,
-    "rows": [
-        {"estimator": "stack", "options": {}, "rounds": 4, "kernel_ms": 12.5, "variance": 0.5, "efficiency": 0.16,
-         "note": ""},
-        {"estimator": "event", "options": {"capacity": 4}, "rounds": 4, "kernel_ms": 10.0, "variance": 0.5,
-         "efficiency": 0.2, "note": ""},
-        {"estimator": "gather", "options": {}, "rounds": 0, "kernel_ms": None, "variance": None, "efficiency": None,
-         "note": "not measured: at most 0.50 of the best's efficiency"},
-    ],
-}  # fmt: skip
 MEMORY = {
     "budget_bytes": 2**30, "samples_per_pass": 8, "passes": 2, "peak_mib": 612.5, "exceeded": False,
     "expected_bytes": {"fixed": 2**20, "images": 2**20, "scratch": 0, "paths": 2**21},

@@ -17,7 +17,6 @@ from report.measured import (
     FLOOR,
     LAMP,
     MEMORY,
-    PILOT,
     SCALING,
     make_run,
     write_bench,
@@ -211,13 +210,8 @@ def test_swatches_have_the_colours_of_the_values(tmp_path):
     assert lamp[0] == (188, 137, 99)
 
 
-def test_pilot_scaling_memory_and_run_are_tables(tmp_path):
-    page = page_of(make_run(tmp_path / "lamp", pilot=PILOT, memory=MEMORY, scaling=SCALING))
-    best, second, last = page.cells["Choice of the estimator"][1:]
-    assert best[:4] == ["event, capacity 4", "1", "0.5", "10 ms"]
-    assert second[:2] == ["stack", "0.8"]
-    assert last[-1].startswith("not measured")
-    assert "1.25 times as efficient" in page.sections["Choice of the estimator"]
+def test_scaling_memory_and_run_are_tables(tmp_path):
+    page = page_of(make_run(tmp_path / "lamp", memory=MEMORY, scaling=SCALING))
     assert page.row("Scale of the parameters", LAMP)[1] == "3e+06"
     assert page.row("Memory budget", "budget")[1] == "1024 MiB"
     assert page.row("Run", "an iteration")[1] == "90 ms (median): 40 ms up to image and loss, 50 ms for the gradient"
@@ -245,15 +239,14 @@ def test_what_workers_took_is_told_by_part_and_by_worker(tmp_path):
     assert "cannot be shown" in damaged.sections["Workers"]
 
 
-def test_paths_and_how_they_are_drawn_stand_below_the_estimator(tmp_path):
+def test_paths_and_how_they_are_drawn_are_told(tmp_path):
     """In the order in which they are decided, each where it was left to measurement."""
     paths = PathsRecord(paths="both", light_share=0.125, gain=1.5, low=1.2, high=1.9, measure_s=2.0, compile_s=3.0)
     guided, sequence = GuidedRecord(guided=False, note="<b>"), SequenceRecord(low_discrepancy=False, note="alike")
-    decided = {"pilot": PILOT, "paths": paths, "guided": guided, "sequence": sequence}
-    records = {name: each if name == "pilot" else each.to_json() for name, each in decided.items()}
-    told = page_of(make_run(tmp_path / "all", iterations=0, **records)).sections["Choice of the estimator"]
+    decided = {"paths": paths, "guided": guided, "sequence": sequence}
+    records = {name: each.to_json() for name, each in decided.items()}
+    told = page_of(make_run(tmp_path / "all", iterations=0, **records)).sections["Choice of the samples"]
     lines = [
-        "estimator event, capacity 4: 1.25 times",
         "paths both, 12.5 % light paths: 1.5 times the efficiency here (1.2 to 1.9)"
         " (measured in 2.0 s and 3.0 s of first steps)",
         "guiding off: <b>",
@@ -266,7 +259,7 @@ def test_paths_and_how_they_are_drawn_stand_below_the_estimator(tmp_path):
 def test_paths_alone_are_told(tmp_path):
     """Where the estimator is given."""
     camera = PathsRecord(paths="camera", light_share=0.0, note="all is diffuse").to_json()
-    title = "Choice of the estimator"
+    title = "Choice of the samples"
     page = page_of(make_run(tmp_path / "camera", iterations=0, paths=camera))
     assert page.sections[title].strip() == f"{title}paths camera: all is diffuse"
     for number, unread in enumerate((None, {}, {"paths": "both", "of another": "version"})):
@@ -406,7 +399,7 @@ LONG = "wall_of_the_north_western_corridor_behind_the_second_door_0123456789_" *
 NOISY = {"start": {"mean": 1.31e-7, "error": 4e-9}, "end": {"mean": 1.33e-7, "error": 4e-9}, "change": "flat"}
 EVERYTHING = "all of them, and measurements"
 RUNS = {
-    "textures and colours": {"pilot": PILOT, "memory": MEMORY, "scaling": SCALING, "shared": asdict(SHARED)},
+    "textures and colours": {"memory": MEMORY, "scaling": SCALING, "shared": asdict(SHARED)},
     "three sensors": {"sensors": 3, "size": (240, 320)},
     "no truth": {"truth": False},
     "failed": {"status": Status.FAILED, "error": "x" * 400, "iterations": 0},

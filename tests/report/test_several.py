@@ -12,7 +12,6 @@ from report.measured import (
     LAMP,
     MEMORY,
     ORIGIN,
-    PILOT,
     SCALING,
     convergence_lines,
     make_run,
@@ -25,6 +24,7 @@ from report.measured import (
 from report.test_page import EVIL, Page, pixels
 
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.records.decisions import GuidedRecord
 from reslrb_cli.records.manifest import Status
 from reslrb_cli.report.page import render
 from reslrb_cli.report.page.run import DAMAGED
@@ -74,18 +74,19 @@ def test_the_errors_of_runs_with_different_units_are_relative(tmp_path):
 
 
 def test_every_record_of_each_run_is_there(tmp_path):
-    records = {"pilot": PILOT, "memory": MEMORY, "scaling": SCALING, "plan": PLAN}
+    guided = GuidedRecord(guided=False, note="not measured").to_json()
+    records = {"guided": guided, "memory": MEMORY, "scaling": SCALING, "plan": PLAN}
     page = page_of(
         make_run(tmp_path / "a", iterations=0, **records),
         make_run(tmp_path / "b", iterations=0, command_line=["reslrb", "optimize", "b"]),
     )
     own = page.sections["Run a"]
-    for words in ("Plan", "the scene has masks", "Choice of the estimator", "not measured", "Memory budget",
+    for words in ("Plan", "the scene has masks", "Choice of the samples", "not measured", "Memory budget",
                   "Scale of the parameters", "Configuration", "versions", "mitsuba"):  # fmt: skip
         assert words in own
     assert page.row("Run b", "command line")[1] == "reslrb optimize b"
     assert page.row("Run b", "to do it again")[1] == f"reslrb optimize {tmp_path / 'b' / 'config.yaml'}"
-    assert page.row("Runs", "a")[2] == "event, capacity 4"
+    assert page.row("Runs", "a")[2] == PLAN["estimator"]
 
 
 def test_the_plan_stands_on_the_page_of_one_run(tmp_path):
@@ -272,7 +273,7 @@ def damage(folder, change):
         lambda manifest: manifest.update(results=[1, 2]),
         lambda manifest: manifest.update(results={"parameters": {"a": 3}, "seen": {"images": {"": 7}}}),
         lambda manifest: manifest.update(results={"parameters": 5, "rmse": 3}),
-        lambda manifest: manifest.update(pilot={"rows": 3}, memory={"budget": "x"}, scaling=[{}], plan={"rows": "no"}),
+        lambda manifest: manifest.update(guided={"rows": 3}, memory={"budget": "x"}, scaling=[{}], plan={"rows": "no"}),
         lambda manifest: manifest.update(status=["x"], versions=7, command_line=5, started=3),
     ],
 )

@@ -87,7 +87,6 @@ CASES: dict[str, list[str]] = {
     "gather": [*BATCHED, "integrator.estimator=gather"],
     "guided": [*BATCHED, "integrator.guiding=on", "integrator.estimator=stack"],
     "pixels": [*BATCHED, "run.spp=16", "integrator={estimator: stack, paths: both, pixels: measured}"],
-    "pilot": ["integrator.estimator=auto", "parameters=[{key: poster.reflectance.data, initial: 0.5, bounds: [0, 1]}]"],
     "shards": ["run.spp=8", "run.adjoint=others", "run.shards=4", "integrator.guiding=on", "optimizer.scale=auto"],
     "shards of views": [*BATCHED, "scene.sensors=all", "run.shards=2"],
     "passes": [*BATCHED, "integrator.samples_per_pass=1"],

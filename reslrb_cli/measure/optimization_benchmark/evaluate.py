@@ -24,11 +24,11 @@ from reslrb_cli.measure.references import leave_out_border
 from reslrb_cli.measure.stepper import multiple_of
 from reslrb_cli.measure.workers import Begun
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.autotune.estimators import find_options
 from reslrb_cli.optimization.autotune.sampling import settle
 from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.optimization.identifiability import find_reached
 from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.memory import fit_memory
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.views import set_targets, target_arrays
@@ -228,14 +228,13 @@ def begin_run(first: dict[str, Any]) -> Begun:
     done, and the peak of Dr.Jit's arrays.
     """
     start = time.perf_counter()
-    problem = assemble_scene(told(first))
-    options = find_options(problem)
+    problem = fit_memory(assemble_scene(told(first)))
     with np.load(first["targets"]) as targets:
         set_targets(problem.views, targets)
     if first["masked"]:
         leave_out_border(problem)
-    # Nothing is remembered of earlier pilots: what a pilot costs is to be seen.
-    problem = settle(problem, options, lambda line: None)
+    # No cache: the measuring before the first iteration is part of the run's time.
+    problem = settle(problem, lambda line: None)
     dr.sync_thread()
     loading_s = time.perf_counter() - start
     records = optimize(problem, progress=lambda: advance.progress())  # first asked for in its first iteration
@@ -259,8 +258,7 @@ def begin_run(first: dict[str, Any]) -> Begun:
 
 def decisions(problem: Problem) -> list[str]:
     """What was decided by measurement, in words; of how samples are drawn without figures, which differ every time."""
-    found = [] if problem.pilot is None else [problem.pilot.line()]
-    return found + [each.decision() for each in (problem.guided, problem.sequence) if each is not None]
+    return [each.decision() for each in (problem.guided, problem.sequence) if each is not None]
 
 
 def copies(problem: Problem) -> dict[str, Array]:

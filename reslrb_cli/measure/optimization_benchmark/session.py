@@ -222,7 +222,7 @@ class RunsSession(Arena[RunsPlan, Run]):
         return run
 
     def _load(self, run: Run) -> None:
-        """Have it load the scene, and measure where there is a pilot: before the next one starts, for that is timed."""
+        """Have a run load its scene and take its decisions, before the next one starts: both are timed."""
         opening = run.answer(self._stop, self._late(2 * self._startup_s + self.limit_s))
         if opening is None:
             self._say_how(run)

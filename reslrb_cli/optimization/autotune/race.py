@@ -13,9 +13,8 @@
 
 For another option of which two ways are compared: its record in `records/decisions.py` (a `PaidRecord`); its row in
 `LATER`; in `sampling.py` a `Turns` that makes the record (`SequencePilot`), a function beside `_sequence` that has
-`Tuner.decide` find it, by a `StepTrial` of two integrators, and lines in `settle_sampling` that take it. Of more than
-two ways, or of a number, each has its turns with the best so far. What traces equal paths, and goes with the estimator,
-is an option of `candidates` in `estimators.py` instead.
+`Tuner.decide` find it, by a `StepTrial` of two integrators, and lines in `settle_sampling` that take it. If an option
+has more than two values, each takes turns with the best so far.
 """
 
 from __future__ import annotations
@@ -48,17 +47,16 @@ from reslrb_cli.statistics import Array, jackknife_variance, sum_of_squares
 
 #: Iterations of the run that what measuring costs is a share of.
 ITERATIONS = 200
-#: Share of a run of ITERATIONS that all measuring but for that of `prb` may cost, compilation apart; that of whether
-#: guiding pays is planned for (where it is not clear by then, it may take what the pilot has left of its own), and that
-#: of the sequence is left by what is measured before.
+#: Shares of a run of ITERATIONS, compilation left out: the limit for all measuring, and the plans for guiding, sequence
+#: and paths. If guiding is not decided after its plan, it may go on to the limit, less the plan for the sequence.
 SHARE, GUIDING_SHARE, SEQUENCE_SHARE, PATHS_SHARE = 0.05, 0.025, 0.005, 0.015
 #: What measurements take at least that say anything. Compiling is that of both kinds of steps, and of walks that are
 #: learned from.
-ESTIMATOR_NEEDS, GUIDING_NEEDS, SEQUENCE_NEEDS, PATHS_NEEDS = (4.0, 4.0), (2.5, 3.0), (2.5, 1.0), (1.5, 2.0)
+GUIDING_NEEDS, SEQUENCE_NEEDS, PATHS_NEEDS = (2.5, 3.0), (2.5, 1.0), (1.5, 2.0)
 #: The same of camera paths alone beside half of each kind: kernels are those of the run, whichever wins, and few steps
 #: of few samples tell.
 CAMERA_NEEDS = (0.0, 3.0)
-#: What is measured once the estimator is settled, by option: the time that is kept aside for it, all that is planned.
+#: The decisions by option: the time that is kept aside for each, and its plan.
 #: What it takes at the least would be too little where kernels are there: first steps take their time all the same.
 LATER = {
     "paths": (PATHS_NEEDS[0], PATHS_SHARE * ITERATIONS),
@@ -183,7 +181,7 @@ def sets_of(config: Config) -> int:
 
 
 def situation(problem: Problem) -> dict[str, Any]:
-    """All that the choice of an estimator depends on, as plain values."""
+    """Return all that a decision depends on, as plain values."""
     config = problem.config
     dump = config.model_dump(mode="json")
     run = config.step_options() | {"memory_budget": dump["run"]["memory_budget"]}
@@ -233,7 +231,7 @@ def timed(times: StepTimes, wall_ms: float | None = None) -> Step:
 
 
 def measured_step(problem: Problem, integrator: Any, clock: StepClock, round: int, spp: int) -> Step:
-    """One step of all views, with seeds of the pilot's own; leaves neither gradient nor change behind."""
+    """Take one step of all views, with seeds of its own; leave neither gradient nor change behind."""
     start = time.perf_counter()
     problem.apply()
     with clock.step() as times:

@@ -37,7 +37,6 @@ from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.optimization.autotune import race
-from reslrb_cli.optimization.autotune.estimators import Candidate, settle_estimator
 from reslrb_cli.optimization.decisions import Allowance
 from reslrb_cli.optimization.memory import pixels_of
 from reslrb_cli.optimization.moving import is_attached
@@ -68,24 +67,23 @@ MOST_VIEWS, MOST_VALUES = 4, 2**15
 IMAGE_SHARE = 0.25
 
 
-def settle(problem: Problem, options: Sequence[Candidate], say: race.Say, cache: PilotCache | None = None) -> Problem:
-    """`problem` with its integrator settled: the best of the `options` (`find_options`), drawing samples as pays here.
+def settle(problem: Problem, say: race.Say, cache: PilotCache | None = None) -> Problem:
+    """Return `problem` with an integrator that draws samples as pays here, where that is left to measurement.
 
-    Needs the targets. Fields of the problem say what was measured; `say` is told, and `cache` holds what earlier runs
-    measured.
+    Needs the targets. Fields of the problem hold the measurements; `say` is given a line of each, and `cache` holds the
+    measurements of earlier runs.
     """
     tuner = race.Tuner(problem, say, cache)
-    settle_estimator(tuner, options)
     settle_paths(tuner)
     settle_pixels(tuner)
     settle_sampling(tuner)
     problem = tuner.problem
-    tuner.tell(problem.pilot, problem.sides, problem.guided, problem.sequence, problem.pixels)
+    tuner.tell(problem.sides, problem.guided, problem.sequence, problem.pixels)
     return tuner.problem
 
 
 def settle_paths(tuner: race.Tuner) -> None:
-    """Have the integrator, whose estimator is settled, trace the paths that pay here, as far as that is left to
+    """Have the integrator trace the paths that pay here, as far as that is left to
     measurement, and both kinds can render the scene."""
     problem = tuner.problem
     if not race.is_auto(problem.config, "paths") or problem.paths != "both":
@@ -138,7 +136,7 @@ def with_sides(integrator: Any, sides: PathsRecord | None) -> Any:
 
 
 def settle_sampling(tuner: race.Tuner) -> None:
-    """Have the integrator, whose estimator is settled, draw samples as pays here, as far as that is left to
+    """Have the integrator draw samples as pays here, as far as that is left to
     measurement: guided or not; then from which sequence, in place of being guided, or else as the integrator is then.
     """
     config, plain, memory = tuner.problem.config, tuner.problem.integrator, tuner.problem.memory
@@ -163,7 +161,7 @@ def settle_sampling(tuner: race.Tuner) -> None:
 
 
 def as_decided(integrator: Any, guided: GuidedRecord | None, sequence: SequenceRecord | None) -> Any:
-    """An integrator of the settled estimator that draws samples as was decided, where it was."""
+    """Return `integrator` with the ways of drawing samples that were decided."""
     if guided is not None and guided.guided:
         integrator = integrator.afresh(guided=True, images=guided.images)
     if sequence is not None and sequence.low_discrepancy:
@@ -228,7 +226,7 @@ def planned(share: float) -> float:
 def share_left(problem: Problem, allowance: Allowance, reserved: float = 0.0, kernels: float = 0.0) -> float:
     """What earlier measurements left of the share of 200 iterations that all of them may cost, but for what is
     `reserved`, and no more than there is time for in a run as short as this, with `kernels` to compile."""
-    spent = sum(each.share for each in (problem.pilot, problem.sides, problem.guided) if each is not None)
+    spent = sum(each.share for each in (problem.sides, problem.guided) if each is not None)
     return max(min(race.SHARE - spent - reserved, allowance.iterations_left(kernels) / race.ITERATIONS), 0.0)
 
 
@@ -319,7 +317,7 @@ def _paths(tuner: race.Tuner) -> PathsRecord:
     later = [race.LATER[option] for option in ("guiding", "sequence") if race.is_auto(problem.config, option)]
     return tuner.decide(
         PathsRecord,
-        of={"paths": 4, "of": problem.pilot and problem.pilot.chosen},
+        of={"paths": 5},
         # What is measured later is of light paths: where camera paths may do without, it can wait.
         needs=[needs] if alone else [needs, *later],
         integrator=problem.integrator,
@@ -336,7 +334,7 @@ def _of_share(problem: Problem, share: float) -> Tracer:
 
 
 def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord | None:
-    """Whether the problem's integrator, whose estimator is settled, is to be guided, or light paths in place of it;
+    """Whether the problem's integrator is to be guided, or light paths in place of it;
     `trials` gets the steps of it. None where nothing begins at the emitters."""
     problem = tuner.problem
     alone = guides_light_alone(problem)
@@ -363,7 +361,7 @@ def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord | None:
     return tuner.decide(
         GuidedRecord,
         # Learning is a larger part of a short run, where tables learn most often at first.
-        of={"guiding": 5, "of": problem.pilot and problem.pilot.chosen, "lessons": plan.lessons} | _sides(problem),
+        of={"guiding": 6, "lessons": plan.lessons} | _sides(problem),
         # Where even numbers are likely to do better, to measure guiding alone would mislead.
         needs=(race.GUIDING_NEEDS, *([] if why is None else 2 * [race.SEQUENCE_NEEDS])),
         integrator=problem.integrator,
@@ -409,7 +407,7 @@ def _sequence(tuner: race.Tuner, trials: list[StepTrial]) -> SequenceRecord:
         return SequenceRecord(low_discrepancy=not is_guided, note=note)
 
     guided = None if found is None else [found.guided, found.images]
-    of = {"sequence": 1, "of": [problem.pilot and problem.pilot.chosen, guided]} | _sides(problem)
+    of = {"sequence": 2, "of": guided} | _sides(problem)
     return tuner.decide(SequenceRecord, of, [race.SEQUENCE_NEEDS], plain, measure, unmeasured)
 
 

@@ -206,9 +206,7 @@ def overview(runs: Sequence[Run]) -> Markup:
 
 def _estimator(run: Run) -> str:
     """What computed the gradients, as far as the manifest says."""
-    pilot, plan = run.manifest.get("pilot"), run.manifest.get("plan")
-    if isinstance(pilot, dict):
-        return str(pilot.get("label", ""))
+    plan = run.manifest.get("plan")
     return str(plan.get("estimator") or plan.get("integrator") or "") if isinstance(plan, dict) else ""
 
 

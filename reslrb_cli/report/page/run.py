@@ -16,11 +16,9 @@ from pydantic import TypeAdapter
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.clock import SharedTime
 from reslrb_cli.records.decisions import (
-    EstimatorRecord,
     GuidedRecord,
     PathsRecord,
     PixelsRecord,
-    RivalRecord,
     SequenceRecord,
 )
 from reslrb_cli.records.images import load_image
@@ -102,17 +100,6 @@ def _wall(manifest: Mapping[str, Any]) -> str:
         return ""
     pauses = ", and the time in which it was not at work" if manifest.get("resumed") else ""
     return f"{duration((end - start).total_seconds())}, with its images and files{pauses}"
-
-
-def pilot_table(pilot: Mapping[str, Any] | None) -> Markup:
-    """What the pilot measured of each estimator, the most efficient first, and what it chose."""
-    try:
-        outcome = EstimatorRecord.from_json(dict(pilot or {}))
-    except TypeError:  # there was none, or another version's
-        return Markup()
-    rows = sorted(outcome.rows, key=lambda row: -(row.efficiency or 0.0))
-    best = rows[0].efficiency or 1.0 if rows else 1.0
-    return lay_out("run.pilot", outcome.line(cost=True), rows, best)
 
 
 def workers(shared: Mapping[str, Any] | None, elapsed_s: float | None) -> Markup:
@@ -201,13 +188,11 @@ def record_parts(run: Run) -> dict[str, Markup]:
         "Regularizers": lambda: lay_out("run.regularized", results.get("regularized") or {}),
         "Run": lambda: lay_out("run.run", run, StepParts.of(run.records), _wall(manifest)),
         "Plan": lambda: lay_out("run.plan", plan["rows"]) if (plan := manifest.get("plan")) else Markup(),
-        "Choice of the estimator": lambda: (
-            pilot_table(manifest.get("pilot"))
-            + soft(measured_line(PathsRecord, manifest.get("paths")))
+        "Choice of the samples": lambda: (
+            soft(measured_line(PathsRecord, manifest.get("paths")))
             + soft(measured_line(GuidedRecord, manifest.get("guided")))
             + soft(measured_line(SequenceRecord, manifest.get("sequence")))
             + soft(measured_line(PixelsRecord, manifest.get("pixels")))
-            + soft(measured_line(RivalRecord, manifest.get("rival")))
         ),
         "Scale of the parameters": lambda: lay_out("run.scaling", manifest.get("scaling") or []),
         "Memory budget": lambda: lay_out("run.memory", kept) if (kept := manifest.get("memory")) else Markup(),
