@@ -186,30 +186,6 @@ class RunValue(Section):
     file."""
 
 
-class TransportStart(Section, json_schema_extra={"required": ["receiver"]}):
-    """The plane onto which a heightmap throws the target, and how."""
-
-    receiver: Name
-    """Id of a plane shape, a `rectangle`: what the view's target shows of it is what light is brought to."""
-    floor: Annotated[
-        Annotated[float, Field(ge=0, lt=1), mark("number")] | Annotated[Literal["auto"], mark("text")],
-        Discriminator(lambda value: MARK + ("text" if isinstance(value, str) else "number")),
-    ] = "auto"
-    """What is darker than this share of the target's maximum is lifted to it; `auto`: the least share with which light
-    is not torn apart."""
-    lamp: Name | None = None
-    """Id of the lamp, or of its shape; null: the only one that has light."""
-
-
-class TransportValue(Section, json_schema_extra={"required": ["transport"]}):
-    """A heightmap that throws the target, found by optimal transport."""
-
-    TAG: ClassVar[str] = "transport"
-
-    transport: TransportStart
-    """A face over a plane, glass or mirror, that throws the view's target onto a receiver: docs/lens.md."""
-
-
 #: A value for a scene parameter: one number, a list such as [r, g, b], or an image file.
 Value = Annotated[
     Annotated[float, mark("number")] | Annotated[Numbers, mark("list")] | Annotated[ImageFile, mark("mapping")],
@@ -220,8 +196,6 @@ Value = Annotated[
 def _initial_tag(value: Any) -> str | None:
     if isinstance(value, RunValue) or (isinstance(value, dict) and "run" in value):
         return MARK + RunValue.TAG
-    if isinstance(value, TransportValue) or (isinstance(value, dict) and "transport" in value):
-        return MARK + TransportValue.TAG
     if isinstance(value, ByWord) or (isinstance(value, dict) and not {"file", "color_space"} & value.keys()):
         return MARK + ByWord.TAG
     return kind_tag(value, "scene")
@@ -233,14 +207,12 @@ Initial = Annotated[
     | Annotated[Numbers, mark("list")]
     | Annotated[ImageFile, mark("mapping")]
     | Annotated[RunValue, mark(RunValue.TAG)]
-    | Annotated[TransportValue, mark(TransportValue.TAG)]
     | Annotated[MotionInitial, mark(ByWord.TAG)]
     | Annotated[Literal["scene"], mark("text")],
     Discriminator(
         _initial_tag,
         custom_error_type="wrong",
-        custom_error_message="must be a number, a list of numbers, {file: IMAGE}, {run: RUN}, {transport: ...}, or "
-        "`scene`",
+        custom_error_message="must be a number, a list of numbers, {file: IMAGE}, {run: RUN}, or `scene`",
     ),
 ]
 
@@ -466,11 +438,6 @@ class ParameterSpec(Section):
                 raise located("resolution", "goes with one key alone, not with a list that ties several together")
         if self.heightmap is not None and self.resolution is not None:
             raise located("resolution", "belongs into `heightmap`, which has its own; remove it here")
-        if isinstance(self.initial, TransportValue):
-            if self.heightmap is None:
-                raise located("initial.transport", "makes a heightmap, and this is none")
-            if len(self.heightmap.mesh) > 1:
-                raise located("initial.transport", "makes the heightmap of one mesh; name one in `heightmap.mesh`")
         if self.motion is not None and self.resolution is not None:
             raise located("resolution", "has no effect on a motion, which is no texture; remove it")
         if self.motion is not None and self.precondition is not None:

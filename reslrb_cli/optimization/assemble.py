@@ -16,12 +16,11 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
 from reslrb_cli.config.loader import check_code
-from reslrb_cli.config.parameters import HEIGHTMAP, ParameterSpec, TransportValue
+from reslrb_cli.config.parameters import HEIGHTMAP, ParameterSpec
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.own import OwnIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
-from reslrb_cli.optimization import start
 from reslrb_cli.optimization.autotune.sampling import settle
 from reslrb_cli.optimization.errors import quantity
 from reslrb_cli.optimization.identifiability import check_exposures, find_reached
@@ -42,7 +41,6 @@ from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.views import View, expose, make_views
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.tree import Stored
-from reslrb_cli.scene.load import warn_once
 from reslrb_cli.scene.parameters import Selection, select_parameters
 from reslrb_cli.scene.values import resample
 
@@ -65,7 +63,7 @@ def assemble(
     """
     if to_run:
         check_code(config)
-    problem = assemble_scene(config, starts=True)
+    problem = assemble_scene(config)
     if isinstance(problem.integrator, OwnIntegrator):
         problem.integrator.ready()
     if settled is not None:
@@ -74,12 +72,10 @@ def assemble(
     line = outlook(config, problem.scene, problem.sensors) if to_run else None
     if line is not None:
         say(line)
-    starts = start.prepare(problem) if settled is None else []
     problem = make_targets(problem, say)
     for view in problem.views if to_run else ():
         for own in view.codes:
             own.attempt(view.target, view.weights)
-    problem = start.begin(problem, starts, say)
     if settled is not None:
         return reach_as(decide_as(problem, settled), settled)
     problem = settle(problem, say, cache)
@@ -90,20 +86,14 @@ def assemble(
 
 
 def load_for_rendering(
-    config: Config,
-    initial: bool,
-    values: Mapping[str, Any] | None = None,
-    say: Callable[[str], None] = lambda line: None,
+    config: Config, initial: bool, values: Mapping[str, Any] | None = None
 ) -> tuple[Any, list[int], Any, int | None]:
     """Load the scene (with the parameters' initial values, if `initial`, or `values`), and make the integrator.
 
     Returns both, between them the indices of the sensors in use, and the integrator's `samples_per_pass`.
     """
     if initial:
-        problem = assemble_scene(config, starts=True)
-        starts = start.prepare(problem) if values is None else []
-        if starts:
-            start.begin(make_targets(problem, say), starts, say)
+        problem = assemble_scene(config)
         if values is not None:
             problem = set_values(problem, values)
         return problem.scene, problem.sensors, problem.integrator, samples_per_pass(config)
@@ -142,17 +132,12 @@ def set_values(problem: Problem, values: Mapping[str, Any]) -> Problem:
     return problem.afresh({**problem.values(), **found})
 
 
-def assemble_scene(
-    config: Config, scene: Any = None, values: Mapping[str, Array] | None = None, starts: bool = False
-) -> Problem:
+def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array] | None = None) -> Problem:
     """Load and check what `config` names, targets left out.
 
-    `scene` is used in place of `scene.file`, `values` in place of the parameters' initial ones. What is to begin by
-    transport of light, which takes targets, is flat; that is warned of, unless it is seen to (`starts`). Raises
-    ValueError where `values` are not one finite array for each parameter, of its shape.
+    `scene` is used in place of `scene.file`, `values` in place of the parameters' initial ones. Raises ValueError where
+    `values` are not one finite array for each parameter, of its shape.
     """
-    if not starts and values is None and any(isinstance(spec.initial, TransportValue) for spec in config.parameters):
-        warn_once("initial.transport: flat here; `initial: {run: RUN}` takes what a run came to")
     check_announced(config)
     scene = load_configured(config, functools.partial(check_described, config)) if scene is None else scene
     views = make_views(config, scene)
@@ -233,7 +218,7 @@ def at_stage(problem: Problem, number: int, values: Mapping[str, Array] | None =
     scene = config.scene if film is None else config.scene.model_copy(update={"size": film})
     config = config.model_copy(update={"parameters": _specs_at(problem, number), "scene": scene})
     # What is doubtful in the scene was told of the whole problem's.
-    made = assemble_scene(config, load_configured(config, warn=False), values, starts=True)
+    made = assemble_scene(config, load_configured(config, warn=False), values)
     if values is None:
         made.selection.set_arrays({key: bounded(made, key, resized(made, key, value))
                                    for key, value in problem.values().items()})  # fmt: skip

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.parameters import RunValue, Settings, TransportValue
+from reslrb_cli.config.parameters import RunValue, Settings
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.run_folder import read_value
 from reslrb_cli.scene.catalog import halo
@@ -93,7 +93,7 @@ def initial_array(
         least = [2, 3] if slot.halo else [2, 2]
         if resolution[0] < least[0] or resolution[1] < least[1]:
             raise place.fail("resolution", f"must be at least {least}; Mitsuba has no smaller textures")
-    if isinstance(initial, (str, TransportValue)):  # what transport makes of it takes the target, which comes later
+    if isinstance(initial, str):
         array = current
     elif isinstance(initial, (int, float)):
         array = np.full_like(current, initial)

@@ -320,7 +320,7 @@ WRONG = {
     ),
     "start that is text": (
         "{key: a, initial: grey}",
-        ("[0].initial: must be a number", "{file: IMAGE}, {run: RUN}, {transport: ...}, or `scene`"),
+        ("[0].initial: must be a number", "{file: IMAGE}, {run: RUN}, or `scene`"),
     ),
     "file for a motion": (f"{{{LENS}, initial: {{file: a.png}}}}", ("parameters[0].initial: is an image file",)),
     "bounds of a word": (
