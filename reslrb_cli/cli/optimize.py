@@ -30,33 +30,26 @@ if TYPE_CHECKING:
     from reslrb_cli.runs.prepare import Begun
 
 
-def show_forecast(config: Config, variant: str, place: Place | None) -> None:
-    """Print the expected time and memory of a run of `config`, by a few measured steps; with the workers at `place`,
-    also those of a step on them (`cluster.forecast.measure`).
+def show_forecast(config: Config) -> None:
+    """Print the expected time and memory of a run of `config`, by a few measured steps.
 
     A variant must be set. Writes nothing but the caches of kernels and decisions, which a run then finds.
     """
     from reslrb_cli.backend.memory import resident_bytes
-    from reslrb_cli.cluster import forecast as model  # which asks for dask where there is a place
     from reslrb_cli.optimization.forecast import make_forecast
     from reslrb_cli.records.cache import PilotCache
-    from reslrb_cli.report.format import duration
 
     forecast = make_forecast(config, logging.getLogger(__name__).info, PilotCache())
     sums = f"{forecast.iterations} x {1e3 * forecast.iteration_s:.3g} ms"
     sums += f" + {rough_duration(forecast.start_s)}" if forecast.start_s > 0.01 * forecast.elapsed_s else ""
-    shared = None if place is None else model.measure(config, variant, place, logging.getLogger(__name__).info)
     text = fill(
         "forecast.txt.j2",
-        {"bytes": in_words, "time": rough_duration, "duration": duration},
+        {"bytes": in_words, "time": rough_duration},
         source=config.source,
         forecast=forecast,
         budget=config.run.budget_bytes,
         resident=resident_bytes(),
         sums=sums,
-        place=place,
-        shared=shared,
-        model=model,
     )
     click.echo(text, nl=False)
 
@@ -110,6 +103,8 @@ def command(
         if dry_run:
             raise click.UsageError("--dry-run is of a run that begins, --resume goes on with one; give one of the two")
         return _resume(resumed, config_file, overrides, allow_code, workers, quiet)
+    if dry_run and workers is not None:
+        raise click.UsageError("--dry-run measures steps of this process; leave out --cluster")
     if config_file is None:
         raise click.UsageError("Missing argument 'CONFIG'")
     return _begin(config_file, overrides, force, dry_run, allow_code, workers, quiet)
@@ -143,7 +138,7 @@ def _begin(
         workers.check()
     variant = start_variant(config)
     if dry_run:
-        show_forecast(config, variant, workers)
+        show_forecast(config)
         return ExitCode.DONE
 
     from reslrb_cli.runs.prepare import begin

@@ -1,22 +1,15 @@
-"""The time of workers: what of it a run keeps, and what a forecast says of it."""
+"""The time of workers that a run records."""
 
 from __future__ import annotations
 
 import json
-import os
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from runs.going_on import optimize
 
-from reslrb_cli.cluster import forecast as model
-from reslrb_cli.cluster.connection import Place
-from reslrb_cli.cluster.forecast import Parts, Round, StepTime
-from reslrb_cli.config.loader import load
 from reslrb_cli.optimization.shards import serially
 from reslrb_cli.records.clock import SharedTime, WorkerTime
 
@@ -94,82 +87,3 @@ def test_what_workers_did_is_all_there(experiment: Path) -> None:
     elapsed = json.loads(Path("runs/tiny/metrics.jsonl").read_text().splitlines()[-1])["elapsed_s"]
     assert 0 < both.computing_s < both.computing_s + both.waiting_s + both.sending_s == pytest.approx(both.wall_s)
     assert both.wall_s < elapsed
-
-
-# --- the forecast -----------------------------------------------------------------------------------------------------
-
-#: 16 shards in two rounds. All bytes of a step: 2 x (4 x 1e6 + 16 x 250,000) on 4 workers.
-PARTS = Parts(
-    shards=16, paths=1_000_000, here_s=0.05, round_s=0.01, call_s=0.001, byte_s=1e-9,
-    rounds=(Round(0.1, 0.02, 1_000_000, 50_000, 200_000), Round(0.3, 0.0, 1_000_000, 200_000, 50_000)),
-)  # fmt: skip
-NONE = Parts(16, 1_000_000, (Round(0.1, 0.0, 0, 0, 0),), 0.0, 0.0, 0.0, 0.0)
-
-
-def test_a_step_is_the_sum_of_its_parts() -> None:
-    time = model.step_time(PARTS, 4, 1e9)
-    sending = 16_000_000 * (1e-9 + 8e-9)
-    assert time == StepTime(pytest.approx(4 * 0.4 + 0.02), pytest.approx(sending), pytest.approx(2 * 0.03), 0.05)
-    assert time.whole == pytest.approx(1.62 + 0.144 + 0.06 + 0.05)
-    assert model.efficiency(PARTS, 4, 1e9) == pytest.approx((16 * 0.4 + 0.05) / (4 * time.whole))
-    assert model.step_time(PARTS, 5).computing == pytest.approx(4 * 0.4 + 0.02)  # one of five has four of them
-    assert model.step_time(PARTS, 16).computing == model.step_time(PARTS, 32).computing
-
-
-def test_what_costs_nothing_beside_is_worth_it_as_far_as_there_are_shards() -> None:
-    assert [model.efficiency(NONE, workers) for workers in model.WORKERS] == [pytest.approx(1.0)] * 5
-    assert model.not_worth(NONE, 1e9) is None
-    assert model.enough_paths(NONE, 8, 0.85, 1e9) == 0
-    assert model.not_worth(replace(NONE, shards=4), 1e9) == 8
-    assert model.not_worth(replace(NONE, here_s=10.0), 1e9) == 2
-
-
-@pytest.mark.parametrize("link", model.LINKS.values())
-def test_that_many_paths_are_enough(link: float) -> None:
-    """A step of so many, each shard as much longer, has just that efficiency; of one that has it already, fewer do."""
-    for parts in (PARTS, replace(PARTS, rounds=tuple(replace(each, shard_s=50.0) for each in PARTS.rounds))):
-        paths = model.enough_paths(parts, 8, 0.85, link)
-        assert paths is not None
-        assert (paths > parts.paths) is (model.efficiency(parts, 8, link) < 0.85)
-        times = paths / parts.paths
-        scaled = replace(parts, rounds=tuple(replace(one, shard_s=times * one.shard_s) for one in parts.rounds))
-        assert model.efficiency(scaled, 8, link) == pytest.approx(0.85)
-    assert model.enough_paths(replace(PARTS, shards=9), 8, 0.85, link) is None
-
-
-def test_links_that_say_the_same_are_told_together() -> None:
-    [(links, first, paths)] = model.verdicts(NONE)
-    assert (links, first, paths) == (list(model.LINKS), None, 0)
-    sent = replace(NONE, rounds=(Round(0.1, 0.0, 10**8, 0, 0),))
-    told = model.verdicts(sent)
-    assert [links for links, _, _ in told] == [[link] for link in model.LINKS]
-    assert [first for _, first, _ in told] == [2, 8, 16]
-
-
-def test_a_dry_run_says_what_a_step_takes_on_so_many(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before = sorted(os.listdir(experiment))
-    assert optimize("tiny.yaml", *QUICK, "--dry-run", "--cluster", "local:1") == 0
-    printed = capsys.readouterr().out
-    assert sorted({*os.listdir(experiment)} - {"cache"}) == sorted(before)
-    assert "a step on workers, such as those of local:1, of 4 shards and 512 light paths, in two rounds" in printed
-    assert re.search(r"^measured on 1 worker: \S+ m?s a step; by these parts it is \S+ m?s$", printed, re.MULTILINE)
-    rows = re.findall(r"^ +(\d+)((?: +\S+ (?:ms|s) +\d\.\d\d){3})$", printed, re.MULTILINE)
-    assert [int(workers) for workers, _ in rows] == list(model.WORKERS)
-    assert "with no batch, for 4 shards cannot be shared out so well: raise run.shards" in printed
-    assert "not worth it from" in printed
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("workers", [1, 2])
-def test_what_the_model_says_is_what_steps_take(experiment: Path, workers: int) -> None:
-    """Of steps of a second and more, whose parts were measured by themselves; within a factor, as machines are busy."""
-    config = load(experiment / "tiny.yaml", [*SETS, "run.spp=65536", "run.shards=8"])
-    found = model.measure(config, "llvm_ad_rgb", Place(workers), lambda line: None)
-    assert found.workers == workers
-    assert found.step_s > 0.5
-    assert 0.5 < found.expected_s / found.step_s < 1.5
-    assert all(each.stand > 300 and each.call > 100 and each.answer > 400 for each in found.parts.rounds)
-    assert len(found.parts.rounds) == 2
-    image, gradient = found.parts.rounds
-    assert image.answer > 8 * 8 * 3 * 4 > image.call
-    assert gradient.call > 8 * 8 * 3 * 4
