@@ -9,7 +9,6 @@ from textwrap import fill
 
 import benchmarks_tables as tables
 from benchmarks_list import CHECKED, EXPERIMENTS, MEASUREMENTS, OTHERS, RECORDS, ROOT, experiment_record
-from gpu_report import gpu_section
 
 PAGE, README, TEMPLATE = ROOT / "docs" / "benchmarks.md", ROOT / "README.md", "page.md"
 #: Where a table stands in the template, in a line of its own, and between what in the README.
@@ -53,7 +52,7 @@ class Blocks:
             "others": self.others,
             "paths": self.paths,
             "runs": self.runs,
-            "gpu": lambda: gpu_section(self.folder),
+            "gpu": self.gpu,
         }
 
     def make(self, name: str) -> str:
@@ -71,6 +70,13 @@ class Blocks:
         """The command that was measured, how long it took, and under what conditions."""
         record = self.record(name)
         return f"    {record.command}\n\nThis took {record.origin['seconds']:.0f} s{conditions and f'; {conditions}'}:"
+
+    def gpu(self) -> str:
+        """Return what `scripts/gpu_check` recorded on a GPU."""
+        file = self.folder / "gpu.md"
+        if not file.exists():
+            return "No figure on this page is from a GPU so far."
+        return file.read_text(encoding="utf-8").rstrip()
 
     def machine(self) -> str:
         """What all records were measured on."""
