@@ -56,7 +56,7 @@ def test_a_command_that_fails_is_named_and_the_others_run(tmp_path: Path) -> Non
     lines = done.stdout.splitlines()
     assert [line.split(":")[0] for line in lines[:-1]] == NAMES
     assert lines[1].startswith("bench: exit code 3 after")
-    assert lines[4] == "demo: stopped at its limit of 300 s"
+    assert lines[4] == "demo: stopped at its limit of 900 s"
     assert "--max-depth 128" in (tmp_path / "out" / "bench.out").read_text()
     assert gpu_check("-o", tmp_path / "out", "doctor", "conformance", python=python).returncode == 0
     assert gpu_check("docter").returncode == 2
