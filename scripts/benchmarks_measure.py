@@ -26,6 +26,8 @@ import yaml
 ROOT = Path(__file__).resolve().parent.parent
 RECORDS = ROOT / "docs" / "benchmarks"
 PAPER = ROOT / "docs" / "paper"
+#: The page that `gradcheck --suite extreme` writes. Its record only counts the comparisons, which are thousands.
+EXTREME = ROOT / "docs" / "extreme.md"
 #: The code that every figure depends on, and the code that the figures of a command depend on besides.
 CODE = tuple(f"reslrb_cli/{name}" for name in ("backend", "scene", "transport", "estimators", "guiding", "integrators"))
 MEASURED_BY = {
@@ -85,6 +87,7 @@ def _all() -> list[Measurement]:
         "spp": "bench --sweep spp --values 1,4,16,64 --integrators ptracer,reslrb:reservoir,reslrb:stack --budget 120",
         "moving": _GLASS,
     }
+    commands["extreme"] = f"gradcheck --suite extreme --markdown {EXTREME.relative_to(ROOT)}"
     commands |= {f"gradcheck_{name}": f"gradcheck configs/{name}.yaml --seeds 16" for name in CHECKED}
     for name in EXPERIMENTS:
         commands[experiment_record(name)] = f"optimize configs/{name}.yaml"
@@ -178,6 +181,10 @@ def measure(measurement: Measurement) -> None:
             raise SystemExit(f"benchmarks: {measurement.name}: exit code {code}; its record is left as it was")
         lines = run_lines(folder / "run") if kind == "optimize" else _read(record)
         lines[0] |= {"command": measurement.command, "seconds": round(seconds, 1)} | tree
+        if measurement.name == "extreme":
+            holds = [line["holds"] for line in lines if "verdict" in line]
+            counts = {"comparisons": len(holds), "hold": holds.count(True), "fail": holds.count(False)}
+            lines = [lines[0], {"kind": "suite"} | counts]
         RECORDS.mkdir(exist_ok=True)
         text = "".join(json.dumps(line) + "\n" for line in lines)
         measurement.file.write_text(text, encoding="utf-8")

@@ -21,6 +21,7 @@ from typing import Any
 from benchmarks_measure import (
     CHECKED,
     EXPERIMENTS,
+    EXTREME,
     MEASUREMENTS,
     OTHERS,
     RECORDS,
@@ -227,6 +228,7 @@ class Blocks:
             "moving": lambda: self._bench("moving", "max_depth"),
             "moving_ratios": lambda: self._ratios("moving", "max_depth"),
             "gradcheck": self.gradcheck,
+            "extreme": self.extreme,
             "experiments": self.experiments,
             "others": self.others,
             "runs": self.runs,
@@ -275,6 +277,28 @@ class Blocks:
         }  # fmt: skip
         rows = [[f"`{record.command}`", *gradcheck_line(record)] for record in records.values()]
         return self._with_commits(table(head, rows), records)
+
+    def extreme(self) -> str:
+        """Return what the extreme suite comes to, by its page, and by its record where there is one."""
+        rows = [line for line in EXTREME.read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
+        notes = [" ".join(re.findall(r"\*\*(.*?)\*\*", row)) for row in rows]
+        kinds = (": roughness", ": image", "no reference: expectation")
+        roughness, image, left_out = (sum(kind in note for note in notes) for kind in kinds)
+        found, origin = f"{len(rows)} scenes: none fails", {}
+        if (self.folder / MEASUREMENTS["extreme"].file.name).exists():
+            record = self.record("extreme")
+            counts, origin = record.rows[0], record.origin
+            hold, compared, fail = (counts[name] for name in ("hold", "comparisons", "fail"))
+            found = f"{len(rows)} scenes: {hold} of {compared} comparisons hold, {fail} fail"
+        text = (
+            "`reslrb gradcheck --suite extreme` ([docs/extreme.md](docs/extreme.md)) compares every estimator, and "
+            f"`stack` on both kinds of paths and on camera paths alone, in {found}. The roughness of `principled` "
+            f"stays open in {roughness} scenes, because its lobes are chosen. An image of camera paths stays open in "
+            f"{image}. "
+            f"Camera paths are left out of {left_out} scenes, whose light they do not find, or too rarely. "
+            f"Measured at {commit_of(origin)}."
+        )
+        return fill(text, WIDTH, break_long_words=False, break_on_hyphens=False)
 
     def experiments(self) -> str:
         """The README's table of whole runs."""

@@ -63,7 +63,7 @@ def test_every_table_of_records_says_at_which_commit_it_was_measured(folder: Pat
     assert {f"{number:012x}" for number in range(len(list(folder.glob("*.jsonl"))))} <= set(
         re.findall(r"\b[0-9a-f]{12}\b", pages.page(blocks) + blocks.others())
     )
-    for name in blocks.makers.keys() - {"machine", "gpu"}:
+    for name in blocks.makers.keys() - {"machine", "gpu", "extreme"}:
         assert re.search(r"at commit `[0-9a-f]{12}`", blocks.make(name)), name
     assert "000000000001` with changes that were not committed" in " ".join(pages.page(blocks).split())
     assert paper_page.page().count("at commit `") == 3
@@ -256,19 +256,13 @@ def test_wrong_names_are_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["write", "depth"]) == 2
 
 
-def test_the_readme_says_of_the_extreme_suite_what_its_page_does() -> None:
+def test_the_readme_says_of_the_extreme_suite_what_its_page_and_record_do(folder: Path) -> None:
     page = (ROOT / "docs" / "extreme.md").read_text(encoding="utf-8")
-    rows = [line for line in page.splitlines() if line.startswith("| `")]
-    notes = [set(re.findall(r"\*\*(.*?)\*\*", row)) for row in rows]
-    of = {kind: sum(any(note.endswith(kind) for note in row) for row in notes) for kind in ("roughness", "image")}
-    left_out = sum("no reference: expectation" in row for row in notes)
     known = {"unresolved: roughness", "heavy tailed: roughness", "heavy tailed: image", "no reference: expectation"}
-    assert set().union(*notes) <= known
-    said = re.search(
-        r"^\| the extreme suite, (\d+) scenes,.*?and none fails; roughness of .*? in (\d+) scenes, an image of "
-        r"camera paths in (\d+), and camera paths are left out of (\d+) ",
-        pages.README.read_text(encoding="utf-8"),
-        re.MULTILINE,
-    )
-    assert said is not None
-    assert [int(number) for number in said.groups()] == [len(rows), of["roughness"], of["image"], left_out]
+    assert set(re.findall(r"\*\*(.*?)\*\*", page)) <= known
+    origin = {"kind": "origin", "commit": "0" * 12, "clean": True}
+    counts = {"kind": "suite", "comparisons": 4321, "hold": 4320, "fail": 0}
+    (folder / "extreme.jsonl").write_text(f"{json.dumps(origin)}\n{json.dumps(counts)}\n")
+    said = " ".join(pages.Blocks(folder).extreme().split())
+    assert f"in {page.count(chr(10) + '| `')} scenes: 4320 of 4321 comparisons hold, 0 fail. The roughness" in said
+    assert said.endswith(f"Measured at commit `{'0' * 12}`.")
