@@ -12,6 +12,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from benchmarks_measure import code_state
+
 from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.backend.variant import choose
 from reslrb_cli.errors import ExitCode, ReslrbError, one_line
@@ -78,4 +80,4 @@ def _origin(name: str, options: argparse.Namespace, result: Any) -> dict[str, An
     variant, _ = choose(result.config.variant)
     words = ["scripts/paper", name, *(["ROOM"] if hasattr(options, "room") else []), "--seeds", str(options.seeds)]
     words += [word for setting in options.sets for word in ("--set", setting)]
-    return json.loads(Origin(device_name(variant), variant, words).to_json())  # type: ignore[no-any-return]
+    return json.loads(Origin(device_name(variant), variant, words).to_json()) | code_state()  # type: ignore[no-any-return]

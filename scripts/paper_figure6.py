@@ -15,6 +15,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from benchmarks_measure import code_state
 from paper_command import figure_parser
 from paper_room import ROOM, room_config
 
@@ -50,7 +51,7 @@ def main(arguments: list[str]) -> int:
 def _name_the_command(file: Path, others: list[str]) -> None:
     """Have the record say what does it again: `reslrb bench` saw an experiment that is gone now."""
     first, _, rest = file.read_text(encoding="utf-8").partition("\n")
-    origin = json.loads(first) | {"command": ["scripts/paper", "figure6", "ROOM", *others]}
+    origin = json.loads(first) | {"command": ["scripts/paper", "figure6", "ROOM", *others]} | code_state()
     file.write_text(f"{json.dumps(origin)}\n{rest}", encoding="utf-8")
 
 

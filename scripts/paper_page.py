@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import benchmarks_tables as tables
+import benchmarks_page as tables
 
 ROOT = Path(__file__).resolve().parent.parent
 RECORDS = ROOT / "docs" / "paper"
@@ -32,7 +32,7 @@ def _figure1(folder: Path) -> str:
     about = f"Each process under {limit:g} GiB of address space:"
     means = "Means of the gradients, compared in standard errors:"
     compared = _comparisons(record["comparisons"])
-    return "\n\n".join([_command(record, "figure1"), about, _gradients(record), means, compared, _fall(record)])
+    return "\n\n".join([_origin(record["origin"]), about, _gradients(record), means, compared, _fall(record)])
 
 
 def _figure5(folder: Path) -> str:
@@ -44,7 +44,7 @@ def _figure5(folder: Path) -> str:
     about += ":"
     means = "Means of the gradients, compared in standard errors; the exact estimators at equal seeds, in relative L2:"
     compared = _comparisons(record["comparisons"])
-    return "\n\n".join([_command(record, "figure5 ROOM"), about, _gradients(record), means, compared])
+    return "\n\n".join([_origin(record["origin"]), about, _gradients(record), means, compared])
 
 
 def _figure6(folder: Path) -> str:
@@ -85,13 +85,9 @@ def _published_ratio(depth: int) -> str:
     return "" if naive is None or ours is None else f"{ours / naive:.2f}"
 
 
-def _command(record: Mapping[str, Any], figure: str) -> str:
-    """The command of a record; older ones do not name theirs, nor the device."""
-    return _origin(record["origin"]) if "origin" in record else f"    scripts/paper {figure}"
-
-
 def _origin(origin: Mapping[str, Any]) -> str:
-    return f"    {shlex.join(origin['command'])}\n\n{origin['device']}, {origin['variant']}."
+    where = f"{origin['device']}, {origin['variant']}, at {tables.commit_of(origin)}"
+    return f"    {shlex.join(origin['command'])}\n\n{where}."
 
 
 def _gradients(record: Mapping[str, Any]) -> str:

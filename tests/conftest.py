@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from compilation import compute_alone, leave_out_optimisations
+from report import chromium
 
 import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before any test imports Mitsuba
 from reslrb_cli.backend.variant import set_variant
@@ -20,6 +21,23 @@ from reslrb_cli.errors import BackendError
 
 #: What most tests come to import.
 HEAVY = ("colour", "matplotlib.pyplot", "reslrb_cli.cli.optimize", "reslrb_cli.report.page", "reslrb_cli.runs.recorder")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the tests that need a browser, if there is none."""
+    if chromium.find_chromium() is None:
+        left_out = [item for item in items if "chromium" in getattr(item, "fixturenames", ())]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in left_out]
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say in one line that they were left out."""
+    if chromium.find_chromium() is None:
+        terminalreporter.write_line(
+            "no Chromium: tests that look at pages in a browser are left out (scripts/setup --test brings one)"
+        )
 
 
 def pytest_collection_finish() -> None:
@@ -51,11 +69,16 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture(scope="session")
 def llvm(pytestconfig: pytest.Config) -> str:
-    """Sets the variant, once: `llvm_ad_rgb`, or that of RESLRB_TEST_VARIANT; skips where its backend is missing."""
+    """Sets the variant, once, and returns its name.
+
+    It is `llvm_ad_rgb`, and tests are skipped if the machine has no backend for it. If RESLRB_TEST_VARIANT names a
+    variant, a missing backend fails the tests: whoever names one wants it tested.
+    """
+    named = os.environ.get("RESLRB_TEST_VARIANT")
     try:
-        variant = set_variant(os.environ.get("RESLRB_TEST_VARIANT", "llvm_ad_rgb"))
+        variant = set_variant(named or "llvm_ad_rgb")
     except BackendError as error:
-        pytest.skip(str(error))
+        (pytest.fail if named else pytest.skip)(str(error))
     if variant.startswith("llvm") and is_quick(pytestconfig):
         compute_alone()
     return variant

@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from reslrb_cli.backend import llvm, variant
+from reslrb_cli.backend import doctor, llvm, variant
 from reslrb_cli.backend import probe as probe_module
 from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.backend.probe import Probe, probe
@@ -249,6 +250,20 @@ def test_cuda_without_a_driver_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
     with pytest.raises(BackendError, match="no NVIDIA driver") as refused:
         variant.set_variant("cuda_ad_rgb")
     assert refused.value.exit_code is ExitCode.BACKEND
+
+
+def test_a_driver_that_hangs_has_no_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "nvidia-smi"
+    program.write_text("#!/bin/sh\necho 'A GPU, 1.2'\n[ -e hangs ] && exec sleep 30\n:\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.chdir(tmp_path)
+    assert doctor.ask_gpu("name,driver_version") == ["A GPU, 1.2"]
+    (tmp_path / "hangs").touch()
+    monkeypatch.setattr(doctor, "PATIENCE", 0.2)
+    start = time.monotonic()
+    assert doctor.ask_gpu("name,driver_version") == []
+    assert time.monotonic() - start < 10
 
 
 def test_set_variant_logs_its_choice(llvm: str, caplog: pytest.LogCaptureFixture) -> None:

@@ -1,90 +1,72 @@
-"""`scripts/gpu_check`: all parts run on a CPU too; what fails or takes too long is named, and the rest goes on."""
+"""`scripts/gpu_check`: its commands run on a CPU at the smallest sizes, and all that it names is there."""
 
 from __future__ import annotations
 
-import json
 import os
+import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
-import gpu_check as check
-import gpu_steps
 import pytest
-from gpu_report import gpu_section
 
 ROOT = Path(__file__).resolve().parents[1]
+NAMES = ["doctor", "bench", "gradcheck", "gradcheck_moving", "demo", "conformance"]
 
 
-def test_quick_on_a_cpu(tmp_path: Path, llvm: str) -> None:
-    command = [ROOT / "scripts" / "gpu_check", "--variant", "llvm_ad_rgb", "--quick", "-o", tmp_path]
-    environment = os.environ | {"PYTHON": sys.executable}
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+def gpu_check(*words: object, python: object = sys.executable) -> subprocess.CompletedProcess[str]:
+    """Run `scripts/gpu_check` on the CPU."""
+    command = [ROOT / "scripts/gpu_check", "--variant", "llvm_ad_rgb", *words]
+    environment = os.environ | {"PYTHON": str(python)}
+    return subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+
+
+def test_its_commands_run_at_the_smallest_sizes(tmp_path: Path, llvm: str) -> None:
+    done = gpu_check("--small", "-o", tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
-    found = json.loads((tmp_path / "gpu_check.json").read_text())
-    assert {part["status"] for part in found["parts"]} == {"ok"}
-    assert len(found["parts"]) == len(done.stdout.splitlines()) - 1
-    results = {part["name"]: part["results"] for part in found["parts"]}
-    assert {row["estimator"] for row in results["steps"]["steps"]} == {"reservoir", "stack"}
-    assert {row["max_depth"] for row in results["figure 6"]} == {2, 4}
-    assert results["demo"]["last"]["loss"] < results["demo"]["first"]["loss"]
-    page = (tmp_path / "gpu_check.md").read_text()
-    assert "| `reslrb:reservoir` |" in page
-    for part in found["parts"]:
-        assert f"| {part['name']} | ok |" in page
+    said = (tmp_path / "summary.md").read_text()
+    assert re.findall(r"^### (\w+): exit code 0 after", said, re.MULTILINE) == NAMES
+    assert re.match(r"Commit \w{12}(-dirty)?, llvm_ad_rgb, ", said)
+    assert said.count("5 of 5 comparisons hold") == 2
+    assert "1 passed" in said
+    for record in ("bench.jsonl", "gradcheck.jsonl", "gradcheck_moving.jsonl", "demo/metrics.jsonl"):
+        assert (tmp_path / record).stat().st_size > 0
 
 
-def test_what_fails_is_named_and_the_rest_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    sleeper = tmp_path / "pid"
-    slow = f"import os, time; open({str(sleeper)!r}, 'w').write(str(os.getpid())); time.sleep(60)"
-
-    def tasks(variant: str, quick: bool, folder: Path) -> list:
-        return [
-            check.Task("broken", ["-c", "print('why'); raise SystemExit(3)"], 20),
-            check.Task("slow", ["-c", slow], 1.5),
-            check.Task("unread", ["-c", ""], 20, check._rows("nothing.jsonl")),
-            check.Task("absent", ["-c", ""], 20, skip="pytest is not installed here"),
-            check.Task("fine", ["-c", ""], 20),
-        ]
-
-    monkeypatch.setattr(check, "_tasks", tasks)
-    assert check.main(["--variant", "llvm_ad_rgb", "-o", str(tmp_path / "out")]) == 1
-    parts = {part["name"]: part for part in json.loads((tmp_path / "out" / "gpu_check.json").read_text())["parts"]}
-    assert [part["status"] for part in parts.values()] == ["failed", "timed out", "failed", "skipped", "ok"]
-    assert parts["broken"]["output"] == ["why"]
-    assert "its results cannot be read" in parts["unread"]["reason"]
-    with pytest.raises(ProcessLookupError):
-        os.kill(int(sleeper.read_text()), 0)
-    assert "timed out" in capsys.readouterr().out
+@pytest.mark.parametrize("small", [[], ["--small"]])
+def test_all_that_it_names_is_there(small: list[str]) -> None:
+    listed = [line.split("\t") for line in gpu_check("--list", *small).stdout.splitlines()]
+    assert [name for name, _, _ in listed] == NAMES
+    assert all(0 < int(limit) <= 3600 for _, limit, _ in listed)
+    words = [word for _, _, command in listed for word in shlex.split(command)]
+    named = [word for word in words if word.startswith(("configs/", "tests/"))]
+    assert len(named) == 4
+    for file, _, test in (word.partition("::") for word in named):
+        assert (ROOT / file).exists(), file
+        assert not test or f"def {test}(" in (ROOT / file).read_text(), test
 
 
-def test_bench_rows_that_failed_fail(tmp_path: Path) -> None:
-    rows = [{"status": "ok"}, {"status": "out_of_memory"}]
-    (tmp_path / "a.jsonl").write_text("\n".join(map(json.dumps, rows)))
-    assert check._rows("a.jsonl")(tmp_path) == (rows, "")
-    (tmp_path / "b.jsonl").write_text(json.dumps({"holds": False}))
-    assert check._rows("b.jsonl")(tmp_path)[1] == "1 of 1 rows failed"
+def test_a_command_that_fails_is_named_and_the_others_run(tmp_path: Path) -> None:
+    python = tmp_path / "python"
+    python.write_text('#!/bin/sh\necho "$@"\ncase "$*" in *bench*) exit 3 ;; *optimize*) exit 124 ;; esac\n')
+    python.chmod(0o755)
+    done = gpu_check("-o", tmp_path / "out", python=python)
+    assert done.returncode == 1
+    lines = done.stdout.splitlines()
+    assert [line.split(":")[0] for line in lines[:-1]] == NAMES
+    assert lines[1].startswith("bench: exit code 3 after")
+    assert lines[4] == "demo: stopped at its limit of 900 s"
+    assert "--max-depth 128" in (tmp_path / "out" / "bench.out").read_text()
+    assert gpu_check("-o", tmp_path / "out", "doctor", "conformance", python=python).returncode == 0
+    assert gpu_check("docter").returncode == 2
 
 
-def test_steps_that_compile_or_grow_are_problems() -> None:
-    def row(depth: int, peak: float, new: list[int], apart: float | None = None) -> object:
-        return gpu_steps.Steps("room", "stack", depth, 1.0, 1.0, 1.0, peak, 0, None, new, apart)
-
-    assert gpu_steps._problems([row(4, 10.0, [1, 0, 0], 1e-7), row(64, 10.1, [0, 0, 0])]) == []
-    assert "compile" in gpu_steps._problems([row(4, 10.0, [1, 0, 1])])[0]
-    assert "grows" in gpu_steps._problems([row(4, 10.0, [0, 0, 0]), row(64, 11.0, [0, 0, 0])])[0]
-    assert "recorded" in gpu_steps._problems([row(4, 10.0, [0, 0, 0], float("nan"))])[0]
-
-
-def test_the_section_is_made_of_what_was_kept_last(tmp_path: Path) -> None:
-    assert gpu_section(tmp_path).startswith("No figure")
-    for device in ("One", "Two"):
-        part = {"name": "doctor", "status": "failed", "seconds": 3.0, "reason": "why", "results": [1], "output": ["x"]}
-        found = {"variant": "cuda_ad_rgb", "device": device, "quick": False, "parts": [part]}
-        check.record(found, tmp_path)
-    assert gpu_section(tmp_path) == check.section(found).rstrip()
-    assert "### Two" in gpu_section(tmp_path)
-    assert "| doctor | failed: why | 3 |" in gpu_section(tmp_path)
-    assert '"x"' not in (tmp_path / "gpu.json").read_text()
+def test_a_variant_that_is_named_is_tested_or_fails() -> None:
+    """Tests that are skipped for want of a GPU would look like tests that pass on it."""
+    test = "tests/conformance/test_replay.py::test_no_light_no_replay"
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", test]
+    environment = os.environ | {"RESLRB_TEST_VARIANT": "cuda_ad_rgb", "DRJIT_LIBCUDA_PATH": "/nonexistent.so"}
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 1
+    assert "1 error" in done.stdout

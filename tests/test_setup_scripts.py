@@ -43,22 +43,41 @@ esac
 """
 
 
-def set_up(folder: Path, python: Path) -> str:
+def set_up(folder: Path, python: Path, *options: str, **environment: str) -> str:
     """Run a checkout's `scripts/setup` with a pretended Python; what it said."""
-    environment = os.environ | {"RESLRB_PYTHON": str(python)}
-    done = subprocess.run([folder / "scripts/setup"], env=environment, capture_output=True, text=True, check=True)
+    command = [folder / "scripts/setup", *options]
+    environment = os.environ | {"RESLRB_PYTHON": str(python)} | environment
+    done = subprocess.run(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=True
+    )
     return done.stdout
 
 
-def test_a_copied_folder_gets_an_environment_of_its_own(tmp_path: Path) -> None:
+def make_checkout(folder: Path) -> None:
+    """Make a folder with what `scripts/setup` reads."""
+    (folder / "scripts").mkdir(parents=True)
+    shutil.copy(ROOT / "scripts/setup", folder / "scripts/setup")
+    shutil.copy(ROOT / "pyproject.toml", folder / "pyproject.toml")
+
+
+@pytest.fixture
+def python(tmp_path: Path) -> Path:
+    """The pretended Python."""
+    return make_program(tmp_path / "python", PYTHON)
+
+
+def make_program(path: Path, text: str) -> Path:
+    """Write a script that can be run."""
+    path.unlink(missing_ok=True)
+    path.write_text(text)
+    path.chmod(0o755)
+    return path
+
+
+def test_a_copied_folder_gets_an_environment_of_its_own(tmp_path: Path, python: Path) -> None:
     """Its scripts would otherwise run the folder that was copied."""
-    python = tmp_path / "python"
-    python.write_text(PYTHON)
-    python.chmod(0o755)
     first, second = tmp_path / "a checkout", tmp_path / "a checkout 2"
-    (first / "scripts").mkdir(parents=True)
-    shutil.copy(ROOT / "scripts/setup", first / "scripts/setup")
-    shutil.copy(ROOT / "pyproject.toml", first / "pyproject.toml")
+    make_checkout(first)
     assert set_up(first, python).endswith("setup: done\n")
     (first / ".venv/bin/reslrb").write_text(f"#!{first}/.venv/bin/python")
     assert set_up(first, python) == ""
@@ -73,6 +92,72 @@ def test_a_copied_folder_gets_an_environment_of_its_own(tmp_path: Path) -> None:
     (first / "pyproject.toml").write_text("")
     assert "removing" not in set_up(first, python)
     assert (first / ".venv/bin/reslrb").exists()
+
+
+#: A Chromium that draws pages, and one that does not.
+CHROMIUM, BROKEN = "#!/bin/sh\necho '<html></html>'\n", "#!/bin/sh\nexit 1\n"
+#: Stands in for `apt-get`: installs Chromium, or puts its package into the working folder.
+APT = """#!/bin/sh
+echo "$@" >>'{log}'
+case "$*" in
+*update*) ;;
+*{works}install*) cp '{chromium}' '{programs}/chromium-headless-shell' ;;
+*{works}download*) touch chromium.deb ;;
+*) exit 100 ;;
+esac
+"""
+#: Stands in for `dpkg`: unpacks it.
+DPKG = """#!/bin/sh
+mkdir -p "$3/usr/lib/chromium" && cp '{chromium}' "$3/usr/lib/chromium/chromium-headless-shell"
+"""
+
+
+@pytest.mark.parametrize("user", [0, 1000])
+def test_the_tests_setup_brings_a_chromium_where_one_can_be_had(tmp_path: Path, python: Path, user: int) -> None:
+    checkout, programs, log = tmp_path / "checkout", tmp_path / "programs", tmp_path / "log"
+    make_checkout(checkout)
+    programs.mkdir()
+    for folder in (Path("/bin"), Path("/usr/bin")):
+        for file in folder.iterdir():
+            if "chrom" not in file.name and not (programs / file.name).is_symlink():
+                (programs / file.name).symlink_to(file)
+    names = {"log": log, "programs": programs, "chromium": make_program(tmp_path / "chromium", CHROMIUM)}
+    make_program(programs / "id", f"#!/bin/sh\necho {user}\n")
+    make_program(programs / "apt-cache", "#!/bin/sh\n")
+    make_program(programs / "dpkg-query", "#!/bin/sh\nexit 1\n")
+    make_program(programs / "dpkg", DPKG.format(**names))
+    make_program(programs / "apt-get", APT.format(works="nothing", **names))
+    make_program(programs / "chromium", BROKEN)
+
+    said = set_up(checkout, python, "--test", PATH=str(programs))
+    assert "setup: Chromium: none can be had; tests that look at pages in a browser are left out\n" in said
+    assert said.endswith("setup: done\n")
+
+    (checkout / ".venv/.setup-test").unlink()
+    make_program(programs / "apt-get", APT.format(works="", **names))
+    said = set_up(checkout, python, "--test", PATH=str(programs))
+    found = checkout / ".cache/bin/chromium" if user else programs / "chromium-headless-shell"
+    assert f"setup: Chromium: {found}\n" in said
+    assert subprocess.run([found], capture_output=True, text=True, check=True).stdout == "<html></html>\n"
+    assert log.read_text().count("--yes --no-install-recommends chromium-headless-shell\n") == (0 if user else 2)
+
+    (checkout / ".venv/.setup-test").unlink()
+    said = set_up(checkout, python, "--test", PATH=str(programs))
+    assert f"setup: Chromium: {found}\n" in said
+    assert "setup: fetching" not in said
+    assert "setup: installing chromium" not in said
+
+
+def test_without_a_chromium_the_tests_say_so_in_one_line() -> None:
+    script = (
+        "import sys, pytest; sys.path.insert(0, 'tests'); from report import chromium; "
+        "chromium.find_chromium = lambda: None; "
+        "sys.exit(pytest.main(['--collect-only', '-q', '-p', 'no:cacheprovider', 'tests/report/test_page.py']))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.count("no Chromium: tests that look at pages in a browser are left out") == 1
+    assert "::test_nothing_scrolls_sideways" not in done.stdout
+    assert "::test_what_went_wrong_stands_first" in done.stdout
 
 
 @pytest.mark.skipif(

@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import subprocess
 from pathlib import Path
 
 import benchmarks_measure
 import benchmarks_page as pages
 import paper_page
 import pytest
-from benchmarks_list import MEASUREMENTS, OTHERS, RECORDS, ROOT, Measurement, experiment_record
-from benchmarks_tables import read
-from make_benchmarks import main
+from benchmarks_measure import MEASUREMENTS, OTHERS, RECORDS, ROOT, Measurement
+from benchmarks_page import main, read
 
 TINY = ("bench", "--values", "2", "--integrators", "reslrb:stack", "--rounds", "1", "--set", "scene.options.size=8",
         "--set", "run.spp=1")  # fmt: skip
@@ -44,6 +44,81 @@ def test_every_measurement_is_recorded_by_its_own_command() -> None:
         assert origin["seconds"] > 0
 
 
+def test_every_record_says_at_which_commit_it_was_measured() -> None:
+    found = benchmarks_measure.origins()
+    assert {"depth", "optimize_grey_room", "figure1", "figure5", "figure6"} <= set(found)
+    for name, origin in found.items():
+        assert re.fullmatch(r"[0-9a-f]{12}", origin["commit"]), name
+        assert origin["clean"] in (True, False, None), name
+        for place in benchmarks_measure.measures(origin["command"]):
+            assert (ROOT / place).exists(), f"{name}: {place}"
+
+
+def test_every_table_of_records_says_at_which_commit_it_was_measured(folder: Path) -> None:
+    for number, file in enumerate(sorted(folder.glob("*.jsonl"))):
+        first, _, rest = file.read_text(encoding="utf-8").partition("\n")
+        origin = json.loads(first) | {"commit": f"{number:012x}", "clean": number % 2 == 0}
+        file.write_text(f"{json.dumps(origin)}\n{rest}", encoding="utf-8")
+    blocks = pages.Blocks(folder)
+    assert {f"{number:012x}" for number in range(len(list(folder.glob("*.jsonl"))))} <= set(
+        re.findall(r"\b[0-9a-f]{12}\b", pages.page(blocks) + blocks.others())
+    )
+    for name in blocks.makers.keys() - {"machine", "gpu", "extreme"}:
+        assert re.search(r"at commit `[0-9a-f]{12}`", blocks.make(name)), name
+    assert "000000000001` with changes that were not committed" in " ".join(pages.page(blocks).split())
+    assert paper_page.page().count("at commit `") == 3
+
+
+def commit_all(folder: Path) -> None:
+    """Commit everything in a folder."""
+    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b.c"]
+    subprocess.run([*git, "add", "-A"], cwd=folder, check=True)
+    subprocess.run([*git, "commit", "-qm", "x"], cwd=folder, check=True)
+
+
+def test_a_record_is_stale_once_the_code_that_it_measures_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, content in {
+        "configs/room.yaml": "scene: {file: ../scenes/room/scene.xml}", "scenes/room/scene.xml": "", "docs/a.md": "",
+        "reslrb_cli/transport/walk.py": "", "reslrb_cli/measure/bench.py": "", "reslrb_cli/cli/bench.py": "",
+    }.items():  # fmt: skip
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(content)
+    subprocess.run(["git", "init", "-q"], cwd=tmp_path, check=True)
+    commit_all(tmp_path)
+    for name, value in {"ROOT": tmp_path, "RECORDS": tmp_path / "docs" / "benchmarks", "PAPER": tmp_path}.items():
+        monkeypatch.setattr(benchmarks_measure, name, value)
+    (tmp_path / "docs" / "benchmarks").mkdir()
+    (tmp_path / "docs/a.md").write_text("no code")
+    state = benchmarks_measure.code_state()
+    assert state["clean"] is True
+    commands = {"depth": ["reslrb", "bench"], "room": ["reslrb", "optimize", "configs/room.yaml"]}
+    for name, command in commands.items():
+        origin = {"kind": "origin", "command": command} | state
+        (tmp_path / "docs" / "benchmarks" / f"{name}.jsonl").write_text(json.dumps(origin) + "\n")
+    (tmp_path / "reslrb_cli/cli/bench.py").write_text("1")  # changes no figure
+    assert benchmarks_measure.code_state()["clean"] is False
+    commit_all(tmp_path)
+    assert main(["stale"]) == 0
+    for place, names in {
+        "reslrb_cli/measure/bench.py": ["depth"], "scenes/room/scene.xml": ["depth", "room"],
+        "reslrb_cli/transport/walk.py": ["depth", "room"],
+    }.items():  # fmt: skip
+        capsys.readouterr()
+        (tmp_path / place).write_text("1")
+        commit_all(tmp_path)
+        assert main(["stale"]) == 1
+        lines = capsys.readouterr().out.splitlines()
+        assert [line.split(":")[0] for line in lines] == names
+    assert lines[1] == (
+        f"room: measured at {state['commit']}; commits since then change reslrb_cli/transport (1), scenes/room (1)"
+    )
+    record = tmp_path / "docs" / "benchmarks" / "room.jsonl"
+    record.write_text(json.dumps({"kind": "origin", "command": commands["room"], "commit": "0" * 12}) + "\n")
+    assert benchmarks_measure.stale()[1] == "room: the commit that it was measured at is not known"
+
+
 def test_no_figure_is_typed() -> None:
     """Units with a figure before them stand in records alone; memory and time of the paper's machine are published."""
     published = ("142 MB",)
@@ -59,6 +134,32 @@ def test_all_that_the_pages_name_is_there() -> None:
     for page in (pages.PAGE, ROOT / "docs" / "paper.md"):
         for name in re.findall(r"\]\(([^)#:]+)[^)]*\)", page.read_text(encoding="utf-8")):
             assert (page.parent / name).exists(), f"{page.name} names {name}"
+
+
+#: Names of files of this repository, as text has them.
+NAMED = re.compile(
+    r"(?<![\w/.{}-])((?:configs|docs|scenes|scripts|tests|reslrb_cli)(?:/[\w-]+)*/[\w-]+\.\w+(?:\.\w+)*"
+    r"|(?:[\w-]+/)*test_\w+\.py|(?:[a-z]\w*/)+\w+\.py|scripts/\w+)\b"
+)
+#: Files that are written, and names that stand for others.
+NOT_HERE = {"docs/benchmarks/gpu.md"}
+
+
+def test_files_that_text_names_are_there() -> None:
+    """The documentation may name any file; of other files' text the names of tests are looked at."""
+    listed = subprocess.check_output(["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, text=True)
+    files = [name for name in listed.split() if (ROOT / name).is_file()]
+    ends = {name[at:] for name in (f"/{file}" for file in files) for at in range(len(name)) if name[at] == "/"}
+    gone = []
+    for file in files:
+        if file.endswith((".md", ".py")) and file != "CHANGELOG.md":
+            for name in set(NAMED.findall((ROOT / file).read_text(encoding="utf-8"))):
+                is_told = file.endswith(".md") or Path(name).name.startswith("test_")
+                if is_told and f"/{name}" not in ends and name not in NOT_HERE:
+                    gone.append(f"{file} names {name}")
+    assert gone == []
+    text = "`walk/x.py`, scripts/a (tests/b.py)"
+    assert NAMED.findall(text) == ["walk/x.py", "scripts/a", "tests/b.py"]
 
 
 @pytest.fixture
@@ -100,19 +201,6 @@ def test_the_readme_takes_its_figures_from_records(folder: Path) -> None:
     assert row not in text
 
 
-def test_the_readme_says_of_what_paths_its_rows_are_as_long_as_that_is_not_the_default(folder: Path) -> None:
-    runs = {name: folder / f"{experiment_record(name)}.jsonl" for name in ("cornell_floor", "stiff/lamp")}
-    for file in folder.glob("optimize_*.jsonl"):
-        origin, row = map(json.loads, file.read_text(encoding="utf-8").splitlines())
-        origin["written"] = "2026-11-2" + ("2" if file in runs.values() else "4") + "T09:41:54+00:00"
-        file.write_text(f"{json.dumps(origin)}\n{json.dumps(row)}\n", encoding="utf-8")
-    said = pages.Blocks(folder).paths()
-    # A named estimator has light paths alone before and after.
-    assert said.startswith("The rows of `cornell_floor` are of light paths alone, recorded before")
-    runs["cornell_floor"].write_text((folder / "optimize_mixed_room.jsonl").read_text(encoding="utf-8"))
-    assert pages.Blocks(folder).paths().startswith("Which paths each run took stands in")
-
-
 @pytest.mark.parametrize(
     ("needed", "reason", "chosen", "shown"),
     [
@@ -131,9 +219,9 @@ def test_the_paths_of_a_run_are_those_of_its_manifest(
         {"feature": "guided emission", "needed": True, "reason": ""},
     ]
     row = benchmarks_measure.traced({"plan": {"rows": rows}, "paths": chosen})
-    assert pages.tables.paths(pages.tables.Record({}, [row])) == shown
+    assert pages.paths_of(pages.Record({}, [row])) == shown
     of_prb = benchmarks_measure.traced({"plan": {"rows": []}, "paths": None})
-    assert pages.tables.paths(pages.tables.Record({}, [of_prb])) == ""
+    assert pages.paths_of(pages.Record({}, [of_prb])) == ""
 
 
 def test_ratios_are_of_medians() -> None:
@@ -144,18 +232,18 @@ def test_ratios_are_of_medians() -> None:
 
     rows = [row("ptracer", None, 2, 8.0), row("reslrb", "stack", 2, 4.0), row("ptracer", None, 4, 1.0, "out_of_memory"),
             row("reslrb", "stack", 4, 5.0)]  # fmt: skip
-    made = pages.tables.bench_ratios(pages.tables.Record({}, rows), "max_depth")
+    made = pages.bench_ratios(pages.Record({}, rows), "max_depth")
     assert made.splitlines()[2:] == ["| `ptracer` | 1.00 | out of memory | 2.0 |", "| `stack` | 0.50 | | 2.0 to 4.0 |"]
 
 
 def test_a_measurement_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, llvm: str) -> None:
     monkeypatch.setattr(benchmarks_measure, "RECORDS", tmp_path)
-    monkeypatch.setattr("benchmarks_list.RECORDS", tmp_path)
     tiny = Measurement("tiny", TINY)
     benchmarks_measure.measure(tiny)
     record = read(tmp_path / "tiny.jsonl")
     assert record.origin["command"] == ["reslrb", *TINY]
     assert record.origin["seconds"] > 0
+    assert {name: record.origin[name] for name in ("commit", "clean")} == benchmarks_measure.code_state()
     assert [row["status"] for row in record.rows] == ["ok"]
     with pytest.raises(SystemExit, match="exit code 2; its record is left as it was"):
         benchmarks_measure.measure(Measurement("tiny", ("bench", "--nonsense")))
@@ -168,19 +256,13 @@ def test_wrong_names_are_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["write", "depth"]) == 2
 
 
-def test_the_readme_says_of_the_extreme_suite_what_its_page_does() -> None:
+def test_the_readme_says_of_the_extreme_suite_what_its_page_and_record_do(folder: Path) -> None:
     page = (ROOT / "docs" / "extreme.md").read_text(encoding="utf-8")
-    rows = [line for line in page.splitlines() if line.startswith("| `")]
-    notes = [set(re.findall(r"\*\*(.*?)\*\*", row)) for row in rows]
-    of = {kind: sum(any(note.endswith(kind) for note in row) for row in notes) for kind in ("roughness", "image")}
-    left_out = sum("no reference: expectation" in row for row in notes)
     known = {"unresolved: roughness", "heavy tailed: roughness", "heavy tailed: image", "no reference: expectation"}
-    assert set().union(*notes) <= known
-    said = re.search(
-        r"^\| the extreme suite, (\d+) scenes,.*?and none fails; roughness of .*? in (\d+) scenes, an image of "
-        r"camera paths in (\d+), and camera paths are left out of (\d+) ",
-        pages.README.read_text(encoding="utf-8"),
-        re.MULTILINE,
-    )
-    assert said is not None
-    assert [int(number) for number in said.groups()] == [len(rows), of["roughness"], of["image"], left_out]
+    assert set(re.findall(r"\*\*(.*?)\*\*", page)) <= known
+    origin = {"kind": "origin", "commit": "0" * 12, "clean": True}
+    counts = {"kind": "suite", "comparisons": 4321, "hold": 4320, "fail": 0}
+    (folder / "extreme.jsonl").write_text(f"{json.dumps(origin)}\n{json.dumps(counts)}\n")
+    said = " ".join(pages.Blocks(folder).extreme().split())
+    assert f"in {page.count(chr(10) + '| `')} scenes: 4320 of 4321 comparisons hold, 0 fail. The roughness" in said
+    assert said.endswith(f"Measured at commit `{'0' * 12}`.")

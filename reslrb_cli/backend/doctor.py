@@ -24,6 +24,9 @@ from reslrb_cli.errors import BackendError
 #: Lanes of a vector on the CPU, at most (AVX-512); resident threads of a large GPU, where the driver does not tell.
 LLVM_LANES, LARGE_GPU = 16, 132 * 2048
 
+#: Seconds for `nvidia-smi`, which hangs if the driver does.
+PATIENCE = 20.0
+
 
 def device_name(variant: str) -> str:
     """The device that the Mitsuba variant `variant` runs on: GPU and driver's version, or processor and threads."""
@@ -33,12 +36,19 @@ def device_name(variant: str) -> str:
 
 
 def ask_gpu(query: str) -> list[str]:
-    """What `nvidia-smi` says of each GPU, numbers without their units; nothing where there is no such program."""
+    """Return the line that `nvidia-smi` prints for each GPU, numbers without their units.
+
+    The list is empty if there is no such program, or if it gives no answer in time.
+    """
     command = shutil.which("nvidia-smi")
     if command is None:
         return []
     words = [command, f"--query-gpu={query}", "--format=csv,noheader,nounits"]
-    return subprocess.run(words, capture_output=True, text=True, check=False).stdout.strip().splitlines()
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    except subprocess.TimeoutExpired:
+        return []
+    return done.stdout.strip().splitlines()
 
 
 def gpu_bytes(kind: str, most: int) -> int:

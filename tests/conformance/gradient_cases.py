@@ -228,9 +228,9 @@ CASES = [
                  ("sign.emitter.radiance.data", "lamp.emitter.radiance.value"), "prb"),
 ]  # fmt: skip
 
-#: The default suite compares the exact estimators with naive AD in these (test_estimators.py),
+#: The default suite compares the exact estimators with naive AD in these (test_gradients.py),
 AT_EQUAL_SEEDS = ("texture", "roulette", "roughplastic", "bumpmap", "glass", "mesh_attribute", "mask_texture_in_view",
                   "visible_lamp")  # fmt: skip
-#: and the reservoir with stock integrators and with finite differences in these (test_gradient_reference.py).
+#: and the reservoir with stock integrators and with finite differences in these.
 IN_EXPECTATION = ("texture", "roughconductor", "plastic", "blend", "mirror", "glass", "mask", "thin_glass",
                   "directional", "constant", "envmap")  # fmt: skip

@@ -291,10 +291,12 @@ def test_gradients_are_those_of_prb(case: GradientCase):
         assert compare(ours, reference, block=None), paths
 
 
-@pytest.mark.parametrize("case", a_few(BOTH, ["texture", "area"]))
+#: Only light paths find caustics in reasonable time.
+NO_CAUSTICS = [case for case in BOTH if case.name not in ("glass", "mirror")]
+
+
+@pytest.mark.parametrize("case", a_few(NO_CAUSTICS, ["texture", "area"]))
 def test_both_is_in_expectation_what_camera_paths_are(case: GradientCase):
-    if case.name in ("glass", "mirror"):  # caustics, which light paths alone find in reasonable time
-        pytest.skip("camera paths hardly find its light")
     scene = Case(case.scene(), case.keys)
     ours, reference = (
         scene.gradients(integrator("reslrb", **options_of(case, paths)), seeds(16, at), case.spp)

@@ -32,7 +32,7 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 # Every estimator in every case: exact ones equal naive AD of the same paths, the others do in expectation.
 #
-# The cases' own references (test_gradient_reference.py) say that naive AD of our walk is right. Here it is the
+# The cases' own references (`test_gradient` below) say that naive AD of our walk is right. Here it is the
 # reference at equal seeds, which sees what a test over many seeds cannot.
 
 EXACT = {"gather": {}, "stack": {}, "stack_of_2": {"estimator": "stack", "stack_size": 2}}

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("llvm")
 ESTIMATORS = ("reservoir", "gather", "event", "stack")
 #: Those whose draws follow from few features; `event` draws among what can be differentiated.
 STEADY = ("reservoir", "gather", "stack")
-#: What makes `reservoir` draw among other connections. That both are right is for test_estimators.py.
+#: What makes `reservoir` draw among other connections. That both are right is for test_gradients.py.
 CANDIDATES = ("derivatives of null surfaces",)
 WALL = "wall.brdf_0.reflectance.value"
 RADIANCE = "lamp.emitter.radiance.value"
@@ -227,7 +227,7 @@ def test_a_step_plans_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 # What comes after the last vertex with anything to differentiate, or has no such vertex, costs nothing.
 #
-# That results stay right is for test_estimators.py, whose cases differentiate one surface of several.
+# That results stay right is for test_gradients.py, whose cases differentiate one surface of several.
 
 FLOOR_ALONE = ("floor.brdf_0.reflectance.value",)
 ALL = (*FLOOR_ALONE, *(f"{name}.reflectance.value" for name in ("wall.brdf_0", "side.brdf_0", "cave.bsdf")))

@@ -272,7 +272,7 @@ def test_enough():
     assert len(SCENES) >= 16
 
 
-#: Rooms in which light bounces are too noisy for that; `test_attached_sampling.py` has them.
+#: Rooms in which light bounces are too noisy for that.
 STEADY = [name for name in SCENES if name not in {room.name for room in ROOMS}]
 
 

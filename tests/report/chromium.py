@@ -11,7 +11,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+#: The first is the one that `scripts/setup --test` unpacks.
+NAMES = (
+    str(Path(__file__).resolve().parents[2] / ".cache" / "bin" / "chromium"),
+    "chromium", "chromium-headless-shell", "chromium-browser", "google-chrome", "google-chrome-stable",
+)  # fmt: skip
 SWITCHES = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
     "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage", "--hide-scrollbars",

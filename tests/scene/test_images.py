@@ -32,9 +32,10 @@ def picture():
     return noise + np.stack([x / 200, y / 200, (x + y) / 400], axis=-1)
 
 
-@pytest.fixture(
-    params=["a.jpg", "progressive.jpg", "restarts.jpg", "a.png", "a.exr", "a.hdr", "a.pfm", "a.ppm", "a.bmp"]
-)
+NAMES = ["a.jpg", "progressive.jpg", "restarts.jpg", "a.png", "a.exr", "a.hdr", "a.pfm", "a.ppm", "a.bmp"]
+
+
+@pytest.fixture(params=NAMES)
 def image(request, tmp_path):
     """A whole image file of each format that can be read."""
     import mitsuba as mi
@@ -74,11 +75,13 @@ def test_a_file_that_is_cut_off_is_refused(image, share, capfd):
     assert capfd.readouterr() == ("", "")  # libjpeg's own words do not reach the terminal
 
 
-@pytest.mark.parametrize("share", [0.25, 0.5, 0.9])
+#: Zeros are black pixels in the last three formats, and part of the last lines of an EXR file, which have no checksum.
+PADDED = [(name, share) for name in NAMES[:-3] for share in (0.25, 0.5, 0.9) if (name, share) != ("a.exr", 0.9)]
+
+
+@pytest.mark.parametrize(("image", "share"), PADDED, indirect=["image"])
 @pytest.mark.parametrize("padding", ["zeros", "the end"])
 def test_a_file_that_is_cut_off_and_padded_is_refused(image, share, padding, capfd):
-    if image.suffix in (".pfm", ".ppm", ".bmp") or (image.suffix == ".exr" and share > 0.5):
-        pytest.skip("zeros are black pixels, or part of the last lines, which have no check sum")
     data = image.read_bytes()
     begin, end = data[: int(share * len(data))], data[-12:] if padding == "the end" else b""
     if image.suffix == ".jpg":
