@@ -187,11 +187,10 @@ class Replacing:
         home = self.description.root.source.file.absolute().parent.resolve()
         copies: dict[Path, str] = {}
         for element in self.description.root.walk("string", "spectrum"):
-            attribute = "filename" if element.tag == "spectrum" else "value"
-            name = element.attributes.get(attribute)
-            if not name or element in self._made or (element.tag == "string" and element.name != "filename"):
+            attribute = element.file_attribute
+            if not attribute or element in self._made:
                 continue
-            path = self.description.find_file(name)
+            path = self.description.find_file(element.attributes[attribute])
             if path is not None and path.is_file():
                 source = path.resolve()
                 if source not in copies:
