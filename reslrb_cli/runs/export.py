@@ -48,6 +48,9 @@ Array = np.ndarray[Any, Any]
 #: Samples per pixel of the solid's picture.
 PICTURE_SPP = 128
 
+#: Formats of solids that are not written: a folder of that name is not what anyone wants.
+_OTHER_SOLIDS = (".step", ".stp", ".iges", ".igs", ".dxf", ".f3d", ".sldprt", ".glb", ".gltf", ".fbx", ".amf")
+
 #: Told of what was written.
 Say = Callable[[str], None]
 
@@ -59,6 +62,9 @@ def check_export(config: Config, output: Path, tolerances: bool) -> None:
                           "`fabrication`")  # fmt: skip
     if output.suffix.lower() in WRITERS:
         check_file(output, config)
+    elif output.suffix.lower() in _OTHER_SOLIDS:
+        raise ConfigError("--output", "", f"{output}: {output.suffix} is not written; name a folder, or a file that "
+                          f"ends in {', '.join(WRITERS)}")  # fmt: skip
     else:
         check_folder(output)
 
