@@ -196,8 +196,10 @@ def shape_surface(
     if floor == "auto":
         with np.errstate(invalid="ignore", divide="ignore"):  # of trials that send light nowhere
             found = transport.least_floor(rays, target, setting.size, setting.picture_size, start)
-            even = found or transport.least_floor(rays, target, setting.size, setting.picture_size, start, [0.9])
-        if found is None and even is None:
+            is_lit = found is not None or transport.least_floor(
+                rays, target, setting.size, setting.picture_size, start, [0.9]
+            ) is not None  # fmt: skip
+        if not is_lit:
             near = np.isfinite(setting.light_distance)
             key, what = ("light_distance", "a light farther away") if near else ("distance", "a larger distance")
             raise ConfigError("", key, f"is {getattr(setting, key):g} mm, from where no {setting.kind} was found that "
