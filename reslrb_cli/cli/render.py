@@ -127,14 +127,11 @@ def command(
     with writing("--output", output):
         write_file(output.resolve(), image * factor, linear)
     words = [f"{image.shape[1]}x{image.shape[0]}", f"{samples} spp", *filter(None, [exposure_words(factor)])]
+    hint = "" if suits == 1 or is_given("exposure") else f"; --exposure auto: {exposure_words(suits)}"
     if np.any(applied != 1):
         shown = " ".join(f"{value:.4g}" for value in np.ravel(applied))
         words.append(f"times {shown}, the run's exposure (--exposure 1 leaves it out)")
-    hint = (
-        ""
-        if suits == 1 or is_given("exposure") or np.any(applied != 1)
-        else f"; --exposure auto: {exposure_words(suits)}"
-    )
+        hint = ""
     echo(f"{output}: {', '.join(words)}{hint}")
 
 

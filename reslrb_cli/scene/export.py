@@ -243,9 +243,9 @@ def export_scene(
     """Write what `description` says, with the values that `params` have of `keys`, and an integrator, to `folder`.
 
     `params` are of a scene that was built from the description, which is changed. `integrator` has its type and
-    options; `beside` are more files, by name, and who writes each; `note` stands at the scene's head. The folder appears once it is whole, and Mitsuba has
-    read the same values back from it. Raises ConfigError, located in `source` and the key, where a value cannot be
-    said, and OSError.
+    options; `beside` are more files, by name, and who writes each; `note` stands at the head of the scene. The folder
+    appears once it is whole, and Mitsuba has read the same values back from it. Raises ConfigError, located in
+    `source` and the key, where a value cannot be said, and OSError.
     """
     replacing, root = Replacing(description, params, source), description.root
     for key in keys:
@@ -258,11 +258,8 @@ def export_scene(
         if name != "type"
     ]
     root.children.insert(0, root.new("integrator", *options, type=str(integrator["type"])))
-    lines = [
-        f"<!-- Written by `reslrb export`. {note} -->".replace("  ", " "),
-        *(line for line, _ in tag_lines(root)),
-        "",
-    ]
+    head = f"<!-- {' '.join(filter(None, ['Written by `reslrb export`.', note]))} -->"
+    lines = [head, *(line for line, _ in tag_lines(root)), ""]
     replacing.writers[SCENE] = lambda path: path.write_text("\n".join(lines), encoding="utf-8")
     folder = folder.absolute()
     folder.parent.mkdir(parents=True, exist_ok=True)
