@@ -6,6 +6,7 @@ named `command`; it is loaded when it is called.
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import logging
 import os
@@ -55,6 +56,14 @@ class _Main(click.Group):
             return None
         command: click.Command = importlib.import_module(f"{__name__}.{cmd_name}").command
         return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        near = difflib.get_close_matches(args[0], _SUMMARIES, n=1)
+        if near and args[0] not in _SUMMARIES and not ctx.resilient_parsing:
+            raise click.UsageError(f"No such command {args[0]!r}; did you mean `{near[0]}`?", ctx)
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):

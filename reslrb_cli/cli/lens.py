@@ -26,20 +26,23 @@ _OPTIONS = {"picture_size": "--picture-size", "light_distance": "--light-distanc
 
 
 def read_luminance(path: Path) -> np.ndarray:
-    """Linear luminance (H, W) of an image file, upright, what is transparent over white. Raises ConfigError."""
+    """Return the linear luminance (H, W) of an image file, upright. Raises ConfigError.
+
+    Transparent parts are white, as viewers show them; black where all would be white otherwise.
+    """
     import numpy as np
 
+    from reslrb_cli.lens.surface import is_even
     from reslrb_cli.scene.images import read_bitmap, read_photo
 
-    image = read_photo(path).image.astype(np.float64)
+    image = read_photo(path).image.astype(np.float64) @ np.array([0.2126, 0.7152, 0.0722])
     bitmap = read_bitmap(path, upright=True)
     if bitmap.has_alpha():
-        raw = np.array(bitmap)
-        raw = raw.reshape(*image.shape[:2], -1)
-        alpha = raw[:, :, -1:].astype(np.float64)
-        alpha = np.clip(alpha / np.iinfo(raw.dtype).max if raw.dtype.kind in "ui" else alpha, 0, 1)
-        image = (image if bitmap.premultiplied_alpha() else alpha * image) + 1 - alpha
-    return image @ np.array([0.2126, 0.7152, 0.0722])
+        raw = np.array(bitmap)[:, :, -1]
+        alpha = np.clip(raw / np.iinfo(raw.dtype).max if raw.dtype.kind in "ui" else raw, 0.0, 1.0)
+        image = image if bitmap.premultiplied_alpha() else alpha * image
+        image = image if is_even(image + 1 - alpha) else image + 1 - alpha
+    return image
 
 
 @click.command("lens")
@@ -100,7 +103,7 @@ def command(
 
     from reslrb_cli.backend.variant import set_variant
     from reslrb_cli.lens import experiment
-    from reslrb_cli.lens.surface import Setting, shape_surface
+    from reslrb_cli.lens.surface import Setting, is_even, shape_surface
     from reslrb_cli.lens.transport import resized
 
     for option, value in (("--size", size), ("--distance", distance), ("--picture-size", picture_size),
@@ -132,11 +135,14 @@ def command(
 
     from reslrb_cli.records.images import write_file
 
-    image = read_luminance(picture)
+    image = whole = read_luminance(picture)
     longer = max(image.shape)
     if longer > pixels:
         image = resized(image, (max(1, round(image.shape[0] * pixels / longer)),
                                 max(1, round(image.shape[1] * pixels / longer))))  # fmt: skip
+    if is_even(image) and not is_even(whole):
+        raise ConfigError("--pixels", "", f"is {pixels}, at which {picture} is of one colour: its pattern is finer; "
+                          f"it has {longer} pixels")  # fmt: skip
     rows, columns = image.shape
     if outline == "round" and light_distance is not None and (mirror or rows != columns):
         raise ConfigError("--outline", "", "round goes with parallel light, or with a point light and a lens for a "

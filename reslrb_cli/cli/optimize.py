@@ -200,6 +200,8 @@ def _run(begun: Begun, workers: Place | None, quiet: bool) -> int:
     tallies = [str(tally) for tally in kept if tally.iterations]
     page = place.path if "page" in manifest.missing else place.path / "report.html"
     echo(last_line(status.value, manifest.results, tallies, os.path.relpath(page)))
+    if not quiet and status is Status.INTERRUPTED:
+        echo(f"next: `reslrb optimize --resume {os.path.relpath(place.path)}` goes on from here")
     if not quiet and status is Status.FINISHED and course.problem.config.fabrication is not None:
         echo(f"next: `reslrb export {os.path.relpath(place.path)} -o FOLDER` makes the solid")
     return ExitCode.DONE if status is Status.FINISHED else ExitCode.INTERRUPTED

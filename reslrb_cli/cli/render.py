@@ -74,7 +74,8 @@ class Exposure(click.ParamType):
     type=Exposure(),
     default="1",
     show_default=True,
-    help="What a PNG or JPG shows the image times: a number, or auto, which suits what is in view but lamps.",
+    help="What a PNG or JPG shows the image times: a number, or auto, which suits what is in view but lamps. "
+    "With --run the default is the run's exposure, in EXR, HDR and PFM as well; 1 leaves it out.",
 )
 @click.option(
     "--initial/--scene",
@@ -97,15 +98,18 @@ def command(
     if run is not None and is_given("initial"):
         raise click.UsageError("--run renders the values that the run recovered; leave out --initial and --scene")
     linear = output.suffix.lower() in FLOAT_FORMATS
-    if linear and is_given("exposure"):
+    if linear and is_given("exposure") and (run is None or exposure != 1):
         raise click.UsageError(f"{output.suffix} holds light as it is; --exposure is for PNG and JPG")
     config = _read(config_file, run, overrides).with_code(allow_code)
     check_image_path(output)
     start_variant(config)
 
+    import numpy as np
+
     from reslrb_cli.optimization.assemble import check_passes, load_for_rendering
     from reslrb_cli.optimization.loading import render_in_passes
     from reslrb_cli.records.images import write_file
+    from reslrb_cli.records.run_folder import exposures
     from reslrb_cli.report.tonemap import exposure_words
 
     if sensor is not None:
@@ -115,12 +119,19 @@ def command(
     if spp is not None:
         check_passes("--spp", spp, multiple)
     image = render_in_passes(integrator, scene, sensors[0], samples, config.run.seed, 0, "render", multiple)
+    own = {} if run is None or is_given("exposure") else exposures(run)
+    applied = own.get(sensors[0], np.float32(1))
+    image[:, :, : 1 if image.shape[2] <= 2 else 3] *= applied
     suits = 1.0 if linear else _suiting(image, scene, scene.sensors()[sensors[0]])
     factor = suits if exposure is None else exposure
     with writing("--output", output):
         write_file(output.resolve(), image * factor, linear)
     words = [f"{image.shape[1]}x{image.shape[0]}", f"{samples} spp", *filter(None, [exposure_words(factor)])]
     hint = "" if suits == 1 or is_given("exposure") else f"; --exposure auto: {exposure_words(suits)}"
+    if np.any(applied != 1):
+        shown = " ".join(f"{value:.4g}" for value in np.ravel(applied))
+        words.append(f"times {shown}, the run's exposure (--exposure 1 leaves it out)")
+        hint = ""
     echo(f"{output}: {', '.join(words)}{hint}")
 
 

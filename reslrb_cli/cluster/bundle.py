@@ -90,11 +90,10 @@ def _scene_text(bundle: Bundle, config: Config) -> str:
     texts = {name: _text(value) for name, value in config.scene.options.items()}
     description = read_description(config.scene.file, texts)
     for element in description.root.walk():
-        for key, named in (("value", element.tag == "string" and element.name == "filename"),
-                           ("filename", element.tag == "spectrum" and "filename" in element.attributes)):  # fmt: skip
-            path = description.find_file(element.attributes.get(key, "")) if named else None
-            if path is not None and path.is_file():
-                element.attributes[key] = bundle.add(path)
+        key = element.file_attribute
+        path = description.find_file(element.attributes[key]) if key else None
+        if path is not None and path.is_file():
+            element.attributes[key] = bundle.add(path)
     return "".join(f"{line}\n" for line, _ in tag_lines(description.root))
 
 

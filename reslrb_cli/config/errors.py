@@ -177,6 +177,7 @@ def _below(section: type[Section], name: str, key: str) -> list[str]:
 
 
 def _one_of(known: list[str], value: Any) -> str:
+    known = list(dict.fromkeys(known))  # a union within a union names its members twice
     near = _nearest(value, known) if isinstance(value, str) else []
     choices = " or ".join(known) if len(known) < 3 else "one of " + ", ".join(known)
     return choices + (f" (did you mean {near[0]}?)" if near else "")

@@ -214,7 +214,7 @@ def check_views(views: list[ViewSpec], scene: Any, target: TargetConfig) -> None
         if view.target is None and target.render is None and scene.cameras is None:
             raise located(f"views[{number}].target", "missing; name an image, or have all rendered by target.render")
     if scene.sensors != [0]:
-        raise located("scene.sensors", "has no effect beside `views`, which name their sensors")
+        raise located("scene.sensors", "stands beside `views`, which name their own sensors; remove it")
     if target.file is not None:
         raise located("target.file", "has no effect beside `views`; give each view its own target")
     if isinstance(target.exposure, list):

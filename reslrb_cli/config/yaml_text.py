@@ -172,6 +172,8 @@ def _problem(error: yaml.MarkedYAMLError, text: str, example: Callable[[str], st
         quoted = f'"{word[0]}"'
         mended = quoted if example is None else example(text[: word.start()] + quoted + text[word.end() :])
         return f"{word[0]} is an alias in YAML, and names nothing here; text that begins with * wants quotes: {mended}"
+    if "'\\t' that cannot start any token" in problem:
+        return "not valid YAML: a tab; YAML allows only spaces for indentation and after a colon"
     hint = "; put text that begins with it in quotes" if "cannot start any token" in problem else ""
     return f"not valid YAML: {problem}{hint}"
 

@@ -196,8 +196,10 @@ def shape_surface(
     if floor == "auto":
         with np.errstate(invalid="ignore", divide="ignore"):  # of trials that send light nowhere
             found = transport.least_floor(rays, target, setting.size, setting.picture_size, start)
-            even = found or transport.least_floor(rays, target, setting.size, setting.picture_size, start, [0.9])
-        if found is None and even is None:
+            is_lit = found is not None or transport.least_floor(
+                rays, target, setting.size, setting.picture_size, start, [0.9]
+            ) is not None  # fmt: skip
+        if not is_lit:
             near = np.isfinite(setting.light_distance)
             key, what = ("light_distance", "a light farther away") if near else ("distance", "a larger distance")
             raise ConfigError("", key, f"is {getattr(setting, key):g} mm, from where no {setting.kind} was found that "
@@ -265,13 +267,18 @@ def _start(rays: Rays) -> Array:
 # ---- what cannot be
 
 
+def is_even(picture: Array) -> bool:
+    """Whether a picture is of one colour: a level of 8 bits, or dithering between two levels, counts as none."""
+    return bool(picture.max() - picture.min() <= 0.02 * picture.max())
+
+
 def _check(picture: Array, setting: Setting) -> None:
     s = setting
     if picture.ndim != 2 or min(picture.shape) < 2:
         raise ConfigError("", "picture", f"is {' x '.join(map(str, picture.shape))}; it must have 2 x 2 pixels or more")
     if not np.all(np.isfinite(picture)) or picture.min() < 0:
         raise ConfigError("", "picture", "has values that are negative or not finite")
-    if picture.max() - picture.min() <= 0.02 * picture.max():  # a level of 8 bits, or dithering between two, is none
+    if is_even(picture):
         raise ConfigError("", "picture", "is of one colour; there is nothing to throw")
     for key in ("size", "picture_size"):
         if min(getattr(s, key)) <= 0:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import scipy.fft
@@ -82,17 +82,30 @@ def sample(values: Array, size: tuple[float, float], x: Array, y: Array) -> Arra
     return scipy.ndimage.map_coordinates(values, places, order=1, mode="nearest")
 
 
-def resized(values: Array, shape: tuple[int, int]) -> Array:
-    """`values` (ny, nx) of another number of cells, means over areas: the sum times the cell's area stays."""
-    for axis, n in enumerate(shape):
-        total = np.cumsum(values, axis=axis)
-        total = np.concatenate([np.zeros_like(np.take(total, [0], axis=axis)), total], axis=axis)
-        at = np.linspace(0, values.shape[axis], n + 1)
-        low = np.minimum(at.astype(int), values.shape[axis] - 1)
-        part = np.expand_dims(at - low, tuple(i for i in range(values.ndim) if i != axis))
-        edges = np.take(total, low, axis=axis) * (1 - part) + np.take(total, low + 1, axis=axis) * part
-        values = np.diff(edges, axis=axis) * (n / values.shape[axis])
+def resized(values: NDArray[Any], shape: tuple[int, int], between: bool = False) -> NDArray[Any]:
+    """Return `values` (ny, nx, ...) with another number of rows and columns, and no value beyond theirs.
+
+    Each new cell is the mean over its area, so the sum times the cell's area stays. With `between`, an axis that gets
+    more cells is interpolated linearly between the old cells' centres instead.
+    """
+    for axis, (old, new) in enumerate(zip(values.shape, shape)):  # noqa: B905  # `values` may have channels as well
+        if old != new:
+            part = _shares(old, new, between and new > old).astype(np.result_type(values, np.float32))
+            values = np.moveaxis(np.tensordot(part, values, (1, axis)), 0, axis)
     return values
+
+
+def _shares(old: int, new: int, between: bool) -> Array:
+    """Return the share that each of `new` cells takes of each of `old` cells on a line: (new, old), rows sum to 1."""
+    if between:
+        at = np.clip((np.arange(new) + 0.5) * (old / new) - 0.5, 0, old - 1)
+        return np.asarray(np.maximum(1 - np.abs(at[:, None] - np.arange(old)), 0))
+    edges = np.arange(new + 1) * (old / new)
+    low = np.maximum(edges[:-1, None], np.arange(old))
+    shares = np.maximum(np.minimum(edges[1:, None], np.arange(1, old + 1)) - low, 0)
+    # Rounding leaves slivers, through which a clipped or infinite cell would reach cells that it does not overlap.
+    shares[shares < 1e-6] = 0
+    return np.asarray(shares / shares.sum(axis=1, keepdims=True))
 
 
 def _shrunk(picture: Array, part: float) -> Array:

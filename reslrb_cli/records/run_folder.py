@@ -77,6 +77,18 @@ def recovered(run: Path, overrides: Sequence[str | Override]) -> Config:
     return config.model_copy(update={"parameters": specs})
 
 
+def exposures(run: Path) -> dict[int, Array]:
+    """Return the exposure of each sensor that a run compares, recovered or given: one number, or one for each channel.
+
+    Raises ConfigError as `read_value`.
+    """
+    found: dict[int, Array] = {}
+    for view in _manifest_of(run).get("views") or ():
+        exposure = view.get("exposure", 1.0)
+        found[view["sensor"]] = read_value(run, exposure) if isinstance(exposure, str) else np.float32(exposure)
+    return found
+
+
 def checkpoint_of(run: Path) -> Path:
     """The file of the newest checkpoint of the run folder `run`. Raises ConfigError where there is none."""
     _manifest_of(run)

@@ -36,7 +36,7 @@ from reslrb_cli.optimization.moving import moves_anything
 from reslrb_cli.records.atomic import write_atomically, writing
 from reslrb_cli.records.images import write_bitmap, write_file, write_image
 from reslrb_cli.records.metrics import finite
-from reslrb_cli.records.run_folder import FABRICATION_FILE, SOLID_PICTURE
+from reslrb_cli.records.run_folder import FABRICATION_FILE, SOLID_PICTURE, exposures
 from reslrb_cli.scene.export import export_scene
 from reslrb_cli.scene.graph import interpolates_normals
 from reslrb_cli.scene.images import read_image, read_photo
@@ -47,6 +47,9 @@ Array = np.ndarray[Any, Any]
 
 #: Samples per pixel of the solid's picture.
 PICTURE_SPP = 128
+
+#: Formats of solids that are not written: a folder of that name is not what anyone wants.
+_OTHER_SOLIDS = (".step", ".stp", ".iges", ".igs", ".dxf", ".f3d", ".sldprt", ".glb", ".gltf", ".fbx", ".amf")
 
 #: Told of what was written.
 Say = Callable[[str], None]
@@ -59,6 +62,9 @@ def check_export(config: Config, output: Path, tolerances: bool) -> None:
                           "`fabrication`")  # fmt: skip
     if output.suffix.lower() in WRITERS:
         check_file(output, config)
+    elif output.suffix.lower() in _OTHER_SOLIDS:
+        raise ConfigError("--output", "", f"{output}: {output.suffix} is not written; name a folder, or a file that "
+                          f"ends in {', '.join(WRITERS)}")  # fmt: skip
     else:
         check_folder(output)
 
@@ -95,9 +101,12 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
             if is_there(scene, plan):
                 light = where_light_goes(scene, scene.sensors()[sensors[0]], plan, luminance(target))
         beside = solid_files(plan, sheets, solid, light, loss, off)
+    exposure = exposure_line(run)
     with writing("--output", output):
-        export_scene(described[0], selection.params, selection.scene_keys, integrator, output, run, beside)
+        export_scene(described[0], selection.params, selection.scene_keys, integrator, output, run, beside, exposure)
     say(f"{output / 'scene.xml'}: {', '.join(selection.keys)}; rendered by {integrator['type']}{why}")
+    if exposure:
+        say(exposure)
     faces = [spec.heightmap.mesh[0] for spec in config.parameters if spec.heightmap is not None]
     if plan is None and faces:
         how = (
@@ -117,6 +126,16 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
             say(f"{plan.kind}.3mf is left out, since lib3mf is missing: pip install 'reslrb[fabrication]'")
     if off:
         keep_tolerances(config, run, off, say)
+
+
+def exposure_line(run: Path) -> str:
+    """Say what renderings are to be multiplied by to match a run's photographs; empty where that is 1."""
+    found = {sensor: " ".join(f"{value:.4g}" for value in np.ravel(each)) for sensor, each in exposures(run).items()}
+    if set(found.values()) <= {"1"}:
+        return ""
+    same = len(set(found.values())) == 1
+    words = [each if same else f"{each} (sensor {sensor})" for sensor, each in found.items()]
+    return f"multiply renderings by the exposure, {words[0] if same else ', '.join(words)}, to match the photographs"
 
 
 # --- what the run's own folder has of its solid -----------------------------------------------------------------------

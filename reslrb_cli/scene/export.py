@@ -187,11 +187,10 @@ class Replacing:
         home = self.description.root.source.file.absolute().parent.resolve()
         copies: dict[Path, str] = {}
         for element in self.description.root.walk("string", "spectrum"):
-            attribute = "filename" if element.tag == "spectrum" else "value"
-            name = element.attributes.get(attribute)
-            if not name or element in self._made or (element.tag == "string" and element.name != "filename"):
+            attribute = element.file_attribute
+            if not attribute or element in self._made:
                 continue
-            path = self.description.find_file(name)
+            path = self.description.find_file(element.attributes[attribute])
             if path is not None and path.is_file():
                 source = path.resolve()
                 if source not in copies:
@@ -239,13 +238,14 @@ def export_scene(
     folder: Path,
     source: object,
     beside: Mapping[str, Callable[[Path], object]] | None = None,
+    note: str = "",
 ) -> None:
     """Write what `description` says, with the values that `params` have of `keys`, and an integrator, to `folder`.
 
     `params` are of a scene that was built from the description, which is changed. `integrator` has its type and
-    options; `beside` are more files, by name, and who writes each. The folder appears once it is whole, and Mitsuba has
-    read the same values back from it. Raises ConfigError, located in `source` and the key, where a value cannot be
-    said, and OSError.
+    options; `beside` are more files, by name, and who writes each; `note` stands at the head of the scene. The folder
+    appears once it is whole, and Mitsuba has read the same values back from it. Raises ConfigError, located in
+    `source` and the key, where a value cannot be said, and OSError.
     """
     replacing, root = Replacing(description, params, source), description.root
     for key in keys:
@@ -258,7 +258,8 @@ def export_scene(
         if name != "type"
     ]
     root.children.insert(0, root.new("integrator", *options, type=str(integrator["type"])))
-    lines = ["<!-- Written by `reslrb export`. -->", *(line for line, _ in tag_lines(root)), ""]
+    head = f"<!-- {' '.join(filter(None, ['Written by `reslrb export`.', note]))} -->"
+    lines = [head, *(line for line, _ in tag_lines(root)), ""]
     replacing.writers[SCENE] = lambda path: path.write_text("\n".join(lines), encoding="utf-8")
     folder = folder.absolute()
     folder.parent.mkdir(parents=True, exist_ok=True)

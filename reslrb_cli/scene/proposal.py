@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.lens.transport import resized
 from reslrb_cli.records.images import write_bitmap
 from reslrb_cli.scene.catalog import ParameterInfo, list_parameters
 from reslrb_cli.scene.export import LOBES
@@ -74,25 +75,12 @@ def write_smaller(photo: Photograph, size: tuple[int, int], path: Path) -> None:
 
 def _means(image: Image, size: tuple[int, int]) -> Image:
     """The means of an (H, W, C) image over the pixels of one of `size` (width, height), shares of its own included."""
-    (height, width, channels), (columns, rows) = image.shape, size
     values = image.astype(np.float32)
     known = np.isfinite(values)
     if not known.all():  # which would reach whole rows
         lost = _means(~known, size) > 0
         return np.where(lost, np.float32(np.nan), _means(np.where(known, values, 0), size))
-    lower = (_box_weights(height, rows) @ values.reshape(height, -1)).reshape(rows, width, channels)
-    return np.asarray(_box_weights(width, columns) @ lower, dtype=np.float32)
-
-
-def _box_weights(old: int, new: int) -> Image:
-    """How much of each of `new` intervals each of `old` intervals of the same line takes: (new, old), rows sum to 1."""
-    edges = np.arange(new + 1) * (old / new)
-    low = np.maximum(edges[:-1, None], np.arange(old)[None, :])
-    high = np.minimum(edges[1:, None], np.arange(1, old + 1)[None, :])
-    shares = np.maximum(high - low, 0)
-    # Rounding leaves slivers, by which what is clipped, or not a number, would reach pixels that it is no part of.
-    shares[shares < 1e-6] = 0
-    return np.asarray(shares / shares.sum(axis=1, keepdims=True), dtype=np.float32)
+    return np.asarray(resized(values, size[::-1]))
 
 
 #: Colours of materials, by which a photograph mostly differs from a scene.

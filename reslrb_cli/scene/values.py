@@ -135,13 +135,10 @@ def check_transform(slot: ParameterValue, array: Array, spec: Settings, place: P
 
 
 def resample(array: Array, resolution: tuple[int, int]) -> Array:
-    """Resample an (H, W, C) image bilinearly to `resolution` (width, height), smoothed first where it shrinks."""
-    from skimage.transform import resize
+    """Resample an (H, W, C) image to `resolution` (width, height): means over areas, linear where it grows."""
+    from reslrb_cli.lens.transport import resized  # late: SciPy takes a while to load
 
-    smaller = resolution[0] < array.shape[1] or resolution[1] < array.shape[0]
-    shape = (resolution[1], resolution[0], array.shape[2])
-    result = resize(array, shape, order=1, mode="edge", anti_aliasing=smaller, preserve_range=True)
-    return np.asarray(result, dtype=np.float32)
+    return np.asarray(resized(array, resolution[::-1], between=True), dtype=np.float32)
 
 
 def _channels(node: Any, key: str, value: Any, is_tensor: bool) -> int:

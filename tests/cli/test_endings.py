@@ -45,7 +45,9 @@ def test_a_signal_ends_a_run_after_the_iteration(optimize, during, number):
     assert (code, faults(RUN, code, err)) == (130, [])
     assert COMPLETE <= files(RUN)
     assert read_content(RUN)["results"]["iterations"] == len(read_metrics(RUN)) == 2
-    assert out.splitlines()[-1].startswith("interrupted after 2 iterations")
+    *_, ending, advice = out.splitlines()
+    assert ending.startswith("interrupted after 2 iterations")
+    assert advice == f"next: `reslrb optimize --resume {RUN}` goes on from here"
 
 
 @pytest.mark.parametrize(("name", "call"), [("write_image", 0), ("write_parameters", 2), ("write_image", 2)])

@@ -119,7 +119,9 @@ def test_a_fault_of_ours_keeps_its_traceback() -> None:
     ("args", "line"),
     [
         ([], "reslrb: Missing command"),
-        (["optimise"], "reslrb: No such command"),
+        (["optimise"], "reslrb: No such command 'optimise'; did you mean `optimize`?"),
+        (["inspekt", "a.yaml"], "reslrb: No such command 'inspekt'; did you mean `inspect`?"),
+        (["frobnicate"], "reslrb: No such command 'frobnicate'. See"),
         (["--nope"], "reslrb: No such option"),
         (["doctor", "--nope"], "reslrb doctor: No such option"),
     ],

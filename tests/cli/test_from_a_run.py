@@ -116,6 +116,35 @@ def test_rendering_a_run_is_rendering_what_it_recovered(folder: Path) -> None:
     assert not np.allclose(load_image(folder / "a.exr"), load_image(folder / "c.exr"), rtol=1e-2)
 
 
+@pytest.mark.parametrize("exposure", ["per_channel", "0.6"])
+def test_renderings_of_a_run_have_its_exposure_and_its_exported_scene_names_it(
+    folder: Path, exposure: str, tmp_path: Path
+) -> None:
+    spec = "[{motion: {of: wall, free: [translation]}, learning_rate: 0.01}]"  # a colour cannot be told from it
+    given = tiny.settings(f"target.exposure={exposure}", f"parameters={spec}", f"run.output={tmp_path}/runs")
+    result = reslrb("optimize", folder / "tiny.yaml", *given, *tiny.settings("optimizer.learning_rate=0.2"))
+    assert result.exit_code == 0, result.output
+    run = tmp_path / "runs/tiny"
+    factor = read_value(run, "exposure") if exposure == "per_channel" else np.float32(exposure)
+    assert np.all(np.abs(factor - 1) > 0.01)
+    words = " ".join(f"{value:.4g}" for value in np.ravel(factor))
+    for suffix in (".exr", ".png"):
+        result = reslrb("render", "--run", run, "--spp", 4, "-o", tmp_path / f"with{suffix}")
+        assert f"times {words}, the run's exposure (--exposure 1 leaves it out)" in result.output
+        plain = reslrb("render", "--run", run, "--spp", 4, "--exposure", 1, "-o", tmp_path / f"without{suffix}")
+        assert plain.exit_code == 0
+        assert "times" not in plain.output
+    light, shown = (load_image(tmp_path / f"{name}.exr") for name in ("without", "with"))
+    assert np.allclose(shown, light * factor, rtol=1e-5)
+    assert load_image(tmp_path / "with.png").mean() != load_image(tmp_path / "without.png").mean()
+    assert "--exposure is for PNG" in reslrb("render", "--run", run, "--exposure", 2, "-o", tmp_path / "a.exr").output
+    result = reslrb("export", run, "-o", tmp_path / "exported")
+    line = f"multiply renderings by the exposure, {words}, to match the photographs"
+    assert line in result.output.splitlines()
+    assert line in (tmp_path / "exported/scene.xml").read_text()
+    assert "exposure" not in reslrb("export", folder / "runs/tiny", "-o", tmp_path / "plain").output
+
+
 def test_mitsuba_renders_what_was_exported_as_the_run_does(folder: Path) -> None:
     result = reslrb("export", folder / "runs/tiny", "-o", folder / "exported")
     assert result.exit_code == 0, result.output
@@ -273,7 +302,8 @@ def test_each_camera_is_rendered_with_the_relief(run: Path, tmp_path: Path, sens
     heights = read_value(run, "sheet.heightmap")
     assert np.abs(heights).max() > 0.05, "it never rose, so this would show nothing"
     file = tmp_path / "image.exr"
-    done = reslrb("render", "--run", run, "--sensor", sensor, "--spp", 256, "--set", "run.seed=3", "-o", file)
+    common = ("--spp", 256, "--exposure", 1, "--set", "run.seed=3")
+    done = reslrb("render", "--run", run, "--sensor", sensor, *common, "-o", file)
     assert done.exit_code == 0, done.output
     image = load_image(file)
     assert image.shape == (SIZE, SIZE, 3)

@@ -58,7 +58,16 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
     "not UTF-8": (b"\xff\xfe\x00a", "is not UTF-8 text"),
     "control character": ("scene:\n  \x01", ":2: not valid YAML"),
     "syntax": (GOOD + "run: [1,\n", ":6: not valid YAML"),
-    "tab": ("scene:\n\tfile: x", ":2: not valid YAML"),
+    "tab": ("scene:\n\tfile: x", ":2: not valid YAML: a tab; YAML allows only spaces for indentation"),
+    "tab behind a colon": ("scene:\n  file:\tx", ":2: not valid YAML: a tab; YAML allows only spaces"),
+    "loss unknown": (
+        GOOD + "loss: {type: huba}\n",
+        "loss.type: must be one of l2, l1, relative_l2, log_l2, smape, ssim, custom, not",
+    ),
+    "sensors beside views": (
+        scene("a.xml, sensors: [1]") + "views: [{sensor: 0}]\n",
+        "scene.sensors: stands beside `views`, which name their own sensors; remove it",
+    ),
     "two documents": (GOOD + "---\n" + GOOD, ":5: not valid YAML"),
     "python object": ("scene: !!python/object:os.x {}", ":1: not valid YAML"),
     "contradicting tag": ("variant: !!bool maybe", "not valid YAML"),

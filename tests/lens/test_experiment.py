@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from cli.tiny import done
 from click.testing import CliRunner
+from PIL import Image
 
-from reslrb_cli.cli.lens import command
+from reslrb_cli.cli.lens import command, read_luminance
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.lens import transport
@@ -50,6 +51,56 @@ def flattened(heights: np.ndarray, folder: Path) -> mi.Scene:
     params["face.vertex_positions"] = at.ravel()
     params.update()
     return scene
+
+
+def drawn(shape: str, side: int) -> np.ndarray:
+    """Return a picture (side, side) of 0 and 255."""
+    at = np.arange(side)
+    disc = np.hypot(*np.meshgrid(at - side / 2, at - side / 2)) < 0.4 * side
+    shapes = {"logo": ~disc, "inverse": disc, "line": at[:, None] != at, "pixel": np.outer(at == side // 3, at == 9)}
+    return (255 * shapes[shape]).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("shape", "side", "mode", "pixels"),
+    [
+        ("logo", 400, "L", 128),
+        ("logo", 400, "1", 45),
+        ("inverse", 500, "P", 33),
+        ("line", 333, "RGB", 40),
+        ("pixel", 150, "L", 50),
+        ("logo", 16, "I;16", 32),
+        ("logo", 90, "ink", 32),
+        ("inverse", 90, "light", 32),
+    ],
+)
+def test_a_picture_of_black_and_white_becomes_a_lens(
+    shape: str, side: int, mode: str, pixels: int, tmp_path: Path, llvm: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = drawn(shape, side)
+    if mode in ("ink", "light"):  # opaque black, or opaque white, on what is transparent
+        alpha, colour = (255 - values, 0) if mode == "ink" else (values, 255)
+        image = Image.fromarray(np.stack([np.full_like(values, colour), alpha], axis=-1))
+    else:
+        image = Image.fromarray(values.astype(np.uint16) * 257 if mode == "I;16" else values)
+        image = image if mode == "I;16" else image.convert(mode)
+    image.save(tmp_path / "p.png")
+    light = read_luminance(tmp_path / "p.png")
+    assert light == pytest.approx(values / 255, abs=1e-6)
+    monkeypatch.setattr(transport, "STEPS", 0)  # the face itself is tested below
+    monkeypatch.setattr(transport, "GOOD", np.inf)
+    done("lens", tmp_path / "p.png", "-o", tmp_path / "lens", "--pixels", pixels, "--floor", 0.3)
+    seen = read_image(tmp_path / "lens" / "picture.exr")[:, :, 0]
+    margin = (seen.shape[0] - min(side, pixels)) // 2
+    assert seen[margin:-margin, margin:-margin].mean() == pytest.approx(1, rel=1e-5)
+    assert seen.min() == 0
+
+
+def test_a_pattern_that_is_finer_than_the_pixels_is_named(tmp_path: Path) -> None:
+    Image.fromarray((255 * (np.indices((64, 64)).sum(axis=0) % 2)).astype(np.uint8)).save(tmp_path / "p.png")
+    result = CliRunner().invoke(command, [str(tmp_path / "p.png"), "-o", str(tmp_path / "lens"), "--pixels", "32"])
+    assert str(result.exception).startswith(f"--pixels: is 32, at which {tmp_path}/p.png is of one colour")
+    assert not (tmp_path / "lens").exists()
 
 
 @pytest.mark.parametrize("kind", OPTIONS)

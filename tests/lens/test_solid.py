@@ -366,6 +366,7 @@ def test_files_that_cannot_be_are_refused_in_one_line(
     monkeypatch.setattr(export, "_writes_3mf", lambda: False)
     for name, settings, line in (
         ("there.stl", (), "there.stl exists; name a file that does not exist yet"),
+        ("a.step", (), "a.step: .step is not written; name a folder, or a file that ends in .stl"),
         ("a.stl", ("fabrication=null",), "a.stl: name a folder; of a scene a solid is made where"),
         ("a.3mf", (), "a.3mf: 3MF needs lib3mf, which is missing: pip install 'reslrb[fabrication]'"),
         ("a.stl", ("fabrication.thickness=1",), "fabrication.thickness: 1 mm: front and back cross, by"),

@@ -38,6 +38,18 @@ FEW = {
 }  # fmt: skip
 
 
+def test_a_picture_that_needs_no_floor_is_not_solved_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    trials: list[tuple[object, ...]] = []
+
+    def least_floor(*arguments: object) -> float:
+        trials.append(arguments)
+        return 0.0
+
+    monkeypatch.setattr(transport, "least_floor", least_floor)
+    assert shape_surface(smooth(16), LENS, 16).floor == 0
+    assert len(trials) == 1
+
+
 @pytest.mark.parametrize("name", a_few(SETTINGS, FEW))
 def test_light_through_the_face_is_the_picture(name: str) -> None:
     cells = 96 if name == "lens, round" else 128

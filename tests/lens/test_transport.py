@@ -82,6 +82,27 @@ def test_resizing_keeps_the_light() -> None:
         assert resized(picture, shape).mean() == pytest.approx(picture.mean(), rel=1e-12)
 
 
+@pytest.mark.parametrize("side", [16, 63, 400])
+def test_no_size_of_a_black_and_white_picture_has_a_value_beyond_black_and_white(side: int) -> None:
+    at = np.arange(side)
+    disc = np.hypot(*np.meshgrid(at - side / 2, at - side / 2)) < 0.4 * side
+    for picture in (disc, (at[:, None] + at) % 2, np.outer(at == 5, at == 9)):
+        light = picture.astype(np.float64)
+        for size in (7, 32, 45, 64, 127, 128, 256, 511):
+            for between in (False, True):
+                made = resized(light, (size, max(2, size - 7)), between)
+                assert made.min() >= 0  # -1e-16 is negative to who asks
+                assert made.max() <= 1 + 1e-12
+                if not between:
+                    assert made.mean() == pytest.approx(light.mean(), rel=1e-12)
+
+
+def test_more_cells_are_interpolated_between_where_that_is_asked_for() -> None:
+    ramp = np.arange(6.0)[None, :, None] * np.ones((4, 1, 3))
+    finer = resized(ramp, (9, 24), between=True)
+    assert np.allclose(finer, np.clip((np.arange(24) + 0.5) / 4 - 0.5, 0, 5)[None, :, None])
+
+
 def test_what_is_splatted_evenly_is_seen_through_a_tent() -> None:
     picture, fine = smooth(16), 32
     at = (np.arange(16 * fine) + 0.5) / fine

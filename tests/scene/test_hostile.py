@@ -252,6 +252,43 @@ def test_refused_at_once(tmp_path, text, line, said):
     assert len(str(error.value)) < 400
 
 
+NAMED = '<string name="filename" value="pipe"/>'
+#: An object for each way in which a plugin, or the parser, opens a file (Mitsuba 3.9.1).
+OPENED = {
+    **{f"shape {type}": f'<shape type="{type}">{NAMED}</shape>'
+       for type in ("obj", "ply", "serialized", "linearcurve", "bsplinecurve", "sdfgrid", "ellipsoids",
+                    "ellipsoidsmesh")},
+    **{f"bsdf {type}": f'<bsdf type="{type}">{NAMED}</bsdf>' for type in ("measured", "measured_polarized")},
+    "texture": f'<bsdf type="diffuse"><texture type="bitmap" name="reflectance">{NAMED}</texture></bsdf>',
+    "envmap": f'<emitter type="envmap">{NAMED}</emitter>',
+    "volume": f'<medium type="heterogeneous"><volume type="gridvolume" name="albedo">{NAMED}</volume></medium>',
+    "spectrum": '<bsdf type="diffuse"><spectrum name="reflectance" filename="pipe"/></bsdf>',
+    "lamp": '<emitter type="point"><spectrum name="intensity" filename="pipe"/></emitter>',
+    "material": '<bsdf type="conductor"><string name="material" value="mine"/></bsdf>',
+    "rough material": '<bsdf type="roughconductor"><string name="material" value="Cu"/></bsdf>',
+    "nested": '<include filename="part.xml"/>',
+    "include": '<include filename="pipe"/>',
+    "folder": '<path value="pipe"/>',
+}  # fmt: skip
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize("kind", OPENED)
+def test_no_pipe_is_opened_however_a_scene_names_it(kind: str, tmp_path: Path) -> None:
+    (tmp_path / "data" / "ior").mkdir(parents=True)
+    pipes = [tmp_path / "pipe", *(tmp_path / "data" / "ior" / f"{name}.spd" for name in ("mine.eta", "Cu.k"))]
+    for pipe in pipes:
+        os.mkfifo(pipe)
+    write(tmp_path, f'<scene version="3.0.0">{OPENED["spectrum"]}</scene>', "part.xml")
+    opened = "".join(f": <> {pipe}; " for pipe in pipes)  # frees who waits there, so that the test fails, not hangs
+    with subprocess.Popen(["sh", "-c", f"sleep 30; {opened}"]) as freeing:
+        start = time.monotonic()
+        with pytest.raises(ConfigError, match=r"no regular file|not a regular file|folder `pipe` not found"):
+            load_scene(write(tmp_path, HEAD + OPENED[kind] + "</scene>"))
+        assert time.monotonic() - start < 20
+        freeing.kill()
+
+
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize(
     ("objects", "said"),

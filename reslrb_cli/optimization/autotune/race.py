@@ -393,8 +393,8 @@ class Turns(Race, Generic[Record]):
         # What Python takes is the same for both.
         kernels = (1 + self._sizes.longer) * (plain.kernel_ms + plain.image_ms)
         if not self._learned(kernels + 2 * plain.beside_ms):
-            share = f"{100 * self._most:.2g} % of {ITERATIONS} iterations"
-            return self._record(f"to measure it would cost more than {share}")
+            most = f"{self._most * ITERATIONS:.2g}"
+            return self._record(f"to measure it would cost more than {most} iteration{'s' * (most != '1')}")
         self._spend(take(True, 0, spp), first=True)
         for round in range(1, 1 + self.LOOKS * self._sizes.rounds):
             for other in (False, True):

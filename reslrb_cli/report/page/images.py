@@ -81,11 +81,6 @@ def _embed(png: bytes, shape: tuple[int, ...], *about: Any) -> Picture:
 
 def fit(values: Array) -> Array:
     """`values` (H, W, C), shrunk to `MOST_PIXELS` where they are more."""
-    together = max(values.shape[:2]) // MOST_PIXELS
-    if together > 1:  # means of whole blocks first, since resampling smooths at the size that there is
-        rows, columns = (max(size // together, 1) for size in values.shape[:2])
-        blocks = values[: rows * together, : columns * together]
-        values = blocks.reshape(rows, -1, columns, blocks.shape[1] // columns, values.shape[2]).mean(axis=(1, 3))
     longest = max(values.shape[:2])
     if longest <= MOST_PIXELS:
         return values

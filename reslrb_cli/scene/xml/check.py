@@ -182,18 +182,13 @@ def _size_of(film: Element) -> FilmSize:
 
 def check_files(description: Description) -> None:
     """Raise ConfigError, located by file and line, for files that are not there, or larger than can be held."""
-    named = [
-        (element, owner)
-        for owner in description.root.walk()
-        for element in owner.children
-        if element.tag == "string" and element.name == "filename"
-    ]
+    named = list(description.named_files())
     free = free_bytes(mi.variant()) if named else 0
-    for element, owner in named:
+    for owner, element, name in named:
         as_floats = any(child.name == "format" and child.value == "variant" for child in owner.children)
-        wrong = _wrong_file(element.value, description, free, _FLOAT_BYTES if as_floats else _TEXEL_BYTES)
+        wrong = _wrong_file(name, description, free, _FLOAT_BYTES if as_floats else _TEXEL_BYTES)
         if wrong is not None:
-            raise element.fail("filename", wrong)
+            raise element.fail("material" if element.name == "material" else "filename", wrong)
 
 
 def _wrong_file(name: str, description: Description, free: int, texel: int) -> str | None:

@@ -91,6 +91,13 @@ class Element:
         return self.attributes.get("value", "")
 
     @property
+    def file_attribute(self) -> str:
+        """The attribute that names a file, empty where none does; Mitsuba's plugins read files by `filename` alone."""
+        if self.tag == "spectrum":
+            return "filename" if self.attributes.get("filename") else ""
+        return "value" if self.tag == "string" and self.name == "filename" else ""
+
+    @property
     def id(self) -> str:
         """Its own id, or the one that it refers to; empty where it has none."""
         return self.attributes.get("id", "")
@@ -231,6 +238,19 @@ class Description:
     def find_file(self, name: str) -> Path | None:
         """The file or folder that Mitsuba opens by this name: the first in `folders`, or what it says by itself."""
         return _find(name, self.folders)
+
+    def named_files(self) -> Iterator[tuple[Element, Element, str]]:
+        """Yield the name of each file that Mitsuba opens for the scene, after the object and the element that name it.
+
+        A metal's `material` names two tables of Mitsuba's own; files in `folders` take their place.
+        """
+        for owner in self.root.walk():
+            for element in owner.children:
+                if element.file_attribute:
+                    yield owner, element, element.attributes[element.file_attribute]
+                elif element.tag == "string" and element.name == "material":
+                    tables = (f"data/ior/{element.value}.{table}.spd" for table in ("eta", "k"))
+                    yield from ((owner, element, name) for name in tables if self.find_file(name) is not None)
 
 
 def read_description(file: Path, options: Mapping[str, str]) -> Description:
