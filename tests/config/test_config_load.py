@@ -304,7 +304,7 @@ WRONG = {
     "nothing moves": ("{motion: {of: []}}", ("parameters[0].motion.of: must have at least one entry",)),
     "nothing free": ("{motion: {of: a, free: []}}", ("parameters[0].motion.free: must have at least one entry",)),
     "unknown word": ("{motion: {of: a, free: [shear]}}", ("parameters[0].motion.free[0]: must be one of", "rotation")),
-    "an axis twice": ("{motion: {of: a, free: [translation, x]}}", ("motion.free: has both `translation` and an axis",)),
+    "an axis twice": ("{motion: {of: a, free: [translation, x]}}", ("motion.free: has both `translation` and",)),
     "bounds of an axis that is held": (
         "{motion: {of: a, free: [x, y]}, bounds: {z: [0, 1]}}",
         ("parameters[0].bounds.z: has no effect: `motion.free` has x, y alone",),
