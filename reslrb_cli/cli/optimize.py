@@ -37,6 +37,7 @@ def forecast_run(config: Config) -> tuple[Forecast, list[tuple[str, float, bool]
     """What a run of `config` will take, measured: its forecast; what comes before its first iteration, with the seconds
     that it took now (0: nothing was to be measured) and whether a run finds that where it is kept; and the seconds of
     the whole run. A variant must be set, and nothing is written but the caches of kernels and pilots."""
+    from reslrb_cli.measure.missing import check_missing
     from reslrb_cli.measure.prb_comparison import RIVAL, measure_rival
     from reslrb_cli.optimization.forecast import make_forecast
     from reslrb_cli.records.cache import PilotCache
@@ -45,6 +46,9 @@ def forecast_run(config: Config) -> tuple[Forecast, list[tuple[str, float, bool]
     measured: list[tuple[str, float, bool]] = []
 
     def measure_before(problem: Problem) -> None:
+        begin = time.perf_counter()
+        if check_missing(problem, logger.warning):
+            measured.append(("what the derivative lacks", time.perf_counter() - begin, False))
         begin = time.perf_counter()
         rival = measure_rival(problem, cache, say)
         rival_s = 0.0 if rival is None or rival.cached else time.perf_counter() - begin

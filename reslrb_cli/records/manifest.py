@@ -71,8 +71,9 @@ class Manifest:
     `process` is who works in the folder. `plan` is what a step consists of, `pilot` the table by which an estimator
     was chosen, `paths` which paths paid, `guided` whether guided emission did, `sequence` whether low-discrepancy
     numbers did, `pixels` whether camera paths are shared out over the pixels, `rival` how `prb` did beside that,
-    `memory` how a memory budget is kept, `scaling` what was measured of each parameter for `scale: auto`, `shared` the
-    time that workers took (`SharedTime`); each is None where that was not asked for. `views` has, of each view, its
+    `incomplete` what the derivative of each parameter that moves light lacks (`MissingRecord`), `memory` how a memory
+    budget is kept, `scaling` what was measured of each parameter for `scale: auto`, `shared` the time that workers took
+    (`SharedTime`); each is None, or empty, where that was not asked for. `views` has, of each view, its
     share of the loss, how many of its pixels are left out, by kind, and what its images are multiplied by to be looked
     at (`shown`).
     `results` is what the run found (`iterations`, values and errors by key,
@@ -105,6 +106,7 @@ class Manifest:
     scaling: list[dict[str, Any]] | None = None
     views: list[dict[str, Any]] | None = None
     rival: dict[str, Any] | None = None
+    incomplete: list[dict[str, Any]] = field(default_factory=list)
     shared: dict[str, Any] | None = None
     resumed: list[dict[str, Any]] = field(default_factory=list)
     results: dict[str, Any] = field(default_factory=dict)

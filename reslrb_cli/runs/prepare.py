@@ -14,7 +14,7 @@ import contextlib
 import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, PIXELS, SEQUENCE, plan_rows, with_reason
 from reslrb_cli.integrators.reslrb import Reslrb
+from reslrb_cli.measure.missing import check_missing
 from reslrb_cli.measure.prb_comparison import measure_rival
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.loading import paths_of
@@ -154,11 +155,15 @@ def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[Course, 
     cache = PilotCache()
     problem = assemble(config, say, cache, to_run=True)
     warn_of_border(problem, warn)
+    missing = check_missing(problem, warn)
+    if missing:  # what was moved for it may have reached beyond the sphere that lamps at infinity shine through
+        problem = problem.afresh(problem.values())
     rival = measure_rival(problem, cache, say)
     if rival is not None and rival.is_better:
         warn(f"{rival.line()}; --set {_other_way(problem, rival)}")
     manifest = manifest_of(problem, variant, config.source)
     manifest.rival = None if rival is None else rival.to_json()
+    manifest.incomplete = [asdict(record) for record in missing]
     return Course(problem, variant), manifest
 
 

@@ -99,6 +99,7 @@ class Earlier:
         manifest.resumed = [each for each in resumed if isinstance(each, dict)] if isinstance(resumed, list) else []
         if isinstance(before.get("rival"), dict):
             manifest.rival = before["rival"]
+        manifest.incomplete = list(before.get("incomplete") or ())
         earlier, here = before.get("versions"), versions()
         others = {name: [version, here.get(name)] for name, version in earlier.items() if version != here.get(name)} \
             if isinstance(earlier, dict) else {}  # fmt: skip
