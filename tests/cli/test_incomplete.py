@@ -31,7 +31,8 @@ SCENE = """<scene version="3.0.0">
   <shape type="cube" id="box"><transform name="to_world"><scale value="0.4"/><translate value="0, 0.4, 0"/></transform>
     <bsdf type="diffuse"><rgb name="reflectance" value="0.7, 0.3, 0.2"/></bsdf></shape>
   <shape type="rectangle" id="lamp">
-    <transform name="to_world"><rotate x="1" angle="90"/><scale value="0.7"/><translate value="0.8, 3.5, 0.5"/></transform>
+    <transform name="to_world"><rotate x="1" angle="90"/><scale value="0.7"/><translate value="0.8, 3.5, 0.5"/>
+    </transform>
     <emitter type="area"><rgb name="radiance" value="12, 12, 12"/></emitter></shape>
 </scene>
 """
@@ -43,7 +44,7 @@ parameters:
   - {motion: {of: box, free: [x, z]}, learning_rate: 0.01}
 integrator: {max_depth: 2, estimator: stack, guiding: off, sequence: independent}
 loss: {type: l2}
-run: {iterations: 20, spp: 16, final_spp: 16, reach_spp: 4, measuring: 2}
+run: {iterations: 20, spp: 16, final_spp: 16, reach_spp: 4, measuring: 0.5}
 """
 ACCEPT = "run.accept_incomplete=true"
 
