@@ -420,8 +420,8 @@ class MissingRecord(Line):
 
     @property
     def is_for_the_most_part(self) -> bool:
-        """Whether surely more than half is missing."""
-        return self.share is not None and self.share - NOTHING * (self.standard_error or 0) > HALF
+        """Whether more than half is missing, by two standard errors."""
+        return self.share is not None and self.share - 2 * (self.standard_error or 0) > HALF
 
     @property
     def is_known(self) -> bool:
