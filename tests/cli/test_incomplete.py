@@ -114,7 +114,8 @@ def test_what_there_is_no_time_to_measure_is_said(experiment: Path):
 
 def test_light_without_edges_lacks_nothing(llvm: str, tmp_path: Path):
     """A spot lamp whose light ends smoothly, through glass: its caustic is all in the derivative."""
-    heights = "parameters=[{motion: {of: lamp, free: [translation]}}, {heightmap: {mesh: slab, resolution: [5, 4]}}]"
+    heights = "parameters=[{motion: {of: lamp, free: [translation]}}, {heightmap: {mesh: slab, resolution: [5, 4]}}, "
+    heights += "{key: floor.bsdf.reflectance.value}]"
     path = glass.write_experiment(tmp_path)
     problem = assemble(load(path, [heights, "run.iterations=100", "run.measuring=1"]))
     values = {key: value.copy() for key, value in problem.values().items()}
