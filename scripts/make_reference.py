@@ -178,7 +178,7 @@ _IN_A_LINE = {
     "TransportValue": "{transport: {receiver, floor, lamp}}",
     "CheckpointEvery": "{iterations} or {seconds}",
     **dict.fromkeys(
-        ("MotionInitial", "MotionBounds", "MotionTransform", "MotionRates"), "{translation, rotation, scale}"
+        ("MotionInitial", "MotionBounds", "MotionTransform", "MotionRates"), "{translation, x, y, z, rotation, scale}"
     ),
 }
 

@@ -36,9 +36,10 @@ from reslrb_cli.config.files import KEY_LENGTH, PIXELS
 
 Numbers = Annotated[list[float], Field(min_length=1)]
 
-#: What a motion has; it is applied in the opposite order.
-Word = Literal["translation", "rotation", "scale"]
-WORDS: tuple[Word, ...] = ("translation", "rotation", "scale")
+#: The parts of a motion, applied in the opposite order. An axis is that part of a translation alone.
+Word = Literal["translation", "x", "y", "z", "rotation", "scale"]
+WORDS: tuple[Word, ...] = ("translation", "x", "y", "z", "rotation", "scale")
+AXES: tuple[Word, ...] = ("x", "y", "z")
 
 #: The name, below its mesh's, of what a heightmap recovers.
 HEIGHTMAP = "heightmap"
@@ -75,6 +76,9 @@ class MotionInitial(ByWord):
     """Initial values of a motion."""
 
     translation: _NumberOrList | None = Field(default=None, description="In scene units.")
+    x: float | None = Field(default=None, description="In scene units.")
+    y: float | None = Field(default=None, description="In scene units.")
+    z: float | None = Field(default=None, description="In scene units.")
     rotation: _NumberOrList | None = Field(default=None, description="In degrees.")
     scale: _NumberOrList | None = Field(default=None, description="A factor.")
 
@@ -83,6 +87,9 @@ class MotionBounds(ByWord):
     """Bounds of a motion."""
 
     translation: Bounds | None = Field(default=None, description="[low, high] of each number, in scene units.")
+    x: Bounds | None = Field(default=None, description="[low, high], in scene units.")
+    y: Bounds | None = Field(default=None, description="[low, high], in scene units.")
+    z: Bounds | None = Field(default=None, description="[low, high], in scene units.")
     rotation: Bounds | None = Field(default=None, description="[low, high] of each number, in degrees.")
     scale: Bounds | None = Field(default=None, description="[low, high] of the factor.")
 
@@ -91,6 +98,9 @@ class MotionTransform(ByWord):
     """Transforms of a motion."""
 
     translation: TransformName | None = Field(default=None, description="As `transform`.")
+    x: TransformName | None = Field(default=None, description="As `transform`.")
+    y: TransformName | None = Field(default=None, description="As `transform`.")
+    z: TransformName | None = Field(default=None, description="As `transform`.")
     rotation: TransformName | None = Field(default=None, description="As `transform`.")
     scale: TransformName | None = Field(default=None, description="As `transform`.")
 
@@ -99,6 +109,9 @@ class MotionRates(ByWord):
     """Learning rates of a motion."""
 
     translation: Positive | None = Field(default=None, description="In scene units.")
+    x: Positive | None = Field(default=None, description="In scene units.")
+    y: Positive | None = Field(default=None, description="In scene units.")
+    z: Positive | None = Field(default=None, description="In scene units.")
     rotation: Positive | None = Field(default=None, description="In degrees.")
     scale: Positive | None = Field(default=None, description="Of the factor.")
 
@@ -161,8 +174,15 @@ class MotionSpec(Section):
     pivot: Annotated[list[float], _POINT] | None = None
     """The point about which they are scaled and rotated; null: the centre of their bounding box."""
     free: Annotated[list[Word], Field(min_length=1), _EACH_ONCE] = Field(default=["translation", "rotation"])
-    """What is recovered. `translation`: three numbers, in scene units; `rotation`: three angles in degrees, about the
-    x, then the y, then the z axis of the scene; `scale`: one factor for all axes."""
+    """What is recovered. `translation`: three numbers, in scene units; `x`, `y`, `z`: a translation along this axis
+    alone, such as `free: [x, y]`; `rotation`: three angles in degrees, about the x, then the y, then the z axis of the
+    scene; `scale`: one factor for all axes."""
+
+    @model_validator(mode="after")
+    def _check_axes(self) -> Self:
+        if "translation" in self.free and any(axis in self.free for axis in AXES):
+            raise located("free", "has both `translation` and an axis of it; name the axes, or `translation` alone")
+        return self
 
 
 ColorSpace = Literal["auto", "linear", "srgb"]
@@ -345,9 +365,9 @@ class ParameterSpec(Section):
     heightmap: HeightmapSpec | None = None
     """A displacement of a mesh, recorded as `MESH.heightmap`."""
     motion: MotionSpec | None = None
-    """A motion of shapes and emitters, recorded as `ID.translation`, `ID.rotation` and `ID.scale`. With several `free`,
-    `initial`, `bounds`, `transform` and `learning_rate` are mappings by these words, such as `bounds: {rotation: [-10,
-    10]}`; `transform` and `learning_rate` may also be one for all."""
+    """A motion of shapes and emitters, recorded as `ID.translation`, `ID.x`, `ID.rotation` and so on. With several
+    `free`, `initial`, `bounds`, `transform` and `learning_rate` are mappings by these words, such as `bounds:
+    {rotation: [-10, 10]}`; `transform` and `learning_rate` may also be one for all."""
     initial: Initial = "scene"
     """Value to start from: a number (all entries), a list of numbers (one per channel), an image file, the value to
     which a run brought the same key, or `scene` (the scene's own value; a heightmap is flat there, and nothing is
@@ -461,7 +481,7 @@ class ParameterSpec(Section):
                 continue
             elif len(free) > 1 and option in ("initial", "bounds"):
                 words = ", ".join(f"{word}: ..." for word in free)
-                raise located(option, f"must be a mapping by what is free, {{{words}}}: they have different units")
+                raise located(option, f"must be a mapping by what is free, {{{words}}}")
         return self
 
     @model_validator(mode="after")

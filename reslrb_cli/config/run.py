@@ -183,6 +183,11 @@ class RunConfig(Section):
     kernels that are compiled for it included, as a share of what the run itself is expected to take; first steps of
     camera paths, which most runs need anyway, may take more. What there is no time for is decided by the scene's
     features; 0: all of it, and nothing is measured."""
+    accept_incomplete: bool = False
+    """Run although more than half of the loss's derivative is missing for a parameter that moves light. The derivative
+    lacks silhouettes and edges of shadows. A run measures their share before its first iteration, for `measuring` of
+    its samples, and refuses to begin if they are more than half of it; the steps could lead the other way. A parameter
+    that lacks a significant share gets the verdict `derivative incomplete`, and never `settled`."""
     certainty: bool = True
     """After the last iteration, measure how certain the values are: their spread, and a verdict on each parameter.
     Takes as long as some iterations, ten or so where parameters are few; runs of fewer than 20 iterations, and

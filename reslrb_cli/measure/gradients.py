@@ -164,7 +164,7 @@ def directions(case: Case, key: str, bounds: tuple[float, float], count: int, se
         size = scale * random.uniform(0.5, 1.0, len(values))
         signs = np.ones(len(values)) if number == 0 else random.choice([-1.0, 1.0], len(values))
         row = size * (inward if near_a_bound else signs)
-        found.append(Direction(_embed(case, key, row), "up" if near_a_bound else "both"))
+        found.append(Direction(embed(case, key, row), "up" if near_a_bound else "both"))
     return found
 
 
@@ -175,7 +175,7 @@ def all_directions(case: Case, selection: Selection, moving: int, others: int) -
     for key in case.keys:
         if moves_light(case.params, key):
             rows = smooth_rows(key, case.values.value(key), extent, moving)
-            found[key] = [Direction(_embed(case, key, row), "both") for row in rows]
+            found[key] = [Direction(embed(case, key, row), "both") for row in rows]
             continue
         bounds = selection.spec(key).bounds
         if bounds is None or not np.all(np.isfinite(bounds)):
@@ -211,7 +211,7 @@ def natural_bounds(kind: str, values: np.ndarray) -> tuple[float, float]:
     return (0.0, np.inf) if np.all(values >= 0) else (-np.inf, np.inf)
 
 
-def _embed(case: Case, key: str, row: np.ndarray) -> np.ndarray:
+def embed(case: Case, key: str, row: np.ndarray) -> np.ndarray:
     """A row of one parameter among zeros for the others."""
     whole = np.zeros(case.size)
     whole[case.places[key]] = row

@@ -13,6 +13,8 @@ Of steps that halve, the one is taken around which E changes least: at larger on
 lost in rounding, which is the same for all seeds where it is the scene that is rounded, or in paths that flip. By how
 much E changes there counts as error where it stands out of its noise. What noise adds to the squares is subtracted; the
 standard error is that of the mean over seeds. `MissingCheck` is `gradcheck --missing` on an experiment.
+
+`check_missing` measures the same share before a run's first iteration, of the run's own samples, by a step or two.
 """
 
 from __future__ import annotations
@@ -24,18 +26,35 @@ from typing import Any
 
 import numpy as np
 
+from reslrb_cli.config.parameters import HEIGHTMAP
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import make_integrator
-from reslrb_cli.measure.gradients import STEPS, Case, Direction, all_directions, seeds
+from reslrb_cli.measure.gradients import (
+    REACH,
+    STEPS,
+    UNITS,
+    Case,
+    Direction,
+    all_directions,
+    embed,
+    moves_light,
+    seeds,
+    smooth_rows,
+)
 from reslrb_cli.measure.methods import parse_estimators
 from reslrb_cli.measure.participants import MOVING_DIRECTIONS, NEVER, PATHS
 from reslrb_cli.measure.references import ends
 from reslrb_cli.measure.resume_store import Earlier, head
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.sensitivity import take_gradient, unrecorded
+from reslrb_cli.optimization.uncertainty.curvature import MOST_ENTRIES
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import NOTHING, MissingRecord
+from reslrb_cli.scene.deformation import where_moved
+from reslrb_cli.scene.needs import camera_finds_all
 from reslrb_cli.statistics import jackknife_variance
 
 #: Seeds that steps are chosen with, and the fewest that a share is made of.
@@ -81,19 +100,25 @@ class Missing:
         missing = whole - np.stack(self.ours)
         change, noise = _mean(whole - _extrapolate(far, farthest))
         left = np.square(np.where(np.abs(change) > NOTHING * noise, change, 0))
-        mean, error = _mean(whole)
-        size = np.square(mean).sum() - np.square(error).sum()
-        if size <= NOTHING**2 * np.square(error).sum():
-            return None
-        part, error = _mean(missing)
-        found = _ratio(missing, whole)
-        if np.square(part).sum() <= NOTHING**2 * (np.square(error) + left).sum():
-            return found, float(np.sqrt((np.square(error) + left).sum() / size))
-        # The part's own noise and that of the whole: by leaving out one seed after the other (jackknife).
-        without = [_ratio(np.delete(missing, i, 0), np.delete(whole, i, 0)) for i in range(self.count)]
-        variance = jackknife_variance(np.array(without))
-        truncation = (np.square(part) @ left) / np.square(part).sum() / size
-        return found, float(np.sqrt(variance + truncation))
+        return share_of(whole, missing, left)
+
+
+def share_of(whole: np.ndarray, missing: np.ndarray, left: np.ndarray) -> tuple[float, float] | None:
+    """Return the share of `missing` in `whole`, (N, K) samples each, and its standard error; None where the whole is
+    not told from 0. `left` (K,) are squares of what the whole may be wrong by in all seeds."""
+    mean, error = _mean(whole)
+    size = np.square(mean).sum() - np.square(error).sum()
+    if size <= NOTHING**2 * np.square(error).sum():
+        return None
+    part, error = _mean(missing)
+    found = _ratio(missing, whole)
+    if np.square(part).sum() <= NOTHING**2 * (np.square(error) + left).sum():
+        return found, float(np.sqrt((np.square(error) + left).sum() / size))
+    # The part's own noise and that of the whole: by leaving out one seed after the other (jackknife).
+    without = [_ratio(np.delete(missing, i, 0), np.delete(whole, i, 0)) for i in range(len(whole))]
+    variance = jackknife_variance(np.array(without))
+    truncation = (np.square(part) @ left) / np.square(part).sum() / size
+    return found, float(np.sqrt(variance + truncation))
 
 
 def _ratio(missing: np.ndarray, whole: np.ndarray) -> float:
@@ -241,3 +266,150 @@ class MissingCheck:
             )
         # Its size has no part in a share, and tiny numbers would vanish beside the rounding of a sum.
         self.case.weigh(weights / np.abs(weights).mean())
+
+
+# --- before a run's first iteration -----------------------------------------------------------------------------------
+
+#: Steps of the differences, in tenths of the size of what moves. The longer one has less noise at edges. It is taken
+#: where the shorter one tells too little, and both agree.
+SHORT, LONG = 0.01, 0.25
+
+#: Seeds and views, at most.
+MOST_SEEDS, MOST_VIEWS = 64, 4
+
+
+def check_missing(problem: Problem, warn: Callable[[str], None]) -> list[MissingRecord]:
+    """Measure what share of the loss's derivative is missing, by parameter that moves light, before a run begins.
+
+    Calls `warn` with one line where any is. Raises ConfigError where more than half is, unless the run accepts that.
+    """
+    config, found = problem.config, measure_missing(problem)
+    told = [record for record in found if record.is_incomplete]
+    if not told:
+        return found
+    line, way = "; ".join(record.line() for record in told), "integrator.type=prb_projective"
+    camera = camera_finds_all(problem.scene, config.integrator.max_depth)
+    if any(record.is_for_the_most_part for record in told) and not config.run.accept_incomplete:
+        first = f"--set {way} has all of it, and" if camera else "the steps would go astray;"
+        raise ConfigError(config.source, "integrator.type", f"{line}; {first} --set run.accept_incomplete=true runs it "
+                          "all the same")  # fmt: skip
+    warn(f"{line}; --set {way} has all of it" if camera else line)
+    return found
+
+
+def measure_missing(problem: Problem) -> list[MissingRecord]:
+    """Measure the share by parameter that moves light, where the parameters stand, for `run.measuring` of the run's
+    samples. A parameter that there is no time for has a record without a share.
+
+    Heightmaps whose share is not known are left out: their rims hardly move. Leaves neither gradient nor change behind.
+    """
+    selection, kind = problem.selection, problem.config.integrator.type
+    moving = [key for key in selection.keys if key not in selection.factors and moves_light(selection.params, key)]
+    if not moving or kind == "custom" or kind.endswith("_projective"):  # which have edges, or may have
+        return []
+    problem.apply()
+    try:
+        found = _Short(problem, moving).measure()
+    finally:
+        take_gradient(problem)
+        problem.apply()
+    return [record for record in found if not (record.parameter.endswith(f".{HEIGHTMAP}") and record.is_unknown)]
+
+
+class _Short:
+    """Samples of the derivatives of a run's loss along each of `keys`, by the run's own integrator."""
+
+    def __init__(self, problem: Problem, keys: Sequence[str]) -> None:
+        self.problem, self.keys, run = problem, keys, problem.config.run
+        self._integrator = unrecorded(problem.integrator)
+        if isinstance(self._integrator, LightTracer):
+            self._integrator = self._integrator.to_measure()
+        self._views = problem.trained[:MOST_VIEWS]
+        self._spp = min(max(run.spp // 4, 1), problem.samples_per_pass or run.spp)
+        self._left = run.measuring * run.iterations * run.spp * len(problem.drawn(0)) / len(self._views)
+        self._cases = [Case(problem.scene, keys, view.sensor, problem.selection) for view in self._views]
+        sizes = [_size(item.node.bbox()) for item in where_moved(self._params, problem.selection.scene_keys)
+                 if item.is_shape]  # fmt: skip
+        self._extent = min([size for size in sizes if size > 0], default=_size(problem.scene.bbox()))
+        self._rows = {key: self._directions(key) for key in keys}
+        self._ours: list[np.ndarray] = []
+
+    @property
+    def _params(self) -> Any:
+        return self.problem.selection.params
+
+    def _directions(self, key: str) -> list[np.ndarray]:
+        """All entries one by one of a small parameter, two smooth directions of a large one; among zeros."""
+        case = self._cases[0]
+        size, value = case.initial[key].size, case.values.value(key)
+        if size > MOST_ENTRIES:
+            rows = smooth_rows(key, value, self._extent, 2)
+        else:
+            rows = list((UNITS.get(key.rpartition(".")[2]) or REACH * self._extent) * np.eye(size))
+        return [embed(case, key, row) for row in rows]
+
+    def measure(self) -> list[MissingRecord]:
+        """Measure all parameters by the shorter step, and those whose share is not known then by the longer one."""
+        image_spp, fewest = 2 * self.problem.config.run.spp, seeds(FEWEST)
+        along = sum(map(len, self._rows.values()))
+        if image_spp + FEWEST * (1 + 2 * along) * self._spp > self._left or not self._weigh(image_spp):
+            return [self._record(key, None) for key in self.keys]
+        self._left -= image_spp
+        short = {key: [self._difference(key, SHORT, seed) for seed in fewest] for key in self.keys}
+        records = {key: self._record(key, short[key]) for key in self.keys}
+        for key, record in records.items():
+            if not record.is_known:
+                records[key] = self._look_longer(key, short[key])
+        return list(records.values())
+
+    def _look_longer(self, key: str, short: list[np.ndarray]) -> MissingRecord:
+        """The share by more seeds, and by the longer step, if the two steps agree."""
+        long = [self._difference(key, LONG, seed) for seed in seeds(FEWEST)]
+        change, noise = _mean(np.array(long) - np.array(short))
+        agree = np.square(change).sum() <= NOTHING**2 * np.square(noise).sum()
+        samples, step = (long, LONG) if agree else (short, SHORT)
+        record = self._record(key, samples)
+        for seed in seeds(MOST_SEEDS)[FEWEST:]:
+            if record.is_known or self._left < 0:
+                break
+            samples.append(self._difference(key, step, seed))
+            record = self._record(key, samples)
+        return record
+
+    def _record(self, key: str, samples: list[np.ndarray] | None) -> MissingRecord:
+        """The record of a parameter with these (K,) samples of differences; None: there are none."""
+        share = None
+        if samples is not None:
+            for seed in seeds(MOST_SEEDS)[len(self._ours) : len(samples)]:
+                self._left -= self._spp
+                gradient = sum(case.gradient(self._integrator, seed, self._spp, step=case.known_step)
+                               for case in self._cases)  # fmt: skip
+                self._ours.append(np.asarray(gradient))
+            whole = np.array(samples)
+            ours = np.array([[row @ gradient for row in self._rows[key]] for gradient in self._ours[: len(whole)]])
+            share = share_of(whole, whole - ours, np.zeros(whole.shape[1]))
+        value, error = share or (None, None)
+        source, along = str(self.problem.config.source), len(self._rows[key])
+        return MissingRecord(source, key, value, error, along, len(samples or ()))
+
+    def _difference(self, key: str, step: float, seed: int) -> np.ndarray:
+        """Differences of the loss along all directions of a parameter, (K,)."""
+        rows = self._rows[key]
+        self._left -= 2 * len(rows) * self._spp
+        return np.sum([[case.difference(self._integrator, row, seed, self._spp, step) for row in rows]
+                       for case in self._cases], axis=0)  # fmt: skip
+
+    def _weigh(self, spp: int) -> bool:
+        """Have the cases weigh by the loss's dL/dI; return whether there is any."""
+        problem, weights = self.problem, []
+        for case, view in zip(self._cases, self._views, strict=True):
+            gradient = problem.image_gradient(view, problem.render(view.sensor, spp, 0, "missing"))
+            weights.append(np.nan_to_num(gradient.astype(np.float64)[:, :, : case.weights.shape[2]]) * view.share)
+        size = max(float(np.abs(each).mean()) for each in weights)
+        for case, each in zip(self._cases, weights, strict=True):
+            case.weigh(each / (size or 1.0))
+        return size > 0
+
+
+def _size(box: Any) -> float:
+    return float(np.linalg.norm(np.array(box.max - box.min)))

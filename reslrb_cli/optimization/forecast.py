@@ -162,6 +162,7 @@ class Forecast(Steps):
     scratch: int
     free: int
     iterations: int
+    before_s: float
     measuring_s: float
     kept: bool
     target_s: float
@@ -177,22 +178,27 @@ class Forecast(Steps):
     def whole_s(self) -> float:
         """Seconds of the whole run, with kernels and decisions as they are kept now."""
         again = 0.0 if self.kept else self.measuring_s
-        return self.elapsed_s + again + self.target_s + self.images_s + self.verdicts_s
+        return self.elapsed_s + self.before_s + again + self.target_s + self.images_s + self.verdicts_s
 
 
 def make_forecast(
     config: Config,
     say: Callable[[str], None],
     cache: PilotCache | None = None,
+    before: Callable[[Problem], object] = lambda problem: None,
 ) -> Forecast:
     """Measure a few steps of the run that `config` describes; a variant must be set.
 
-    `say` is told what takes long. Decisions by measurement go to `cache`, for the run. Raises ConfigError and
+    `say` is told what takes long. Decisions by measurement go to `cache`, for the run. `before` is called with the
+    problem as it is before its first iteration, for measurements that no cache keeps. Raises ConfigError and
     UnsupportedScene as the run would, and the errors of its steps.
     """
     # Errors are no part of a step.
     problem = replace(assemble(with_short_target(config), say, cache), truth={})
     image_s, views = _image_seconds(problem), len(problem.views)
+    begin = time.perf_counter()
+    before(problem)
+    before_s = time.perf_counter() - begin
     say("measuring a few steps")
     steps, scratch, integrator = measure_steps(problem), 0, problem.integrator
     if isinstance(integrator, Reslrb):  # of all paths that are traced at a time
@@ -210,6 +216,7 @@ def make_forecast(
         scratch=scratch,
         free=free_bytes(mi.variant()),
         iterations=run.iterations,
+        before_s=before_s,
         measuring_s=sum(each.measure_s + each.compile_s for each in measured if each and not each.cached),
         kept=cache is not None and cache.keeps,
         target_s=image_s * config.target.render.spp * views if config.target.render else 0.0,

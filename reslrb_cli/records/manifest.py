@@ -70,10 +70,11 @@ class Manifest:
 
     `process` is who works in the folder. `plan` is what a step consists of, `paths` which paths paid, `guided` whether
     guided emission did, `sequence` whether low-discrepancy numbers did, `pixels` whether camera paths are shared out
-    over the pixels, `memory` how a memory budget is kept, `scaling` what was measured of each parameter for `scale:
-    auto`, `shared` the time that workers took (`SharedTime`); each is None where that was not asked for. `views` has,
-    of each view, its share of the loss, how many of its pixels are left out, by kind, and what its images are
-    multiplied by to be looked at (`shown`).
+    over the pixels, `incomplete` what the derivative of each parameter that moves light lacks (`MissingRecord`),
+    `memory` how a memory budget is kept, `scaling` what was measured of each parameter for `scale: auto`, `shared` the
+    time that workers took (`SharedTime`); each is None, or empty, where that was not asked for. `views` has, of each
+    view, its share of the loss, how many of its pixels are left out, by kind, and what its images are multiplied by to
+    be looked at (`shown`).
     `results` is what the run found (`iterations`, values and errors by key,
     `certainty`, `warnings`, and `seen`, errors as people see them, ...); `error` is the line that the user saw where
     the run failed. `resumed` says of each time that the run was gone on with after how many iterations, when, by what
@@ -102,6 +103,7 @@ class Manifest:
     memory: dict[str, Any] | None = None
     scaling: list[dict[str, Any]] | None = None
     views: list[dict[str, Any]] | None = None
+    incomplete: list[dict[str, Any]] = field(default_factory=list)
     shared: dict[str, Any] | None = None
     resumed: list[dict[str, Any]] = field(default_factory=list)
     results: dict[str, Any] = field(default_factory=dict)

@@ -379,12 +379,22 @@ NOTHING = 3
 #: A share that single precision may have made.
 LEAST = 1e-4
 
+#: A share that turns a run's steps, where it is told from 0; and one with which they may lead the other way.
+NOTICED, HALF = 0.05, 0.5
+
+#: A standard error of a share that is small enough.
+KNOWN = 0.03
+
+#: The verdict on a parameter whose derivative lacks that much.
+INCOMPLETE = "derivative incomplete"
+
 
 @dataclass(frozen=True)
 class MissingRecord(Line):
     """The share of a parameter's derivative that is not in the attached gradient, relative to finite differences.
 
-    `share` and `standard_error` are None where the derivative itself is lost in its noise.
+    `share` and `standard_error` are None where the derivative itself is lost in its noise, and where there was no time
+    to measure them (no `seeds`).
     """
 
     case: str
@@ -395,11 +405,50 @@ class MissingRecord(Line):
     seeds: int
     kind: Literal["missing"] = "missing"
 
+    @property
+    def is_unknown(self) -> bool:
+        """Whether more than half may be missing, without being told from 0."""
+        if self.share is None or self.standard_error is None:
+            return True
+        margin = NOTHING * self.standard_error
+        return self.share <= margin and self.share + margin > HALF
+
+    @property
+    def is_incomplete(self) -> bool:
+        """Whether the values that the derivative leads to cannot be relied on."""
+        return self.is_unknown or (self.share or 0) > max(NOTHING * (self.standard_error or 0), NOTICED)
+
+    @property
+    def is_for_the_most_part(self) -> bool:
+        """Whether more than half is missing, by two standard errors."""
+        return self.share is not None and self.share - 2 * (self.standard_error or 0) > HALF
+
+    @property
+    def is_known(self) -> bool:
+        """Whether more seeds would hardly change what is made of it."""
+        return self.standard_error is not None and (self.standard_error < KNOWN or self.is_for_the_most_part)
+
+    def percent(self) -> str:
+        """The share in words."""
+        if self.share is None or self.standard_error is None:
+            return "an unknown share"
+        return f"{_percent(self.share)} +- {_percent(self.standard_error)}"
+
     def line(self) -> str:
         """What it says, in one line."""
+        if not self.seeds:
+            return (
+                f"{self.parameter}: silhouettes and edges of shadows are not in the derivative; there was no time to "
+                "measure what they make up"
+            )
         if self.share is None or self.standard_error is None:
             return f"{self.parameter}: the derivative itself is less than what {self.seeds} seeds could see"
-        figures = f"{_percent(self.share)} +- {_percent(self.standard_error)}"
+        figures = self.percent()
+        if self.is_unknown:
+            return (
+                f"{self.parameter}: {self.seeds} seeds could not tell what share of the derivative is missing "
+                f"({figures}; silhouettes, edges of shadows, light that leaves the film)"
+            )
         if self.share <= max(NOTHING * self.standard_error, LEAST):
             return f"{self.parameter}: nothing is missing that {self.seeds} seeds could see ({figures})"
         return (
@@ -423,3 +472,9 @@ def record_of(kind: type[R], entry: Mapping[str, Any]) -> R | None:
     except ValidationError:
         return None
     return found
+
+
+def incomplete_records(entries: Sequence[Mapping[str, Any]]) -> list[MissingRecord]:
+    """The records among `entries`, of a manifest, that say that a derivative is incomplete."""
+    found = (record_of(MissingRecord, entry) for entry in entries)
+    return [record for record in found if record is not None and record.is_incomplete]

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.records.decisions import Finding
+from reslrb_cli.records.measurements import INCOMPLETE, incomplete_records
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.report.format import count, line, number, shorten, with_error
 
@@ -106,6 +107,8 @@ def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
     if about.get("verdict") != MOVING or moved is None or not rate or not iterations:
         return None
     if (results.get("loss_trend") or {}).get("change") == "rose":
+        if incomplete_records(results.get("incomplete") or ()):
+            return None
         return Remedy("a lower rate", _rate_setting(measured, rate, 1 / LOWER))
     way = moved + max((abs(value) for value in about.get("to_go") or () if value is not None), default=0.0)
     reach = about.get("reach")
@@ -139,6 +142,9 @@ def certainty_lines(results: Mapping[str, Any]) -> list[str]:
         remedies = [remedy for key in keys if (remedy := find_remedy(results, key)) is not None]
         of_target = " of the target" if verdict == NOISE and remedies else ""
         line = f"{'not converged, ' if verdict == MOVING else ''}{verdict}{of_target}: {named}{rest}"
+        shares = [record.percent() for record in incomplete_records(results.get("incomplete") or ())
+                  if record.parameter in keys and verdict == INCOMPLETE]  # fmt: skip
+        line += f" ({', '.join(shares)} of it is missing)" if shares else ""
         if remedies:  # that of the steps first, if there is one: more of the wrong ones do not help
             remedy = min(remedies, key=lambda each: ORDER.index(each.words))
             line += f" ({remedy.words}: {remedy.setting})"
@@ -259,7 +265,10 @@ def warnings(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
 
 def _reasons(results: Mapping[str, Any]) -> list[str]:
     """What may have kept a run from getting better, as far as its settings tell."""
-    samples, found = results.get("samples") or {}, []
+    samples = results.get("samples") or {}
+    found = [f"its steps followed derivatives without silhouettes and edges of shadows ({record.percent()} of that of "
+             f"{shorten(record.parameter, KEY_WIDTH)} is missing), and a lower rate does not help"
+             for record in incomplete_records(results.get("incomplete") or ())]  # fmt: skip
     step, target = samples.get("step"), samples.get("target")
     if step and target and target < FEW_STEPS * step:
         found.append(

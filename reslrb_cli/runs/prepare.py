@@ -14,7 +14,7 @@ import contextlib
 import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, PIXELS, SEQUENCE, plan_rows, with_reason
 from reslrb_cli.integrators.reslrb import Reslrb
+from reslrb_cli.measure.missing import check_missing
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.moving import warn_of_border
 from reslrb_cli.optimization.problem import Problem
@@ -150,7 +151,12 @@ def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[Course, 
     """
     problem = assemble(config, say, PilotCache(), to_run=True)
     warn_of_border(problem, warn)
-    return Course(problem, variant), manifest_of(problem, variant, config.source)
+    missing = check_missing(problem, warn)
+    if missing:  # what was moved for it may have reached beyond the sphere that lamps at infinity shine through
+        problem = problem.afresh(problem.values())
+    manifest = manifest_of(problem, variant, config.source)
+    manifest.incomplete = [asdict(record) for record in missing]
+    return Course(problem, variant), manifest
 
 
 def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:

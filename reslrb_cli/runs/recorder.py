@@ -39,6 +39,7 @@ from reslrb_cli.records.images import PARAMETERS_FILE as PARAMETERS_FILE_NAME
 from reslrb_cli.records.images import load_image, write_image, write_mask, write_parameters
 from reslrb_cli.records.manifest import NOT_YET, Manifest, Status
 from reslrb_cli.records.measurement_files import LivePage
+from reslrb_cli.records.measurements import incomplete_records
 from reslrb_cli.records.metrics import MetricsWriter, Record, finite
 from reslrb_cli.records.run_folder import FABRICATION_FILE, RunFolder
 from reslrb_cli.report.page import write_report
@@ -403,7 +404,10 @@ class Recording:
             logger.info("how certain the values are is not measured: it takes a loss of each pixel by itself")
             return
         logger.info("measuring how certain the values are")
-        self.certainty = self.course.certainty.measure(self.done, last.elapsed_s, self._stop)
+        measured = self.course.certainty.measure(self.done, last.elapsed_s, self._stop)
+        self.certainty = measured and measured.without_derivatives(
+            [record.parameter for record in incomplete_records(self.manifest.incomplete)]
+        )
         for key, shown in self.course.certainty.shown.items():
             if key not in self.problem.masks:  # of which it was found out before
                 write_mask(self.folder.parameters, key, shown)
@@ -444,6 +448,8 @@ class Recording:
         """What the run came to, or has come to by now."""
         last = self.course.last
         found = self._ended()
+        if self.manifest.incomplete:
+            found["incomplete"] = self.manifest.incomplete
         if self.certainty is not None:
             found["certainty"] = finite(self.certainty.to_json())
         found["warnings"] = warnings({"iterations": self.done, **found})

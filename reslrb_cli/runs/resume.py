@@ -97,6 +97,7 @@ class Earlier:
         started, resumed = before.get("started"), before.get("resumed")
         manifest.started = started if isinstance(started, str) else manifest.started
         manifest.resumed = [each for each in resumed if isinstance(each, dict)] if isinstance(resumed, list) else []
+        manifest.incomplete = list(before.get("incomplete") or ())
         earlier, here = before.get("versions"), versions()
         others = {name: [version, here.get(name)] for name, version in earlier.items() if version != here.get(name)} \
             if isinstance(earlier, dict) else {}  # fmt: skip

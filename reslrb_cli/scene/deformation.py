@@ -29,7 +29,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.parameters import HEIGHTMAP
+from reslrb_cli.config.parameters import AXES, HEIGHTMAP
 from reslrb_cli.scene.graph import bounds, face_normals, triangles
 
 #: Analytic shapes whose `to_world` moves their surface interactions and their samples.
@@ -213,7 +213,10 @@ class Motion:
         """M, or, not `scaled`, its rotation alone."""
         transform = mi.AffineTransform4f
         pivot = mi.Vector3f(self.pivot)
-        moved = values[self.names["translation"]] if "translation" in self.names else 0
+        if "translation" in self.names:
+            moved = values[self.names["translation"]]
+        else:
+            moved = mi.Vector3f(*(values[self.names[axis]] if axis in self.names else 0 for axis in AXES))
         result = transform().translate(pivot + moved) if scaled else transform()
         if "rotation" in self.names:
             angles = values[self.names["rotation"]]
@@ -279,8 +282,9 @@ class Deformation:
         for item in items:
             self._place(item).motion = motion
         for word, name in names.items():
-            self.values[name] = _opaque(mi.Float(1) if word == "scale" else mi.Vector3f(0))
-            self.quantities[name] = {"translation": "length", "rotation": "degrees"}.get(word, word)
+            start = {"scale": mi.Float(1), **dict.fromkeys(AXES, mi.Float(0))}.get(word, mi.Vector3f(0))
+            self.values[name] = _opaque(start)
+            self.quantities[name] = {"rotation": "degrees", "scale": "scale"}.get(word, "length")
 
     def add_heightmap(self, items: tuple[Movable, ...], resolution: tuple[int, int]) -> None:
         """Displace the meshes `items`, none of which has a heightmap yet."""

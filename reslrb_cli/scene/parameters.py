@@ -308,7 +308,7 @@ def _check_effect(items: list[Movable], word: str, pivot: bool, place: Place) ->
     obstacle = None
     if word != "rotation" and all(item.node.class_name() == "DirectionalEmitter" for item in items):
         obstacle = f"{word} does not move {id}, which is a direction; free: [rotation]"
-    elif alone and items[0].is_point and word != "translation":
+    elif alone and items[0].is_point and word in ("rotation", "scale"):
         obstacle = f"{word} about itself does not move {id}, which is a point"
     elif alone and not items[0].is_shape and word == "scale":
         obstacle = f"scale about itself does not move {id}, which has no size"

@@ -270,6 +270,16 @@ def test_one_free_word_takes_plain_settings() -> None:
     assert spec.settings("translation").bounds == (-1, 1)
 
 
+def test_each_axis_has_settings_of_its_own(tmp_path: Path) -> None:
+    path = tmp_path / "x.yaml"
+    axes = "motion: {of: lens, free: [x, y]}\n    initial: {y: 0.1}\n    bounds: {x: [-1, 1], y: [0, 2]}"
+    path.write_text(changed(PARAMETER, axes))
+    [spec] = load(path).parameters
+    assert spec.names == ["lens.x", "lens.y"]
+    assert (spec.settings("x").initial, spec.settings("x").bounds) == ("scene", (-1, 1))
+    assert (spec.settings("y").initial, spec.settings("y").bounds) == (0.1, (0, 2))
+
+
 def test_a_heightmap_has_its_own_resolution() -> None:
     spec = ParameterSpec(heightmap={"mesh": ["slab", "other"], "resolution": [8, 4]}, bounds=(-0.1, 0.1))  # type: ignore[arg-type]
     assert spec.names == ["slab.heightmap"]
@@ -294,6 +304,11 @@ WRONG = {
     "nothing moves": ("{motion: {of: []}}", ("parameters[0].motion.of: must have at least one entry",)),
     "nothing free": ("{motion: {of: a, free: []}}", ("parameters[0].motion.free: must have at least one entry",)),
     "unknown word": ("{motion: {of: a, free: [shear]}}", ("parameters[0].motion.free[0]: must be one of", "rotation")),
+    "an axis twice": ("{motion: {of: a, free: [translation, x]}}", ("motion.free: has both `translation` and",)),
+    "bounds of an axis that is held": (
+        "{motion: {of: a, free: [x, y]}, bounds: {z: [0, 1]}}",
+        ("parameters[0].bounds.z: has no effect: `motion.free` has x, y alone",),
+    ),
     "pivot of two": ("{motion: {of: a, pivot: [1, 2]}}", ("motion.pivot: must be a point, [x, y, z], not",)),
     "unknown key of a motion": ("{motion: {of: a, about: [1, 2, 3]}}", ("parameters[0].motion.about: unknown key",)),
     "no resolution": ("{heightmap: {mesh: a}}", ("parameters[0].heightmap.resolution: missing",)),

@@ -88,6 +88,24 @@ def test_a_mesh_is_scaled_then_turned_then_moved(scene):
     assert selection.array("box.scale").shape == ()
 
 
+def test_axes_move_alone(scene):
+    """Only the free axes move, each by its own number; the derivative of a held axis has nowhere to go."""
+    import drjit as dr
+    import mitsuba as mi
+
+    before = positions(select(scene, motion("box")))
+    selection = select(scene, motion("box", "x", "y", initial={"x": 0.25, "y": -0.5}))
+    assert selection.keys == ["box.x", "box.y"]
+    assert np.allclose(positions(selection), before + np.array([0.25, -0.5, 0]), atol=1e-5)
+    assert [selection.quantity(key) for key in selection.keys] == ["length", "length"]
+    leaves = {key: mi.Float(selection.value(key)) for key in selection.keys}
+    dr.enable_grad(leaves)
+    selection.hand_over({key: mi.Float(leaf) for key, leaf in leaves.items()})
+    dr.backward(dr.sum(selection.params[MESH] * mi.Float(np.tile([1, 10, 100], len(before)).astype(np.float32))))
+    selection.collect()
+    assert [float(dr.grad(leaf)[0]) / len(before) for leaf in leaves.values()] == pytest.approx([1, 10])
+
+
 def test_all_turn_about_the_centre_of_their_box(scene):
     before = {key: positions(select(scene, motion("box")), key) for key in (MESH, "other.vertex_positions")}
     together = np.concatenate(list(before.values()))

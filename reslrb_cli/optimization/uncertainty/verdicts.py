@@ -18,6 +18,9 @@ entry's scale. All but `spread` are of the optimum of the loss with the target a
 | `not determined` | `alone` <= `OTHERS` of `spread`: others make up for it; the most correlated one is named |
 | `below the noise`| otherwise: the gradients do not tell within tau where the value should be |
 
+`derivative incomplete` replaces the verdict of a parameter whose derivative lacks a significant share: a run measures
+that before its first iteration (`measure/missing.py`).
+
 A parameter of several entries is what `SETTLED_SHARE` of those that are seen and have an effect are, if that is
 `settled`; otherwise what most of the others are.
 """
@@ -26,13 +29,14 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from reslrb_cli.optimization.uncertainty.curvature import MARGIN, Direction, smooth
 from reslrb_cli.optimization.uncertainty.posterior import SURE, Measured, alone, joint
 from reslrb_cli.records.decisions import Jsonable
+from reslrb_cli.records.measurements import INCOMPLETE
 from reslrb_cli.statistics import Array, rms
 
 #: A value that is known to this share of its scale is settled.
@@ -58,6 +62,7 @@ class Verdict(str, enum.Enum):
     BELOW_NOISE = "below the noise"
     NO_EFFECT = "no effect"
     NOT_SEEN = "not seen"
+    INCOMPLETE = INCOMPLETE
     SETTLED = "settled"
 
 
@@ -142,6 +147,13 @@ class CertaintyRecord(Jsonable):
     learning_rate: float
     target_noise: str
     target_spp: int | None = None
+
+    def without_derivatives(self, keys: Collection[str]) -> CertaintyRecord:
+        """Return the record with `derivative incomplete` for these parameters, whatever the derivatives say."""
+        verdict = Verdict.INCOMPLETE.value
+        judged = {key: replace(about, verdict=verdict, shares={verdict: 1.0}, partner=None) if key in keys else about
+                  for key, about in self.parameters.items()}  # fmt: skip
+        return replace(self, parameters=judged)
 
 
 @dataclass

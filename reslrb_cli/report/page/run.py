@@ -22,6 +22,7 @@ from reslrb_cli.records.decisions import (
     SequenceRecord,
 )
 from reslrb_cli.records.images import load_image
+from reslrb_cli.records.measurements import incomplete_records
 from reslrb_cli.records.run_folder import FABRICATION_FILE, SOLID_PICTURE
 from reslrb_cli.report.format import count, duration, number
 from reslrb_cli.report.page.images import image_rows, seen_tables, show, view_table
@@ -167,6 +168,7 @@ def run_parts(run: Run) -> dict[str, Markup]:
     parts: dict[str, Callable[[], Markup]] = {
         "Parameters": lambda: (
             parameter_table(results, "now" if run.at_work else "end", notes=True)
+            + Markup().join(soft(found.line()) for found in incomplete_records(run.manifest.get("incomplete") or ()))
             + lay_out("run.certainty", results.get("certainty") or {})
         ),
         "Images": lambda: image_rows(run),

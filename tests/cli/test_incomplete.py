@@ -1,0 +1,176 @@
+"""What a run says and does where silhouettes and edges of shadows are missing in the derivative of what it moves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cli.tiny import done, reslrb, settings
+from optimization import glass
+
+from reslrb_cli.config.loader import load
+from reslrb_cli.measure.missing import measure_missing, share_of
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.records.measurements import MissingRecord
+from reslrb_cli.report.run_summary import find_remedy, warnings
+
+#: A box on a floor under an area lamp, seen from above; its place is read from a picture by `path`.
+SCENE = """<scene version="3.0.0">
+  <sensor type="perspective">
+    <float name="fov" value="45"/>
+    <transform name="to_world"><lookat origin="0, 3.2, 4.2" target="0, 0.2, 0" up="0, 1, 0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="20"/><integer name="height" value="20"/>
+      <string name="pixel_format" value="rgb"/><rfilter type="gaussian"/></film>
+  </sensor>
+  <shape type="rectangle" id="floor">
+    <transform name="to_world"><rotate x="1" angle="-90"/><scale value="3"/></transform>
+    <bsdf type="diffuse"><rgb name="reflectance" value="0.5, 0.5, 0.5"/></bsdf></shape>
+  <shape type="cube" id="box"><transform name="to_world"><scale value="0.4"/><translate value="0, 0.4, 0"/></transform>
+    <bsdf type="diffuse"><rgb name="reflectance" value="0.7, 0.3, 0.2"/></bsdf></shape>
+  <shape type="rectangle" id="lamp">
+    <transform name="to_world"><rotate x="1" angle="90"/><scale value="0.7"/><translate value="0.8, 3.5, 0.5"/>
+    </transform>
+    <emitter type="area"><rgb name="radiance" value="12, 12, 12"/></emitter></shape>
+</scene>
+"""
+CONFIG = """
+variant: llvm_ad_rgb
+scene: {file: box.xml}
+target: {file: target.exr}
+parameters:
+  - {motion: {of: box, free: [x, z]}, learning_rate: 0.01}
+integrator: {max_depth: 2, estimator: stack, guiding: off, sequence: independent}
+loss: {type: l2}
+run: {iterations: 20, spp: 16, final_spp: 16, reach_spp: 4, measuring: 0.5}
+"""
+ACCEPT = "run.accept_incomplete=true"
+
+
+@pytest.fixture(scope="module")
+def experiment(llvm: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The configuration; in its target the box is 0.25 further along x."""
+    import mitsuba as mi
+
+    folder = tmp_path_factory.mktemp("box")
+    (folder / "box.xml").write_text(SCENE)
+    (folder / "box.yaml").write_text(CONFIG)
+    (folder / "there.xml").write_text(SCENE.replace("0, 0.4, 0", "0.25, 0.4, 0"))
+    image = mi.render(mi.load_file(str(folder / "there.xml")), spp=512, integrator=mi.load_dict({"type": "path"}))
+    mi.Bitmap(image).write(str(folder / "target.exr"))
+    return folder / "box.yaml"
+
+
+@pytest.fixture(scope="module")
+def run(experiment: Path) -> tuple[str, Path]:
+    """What a run says that was told to go on all the same, and its folder."""
+    folder = experiment.parent / "runs"
+    return done("optimize", experiment, *settings(f"run.output={folder}", ACCEPT)).output, folder / "box"
+
+
+def test_a_run_refuses_a_derivative_that_lacks_more_than_half(experiment: Path):
+    result = reslrb("optimize", experiment)
+    assert result.exit_code == 2
+    *_, line = result.output.splitlines()
+    assert line.startswith(f"{experiment}: integrator.type: box.x: ")
+    assert "of the derivative is missing (silhouettes, edges of shadows" in line
+    assert "--set integrator.type=prb_projective has all of it" in line
+    assert f"--set {ACCEPT} runs it all the same" in line
+
+
+def test_a_value_by_an_incomplete_derivative_is_never_settled(run: tuple[str, Path]):
+    output, folder = run
+    manifest: dict[str, Any] = read_manifest(folder) or {}
+    judged = manifest["results"]["certainty"]["parameters"]
+    assert {key: about["verdict"] for key, about in judged.items()} == {
+        "box.x": "derivative incomplete", "box.z": "derivative incomplete",
+    }  # fmt: skip
+    [told] = [line for line in output.splitlines() if line.startswith("box.x: ")]
+    assert "of the derivative is missing" in told
+    assert [entry["parameter"] for entry in manifest["incomplete"]] == ["box.x", "box.z"]
+    assert manifest["incomplete"][0]["share"] > 0.5
+    assert "derivative incomplete: box.x" in output.splitlines()[-1]
+    page = (folder / "report.html").read_text()
+    assert "of the derivative is missing (silhouettes" in page
+    assert "settled" not in output
+
+
+def test_a_run_that_goes_on_knows_what_is_missing(run: tuple[str, Path]):
+    before: dict[str, Any] = read_manifest(run[1]) or {}
+    done("optimize", "--resume", run[1], *settings("run.iterations=22"))
+    after: dict[str, Any] = read_manifest(run[1]) or {}
+    assert after["incomplete"] == before["incomplete"]
+    assert after["results"]["certainty"]["parameters"]["box.x"]["verdict"] == "derivative incomplete"
+
+
+def test_what_there_is_no_time_to_measure_is_said(experiment: Path):
+    """Also by a dry run."""
+    result = done("optimize", experiment, "--dry-run", *settings("run.measuring=0"))
+    assert "box.x: silhouettes and edges of shadows are not in the derivative; there was no time" in result.output
+    assert "--set integrator.type=prb_projective has all of it" in result.output
+
+
+def test_light_without_edges_lacks_nothing(llvm: str, tmp_path: Path):
+    """A spot lamp whose light ends smoothly, through glass: its caustic is all in the derivative."""
+    heights = "parameters=[{motion: {of: lamp, free: [translation]}}, {heightmap: {mesh: slab, resolution: [5, 4]}}, "
+    heights += "{key: floor.bsdf.reflectance.value}]"
+    path = glass.write_experiment(tmp_path)
+    problem = assemble(load(path, [heights, "run.iterations=100", "run.measuring=1"]))
+    values = {key: value.copy() for key, value in problem.values().items()}
+    found = measure_missing(problem)
+    assert [record.parameter for record in found] == ["lamp.translation", "slab.heightmap"]
+    assert not any(record.is_incomplete for record in found), [record.line() for record in found]
+    assert all(np.array_equal(value, values[key]) for key, value in problem.values().items())
+    assert not any(np.any(np.array(gradient)) for gradient in problem.gradients().values())
+
+
+def test_shares_have_their_errors():
+    """The share of samples with known means is right on average, and scatters by its standard error."""
+    random, found = np.random.default_rng(1), []
+    for _ in range(400):
+        whole = np.array([4.0, 0.0]) + random.normal(size=(8, 2))
+        found.append(share_of(whole, np.array([0.0, 2.4]) + 0.5 * random.normal(size=(8, 2)), np.zeros(2)))
+    share, error = np.array(found).T
+    assert share.mean() == pytest.approx(0.6, abs=4 * share.std() / np.sqrt(400))
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(share.std(), rel=0.15)
+    assert share_of(random.normal(size=(8, 2)), np.ones((8, 2)), np.zeros(2)) is None
+
+
+def record(share: float | None, error: float | None, seeds: int = 8) -> MissingRecord:
+    return MissingRecord("a.yaml", "box.x", share, error, 1, seeds)
+
+
+@pytest.mark.parametrize(
+    ("found", "incomplete", "refused"),
+    [
+        (record(0.02, 0.001), False, False),  # of an interior derivative, by a step that is not 0
+        (record(0.1, 0.04), False, False),
+        (record(0.3, 0.04), True, False),
+        (record(0.45, 0.2), True, False),
+        (record(0.9, 0.1), True, True),
+        (record(None, None), True, False),
+        (record(None, None, 0), True, False),
+    ],
+)
+def test_what_is_made_of_a_share(found: MissingRecord, incomplete: bool, refused: bool):
+    assert (found.is_incomplete, found.is_for_the_most_part) == (incomplete, refused)
+    assert ("nothing is missing" in found.line()) is (found.share == 0.1)
+
+
+def test_a_loss_that_rises_is_explained_by_what_is_missing():
+    """No lower rate is proposed, of other parameters that still move either."""
+    level = {"start": {"mean": 1.0, "error": 0.01}, "end": {"mean": 2.0, "error": 0.01}, "change": "rose"}
+    moving = {"verdict": "still moving", "shares": {"still moving": 1.0}, "moved": 0.1, "rate": 0.01, "reach": 10.0}
+    lacking = {"verdict": "derivative incomplete", "shares": {"derivative incomplete": 1.0}}
+    about = {"parameters": {"box.x": lacking, "box.color": moving}, "iterations": 100, "learning_rate": 0.01}
+    results = {"loss_trend": level, "certainty": about, "iterations": 100}
+    remedy = find_remedy(results, "box.color")
+    assert remedy is not None
+    assert remedy.words == "a lower rate"
+    results["incomplete"] = [vars(record(0.47, 0.02))]
+    assert find_remedy(results, "box.color") is None
+    told = warnings(results)
+    assert "silhouettes and edges of shadows (47% +- 2.0% of that of box.x is missing), and a lower rate" in told[1]
+    assert "derivative incomplete: box.x (47% +- 2.0% of it is missing)" in told
