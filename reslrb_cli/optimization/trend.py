@@ -73,15 +73,16 @@ class Change(str, enum.Enum):
 
 @dataclass(frozen=True)
 class Trend:
-    """A series at its start and at its end."""
+    """A series at its start and at its end, and what became of its second half alone (None: too short to say)."""
 
     start: Level
     end: Level
     change: Change
+    late: Change | None = None
 
     def to_json(self) -> dict[str, Any]:
         """As a mapping for JSON."""
-        return {**asdict(self), "change": self.change.value}
+        return {**asdict(self), "change": self.change.value, "late": None if self.late is None else self.late.value}
 
 
 def find_trend(values: Sequence[float]) -> Trend | None:
@@ -90,10 +91,12 @@ def find_trend(values: Sequence[float]) -> Trend | None:
     count, width = series.size, window(series.size)
     if count < LEAST_ITERATIONS:
         return None
+    half_trend = find_trend(series[count // 2 :].tolist())
+    late = None if half_trend is None else half_trend.change
     start, end = _level(series[:width]), _level(series[-width:])
     leap = _quantile(width - 1, 1 - CONFIDENCE) * end.error * math.sqrt(width + 1)
     if series[0] < min(series[1:].min(), end.mean - leap):
-        return Trend(Level(float(series[0]), end.error * math.sqrt(width)), end, Change.ROSE)
+        return Trend(Level(float(series[0]), end.error * math.sqrt(width)), end, Change.ROSE, late)
     ranks = _ranks(series)
     half = _ranks(np.concatenate([series[:EARLY], series[count // 2 :]]))
     is_late = np.arange(half.size) >= EARLY
@@ -104,7 +107,7 @@ def find_trend(values: Sequence[float]) -> Trend | None:
         change = Change.ROSE
     else:
         change = Change.FLAT if _rises(_parts(_ranks(raised))) else Change.UNCLEAR
-    return Trend(start, end, change)
+    return Trend(start, end, change, late)
 
 
 def stands(levels: Array, relative: float, number: int) -> Array:

@@ -107,3 +107,13 @@ def test_flat_losses_hardly_ever_fall_or_rise(kind: str, iterations: int) -> Non
     for change in (Change.FELL, Change.ROSE):
         assert found.count(change) / len(flat) <= 0.05 + tolerance, change
     assert iterations < 400 or found.count(Change.FLAT) > 0.6 * len(flat)
+
+
+def test_the_second_half_of_a_run_is_judged_by_itself() -> None:
+    fading = (0.3 + 26 * 0.5 ** (np.arange(200) / 10)) * NOISE["normal, 10 %"](np.random.default_rng(7), (1, 200))[0]
+    found = [find_trend(series) for series in (fading, 0.5 ** (np.arange(200) / 50), fading[:30])]
+    assert [(each.change, each.late) for each in found if each is not None] == [
+        (Change.FELL, Change.FLAT),
+        (Change.FELL, Change.FELL),
+        (Change.FELL, None),
+    ]
