@@ -187,11 +187,11 @@ class Standing(Section):
     """When a loss is taken to stand."""
 
     patience: Annotated[int, Field(ge=5, lt=2**31)] = 20
-    """Iterations of a window; at the end of each its losses are compared with those of the window before. At least 20
-    where views are held out, whose loss is known every 10 iterations."""
+    """Iterations of a window. The loss is tested at the end of each, from the third on. At least 20 where views are
+    held out, whose loss is known every 10 iterations."""
     relative: Annotated[float, Field(ge=0, lt=1)] = 0.01
-    """The loss stands where its mean over a window did not fall by more than this share of that over the window before,
-    or not by more than the standard error of their difference."""
+    """The loss stands where it is shown to fall by less than this share of itself from one window to the next. The
+    smaller this is, and the more noise losses have, the more windows the test needs."""
 
 
 class Plateau(Standing):

@@ -203,8 +203,10 @@ class RunConfig(Section):
 
     stop: Standing | None = None
     """End the run before its last iteration, as finished, once its loss stands: that of held-out views where there are
-    any, else that of the iterations; with `schedule: plateau` not before the rate is at its least. `{}`: the defaults.
-    null: never."""
+    any, else that of the iterations; with `schedule: plateau` not before the rate is at its least. At most 5 % of runs
+    are stopped whose loss still falls by more than `relative` a window. With the defaults, a run goes on for about 300
+    iterations after its loss stands where losses have 10 % noise, and for 500 at 30 %
+    ([method.md](method.md#when-a-loss-stands)). `{}`: the defaults. null: never."""
 
     @model_serializer(mode="wrap")
     def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:

@@ -1,11 +1,10 @@
 """When a loss stands: what ends a run early (`run.stop`), and lowers its rate (`optimizer.schedule: plateau`); and the
 mean of its last values (`optimizer.average`).
 
-A loss is looked at in windows of `patience` iterations, one after another, once at the end of each. It stands where the
-mean of the newest window is not below that of the one before by more than the standard error of their difference and
-by more than `relative` of it: losses of iterations are noise for the most part, of independent samples. Where views are
-held out it is their loss, which has fewer values, always of the same samples. Windows begin once the run is as it is
-configured (`run.stages`), and anew where the rate is lowered. A run with a plateau ends only at its least rate.
+A loss has windows of `patience` iterations, one after another, and is tested at the end of each: it stands where it is
+shown to fall by less than `relative` a window (`trend.stands`). Where views are held out, the test takes their loss,
+which has fewer values, always of the same samples. Windows begin once the run is as it is configured (`run.stages`),
+and anew where the rate is lowered. A run with a plateau ends only at its least rate.
 
 The mean of the values of the last iterations has less noise than the last of them (Polyak and Juditsky 1992).
 """
@@ -21,6 +20,7 @@ import numpy as np
 from reslrb_cli.config.optimizers import AnyOptimizer, Standing
 from reslrb_cli.config.schema import Config
 from reslrb_cli.optimization.state import Count, State
+from reslrb_cli.optimization.trend import SPANS, levels_of, line, stands
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.records.tree import Arrays, entry
 
@@ -66,23 +66,23 @@ class Watch:
         return math.ceil(stages[-1].until * iterations) + 1 if stages else 0
 
     def _stands(self, asked: Standing, began: int, done: int) -> str:
-        """How the loss stands after `done` iterations, in words; "" where it falls, or no window is at its end."""
+        """Say how the loss stands after `done` iterations; "" where that is not shown, or no window is at its end."""
         span = asked.patience
-        if (done - began) % span or done - began < 2 * span:
+        if (done - began) % span:
             return ""
-        before, now = (
-            np.array([self._values[each] for each in range(end - span, end) if each in self._values])
-            for end in (done - span, done)
-        )
-        if min(len(before), len(now)) < 2:
+        levels: list[float] = []
+        for end in range(done, began, -span)[: SPANS[-1]]:
+            values = [self._values[each] for each in range(end - span, end) if each in self._values]
+            if len(values) < 2:
+                break
+            levels.insert(0, float(levels_of(np.array(values))))
+        if not (count := int(stands(np.array(levels), asked.relative, (done - self._first) // span))):
             return ""
-        error = [float(np.std(each, ddof=1)) / math.sqrt(len(each)) for each in (before, now)]
-        fall = float(before.mean() - now.mean())
-        if fall > max(math.hypot(*error), asked.relative * abs(float(before.mean()))):
-            return ""
-        means = [f"{each.mean():.4g} +- {wide:.1g}" for each, wide in zip((before, now), error, strict=True)]
+        last = np.array(levels[-count:])
+        fall, error = (float(each) / max(abs(float(np.median(last))), 1e-300) for each in line(last))
         kind = "loss of held-out views" if self.held_out else "loss"
-        return f"the {kind} stands: {means[0]}, then {means[1]} in {span} iterations"
+        share = f"{-100 * fall:.2g} +- {100 * error:.1g} %"
+        return f"the {kind} stands: over the last {count * span} iterations it fell by {share} in {span}"
 
 
 @dataclass(frozen=True)

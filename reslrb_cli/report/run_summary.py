@@ -35,7 +35,14 @@ LEAST_LONGER, MOST_LONGER = 2, 5
 LOWER, MORE_SAMPLES = 3, 16
 
 #: What is proposed, that which makes the others of no use first.
-ORDER = ("a lower rate", "scale: auto", "a higher rate", "more iterations", "more samples for it")
+ORDER = (
+    "a lower rate",
+    "scale: auto",
+    "a higher rate",
+    "a new run from here",
+    "more iterations",
+    "more samples for it",
+)
 
 #: Quantities of what emits, which may be of any size.
 EMITTED = ("radiance", "irradiance", "intensity")
@@ -117,6 +124,8 @@ def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
         if emits in EMITTED and measured.get("scale") == "none":
             return Remedy("scale: auto", "--set optimizer.scale=auto")
         return Remedy("a higher rate", _rate_setting(measured, rate, max(2 * way / reach, 2.0)))
+    if (results.get("loss_trend") or {}).get("late") == "flat":  # more of the same steps gain nothing
+        return Remedy("a new run from here", "initial: {run: RUN} for each parameter")
     longer = min(max(way / moved if moved else MOST_LONGER, LEAST_LONGER), MOST_LONGER)
     return Remedy("more iterations", f"--set run.iterations={int(float(f'{longer * iterations:.2g}'))}")
 

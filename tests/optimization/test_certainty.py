@@ -104,6 +104,16 @@ def test_what_fails_is_told_for_what_it_is(folder, toy):
         assert found.certainty.parameters[OTHER_TWIN].partner == TWIN
 
 
+def test_a_value_that_ran_to_its_bound_and_has_no_gradient_there_is_at_its_bound(folder, monkeypatch):
+    """A roughness that ran to its bound, where the lobe is so narrow that no sample differs from 0."""
+    monkeypatch.setattr(measuring, "sample_gradient", lambda *given: None)
+    options = "initial: 0.6, bounds: [0.4, 1], learning_rate: 0.05"
+    toy = Toy("without a gradient", {ALPHA: options, HIDDEN: COLOR}, {ALPHA: BOUND, HIDDEN: NONE},
+              ("run.iterations=24", "run.spp=8", "target.render.spp=64"))  # fmt: skip
+    found = run(folder, toy)
+    assert verdicts(toy, found) == toy.right, told(toy, found)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(5))
 def test_verdicts_of_twenty_runs(folder, seed):

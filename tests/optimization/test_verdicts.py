@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reslrb_cli.optimization.results import Change, find_trend, got_worse, window
+from reslrb_cli.optimization.results import got_worse
+from reslrb_cli.optimization.trend import Change, find_trend, window
 from reslrb_cli.optimization.uncertainty import posterior
 from reslrb_cli.optimization.uncertainty.curvature import Direction, smooth
 from reslrb_cli.optimization.uncertainty.posterior import LastSteps, Measured, alone, joint
@@ -20,14 +21,15 @@ from reslrb_cli.optimization.uncertainty.verdicts import Verdict, judge, noise_c
 def judged(*entries: dict[str, float | bool]) -> list[Verdict]:
     """The verdicts of entries that are settled, but for these changes, of two gradients whose noise has either sign."""
     usual = {"value": 0.5, "low": 0.0, "high": 1.0, "touched": True, "gradient": 0.0, "error": 1.0, "step": 0.01}
-    usual |= {"spread": 0.01, "alone": 0.01, "to_go": 0.0, "to_go_error": 0.01}
+    usual |= {"start": 0.5, "spread": 0.01, "alone": 0.01, "to_go": 0.0, "to_go_error": 0.01}
     every = [usual | changes for changes in entries]
     e = {name: np.array([each[name] for each in every]) for name in usual}
     of_run = np.array([each.get("of_run", each["spread"]) for each in every])
     gradients = np.array([e["gradient"] + sign * e["error"] for sign in (1, -1)]) * e["touched"]
     own = Measured(
-        e["value"], (e["low"][0], e["high"][0]), 0.5, gradients, e["step"] / e["error"] / 2**0.5, [1.0], False
-    )
+        e["value"], (e["low"][0], e["high"][0]), 0.5, gradients, e["step"] / e["error"] / 2**0.5, [1.0], False,
+        start=e["start"],
+    )  # fmt: skip
     np.testing.assert_array_equal(own.touched, e["touched"])
     return judge(own, e["spread"], of_run, e["alone"], e["to_go"], e["to_go_error"])
 
@@ -44,6 +46,10 @@ def judged(*entries: dict[str, float | bool]) -> list[Verdict]:
     ({"spread": 0.2, "alone": 0.2, "to_go": 0.09, "to_go_error": 0.05}, Verdict.BELOW_NOISE),
     ({"spread": 0.2, "alone": 0.02, "to_go": 0.01, "to_go_error": 0.2}, Verdict.NOT_DETERMINED),
     ({"touched": False, "spread": 0.2}, Verdict.NO_EFFECT),
+    # It ran to its bound, where no gradient is left; and it began there, and never had one.
+    ({"touched": False, "value": 0.0}, Verdict.AT_BOUND),
+    ({"touched": False, "value": 1.0}, Verdict.AT_BOUND),
+    ({"touched": False, "value": 0.0, "start": 0.0}, Verdict.NO_EFFECT),
     # At a bound, where the gradient holds it there: L falls downwards where dL/dx > 0.
     ({"value": 0.0, "gradient": 5.0, "spread": 0.2}, Verdict.AT_BOUND),
     ({"value": 0.0, "gradient": 0.5, "spread": 0.2}, Verdict.AT_BOUND),
@@ -253,6 +259,26 @@ def told_of(measured):
             weigh(measured, directions, ROOM, {}, {}, np.zeros((2, 2)), {}).items()}  # fmt: skip
 
 
+def test_what_depends_on_a_value_that_still_moves_is_not_settled():
+    """An exposure and a colour make up for each other: the exposure is not known before the colour is."""
+    H, random = np.array([[1.0, 0.3], [0.3, 0.1]]), np.random.default_rng(1)
+
+    def told(scale, shared):
+        measured = {
+            key: Measured(
+                np.full(1, 0.5), (-np.inf, np.inf), size, mean + 0.002 * random.normal(size=(4, 1)), np.full(1, 0.05),
+                [1.0] * 30, True,
+            )
+            for key, size, mean in (("exposure", scale, 0.06), ("colour", 0.5, 0.02))
+        }  # fmt: skip
+        directions = [Direction(key, np.ones(1), None, 0) for key in measured]
+        found = weigh(measured, directions, H * (np.eye(2) + shared * (1 - np.eye(2))), {}, {}, np.zeros((2, 2)), {})
+        return {key: each.verdict for key, each in found.items()}
+
+    assert told(5.0, 0.95) == {"exposure": "still moving", "colour": "still moving"}
+    assert told(5.0, 0.0) == {"exposure": "settled", "colour": "still moving"}
+
+
 def test_what_creeps_under_noise_of_heavy_tails_is_not_settled(monkeypatch):
     """The wall, off at first, drives the ceiling the wrong way, and large gradients then make steps short; by the steps
     of the end nothing would be left of it."""
@@ -401,7 +427,8 @@ def test_the_levels_are_those_of_the_first_and_the_last_tenth():
     values = np.concatenate([np.tile([1.0, 3.0], 10), np.full(160, 9.0), np.tile([0.4, 0.6], 10)])
     trend = find_trend(values)
     assert (trend.start.mean, trend.end.mean) == (pytest.approx(2.0), pytest.approx(0.5))
-    assert trend.start.error == pytest.approx(np.std(values[:20], ddof=1) / np.sqrt(20))
+    # An interquartile mean leaves out half of the values, and what it keeps of these two is as far apart as all.
+    assert trend.start.error == pytest.approx(2 * np.std(values[:20], ddof=1) / np.sqrt(20))
     assert trend.to_json()["change"] == "fell"
     assert window(200) == 20
 

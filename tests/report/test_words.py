@@ -165,6 +165,12 @@ def judged(about, **measured):
     (judged({"reach": None}), "more iterations", "--set run.iterations=680"),
     (judged({}, trend={"change": "rose", "start": {"mean": 1, "error": 0.1}, "end": {"mean": 2, "error": 0.1}}),
      "a lower rate", "--set optimizer.learning_rate=0.01"),
+    # The loss fell at first, and stands since then: more of the same steps do not help.
+    (judged({"reach": 60.0}, trend=trend("fell", 26.0, 0.3) | {"late": "flat"}),
+     "a new run from here", "initial: {run: RUN} for each parameter"),
+    (judged({"reach": 60.0}, trend=trend("fell", 26.0, 0.3) | {"late": "fell"}),
+     "more iterations", "--set run.iterations=680"),
+    (judged({}, trend=trend("fell", 26.0, 0.3) | {"late": "flat"}), "scale: auto", "--set optimizer.scale=auto"),
 ])  # fmt: skip
 def test_a_value_that_still_moves_is_told_what_helps(found, words, setting):
     assert parameter_lines(found, 120)[1].endswith(f"still moving: {words}")

@@ -267,6 +267,7 @@ class Certainty:
                 seen=self._seen_entries(key, rows),
                 last=self.last.get(key),
                 pace=self._paces_of(key, iterations),
+                start=self._initial[key],
             )
         return found
 

@@ -81,7 +81,7 @@ class Measured:
     factors of all iterations; `pace` is how far a step moved the parameter then, over how far it does at the end, by
     iteration (None: as far). `last` are its last iterations, where they are known, and `recent` is the mean square of
     their gradients, (N,), where the optimiser kept it. `seen` (N,) says which entries of a texture some view shows;
-    None of what is no texture.
+    None of what is no texture. `start` (N,) has the values before the first iteration.
 
     `mean` and `noise`, both (N,), are the gradients' mean and variance.
     """
@@ -97,6 +97,7 @@ class Measured:
     seen: Array | None = None
     last: LastSteps | None = None
     pace: Array | None = None
+    start: Array | None = None
     mean: Array = field(init=False)
     noise: Array = field(init=False)
 
@@ -140,6 +141,11 @@ class Measured:
         lower = (self.value - low <= near) & (self.mean >= np.where(self.value <= low, -back, back))
         upper = (high - self.value <= near) & (self.mean <= np.where(self.value >= high, back, -back))
         return np.asarray(lower | upper)
+
+    @property
+    def driven(self) -> Array:
+        """Which entries the run has moved to a bound, (N,): they had gradients, though they may have none there."""
+        return np.asarray(self.at_bound & (False if self.start is None else self.value != self.start))
 
     def within(self, to_go: Array) -> Array:
         """Ways to the optimum, cut off at the bounds: what is far off is not as the curvature here has it."""

@@ -11,12 +11,14 @@ entry's scale. All but `spread` are of the optimum of the loss with the target a
 | verdict          | holds where |
 |---|---|
 | `not seen`       | it is a texel that no view shows, whatever light by way of it reaches the images |
-| `no effect`      | every gradient sample was exactly 0 |
+| `no effect`      | every gradient sample was exactly 0, and the run has not driven it to a bound |
 | `at its bound`   | the value is within a step of a bound, and the gradient does not pull it back |
 | `settled`        | spread <= tau |
 | `still moving`   | `to_go` is told from its error (`SURE` of them), and spread > tau without the target's noise |
 | `not determined` | `alone` <= `OTHERS` of `spread`: others make up for it; the most correlated one is named |
 | `below the noise`| otherwise: the gradients do not tell within tau where the value should be |
+
+A parameter whose most correlated partner is `still moving` is not `settled`: it will move with that one.
 
 `derivative incomplete` replaces the verdict of a parameter whose derivative lacks a significant share: a run measures
 that before its first iteration (`measure/missing.py`).
@@ -71,7 +73,7 @@ def judge(own: Measured, spread: Array, of_run: Array, alone: Array, to_go: Arra
     noise, `error` that of `to_go`."""
     tolerance = TOLERANCE * own.scale
     rules = [
-        (~own.touched, Verdict.NO_EFFECT),
+        (~own.touched & ~own.driven, Verdict.NO_EFFECT),
         (own.at_bound, Verdict.AT_BOUND),
         (spread <= tolerance, Verdict.SETTLED),
         ((np.abs(to_go) > SURE * error) & (of_run > tolerance), Verdict.STILL_MOVING),
@@ -272,6 +274,11 @@ def weigh(
             result[key] = _small(own, at, found)
         else:
             result[key] = _large(own, diagonal.get(key), fixed_diagonal.get(key), at, found, pixels.get(key))
+    moving = {key for key, about in result.items() if about.verdict == Verdict.STILL_MOVING.value}
+    for place, direction in enumerate(directions):
+        about = result[direction.key]
+        if about.verdict == Verdict.SETTLED.value and found.partners[place] in moving - {direction.key}:
+            result[direction.key] = replace(about, verdict=Verdict.STILL_MOVING.value)
     return result
 
 

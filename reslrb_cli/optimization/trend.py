@@ -1,0 +1,178 @@
+"""Tests on a noisy series of losses: whether it stands, and whether it fell or rose over a run.
+
+Losses of iterations have heavy tails: one bright path multiplies a loss by ten. So no test takes a plain mean.
+
+`stands` shows a standstill; that a fall was not seen is no proof of one. A window of iterations has one level, its
+interquartile mean (`levels_of`). A line through the levels of the last k windows has a slope, and the standard error
+of it has k - 2 degrees of freedom. The loss stands where the upper bound for the fall per window is below `relative`.
+The levels' own spread gives the standard error, so losses may be correlated, over less than a window.
+
+The test is repeated after every window, for several k, and a run stops at the first success. The j-th look therefore
+has the share 2 / (j (j - 1)) of `CHANCE`, in equal parts for its k. The shares add up to 1 from j = 3 on. So a loss
+that falls by `relative` a window is stopped in at most 5 % of runs, however long they are.
+
+`find_trend` tests the ranks of all losses, in ten parts (Conover and Iman 1981), by the same line.
+
+- It rose, or fell, if the line does, and if the last tenth of the iterations is on that side of the first.
+- It fell, too, if the first three losses are above the second half. Many falls are over within a few iterations.
+- It rose, too, if the first loss is below all others, and surely below the last tenth. Some runs leap at their first
+  step, and come down again to a level above their start.
+- It was flat if it did neither, and if it surely fell by less than `MOST_FALL`: raised by as much, the line rises.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from reslrb_cli.statistics import Array
+
+#: The most runs, as a share, that may be stopped though their loss falls by `relative` a window.
+CHANCE = 0.04
+
+#: Numbers of windows over which a loss may stand: more windows show less noise, fewer show an end of the fall sooner.
+SPANS = sorted(least << power for least in (3, 4, 5) for power in range(7))
+
+#: Shorter series are not judged, and no fewer losses make a level at the start or the end.
+LEAST_ITERATIONS, LEAST_WINDOW = 20, 5
+
+#: How sure a change has to be (one-sided).
+CONFIDENCE = 0.99
+
+#: A fall by less than this share of the start counts as none.
+MOST_FALL = 0.25
+
+#: The first losses that show a fall that is over soon.
+EARLY = 3
+
+#: Parts of a series that the line of `find_trend` goes through.
+PARTS = 10
+
+
+@dataclass(frozen=True)
+class Level:
+    """The interquartile mean of some losses, and its standard error."""
+
+    mean: float
+    error: float
+
+
+class Change(str, enum.Enum):
+    """What became of a series, as far as its noise tells."""
+
+    FELL = "fell"
+    ROSE = "rose"
+    FLAT = "flat"
+    UNCLEAR = "unclear"
+
+
+@dataclass(frozen=True)
+class Trend:
+    """A series at its start and at its end, and what became of its second half alone (None: too short to say)."""
+
+    start: Level
+    end: Level
+    change: Change
+    late: Change | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """As a mapping for JSON."""
+        return {**asdict(self), "change": self.change.value, "late": None if self.late is None else self.late.value}
+
+
+def find_trend(values: Sequence[float]) -> Trend | None:
+    """Return the trend of a value per iteration, None of too few; values that are not finite are left out."""
+    series = np.array([value for value in values if math.isfinite(value)], dtype=np.float64)
+    count, width = series.size, window(series.size)
+    if count < LEAST_ITERATIONS:
+        return None
+    half_trend = find_trend(series[count // 2 :].tolist())
+    late = None if half_trend is None else half_trend.change
+    start, end = _level(series[:width]), _level(series[-width:])
+    leap = _quantile(width - 1, 1 - CONFIDENCE) * end.error * math.sqrt(width + 1)
+    if series[0] < min(series[1:].min(), end.mean - leap):
+        return Trend(Level(float(series[0]), end.error * math.sqrt(width)), end, Change.ROSE, late)
+    ranks = _ranks(series)
+    half = _ranks(np.concatenate([series[:EARLY], series[count // 2 :]]))
+    is_late = np.arange(half.size) >= EARLY
+    raised = series + MOST_FALL * abs(start.mean) * np.arange(count) / (count - width)
+    if _rises(-half, is_late) or (_rises(_parts(-ranks)) and end.mean < start.mean):
+        change = Change.FELL
+    elif _rises(_parts(ranks)) and end.mean > start.mean:
+        change = Change.ROSE
+    else:
+        change = Change.FLAT if _rises(_parts(_ranks(raised))) else Change.UNCLEAR
+    return Trend(start, end, change, late)
+
+
+def stands(levels: Array, relative: float, number: int) -> Array:
+    """Say of each series of levels (..., J), one a window, over how many of the last it stands; 0: it does not.
+
+    It stands where it surely falls by less than the share `relative` from one to the next. `number` counts the windows
+    of the run so far, which has looked at the end of each.
+    """
+    spans = [k for k in SPANS if k <= levels.shape[-1]]
+    found = np.zeros(levels.shape[:-1], dtype=int)
+    for k in spans:
+        chance = CHANCE * 2 / (number * (number - 1)) / len(spans)
+        last = levels[..., -k:]
+        slope, error = line(last)
+        allowed = relative * np.abs(np.median(last, axis=-1))
+        found = np.where((found == 0) & (slope + allowed > _quantile(k - 2, chance) * error), k, found)
+    return found
+
+
+def levels_of(values: Array) -> Array:
+    """Return the interquartile mean of each window (..., n)."""
+    cut = values.shape[-1] // 4
+    return np.asarray(np.sort(values, axis=-1)[..., cut : values.shape[-1] - cut].mean(axis=-1))
+
+
+def line(values: Array, at: Array | None = None) -> tuple[Array, Array]:
+    """Return the least-squares slope of values (..., k) over `at` (default: 0 to k - 1), and its standard error."""
+    count = values.shape[-1]
+    x = np.arange(count) if at is None else np.asarray(at, dtype=np.float64)
+    x, y = x - x.mean(), values - values.mean(axis=-1, keepdims=True)
+    slope = y @ x / (x @ x)
+    left = np.square(y - slope[..., None] * x).sum(axis=-1)
+    return slope, np.sqrt(left / (count - 2) / (x @ x))
+
+
+def window(iterations: int) -> int:
+    """Return how many of the first and of the last iterations are averaged."""
+    return max(iterations // 10, LEAST_WINDOW)
+
+
+def _rises(values: Array, at: Array | None = None) -> bool:
+    slope, error = line(values, at)
+    return bool(slope > _quantile(values.size - 2, (1 - CONFIDENCE) / 2) * error)  # of two tests for each change
+
+
+def _parts(values: Array) -> Array:
+    return np.array([part.mean() for part in np.array_split(values, PARTS)])
+
+
+def _ranks(values: Array) -> Array:
+    """Ranks; equal values share the mean of theirs."""
+    _, place, count = np.unique(values, return_inverse=True, return_counts=True)
+    return np.asarray((np.cumsum(count) - count / 2)[place])
+
+
+def _level(values: Array) -> Level:
+    """The interquartile mean, with the standard error of Tukey and McLaughlin (1963)."""
+    order, cut = np.sort(values), len(values) // 4
+    kept = np.clip(values, order[cut], order[-1 - cut])
+    share = 1 - 2 * cut / len(values)
+    return Level(float(levels_of(values)), float(np.std(kept, ddof=1)) / share / math.sqrt(len(values)))
+
+
+def _quantile(freedom: int, chance: float) -> float:
+    """Student's t that is exceeded with this chance."""
+    from scipy.special import stdtrit  # late: imports of the command line are to be fast
+
+    return -float(stdtrit(freedom, chance))

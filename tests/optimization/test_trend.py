@@ -1,0 +1,119 @@
+"""Trend and standstill of losses with heavy tails: how often each test is wrong, over many simulated runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from reslrb_cli.optimization.trend import Change, find_trend, levels_of, stands
+from reslrb_cli.statistics import Array
+
+#: A hundred consecutive losses of grey_room by light paths (48 x 36 pixels, 4 samples), over their trend.
+REAL = np.array([
+    0.92, 1.35, 0.85, 0.72, 0.95, 0.81, 0.84, 1.03, 1.12, 0.65, 1.13, 0.99, 0.81, 12.8, 1.14, 0.91, 1.5, 3.27, 1.26,
+    0.79, 0.65, 1.22, 0.89, 0.81, 0.93, 0.7, 1.28, 0.66, 64.55, 1.4, 0.86, 1.54, 0.95, 300.42, 0.99, 0.69, 1.09, 1.07,
+    0.64, 0.68, 1.08, 0.83, 0.86, 1.0, 0.57, 0.98, 0.68, 0.91, 1.29, 0.95, 0.8, 0.75, 1.12, 1.69, 1.01, 0.79, 0.67,
+    0.81, 0.56, 1.09, 0.9, 1.49, 1.03, 0.65, 0.43, 0.82, 0.68, 0.74, 0.87, 1.04, 0.94, 0.82, 1.07, 0.74, 0.93, 1.16,
+    0.48, 0.75, 0.9, 0.87, 0.9, 0.77, 0.96, 0.78, 0.69, 0.68, 0.75, 1.0, 0.87, 1.07, 1.21, 1.09, 0.94, 0.73, 0.88,
+    0.86, 1.01, 0.99, 1.62, 0.94,
+])  # fmt: skip
+
+
+def bright(random: np.random.Generator, shape: tuple[int, int]) -> Array:
+    """Noise of a tenth, and one iteration in twenty that is up to ten times as bright."""
+    firefly = np.where(random.random(shape) < 0.05, random.uniform(1, 10, shape), 1)
+    return (1 + 0.1 * random.normal(size=shape)) * firefly
+
+
+def real(random: np.random.Generator, shape: tuple[int, int]) -> Array:
+    """Pieces of ten consecutive losses of the real run."""
+    first = random.integers(0, REAL.size - 10, (shape[0], shape[1] // 10))
+    return REAL[first[..., None] + np.arange(10)].reshape(shape)
+
+
+def wandering(random: np.random.Generator, shape: tuple[int, int]) -> Array:
+    """Each loss shares half of its deviation with the one before."""
+    drawn = 0.1 * random.normal(size=shape)
+    for i in range(1, shape[1]):
+        drawn[:, i] = 0.5 * drawn[:, i - 1] + np.sqrt(0.75) * drawn[:, i]
+    return 1 + drawn
+
+
+NOISE: dict[str, Callable[[np.random.Generator, tuple[int, int]], Array]] = {
+    "normal, 10 %": lambda random, shape: 1 + 0.1 * random.normal(size=shape),
+    "normal, 30 %": lambda random, shape: 1 + 0.3 * random.normal(size=shape),
+    "t of 3 degrees": lambda random, shape: 1 + 0.1 * random.standard_t(3, size=shape),
+    "fireflies": bright,
+    "grey_room": real,
+    "wandering": wandering,
+}
+PATIENCE, RELATIVE = 20, 0.01
+
+
+def ends(losses: Array, patience: int = PATIENCE, relative: float = RELATIVE) -> Array:
+    """After how many iterations each run (R, N) stops; beyond the last where it does not."""
+    runs, windows = len(losses), losses.shape[1] // patience
+    levels = levels_of(losses[:, : windows * patience].reshape(runs, windows, patience))
+    end = np.full(runs, losses.shape[1] + 1)
+    for number in range(3, windows + 1):
+        left = np.flatnonzero(end > losses.shape[1])
+        end[left[stands(levels[left, :number], relative, number) > 0]] = number * patience
+    return end
+
+
+def check_stops(kind: str, runs: int, iterations: int) -> None:
+    """Losses that fall by just `RELATIVE` a window, and faster ones, which have less than that to the end."""
+    random, at = np.random.default_rng(4), np.arange(iterations)
+    tolerance = 3 * np.sqrt(0.05 * 0.95 / runs)
+    for window in (1 - RELATIVE, 1 - 2 * RELATIVE, 0.5 ** (PATIENCE / 100)):
+        stopped = ends(window ** (at / PATIENCE) * NOISE[kind](random, (runs, iterations))) <= iterations
+        exact = window == 1 - RELATIVE
+        assert stopped.mean() <= 0.05 + tolerance * exact, (kind, window, stopped.mean())
+    # A fall that fades out: none may stop while it is faster.
+    floor = 1 + 9 * 0.5 ** (at / 50)
+    standing = int(np.argmax(1 - floor[PATIENCE:] / floor[:-PATIENCE] < RELATIVE)) + PATIENCE
+    assert np.mean(ends(floor * NOISE[kind](random, (runs, iterations))) < standing) <= 0.05
+
+
+@pytest.mark.parametrize("kind", NOISE)
+def test_runs_whose_loss_still_falls_are_not_stopped(kind: str) -> None:
+    check_stops(kind, 300, 600)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", NOISE)
+def test_runs_whose_loss_still_falls_are_not_stopped_however_long_they_are(kind: str) -> None:
+    check_stops(kind, 2000, 3000)
+
+
+@pytest.mark.parametrize(("kind", "longest"), [
+    ("normal, 10 %", 300), ("normal, 30 %", 600), ("t of 3 degrees", 360), ("fireflies", 360), ("grey_room", 700),
+])  # fmt: skip
+def test_what_a_stop_costs(kind: str, longest: int) -> None:
+    """Medians over runs that stand from their first iteration on; docs/method.md has the figures."""
+    random = np.random.default_rng(5)
+    assert np.median(ends(NOISE[kind](random, (300, 1000)))) <= longest
+    assert np.median(ends(NOISE[kind](random, (300, 1000)), relative=0.05)) <= 240
+
+
+@pytest.mark.parametrize("kind", NOISE)
+@pytest.mark.parametrize("iterations", [20, 100, 400])
+def test_flat_losses_hardly_ever_fall_or_rise(kind: str, iterations: int) -> None:
+    flat = NOISE[kind](np.random.default_rng(6), (300, iterations))
+    found = [found.change for series in flat if (found := find_trend(series)) is not None]
+    tolerance = 3 * np.sqrt(0.05 * 0.95 / len(flat)) if (kind, iterations) == ("wandering", 20) else 0
+    for change in (Change.FELL, Change.ROSE):
+        assert found.count(change) / len(flat) <= 0.05 + tolerance, change
+    assert iterations < 400 or found.count(Change.FLAT) > 0.6 * len(flat)
+
+
+def test_the_second_half_of_a_run_is_judged_by_itself() -> None:
+    fading = (0.3 + 26 * 0.5 ** (np.arange(200) / 10)) * NOISE["normal, 10 %"](np.random.default_rng(7), (1, 200))[0]
+    found = [find_trend(series) for series in (fading, 0.5 ** (np.arange(200) / 50), fading[:30])]
+    assert [(each.change, each.late) for each in found if each is not None] == [
+        (Change.FELL, Change.FLAT),
+        (Change.FELL, Change.FELL),
+        (Change.FELL, None),
+    ]
