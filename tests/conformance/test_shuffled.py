@@ -6,6 +6,7 @@ import functools
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -16,7 +17,8 @@ from runs.going_on import one_thread
 
 from reslrb_cli.integrators.step import gradient_step, render_image
 from reslrb_cli.measure.gradients import Case, integrator
-from reslrb_cli.measure.scenes.small import camera, diffuse, lamp, rgb, room
+from reslrb_cli.measure.scenes.small import camera, diffuse, lamp, load, rgb, room
+from reslrb_cli.transport.film import AdjointImage, Film
 
 pytestmark = pytest.mark.usefixtures("llvm")
 SPP = 4
@@ -136,3 +138,61 @@ def test_what_came_before_makes_no_difference_in_200_orders(way: str) -> None:
     with one_thread():
         orders = map(np.random.default_rng, range(200 // len(WAYS)))
         assert differing(way, tuple(SCENES), orders, 16) == []
+
+
+def test_weights_of_emitters_may_change() -> None:
+    """Light of both sides is weighed by how often lamps are drawn now."""
+    scene, image = load(SCENES["lamps"][0]()), functools.partial(render_image, sensor=0, seed=3, spp=SPP)
+    params, tracer = mi.traverse(scene), integrator("reslrb", 4, **WAYS["both"])
+    before = np.array(image(tracer, scene))
+    params["lamp.emitter.sampling_weight"] = 0.02
+    params.update()
+    images = [np.array(image(each, scene)) for each in (tracer, integrator("reslrb", 4, **WAYS["both"]))]
+    assert np.abs(images[1] - before).max() > 1e-3
+    np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["reslrb", "ptracer"])
+def test_a_scene_at_the_address_of_one_that_is_freed_is_another_one(name: str) -> None:
+    """The sphere that a sky lights is that of each scene."""
+
+    def mean(tracer: Any, size: float) -> tuple[float, int]:
+        scene = load(room(lamp=None, far={"type": "sphere", "center": [0, size, 0], "radius": 0.1},
+                          light={"type": "directional", "direction": [0, -1, -0.3], "irradiance": 1.0}))  # fmt: skip
+        return float(np.mean(render_image(tracer, scene, 0, 3, SPP))), scene.ptr
+
+    one, addresses = integrator(name, 4), set()
+    for size in (2.0, 200.0, 5.0, 100.0) * 2:
+        found, address = mean(one, size)
+        assert found == pytest.approx(mean(integrator(name, 4), size)[0], rel=1e-5)
+        addresses.add(address)
+    print(len(addresses), "addresses")
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_where_light_lands_has_the_same_derivative_however_it_is_taken(whole: bool) -> None:
+    """By splats under naive AD, by their taps, and by a look-up of dL/dI, also on a film that divides by no sum."""
+    film = Film(load(room(camera=camera("gaussian"))).sensors()[0], whole)
+    shape = film.block().tensor().shape
+    weights = mi.Float(np.random.default_rng(1).random(int(np.prod(shape)), np.float32))
+
+    def splat(u: mi.Point2f) -> Any:
+        block = film.block()
+        film.put(block, u, mi.Spectrum(1), mi.Bool(True), normalization=True)
+        return dr.sum(block.tensor().array * weights)
+
+    image = AdjointImage(film, weights, shape[2])
+
+    def taps(u: mi.Point2f) -> Any:
+        return sum(k * dr.sum(image._pixel(pixel, (pixel.x < shape[1]) & (pixel.y < shape[0])))
+                   for pixel, k in film.taps(u, True))  # fmt: skip
+
+    found = []
+    for objective in (splat, taps, lambda u: dr.sum(image.lookup(u, mi.Bool(True)))):
+        u = mi.Point2f([2.3, 7.8, 0.2], [5.1, 3.4, 9.9])
+        dr.enable_grad(u)
+        dr.backward(objective(u))
+        found.append(np.array(dr.grad(u)))
+    assert np.abs(found[2]).min() > 1e-3
+    np.testing.assert_allclose(found[0], found[2], rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(found[1], found[2], rtol=1e-3, atol=1e-5)
