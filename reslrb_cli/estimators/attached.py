@@ -59,8 +59,8 @@ class Frame:
 
 
 def blank_roulette(plan: Plan) -> list[mi.Float]:
-    """What is kept of a vertex's roulette, where it is played."""
-    return [mi.Float(0)] if plan.roulette else []
+    """Return a blank weight of a vertex's roulette; nothing where light paths play none."""
+    return [mi.Float(0)] if plan.plays_roulette else []
 
 
 @dataclass

@@ -63,15 +63,22 @@ class Replayed(Reversed):
 
     def __init__(self, plugin: mi.Integrator) -> None:
         self.plugin = plugin
-        self.surroundings = Surroundings()
+        self._scene: mi.Scene | None = None  # held, so that no other scene gets its address
+        self._surroundings = Surroundings()
+
+    def _surround(self, scene: mi.Scene) -> None:
+        """Have the emitters of the scene know its bounds as they are now."""
+        if self._scene is not scene:
+            self._scene, self._surroundings = scene, Surroundings()
+        self._surroundings.follow(scene)
 
     def image(self, job: Job) -> mi.TensorXf:
-        self.surroundings.follow(job.scene)
+        self._surround(job.scene)
         with dr.suspend_grad(), _no_word_of_signals():
             return self.plugin.render(job.scene, job.sensor, job.seed, job.spp)
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
-        self.surroundings.follow(job.scene)
+        self._surround(job.scene)
         # Isolated, so that another view's propagation finds the edges above the scene's parameters intact.
         with dr.isolate_grad():
             self.plugin.render_backward(job.scene, job.params, gradient, job.sensor, job.seed, job.spp)
@@ -89,7 +96,7 @@ class NaiveAD(Replayed):
         self.correlated(job, lambda image: gradient)  # as Mitsuba does, which raises where no path meets anything
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        self.surroundings.follow(job.scene)
+        self._surround(job.scene)
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False), dr.isolate_grad():
             with _no_word_of_signals():
                 image = self.plugin.render(job.scene, job.sensor, job.seed, job.spp, develop=True, evaluate=False)

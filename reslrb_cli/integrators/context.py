@@ -1,13 +1,16 @@
 """Findings about a scene, its sensors and what is differentiated: what a light tracer finds out once, and keeps.
 
-`Preparation` is all of it; `Renewal` what was found out about the scene, and is no longer so once shapes have moved.
+`Preparation` has the options and the findings about the last scene. Findings about a scene (`AboutScene`) and about a
+set of parameters (`AboutParameters`) are objects of their own. Another scene, or another set, gets new ones, so that a
+tracer that was used before has the results of a new one. `Renewal` brings plans up to date once shapes have moved.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from numbers import Integral
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -21,7 +24,7 @@ from reslrb_cli.integrators.freezing import Recordings
 from reslrb_cli.scene.catalog import entry_value
 from reslrb_cli.scene.deformation import Surroundings
 from reslrb_cli.scene.graph import SceneGraph, emitted_rays, interpolates_normals
-from reslrb_cli.scene.needs import check_paths, scene_needs
+from reslrb_cli.scene.needs import check_paths, is_bent, scene_needs
 from reslrb_cli.transport.aim import worthwhile
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.emission import used_numbers
@@ -48,8 +51,8 @@ class Renewal:
         self._surroundings = Surroundings()
         self._infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())
         self._lamps = [lamp.shape for lamp in graph.find_lamps(scene) if lamp.faces_by_area]
-        # Vertices as they were when it was decided that interpolated normals need no correction, because meshes are
-        # flat. They are held, so that other arrays do not get their place.
+        # Vertices as they were when meshes were last found to be flat, so that interpolated normals need no correction.
+        # They are held, so that other arrays do not get their place.
         smooth = [shape for shape in graph.shapes() if interpolates_normals(shape)]
         self._before = [(shape, _vertices(shape)) for shape in smooth]
         self._bent = False
@@ -60,11 +63,12 @@ class Renewal:
             mesh.surface_area()  # else Mitsuba adds up its faces when they are first sampled, in the midst of tracing
         if self._infinite:
             plan = replace(plan, horizon=self._surroundings.follow(scene))
-        # Once needed, kept: a mesh that bends and is flat again would have kernels compiled anew each time.
-        self._bent = self._bent or any(
-            [array.index for array in _vertices(shape)] != [array.index for array in before]
-            for shape, before in self._before
-        )
+        for number, (shape, before) in enumerate(self._before if not self._bent else []):
+            now = _vertices(shape)
+            if [array.index for array in now] != [array.index for array in before]:
+                # Once needed, kept: a mesh that bends and is flat again would have kernels compiled anew each time.
+                self._bent = self._bent or is_bent(shape)
+                self._before[number] = shape, now
         return with_shading_normals(plan) if self._bent else plan
 
 
@@ -93,37 +97,63 @@ def sensor_number(scene: mi.Scene, sensor: mi.Sensor) -> int:
     return known.index(sensor.ptr) if sensor.ptr in known else len(known)
 
 
+@dataclass
+class AboutParameters:
+    """Findings about parameters that are differentiated together."""
+
+    which: Differentiated
+    track_zeros: bool = False
+    #: Whether vertices have to stay, by sensor.
+    stays: dict[mi.Sensor, bool] = field(default_factory=dict)
+    #: How camera paths are shared out over the pixels of each sensor, (H, W), by its number.
+    noted: dict[int, NDArray[np.float32]] = field(default_factory=dict)
+
+
+@dataclass
+class AboutScene:
+    """Findings about one scene. Sensors are held, so that no other sensor gets the address of one that is freed."""
+
+    sensors: list[mi.Sensor]
+    #: Plans of images, by sensor and kind of paths.
+    plans: dict[tuple[mi.Sensor, str], Plan] = field(default_factory=dict)
+    #: BSDFs of its surfaces that use a node, and under None all of them.
+    owners: dict[mi.Object | None, list[mi.BSDF]] = field(default_factory=dict)
+    #: By the parameters, and the objects that have them.
+    parameters: dict[tuple[tuple[str, mi.Object], ...], AboutParameters] = field(default_factory=dict)
+    renewal: Renewal | None = None
+    #: The densities of emitters, by what they were made from.
+    emitters: dict[tuple[Any, ...], EmitterDensities] = field(default_factory=dict)
+    recordings: Recordings = field(default_factory=Recordings)
+    #: By sensor, number of paths, and the density that they follow.
+    shares: dict[tuple[int, int, int], PixelShares | None] = field(default_factory=dict)
+    #: Samples per pixel that the cells of guided emission are made for.
+    met: int = 0
+
+
 class Preparation:
-    """Plans by sensor, owners of parameters, and recordings of one scene: the last that was asked for."""
+    """Options of a light tracer, and findings about one scene: the last that was asked for."""
 
     def __init__(
         self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion, guided: bool = False,
         low_discrepancy: bool = False,
     ) -> None:  # fmt: skip
-        #: Whether camera paths are shared out over the pixels, and how, by sensor, (H, W): as was `given`, which goes
-        #: on to other scenes with the same sensors, or as was `noted` of this one.
+        #: Whether camera paths are shared out over the pixels. How, by sensor, (H, W), may be `given` for all scenes
+        #: with the same sensors; else it is noted of each scene and its parameters.
         self.shares_out = False
         self.given: dict[int, NDArray[np.float32]] = {}
-        self.noted: dict[int, NDArray[np.float32]] = {}
-        self._shares: dict[tuple[int, int], PixelShares | None] = {}  # by sensor and number of paths
         self.guiding = Guiding() if guided else None
         #: Samples per pixel of the passes that tables learn from, where somebody said; else as passes come.
         self.expected: int | None = None
-        self._met = 0
         self._low_discrepancy = low_discrepancy
         self._depths, self._hide_emitters, self._motion = (max_depth, rr_depth), hide_emitters, motion
         self._scene: tuple[int, mi.Scene | None] | None = None  # its address, and, so that it is not used again, itself
-        self._plans: dict[int, Plan] = {}
-        # BSDFs of its surfaces that use a node, and under None all of them.
-        self._owners: dict[mi.Object | None, list[mi.BSDF]] = {}
-        self._bounce: dict[int, bool] = {}  # by sensor
-        # By the parameters, and the objects that have them.
-        self._differentiated: dict[tuple[tuple[str, mi.Object], ...], Differentiated] = {}
-        self._track_zeros = False
+        self._found = AboutScene([])
         self.paths, self.whole = "light", False
-        self._emitters: EmitterDensities | None = None
-        self._renewal: Renewal | None = None
-        self.recordings = Recordings()
+
+    @property
+    def recordings(self) -> Recordings:
+        """Recordings of launches on the scene."""
+        return self._found.recordings
 
     def afresh(self, guided: bool | None, images: bool | None, low_discrepancy: bool | None) -> Preparation:
         """A new one with the same options, guided or not; `images`: samples of images alone, too. None: as this is."""
@@ -143,106 +173,119 @@ class Preparation:
         self.guiding = guiding
 
     def plan(
-        self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None, spp: int | None = None
-    ) -> Plan:
-        """What a walk of this scene needs; `params` are those to look for derivatives in, and `spp` are the samples per
-        pixel of a pass, where it is one that is asked for.
+        self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None, spp: int | None = None,
+        image: bool = False,
+    ) -> Plan:  # fmt: skip
+        """Return what a walk of this scene needs to differentiate `params`; None: nothing is differentiated.
 
-        Raises UnsupportedScene for what cannot work.
+        `spp` are the samples per pixel of a pass, if the plan is for one. With `image` the plan is for the image of a
+        step that differentiates `params`: it has the same paths as the gradient, and no derivatives. Raises
+        UnsupportedScene for what cannot work.
         """
         self._turn_to(scene)
         if self.guiding is not None and spp is not None:
-            self._meet(spp, params is not None)
-        if sensor.ptr not in self._plans:
-            self._plans[sensor.ptr] = self._first_plan(scene, sensor)
-        assert self._renewal is not None
-        plan = self._renewal.renew(self._plans[sensor.ptr], scene)
-        if params is None:
+            self._meet(spp, params is not None and not image)
+        about = None if params is None else self._look_through(params)
+        moves = about is not None and bool(about.which.shapes or about.which.emitters or self._motion.attached is True)
+        paths, whole = ("light", self.whole and self.paths == "light") if moves else (self.paths, self.whole)
+        if (sensor, paths) not in self._found.plans:
+            self._found.plans[sensor, paths] = self._first_plan(scene, sensor, paths, whole)
+        assert self._found.renewal is not None
+        plan = self._found.renewal.renew(self._found.plans[sensor, paths], scene)
+        if about is None or image:
             return plan
-        which = self._look_through(params)
+        which = about.which
         only = self._bsdfs(scene, which.bsdf_nodes)
-        plan = plan.differentiating(bool(which.bsdf_nodes), bool(which.emission_nodes), self._track_zeros, only)
+        plan = plan.differentiating(bool(which.bsdf_nodes), bool(which.emission_nodes), about.track_zeros, only)
         drawn = tuple(lamp for lamp in plan.needs.lamps if lamp.texture in which.emission_nodes)
         plan = replace(plan, evened_lamps=drawn)
-        if which.shapes or which.emitters or self._motion.attached is True:
-            if self.paths != "light":  # from here on for images, too: those of one run are of one kind
-                self.paths, self.whole = "light", False
-                self._plans.clear()
-                return self.plan(scene, sensor, params, spp)
+        if moves:
             plan = attach(plan, which, self._motion, scene, sensor)
-        if plan.stays and self._motion.sampling == "auto" and not self._bounces_in(plan, scene, sensor):
-            return replace(plan, stays=False, glossy_follows=False)
+        if plan.stays and self._motion.sampling == "auto":
+            if sensor not in about.stays:  # once, since kernels would be compiled anew for another answer
+                about.stays[sensor] = bounces(plan, scene, sensor)
+            if not about.stays[sensor]:
+                return replace(plan, stays=False, glossy_follows=False)
         return plan
 
-    def shares(self, number: int, size: tuple[int, int]) -> Callable[[int], PixelShares | None] | None:
-        """How the camera paths of a sensor with a film (crop window) of this (width, height) are shared out; None where
-        it is evenly, or not known yet."""
-        known = self.given.get(number, self.noted.get(number))
-        if not self.shares_out or known is None:
-            return None
+    def noted(self, params: mi.SceneParameters) -> dict[int, NDArray[np.float32]]:
+        """Return how camera paths are to be shared out for the derivatives of `params`, by sensor, to be added to."""
+        return self._look_through(params).noted
+
+    def shares(
+        self, number: int, known: NDArray[np.float32], size: tuple[int, int]
+    ) -> Callable[[int], PixelShares | None]:
+        """Return how the camera paths of a sensor with a film (crop window) of this (width, height) are shared out, in
+        proportion to a density that is `known` (H, W)."""
+        made = self._found.shares
 
         def shares(paths: int) -> PixelShares | None:
-            if (number, paths) not in self._shares:
+            key = number, paths, id(known)  # which `given` or `AboutParameters` holds
+            if key not in made:
                 rows, columns = (np.arange(n) * m // n for n, m in zip(size[::-1], known.shape, strict=True))
-                self._shares[number, paths] = PixelShares.of(known[np.ix_(rows, columns)].ravel(), paths)
-            return self._shares[number, paths]
+                made[key] = PixelShares.of(known[np.ix_(rows, columns)].ravel(), paths)
+            return made[key]
 
         return shares
 
     def entries(self, plan: Plan, params: mi.SceneParameters) -> list[int]:
         """How many numbers are differentiated, of each group of BSDFs (`bsdf_groups`) and of emission, by a plan for
         `params`."""
-        which = self._look_through(params)
+        which = self._look_through(params).which
+        owners = self._found.owners
         nodes = [
-            [node for node in which.bsdf_nodes if not group or any(bsdf in group for bsdf in self._owners[node])]
+            [node for node in which.bsdf_nodes if not group or any(bsdf in group for bsdf in owners[node])]
             for group in bsdf_groups(plan)
         ]
         nodes += [list(which.emission_nodes)] if plan.differentiate_emission else []
         return [sum(which.entries[node] for node in each) for each in nodes]
 
-    def emitters(self, scene: mi.Scene) -> EmitterDensities:
-        """The densities of the scene's emitters, whose plans have been asked for."""
-        if self._emitters is None:
-            self._emitters = EmitterDensities.of(next(iter(self._plans.values())), scene)
-        return self._emitters
+    def emitters(self, plan: Plan, scene: mi.Scene) -> EmitterDensities:
+        """Return the densities of the scene's emitters as they are now, for a plan of the scene."""
+        made, weights = self._found.emitters, tuple(float(emitter.sampling_weight()) for emitter in scene.emitters())
+        if (weights, plan.horizon) not in made:
+            made.clear()
+            made[weights, plan.horizon] = EmitterDensities.of(plan, scene)
+        return made[weights, plan.horizon]
 
-    def _first_plan(self, scene: mi.Scene, sensor: mi.Sensor) -> Plan:
-        """The plan of images for a sensor that is new."""
-        check_paths(scene, sensor, self.paths, self._hide_emitters)
+    def _first_plan(self, scene: mi.Scene, sensor: mi.Sensor, paths: str, whole: bool) -> Plan:
+        """Return the plan of images for a sensor that is new, or new with these paths."""
+        check_paths(scene, sensor, paths, self._hide_emitters)
         needs = scene_needs(scene, sensor)
-        self._renewal = self._renewal or Renewal(scene)
+        renewal = self._found.renewal = self._found.renewal or Renewal(scene)
         settle(scene)
         plan = make_plan(needs, *self._depths, self._hide_emitters)
-        shares_out = self.shares_out and self.paths != "light"
-        plan = replace(plan, paths=self.paths, whole=self.whole, shares_out=shares_out)
+        plan = replace(plan, paths=paths, whole=whole, shares_out=self.shares_out and paths != "light")
         if plan.weighs:
-            plan = self._renewal.renew(plan, scene)  # the horizon
+            plan = renewal.renew(plan, scene)  # the horizon
         if plan.paths == "camera" or (self.guiding is None and not self._low_discrepancy):
             return plan
-        [samples] = passes(self._renewal.renew(plan, scene), scene, sensor, dr.opaque(mi.UInt32, 0), 1, None)
+        [samples] = passes(renewal.renew(plan, scene), scene, sensor, dr.opaque(mi.UInt32, 0), 1, None)
         return self._with_numbers(plan, samples)
 
-    def _look_through(self, params: mi.SceneParameters) -> Differentiated:
-        """What of the parameters is differentiated now, and whether zeros have to be tracked.
+    def _look_through(self, params: mi.SceneParameters) -> AboutParameters:
+        """Return the findings about those parameters that are differentiated now, and whether zeros have to be tracked.
 
-        Of what a parameter belongs to nothing changes; whether it tracks derivatives, and is zero, does.
+        What a parameter belongs to does not change. Whether it tracks derivatives, and whether it is zero, does.
         """
         with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
             values = {key: entry_value(params, key) for key in params.properties}
             enabled = {key: value for key, value in values.items() if dr.grad_enabled(value)}
         these = tuple((key, params.properties[key][2]) for key in enabled)
-        if these not in self._differentiated:
-            self._differentiated[these] = Differentiated.of(params, enabled)
-        which = self._differentiated[these]
+        known = self._found.parameters
+        if these not in known:
+            known[these] = AboutParameters(Differentiated.of(params, enabled))
+        about = known[these]
         # Once needed, kept: otherwise kernels would be compiled anew whenever a texel enters or leaves zero.
-        self._track_zeros |= any(_has_singular(key, enabled[key], least) for key, least in which.least.items())
-        return which
+        least = about.which.least.items()
+        about.track_zeros |= any(_has_singular(key, enabled[key], value) for key, value in least)
+        return about
 
     def _with_numbers(self, plan: Plan, samples: Samples) -> Plan:
         """The plan with what says how the numbers of its paths are drawn."""
         grid, aims = None, False
         if self.guiding is not None:
-            spp, sensors = self.expected or self._met, samples.scene.sensors()
+            spp, sensors = self.expected or self._found.met, samples.scene.sensors()
             pixels = max((int(dr.prod(one.film().size())) for one in sensors), default=samples.width)
             grid = self.guiding.grid_of(samples, spp * pixels or None)
             if worthwhile(plan.needs, plan.max_depth):
@@ -257,44 +300,32 @@ class Preparation:
     def _meet(self, spp: int, differentiated: bool) -> None:
         """Have cells so fine as passes of so many samples per pixel can tell: those of the first pass, whatever it is
         for, and of gradients that have more. An image that has more paths teaches the tables nothing."""
-        if self.expected is None and (self._met == 0 or (differentiated and spp > self._met)):
-            self._met = spp
-            self._plans.clear()  # they have the grid
-
-    def _bounces_in(self, plan: Plan, scene: mi.Scene, sensor: mi.Sensor) -> bool:
-        """Whether vertices have to stay. Asked once, since kernels would be compiled anew for another answer."""
-        if sensor.ptr not in self._bounce:
-            self._bounce[sensor.ptr] = bounces(plan, scene, sensor)
-        return self._bounce[sensor.ptr]
+        if self.expected is None and (self._found.met == 0 or (differentiated and spp > self._found.met)):
+            self._found.met = spp
+            self._found.plans.clear()  # they have the grid
 
     def _turn_to(self, scene: mi.Scene) -> None:
-        """Forget what was found out about another scene."""
-        if self._scene is None or self._scene[0] != scene.ptr:
-            # The scene's own integrator does not hold the scene: neither would ever be freed.
+        """Have new findings about another scene."""
+        sensors = scene.sensors()
+        if self._scene is None or self._scene[0] != scene.ptr or self._found.sensors != sensors:
+            # The scene's own integrator does not hold the scene: neither would ever be freed. It holds the scene's
+            # sensors: another scene at the same address has others.
             tracer = getattr(scene.integrator(), "tracer", None)
             own = getattr(tracer, "preparation", None) is self
             self._scene = (scene.ptr, None if own else scene)
-            self._plans.clear()
-            self._owners.clear()
-            self._bounce.clear()
-            self._differentiated.clear()
-            self._met = 0
-            self._renewal = None
-            self._emitters = None
-            self.recordings.clear()
-            self.noted.clear()
-            self._shares.clear()
+            self._found = AboutScene(sensors)
             if self.guiding is not None:
                 self.guiding.clear()
 
     def _bsdfs(self, scene: mi.Scene, nodes: tuple[mi.Object, ...]) -> tuple[mi.BSDF, ...]:
         """The surfaces' BSDFs that use any of these nodes; empty where that is all of them."""
-        if any(node not in self._owners for node in nodes):
+        owners = self._found.owners
+        if any(node not in owners for node in nodes):
             graph = SceneGraph.of(scene)
-            owners = {n: [n.bsdf()] if isinstance(n, mi.Shape) else graph.owning_bsdfs(n) for n in nodes}
-            self._owners |= owners | {None: graph.surface_bsdfs()}
-        used = {bsdf: None for node in nodes for bsdf in self._owners[node]}
-        return () if all(bsdf in used for bsdf in self._owners.get(None, [])) else tuple(used)
+            owners |= {n: [n.bsdf()] if isinstance(n, mi.Shape) else graph.owning_bsdfs(n) for n in nodes}
+            owners[None] = graph.surface_bsdfs()
+        used = {bsdf: None for node in nodes for bsdf in owners[node]}
+        return () if all(bsdf in used for bsdf in owners.get(None, [])) else tuple(used)
 
 
 def settle(scene: mi.Scene) -> None:

@@ -61,9 +61,10 @@ class Recordings:
         longer fits.
         """
         s = samples
-        # Sensors that share a recording have it made anew whenever another one's turn comes.
+        # Sensors that share a recording have it made anew whenever another one's turn comes. The key holds its sensor:
+        # no other sensor gets its address.
         widths = tuple(side.width for side in s.sides())
-        key = (kind, s.plan, s.spp, widths, tuple(s.film.size), s.sensor.ptr)
+        key = (kind, s.plan, s.spp, widths, tuple(s.film.size), s.sensor)
         plain = _on_samples(samples, function)
         common = (s.scene, s.sensor, *(_arrays(side) for side in s.sides()))
         if key not in self._functions and len(self._functions) < MOST_CALLS:

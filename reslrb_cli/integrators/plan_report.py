@@ -348,7 +348,7 @@ def count(integrator: Reslrb, plan: Plan, scene: mi.Scene, sensor: mi.Sensor, kn
     """Operations of each large kernel of a step by this plan."""
     with dr.suspend_grad():
         table = None if plan.grid is None else even_table(plan.grid, film_blocks(sensor) if plan.aimed else None)
-        emitters = integrator.preparation.emitters(scene) if plan.weighs else None
+        emitters = integrator.preparation.emitters(plan, scene) if plan.weighs else None
         [samples] = passes(plan, scene, sensor, 0, 1, None, table, integrator.light_share, emitters)
         camera = samples.camera and replace(samples.camera, width=PATHS)
         samples = replace(samples, width=PATHS, camera=camera)

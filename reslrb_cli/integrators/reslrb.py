@@ -147,32 +147,36 @@ class LightTracer:
             raise ValueError(f'"spp" must be 0 (the sensor\'s own sample count) or more, not {job.spp}')
         spp = job.spp or job.sensor.sampler().sample_count()
         unit = min(self.samples_per_pass or spp, spp)
-        asked = self.preparation, job.params is None, unit
+        purpose = purpose or (Purpose.IMAGE if job.params is None else Purpose.GRADIENT)
+        asked = self.preparation, purpose is Purpose.IMAGE, unit
         if asked not in job.plans:  # once a step, and not once a batch
-            job.plans[asked] = self.preparation.plan(job.scene, job.sensor, job.params, unit)
+            job.plans[asked] = self.preparation.plan(job.scene, job.sensor, job.params, unit, asked[1])
         plan, table = job.plans[asked], None
         guiding = self.preparation.guiding
-        if guiding is not None:
-            purpose = purpose or (Purpose.IMAGE if job.params is None else Purpose.GRADIENT)
-            if guiding.serves(purpose):
-                table = guiding.table(sensor_number(job.scene, job.sensor), purpose, delta)
+        if guiding is not None and guiding.serves(purpose):
+            table = guiding.table(sensor_number(job.scene, job.sensor), purpose, delta)
         given = job.scene, job.sensor, job.seed, spp, self.samples_per_pass, table
         return passes(plan, *given, *self._sides(plan, job.scene), self._shares(job, plan))
 
     def _sides(self, plan: Plan, scene: mi.Scene) -> tuple[float, EmitterDensities | None]:
         """The share of light paths, and the emitters' densities, where paths from both sides are weighed."""
-        return self.light_share, self.preparation.emitters(scene) if plan.weighs else None
+        return self.light_share, self.preparation.emitters(plan, scene) if plan.weighs else None
 
     def _shares(self, job: Job, plan: Plan) -> Callable[[int], PixelShares | None] | None:
-        """How the job's camera paths are shared out; where nobody has said so before, the first derivatives are what it
-        is found out for."""
+        """Return how the job's camera paths are shared out; None: evenly.
+
+        Where nobody has said so before, it is found out once for the parameters that are differentiated.
+        """
         preparation = self.preparation
         if plan.paths == "light" or not preparation.shares_out:
             return None
         number, size = sensor_number(job.scene, job.sensor), job.sensor.film().crop_size()
-        if job.params is not None and number not in preparation.given and number not in preparation.noted:
-            preparation.noted[number] = self.note_pixels(job)
-        return preparation.shares(number, (int(size[0]), int(size[1])))
+        known = preparation.given
+        if job.params is not None and number not in known:
+            known = preparation.noted(job.params)
+            if number not in known:
+                known[number] = self.note_pixels(job)
+        return preparation.shares(number, known[number], (int(size[0]), int(size[1]))) if number in known else None
 
     def note_pixels(self, job: Job) -> NDArray[np.float32]:
         """How the camera paths of a job's sensor are to be shared out over its pixels (H, W), a density with mean 1, as
@@ -206,7 +210,7 @@ class LightTracer:
     def image(self, job: Job, evaluate: bool = True) -> mi.TensorXf:
         """The image (H, W, C), without derivatives."""
         with dr.suspend_grad():
-            parts = self.passes(replace(job, params=None))  # an image has no use for what derivatives ask of a walk
+            parts = self.passes(job, Purpose.IMAGE)  # an image has no use for what derivatives ask of a walk
             if not evaluate:
                 return image_of(parts)
             image = self.launch("image", parts, image_of)

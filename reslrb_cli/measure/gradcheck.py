@@ -115,6 +115,7 @@ class Gradcheck:
                 references = [] if stock is None else [stock]
                 references += [Reference.ANALYTIC] if key in parts.exact else []
                 references += [Reference.FINITE_DIFFERENCE] + ([Reference.FORWARD_MODE] if parts.forward_mode else [])
+                references += [Reference.UNGUIDED] if label in parts.unguided else []
                 found += [Row(key, label, reference, Kind.EXPECTATION, way) for reference in references]
         return sorted(found, key=lambda row: row.key is not None and row.reference.value in NAIVE)
 
@@ -175,6 +176,7 @@ class Gradcheck:
             Reference.WALK_AD: [("gradient", naive)],
             Reference.FINITE_DIFFERENCE: [("differences", row.place)],
             Reference.FORWARD_MODE: [("tangents", row.place)],
+            Reference.UNGUIDED: [("gradient", self.participants.unguided.get(row.label, row.label))],
         }
         return [ours, *its.get(row.reference, [("gradient", row.reference.value)])]
 
@@ -215,7 +217,8 @@ class Gradcheck:
         if row.kind is Kind.EQUAL_SEEDS:
             figures = compare_equal_seeds(ours, reference)
         else:
-            rounding = ROUNDING if shape is None or row.reference is Reference.WALK_AD else STOCK_ROUNDING
+            ours_too = row.reference in (Reference.WALK_AD, Reference.UNGUIDED)
+            rounding = ROUNDING if shape is None or ours_too else STOCK_ROUNDING
             figures = compare_expectations(ours, reference, family, shape=shape, bias=bias, rounding=rounding)
         maps = _maps(ours, reference, shape) if row.key is not None and shape is not None else None
         return Result(self._record(row, figures, len(ours)), maps)

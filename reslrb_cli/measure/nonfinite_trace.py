@@ -472,7 +472,7 @@ def _parts(
         tables = [next(noted) if witness.serves(purpose) else None for _, _, purpose in wanted]
         sets = [(sets[place][0] + word, *sets[place][1:]) for place, word, _ in wanted]
     plan = tracer.plan(scene, sensor, params)
-    emitters = tracer.preparation.emitters(scene) if plan.weighs else None
+    emitters = tracer.preparation.emitters(plan, scene) if plan.weighs else None
     for (name, samples_seed, spp), table in zip(sets, tables, strict=True):
         size = problem.samples_per_pass
         parts = passes(plan, scene, sensor, samples_seed, spp, size, table, tracer.light_share, emitters)

@@ -14,6 +14,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators.own import OwnIntegrator
 from reslrb_cli.integrators.protocol import StepIntegrator
+from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import Case, all_directions, choose_step, seeds, smooth_weights
 from reslrb_cli.measure.methods import Case as Listed
@@ -62,6 +63,9 @@ ALIKE: dict[Reference, dict[str, str]] = {
 
 #: The integrator whose images are differenced: ours, without roulette where paths end without.
 DIFFERENCED = "differenced"
+
+#: Steps that tables learn from before guided steps are compared with unguided ones.
+LESSONS = 8
 
 #: Seeds that the step of finite differences is chosen with.
 PILOT_SEEDS = 2
@@ -189,6 +193,13 @@ class Participants:
             for case in self.listed
         }
         self.each_way = list(dict.fromkeys(self.ways.values()))
+        asked = config.integrator.options().get("guiding", "off")
+        #: By the label of each estimator that a run would guide, or may: the integrator of its unguided steps.
+        self.unguided = {
+            label: label if configs[label].integrator.options()["guiding"] == "off" else f"{label}, unguided"
+            for label, case in ((case.label, case) for case in self.listed if case.type == "reslrb")
+            if case.options.get("guiding", asked) != "off" and self.ways[label].paths != "camera"
+        }
         self.integrators = self._configured({case.label: configs[case.label] for case in self.listed})
         for way in self.each_way:
             attached = naive if way.paths == "light" else {**naive, "attached": False}
@@ -274,6 +285,9 @@ class Participants:
             if self._situation.moved:  # as the run
                 options |= {"paths": "light", "light_share": 0.5}
             made[label] = make_integrator(kind, **options)
+            if label in self.unguided:
+                made[_alike(label, Reference.UNGUIDED)] = make_integrator(kind, **options | {"guiding": "on"})
+                made.setdefault(self.unguided[label], make_integrator(kind, **options | {"guiding": "off"}))
             for reference, alike in ALIKE.items() if self.attached else ():
                 if options | alike != options:
                     made[_alike(label, reference)] = make_integrator(kind, **options | alike)
@@ -304,7 +318,7 @@ class Participants:
         return [*found, Reference.WALK_AD, Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE]
 
     def sampled(self, label: str, reference: Reference) -> str:
-        """The integrator whose gradients stand for those of `label` beside this reference (`ALIKE`)."""
+        """Return the integrator whose gradients stand for those of `label` beside this reference (`ALIKE`)."""
         alike = _alike(label, reference)
         return alike if alike in self.integrators else label
 
@@ -345,8 +359,9 @@ class Participants:
         `differences`, and `tangents`, forward derivatives, which are the same for all estimators of the same paths.
         """
         if kind == "gradient":
-            options = {"step": self.case.known_step} if self.known else {}
-            return self.case.gradient(self.integrators[of], seed, self.spp, **options)
+            if of in (_alike(label, Reference.UNGUIDED) for label in self.unguided):
+                self._teach(of)
+            return self._gradient(of, seed)
         if kind == "image":
             image = self.case.image(self.integrators[of], seed, self.spp)
             if self.masked:
@@ -360,6 +375,20 @@ class Participants:
         tracer = self.integrators[ours[0] if ours else way.named("walk_ad")]
         return np.array([self.case.tangent(tracer, d.vector, seed, self.spp) for d in self.directions[of]])
 
+    def _gradient(self, of: str, seed: int) -> np.ndarray:
+        options = {"step": self.case.known_step} if self.known else {}
+        return self.case.gradient(self.integrators[of], seed, self.spp, **options)
+
+    def _teach(self, of: str) -> None:
+        """Teach the tables of a guided integrator once, and hold them: each sample depends on its seed alone."""
+        tracer = self.integrators[of]
+        assert isinstance(tracer, LightTracer)
+        guiding = tracer.preparation.guiding
+        if guiding is not None and not guiding.held:
+            for lesson in seeds(LESSONS, 8):
+                self._gradient(of, lesson)
+            guiding.held = True
+
 
 def _attaches(case: Listed) -> bool:
     """Whether this is an estimator of ours with derivatives of what moves light."""
@@ -367,7 +396,7 @@ def _attaches(case: Listed) -> bool:
 
 
 def _alike(label: str, reference: Reference) -> str:
-    return f"{label}, as {reference.value}"
+    return f"{label}, guided" if reference is Reference.UNGUIDED else f"{label}, as {reference.value}"
 
 
 def _samples(film: tuple[int, int], most: int, multiple: int | None) -> int:

@@ -196,7 +196,10 @@ class SummaryRecord(Line):
 
 
 class Reference(str, enum.Enum):
-    """What a gradient is compared with; `forward_mode` by the dot product <w, J v> = <J^T w, v>."""
+    """What a gradient is compared with; `forward_mode` by the dot product <w, J v> = <J^T w, v>.
+
+    `unguided`: guided steps are compared with unguided steps of the same estimator.
+    """
 
     PTRACER = "ptracer"
     WALK_AD = "walk_ad"
@@ -205,6 +208,7 @@ class Reference(str, enum.Enum):
     FINITE_DIFFERENCE = "finite_difference"
     ANALYTIC = "analytic"
     FORWARD_MODE = "forward_mode"
+    UNGUIDED = "unguided"
 
 
 class Kind(str, enum.Enum):

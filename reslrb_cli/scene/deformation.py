@@ -174,10 +174,9 @@ class Horizon:
 
 
 class Surroundings:
-    """The horizon of one scene: the last that was asked for."""
+    """The horizon of one scene, always the same one."""
 
     def __init__(self) -> None:
-        self._scene = 0  # its address
         self._horizon: Horizon | None = None
 
     def follow(self, scene: mi.Scene) -> Horizon:
@@ -185,7 +184,7 @@ class Surroundings:
 
         It stays as it is while that is so.
         """
-        sphere, before = scene.bbox().bounding_sphere(), self._horizon if self._scene == scene.ptr else None
+        sphere, before = scene.bbox().bounding_sphere(), self._horizon
         if before is not None and before.holds(scene.bbox()) and before.radius < TOO_LARGE * sphere.radius:
             return before
         x, y, z, radius = (float(value) for value in (*sphere.center, sphere.radius))
@@ -195,7 +194,7 @@ class Surroundings:
             # An emitter asks a scene for its bounds, and nothing else; this one has those that it is to know.
             corner = mi.ScalarTransform4f().translate([x, y, z]).scale(radius / 3**0.5)
             bounded = mi.load_dict({"type": "scene", "box": {"type": "cube", "to_world": corner}})
-        self._scene, self._horizon = scene.ptr, Horizon((x, y, z), radius)
+        self._horizon = Horizon((x, y, z), radius)
         for emitter in scene.emitters():
             if mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite):
                 emitter.set_scene(bounded)

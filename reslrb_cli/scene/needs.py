@@ -52,7 +52,7 @@ _MEDIUM = (
     " a participating medium; no integrator here knows media (nor do Mitsuba's prb, path and ptracer): remove it from "
     "the scene file"
 )
-#: How many see-through surfaces a primary ray is followed through.
+#: How many see-through surfaces a primary ray is followed through, wherever it is asked what it meets.
 CROSSINGS = 32
 #: Primary rays that look at a scene, along each side of a grid.
 LOOK = 128
@@ -126,8 +126,7 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         has_null=flags & int(mi.BSDFFlags.Null) != 0,
         has_instances=graph.has_instances(),
         has_shading_normals=any(
-            bool(bent_faces(shape, 1 - 1e-5).any()) if shape.is_mesh() else shape.class_name() not in _PLAIN_SHAPES
-            for shape in graph.shapes()
+            is_bent(shape) if shape.is_mesh() else shape.class_name() not in _PLAIN_SHAPES for shape in graph.shapes()
         ),
         has_perturbed_normals=any(bsdf.class_name() in ("BumpMap", "NormalMap") for bsdf in graph.of_type(mi.BSDF)),
         bsdfs_read_geometry=_read_geometry(graph),
@@ -142,6 +141,11 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         lamps=lamps,
         small_lamps=small_lamps(scene, sensor, lamps) if is_projective else (),
     )
+
+
+def is_bent(mesh: Any) -> bool:
+    """Whether the interpolated normals of a mesh differ from its geometric ones."""
+    return bool(bent_faces(mesh, 1 - 1e-5).any())
 
 
 def check_paths(scene: Any, sensor: Any, paths: str, hide_emitters: bool = False) -> None:

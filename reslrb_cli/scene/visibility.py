@@ -128,7 +128,6 @@ def _first_surfaces(scene: mi.Scene, ray: mi.Ray3f, count: int) -> tuple[mi.Bool
 
 #: Primary rays for each pixel and for each texel, and in one pass.
 _RAYS_PER_CELL, _MAX_RAYS, _RAYS_PER_PASS = 64, 2**25, 2**20
-_CROSSINGS = 8
 
 
 def visible_texels(
@@ -180,7 +179,7 @@ def _mark_seen(
         rows, columns = kept.shape
         x, y = (mi.UInt32(dr.minimum(c * size, size - 1)) for c, size in ((film.x, columns), (film.y, rows)))
         active = dr.gather(mi.UInt32, mi.UInt32(kept.ravel().astype(np.uint32)), y * columns + x) > 0
-    for _ in range(_CROSSINGS):
+    for _ in range(CROSSINGS):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
         bsdf = si.bsdf()

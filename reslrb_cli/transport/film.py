@@ -50,9 +50,9 @@ class Film:
         """Add `value` (C,) at film position `u` (pixels, relative to the crop window) through the filter.
 
         Under naive AD the weights of the pixels move with `u`. Mitsuba divides them by their sum, which it detaches;
-        with `normalization` the sum has its derivative too.
+        with `normalization` the sum has its derivative too. A `whole` film divides by no sum.
         """
-        if normalization:
+        if normalization and not self.whole:
             total = filter_weights(self.film.rfilter(), u)[2]
             value = value * dr.select(total != 0, dr.detach(total) / total, 1)
         color = [value[c % len(value)] for c in range(N_COLOR)]  # a mono variant fills all three
@@ -63,6 +63,8 @@ class Film:
     def taps(self, u: mi.Point2f, normalization: bool) -> list[tuple[mi.Point2u, mi.Float]]:
         """The pixels that a splat at film position `u` touches, some of them off the film, and the weight of each."""
         first, (weights_x, weights_y), total = filter_weights(self.film.rfilter(), u)
+        if self.whole:
+            total = mi.Float(1)
         if not normalization:
             total = dr.detach(total)
         scale = dr.select(total != 0, dr.rcp(total), 0)

@@ -181,8 +181,13 @@ class Plan:
 
     @property
     def roulette(self) -> bool:
-        """Whether Russian roulette can end a path before the depth limit does."""
+        """Whether roulette on throughput can end a path before the depth limit does."""
         return self.rr_depth < self.max_depth - 1
+
+    @property
+    def plays_roulette(self) -> bool:
+        """Whether light paths play any Russian roulette: on throughput, or the learned one of guided paths."""
+        return self.roulette or self.grid is not None
 
     @property
     def visible_emission(self) -> bool:

@@ -283,6 +283,8 @@ def passes(
     others = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(PASS_STREAM + p))[0] for p in range(1, len(sizes))]
     seeds = [mi.UInt32(seed), *others]
     dr.make_opaque(seeds)
+    if table is None:  # a plan has a grid where paths are guided, and nowhere else
+        plan = replace(plan, grid=None, aims=False)
     film, pixels = Film(sensor, plan.whole), int(dr.prod(sensor.film().size()))  # as for `ptracer`
     # Opaque: as literals these would give every sample count kernels of its own.
     scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / (float(pixels) * spp))

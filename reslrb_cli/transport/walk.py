@@ -280,7 +280,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
 
         # ---- Russian roulette ----
         number = sampler.next_1d(active)
-        if plan.roulette or survival is not None:
+        if plan.plays_roulette:
             throughput = dr.max(dr.abs(product.weight()))
             survives, weight = play(plan, survival, path.depth, throughput, eta, si.p, scattering.d, number)
             active &= survives

@@ -368,12 +368,13 @@ def test_sensors_that_light_paths_cannot_connect_to():
         images(scene, "reslrb", range(1), 4, max_depth=4, estimator="stack", paths="both")
 
 
-def test_what_moves_light_has_light_paths_in_images_too():
+def test_what_moves_light_has_light_paths_in_the_image_of_its_step_too():
     case = next(case for case in CASES if case.name == "gaussian")
     scene = Case(case.scene(), case.keys)
     work = interface_of(integrator("reslrb", estimator="stack", paths="both", attached=True, **case.both))
     job = Job(scene.scene, scene.scene.sensors()[0], mi.UInt32(3), 4, scene.params)
     leaves = scene.leaves()
     assert work.plan(scene.scene, job.sensor, scene.params).paths == "light"
-    assert work.plan(scene.scene, job.sensor).paths == "light"
+    assert work.preparation.plan(scene.scene, job.sensor, scene.params, image=True).paths == "light"
+    assert work.plan(scene.scene, job.sensor).paths == "both"  # nothing moves in an image alone
     scene.release(leaves)

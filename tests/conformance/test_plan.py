@@ -213,9 +213,9 @@ def test_a_step_plans_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Not once a batch: for the image of the first batch, and for all that is differentiated."""
     original, asked = Preparation.plan, []
 
-    def noting(self: Preparation, scene: Any, sensor: Any, params: Any = None, spp: int | None = None) -> Any:
-        asked.append(params is not None)
-        return original(self, scene, sensor, params, spp)
+    def noting(self: Preparation, scene: Any, sensor: Any, params: Any, spp: int, image: bool) -> Any:
+        asked.append(not image)
+        return original(self, scene, sensor, params, spp, image)
 
     monkeypatch.setattr(Preparation, "plan", noting)
     case, ours = Case(plain(), (FLOOR,)), integrator("reslrb", 5, estimator="stack", guiding="on")

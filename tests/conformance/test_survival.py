@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from agreement import compare
+from conformance.attached_cases import CASES as MOVING
 from conformance.test_guiding import SPP, guided, sample, samples, seeds
 from turns import a_few
 
@@ -16,7 +17,7 @@ from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.guiding.collect import FLOOR, LEAN, SURE, Onward, Walked
 from reslrb_cli.guiding.tables import Guiding, Purpose, learning_seed
 from reslrb_cli.integrators.protocol import Job
-from reslrb_cli.measure.gradients import Case, relative
+from reslrb_cli.measure.gradients import Case, integrator, relative
 from reslrb_cli.transport.guide import Table
 from reslrb_cli.transport.roulette import BITS, CELLS, LEAST, SHAPE, Survival
 
@@ -90,6 +91,57 @@ def of_another_cell(patch: pytest.MonkeyPatch) -> None:
 def test_what_would_bias_is_found(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     fault(monkeypatch)
     assert not means_hold("two_emitters", 32)
+
+
+#: A lamp stands before the slab that moves; a texture and a shell lie behind it.
+BOUNCES = next(case for case in MOVING if case.name == "bounces")
+
+
+@pytest.mark.parametrize("rr_depth", [2, 5])
+def test_means_stay_where_light_moves(rr_depth: int) -> None:
+    """For parameters before and behind what moves, with roulette on throughput (2) and without it (5)."""
+    assert moving_means_hold("stack", "harsh", rr_depth, 8, 16)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("rr_depth", [2, 5, 1000])
+@pytest.mark.parametrize("table", ["harsh", "learned"])
+@pytest.mark.parametrize("estimator", ["stack", "reservoir"])
+def test_means_stay_where_light_moves_by_many_seeds(estimator: str, table: str, rr_depth: int) -> None:
+    assert moving_means_hold(estimator, table, rr_depth, 24, 32)
+
+
+def moving_means_hold(estimator: str, table: str, rr_depth: int, count: int, spp: int) -> bool:
+    """Whether guided gradients over unguided ones, along the mean of the latter, are 1 for each parameter."""
+    moving, holds = BOUNCES.moving(), True
+    ours, plain = (
+        integrator("reslrb", 6, rr_depth, estimator=estimator, guiding=guiding, hide_emitters=True)
+        for guiding in ("on", "off")
+    )
+    for lesson in seeds(1 if table == "harsh" else 8, 2):
+        moving.gradient(ours, lesson, spp)
+    ours.preparation.guiding.held = True
+    if table == "harsh":
+        by_harsh_table(ours.preparation.guiding)
+    tracers = enumerate((ours, plain))
+    sides = [[moving.gradient(each, seed, spp) for seed in seeds(count, block)] for block, each in tracers]
+    for key in BOUNCES.start:
+        guided_rows, rows = (np.stack([gradient[key] for gradient in side]) for side in sides)
+        direction = rows.mean(0) / np.linalg.norm(rows.mean(0))
+        result = compare((guided_rows @ direction)[:, None], (rows @ direction)[:, None], block=None)
+        print(estimator, table, rr_depth, key, result)
+        holds = holds and bool(result)
+    return holds
+
+
+def test_a_lost_weight_of_learned_roulette_is_found_where_light_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The walk back asks for roulette on throughput alone, as it once did."""
+    import mitsuba as mi
+
+    from reslrb_cli.estimators import attached
+
+    monkeypatch.setattr(attached, "blank_roulette", lambda plan: [mi.Float(0)] if plan.roulette else [])
+    assert not moving_means_hold("stack", "harsh", 5, 8, 16)
 
 
 def replayed_from(patch: pytest.MonkeyPatch, other: Callable[[Table], Table]) -> None:

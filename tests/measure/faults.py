@@ -18,7 +18,7 @@ from reslrb_cli.records.measurements import GradcheckRecord
 
 Check = Callable[[], Iterable[GradcheckRecord]]
 SMALL = ["scene.options.size=32", "scene.options.texture=4", "run.spp=8", "integrator.max_depth=4"]
-SMALL += ["run.adjoint=correlated"]  # what is kept between image and gradient takes part then
+SMALL += ["integrator.guiding=off", "run.adjoint=correlated"]  # what is kept between image and gradient takes part then
 
 
 def room(name: str, *keys: str, overrides: Iterable[str] = ()) -> Config:
@@ -28,7 +28,7 @@ def room(name: str, *keys: str, overrides: Iterable[str] = ()) -> Config:
 scene: {{file: {Path(__file__).with_name(name)}}}
 target: {{render: {{}}}}
 parameters:
-{parameters}integrator: {{max_depth: 4, rr_depth: 1000000}}
+{parameters}integrator: {{max_depth: 4, rr_depth: 1000000, guiding: off}}
 run: {{spp: 64}}
 """
     return loads(text, name, [*overrides])

@@ -56,6 +56,7 @@ from reslrb_cli.scene.visibility import interior
 # Gradcheck on a small Cornell box: it holds as the code stands, and what is broken on purpose is found and named.
 
 SMALL = ["scene.options.size=32", "scene.options.texture=4", "run.spp=8", "integrator.max_depth=4"]
+SMALL += ["integrator.guiding=off"]  # guided steps have their own test
 
 
 def check(*overrides: str, estimators: str = "reservoir,event,gather,stack", seeds: int = 8) -> list[Result]:
@@ -102,6 +103,29 @@ def test_paths_that_are_drawn_otherwise_agree_with_naive_ad_in_expectation(drawn
     assert [(record.reference.value, record.verdict) for record in records if record.verdict is not Verdict.HOLDS] == []
     kinds = {record.kind for record in records if record.reference is Reference.WALK_AD}
     assert kinds == {Kind.EXPECTATION}
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize("guiding", a_few(["on", "auto"], ["auto"]))
+def test_guided_steps_are_compared_with_unguided_ones(guiding: str, monkeypatch: pytest.MonkeyPatch):
+    """Wherever a run is guided, or may be: also with a table by which half of all paths end at each vertex."""
+    from reslrb_cli.guiding import tables
+    from reslrb_cli.transport import walk
+    from reslrb_cli.transport.roulette import CELLS, Survival
+
+    of, play = Survival.of, walk.play
+    monkeypatch.setattr(tables.Survival, "of", staticmethod(lambda box, chances: of(box, np.zeros(CELLS))))
+    assert failures(results := check(f"integrator.guiding={guiding}", estimators="stack")) == set()
+    assert [each.record.seeds for each in results if each.record.reference is Reference.UNGUIDED] == [8]
+
+    def without_weight(plan: Any, survival: Any, *rest: Any) -> Any:
+        survives, weight = play(plan, survival, *rest)
+        return survives, weight if survival is None else mi.Float(1)
+
+    monkeypatch.setattr(walk, "play", without_weight)
+    found = failures(check(f"integrator.guiding={guiding}", estimators="stack"))
+    assert ("stack", "unguided") in found
+    assert guiding == "on" or found == {("stack", "unguided")}
 
 
 @pytest.mark.usefixtures("llvm")

@@ -14,7 +14,15 @@ import pytest
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene.catalog import summarise
 from reslrb_cli.scene.load import load_scene, warn_once
-from reslrb_cli.scene.needs import check_camera_paths, check_paths, check_supported, light_obstacle, look, scene_needs
+from reslrb_cli.scene.needs import (
+    CROSSINGS,
+    check_camera_paths,
+    check_paths,
+    check_supported,
+    light_obstacle,
+    look,
+    scene_needs,
+)
 from reslrb_cli.scene.visibility import (
     DEPTHS,
     LOST,
@@ -323,6 +331,17 @@ def test_all_of_an_open_floor(make_scene):
     mask = visible_texels(scene, scene.sensors(), KEY)
     assert mask.shape == (4, 6)
     assert mask.all()
+
+
+def test_texels_are_seen_through_as_many_surfaces_as_pixels_are(make_scene):
+    import mitsuba as mi
+
+    place = mi.ScalarTransform4f()
+    for count, is_seen in ((12, True), (CROSSINGS, False)):
+        veil = {"type": "rectangle", "bsdf": {"type": "null"}}
+        places = [place.translate([0, 0, 0.2 + 0.01 * number]).scale(9) for number in range(count)]
+        scene = make_scene(**{f"veil_{number}": veil | {"to_world": at} for number, at in enumerate(places)})
+        assert visible_texels(scene, scene.sensors(), KEY).any() == is_seen
 
 
 def test_crop_window_and_orientation(make_scene):
