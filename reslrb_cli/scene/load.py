@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.backend.variant import check_variant
+from reslrb_cli.config.files import as_path
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.cameras import read_cameras, replace_sensors
 from reslrb_cli.scene.catalog import coarse_bits
@@ -108,7 +109,8 @@ def load_for_script(file: str | os.PathLike[str], keys: Iterable[str] = (), /, *
     BackendError under a variant that reslrb does not work with.
     """
     check_variant(mi.variant())
-    return load_scene(Path(file), options, keys=[keys] if isinstance(keys, str) else keys)
+    path = as_path(file, "file", "the path of a scene file")
+    return load_scene(path, options, keys=[keys] if isinstance(keys, str) else keys)
 
 
 def read_as_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> mi.Scene:
