@@ -25,9 +25,10 @@ import numpy as np
 
 from reslrb_cli.backend.variant import keep_variant
 from reslrb_cli.config import loader
+from reslrb_cli.config.files import as_path
 from reslrb_cli.config.loader import Override
 from reslrb_cli.config.schema import Config
-from reslrb_cli.errors import ConfigError, one_line
+from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.measurement_files import Line
 from reslrb_cli.records.measurements import GradcheckRecord
 from reslrb_cli.records.run_folder import recovered
@@ -42,7 +43,7 @@ NAMELESS = "<dict>"
 #: What errors advise on the command line, and what that is in a script.
 ARGUMENTS = {
     "add --set run.output=FOLDER": "give folder=FOLDER",
-    "--allow-code has it run": "allow_code=True has it run",
+    "--allow-code has it run": "allow_code=True has it run, or the experiment `load(...).with_code()`",
 }
 
 logger = logging.getLogger(__name__)
@@ -116,7 +117,7 @@ def load_with(experiment: Experiment, put_in: Sequence[Override], base: str | os
     if isinstance(experiment, Config):
         return loader.changed(experiment, put_in)
     if isinstance(experiment, Mapping):
-        path = Path(NAMELESS) if base is None else Path(base) / NAMELESS
+        path = Path(NAMELESS) if base is None else as_path(base, "base", "the path of a folder") / NAMELESS
         data = loader.plain(experiment, NAMELESS)
         run = {} if data.get("run") is None else data["run"]
         data["run"] = {"name": "run", **run} if isinstance(run, dict) else run
@@ -125,13 +126,6 @@ def load_with(experiment: Experiment, put_in: Sequence[Override], base: str | os
     if path.is_dir():
         return recovered(path, put_in)
     return loader.load(path, put_in)
-
-
-def as_path(given: object, name: str, what: str) -> Path:
-    """The path that the argument `name` is. Raises ConfigError where it is none, with `what` is wanted."""
-    if isinstance(given, (str, os.PathLike)):
-        return Path(given)
-    raise ConfigError(name, "", f"is {one_line(repr(given), 60)}, not {what}")
 
 
 def render(
@@ -222,7 +216,8 @@ def gradcheck(
     """
     began = time.monotonic()
     with called() as stop:
-        config = load(experiment).with_code(allow_code)
+        config = load(experiment)
+        config = config.with_code(allow_code or config.allows_code)
         for name, value, least in (("seeds", seeds, 3), ("spp", spp, 1)):
             if value is not None and value < least:
                 raise ConfigError(name, "", f"is {value}; at least {least} are needed")
@@ -264,7 +259,8 @@ def convergence(
     """
     began = time.monotonic()
     with called() as stop:
-        config = load(experiment).with_code(allow_code)
+        config = load(experiment)
+        config = config.with_code(allow_code or config.allows_code)
         from reslrb_cli.measure.convergence.judgement import Judgement
         from reslrb_cli.measure.convergence.session import Session
         from reslrb_cli.measure.methods import DEFAULTS, Plan, compared, machine_of

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from reslrb_cli.api.experiment import Experiment, as_path, called, held, load, load_with
+from reslrb_cli.api.experiment import Experiment, called, held, load, load_with
 from reslrb_cli.backend.variant import keep_variant
+from reslrb_cli.config.files import as_path
 from reslrb_cli.config.loader import OVERRIDDEN, Override, overrides_of
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, describe
@@ -273,7 +274,7 @@ def optimize(
 
     `resume` goes on with the run in that folder exactly where it was, in that folder, or with `folder` in a new one.
     `experiment` may then be left out, else it has to be that of the run; `overrides` may change iterations and learning
-    rates. A run that is finished has nothing to iterate over.
+    rates. A finished run has nothing to iterate over, which a warning says.
 
     `loss` is a function of your own in place of the experiment's: `loss(image, target)` of two `mi.TensorXf` (height,
     width, channels), the image attached, or `loss(image, target, weights)`; it returns a `mi.Float` of width 1, or a
@@ -318,8 +319,8 @@ def optimize(
 
 
 def _with_own(config: Config, loss: Loss | None, allow_code: bool) -> Config:
-    """The same experiment with a loss of the caller's, and with code that it names allowed, or not."""
-    config = config.with_code(allow_code)
+    """Return the experiment with a loss of the caller, and with its code allowed if it was not already."""
+    config = config.with_code(allow_code or config.allows_code)
     if loss is not None and not callable(loss):
         reason = "is no function; a file's is named by the setting `loss: {type: custom, file: FILE.py:NAME}`"
         raise ConfigError("loss", "", reason)
@@ -339,4 +340,6 @@ def _reopened(
         earlier.config = _with_own(earlier.config, loss, allow_code)
         variant = keep_variant(earlier.variant, earlier.config.source)
         begun = earlier.begin(variant, logger.info, logger.warning)
+        if earlier.is_done:
+            logger.warning("%s", earlier.done_line("the override", ": "))
         return contextlib.ExitStack() if earlier.is_done else stack.pop_all(), begun, not earlier.is_done

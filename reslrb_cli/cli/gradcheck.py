@@ -64,7 +64,7 @@ def run_missing(
     """Measure, print and write; returns the exit code. `variant` must be set."""
     from reslrb_cli.measure.missing import KIND, MissingCheck
 
-    to_keep = settings(config, variant, device_name(variant), spp=spp, directions=along)
+    to_keep = settings(config, {}, variant, device_name(variant), spp=spp, directions=along)
     check = MissingCheck(config, budget, seeds, spp, along, Earlier.read(KIND, resumed, to_keep))
     echo(check.conditions())
     records: list[MissingRecord] = []

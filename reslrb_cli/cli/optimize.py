@@ -160,9 +160,7 @@ def _resume(
 
     with open_earlier(run, config_file, overrides) as earlier:
         if earlier.is_done:
-            iterations, stopped = earlier.config.run.iterations, earlier.has_stopped
-            more = "run.stop=null" if stopped and iterations > earlier.iteration else "run.iterations=NUMBER"
-            echo(f"{run}: is finished, after {earlier.iteration} of {iterations} iterations; --set {more} goes on")
+            echo(earlier.done_line("--set", "="))
             return ExitCode.DONE
         earlier.config = config = earlier.config.with_code(allow_code)
         _check_shards(config, workers)

@@ -24,6 +24,7 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import write
 from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.records.atomic import unfinished_folder
+from reslrb_cli.scene.files import option_texts
 from reslrb_cli.scene.xml.read import read_description, tag_lines
 
 CONFIG_FILE, SCENE_FILE, INITIAL_FILE, FILES = "config.yaml", "scene.xml", "initial.npz", "files"
@@ -87,18 +88,13 @@ def bundle_of(config: Config, values: Values) -> Bundle:
 
 def _scene_text(bundle: Bundle, config: Config) -> str:
     """The scene as one file, which names files of the bundle."""
-    texts = {name: _text(value) for name, value in config.scene.options.items()}
-    description = read_description(config.scene.file, texts)
+    description = read_description(config.scene.file, option_texts(config.scene.options))
     for element in description.root.walk():
         key = element.file_attribute
         path = description.find_file(element.attributes[key]) if key else None
         if path is not None and path.is_file():
             element.attributes[key] = bundle.add(path)
     return "".join(f"{line}\n" for line, _ in tag_lines(description.root))
-
-
-def _text(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _packed(bundle: Bundle | None, value: Any) -> Any:

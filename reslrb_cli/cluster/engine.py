@@ -123,12 +123,12 @@ def _warmed(problem: Problem) -> dict[str, float]:
 def opening_of(course: Course, folder: Path, own: bool) -> tuple[Opening, Bundle]:
     """What workers need of a run, `own`: which are this run's; `folder` is to write into.
 
-    Raises OSError, and ConfigError where users' own code is another than when the run began.
+    Raises OSError, and ConfigError where a file has changed since the run began.
     """
     config, selection = course.problem.config, course.problem.selection
     bundle, here = bundle_of(config, {key: selection.array(key) for key in selection.keys}), digests(config)
-    for key in config.codes:
-        if here.get(key) != course.files.get(key):
+    for key, digest in course.files.items():
+        if here.get(key) != digest:
             raise ConfigError(config.source, key, "has changed since the run began; put it back, or begin anew")
     course.save(folder)
     write_archive(folder / TARGETS_FILE, target_arrays(course.problem.views))

@@ -65,8 +65,3 @@ class Guard:
         where = f" in line {lines[-1]}" if lines else ""
         said = f"{type(error).__name__}: {error}".rstrip(": ") if str(error) else describe(error)
         raise ConfigError(self.source, self.key, f"{self.what} raises{where} {said}") from error
-
-
-def code_digest(file: Path) -> str:
-    """What is in a file of code, in short; what it imports is not in it. Raises ConfigError."""
-    return hashlib.blake2b(read_file(file, CODE_BYTES), digest_size=16).hexdigest()

@@ -11,7 +11,7 @@ import stat
 from pathlib import Path
 from typing import BinaryIO
 
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.errors import ConfigError, one_line
 
 # --- configurations: read within a second or two, at some 50 microseconds a value -------------------------------------
 
@@ -77,6 +77,14 @@ PIXELS = 2**27
 
 #: Bytes of an image's file: that many pixels of four floats, not compressed, and something for the file's head.
 IMAGE_BYTES = 16 * PIXELS + 2**20
+
+
+def as_path(given: object, name: str, what: str) -> Path:
+    """Return the path that the argument `name` of a call is. Raises ConfigError for another object, and names `what`
+    the call takes."""
+    if isinstance(given, (str, os.PathLike)):
+        return Path(given)
+    raise ConfigError(name, "", f"is {one_line(repr(given), 60)}, not {what}")
 
 
 def open_file(path: Path, most: int | None = None) -> BinaryIO:

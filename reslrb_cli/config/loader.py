@@ -169,11 +169,14 @@ def plain(value: Any, source: object, key: str = "", depth: int = 0) -> Any:
 
 
 def changed(config: Config, overrides: Sequence[str | Override]) -> Config:
-    """The same experiment with overrides put in. Raises ConfigError."""
+    """The same experiment with overrides put in; it keeps its own loss and the permission to run code.
+
+    Raises ConfigError.
+    """
     if not overrides:
         return config
     parsed = [parse_override(each) if isinstance(each, str) else each for each in overrides]
-    return resolve(config.model_dump(mode="json", exclude_none=True), config.source, parsed)
+    return resolve(config.model_dump(mode="json", exclude_none=True), config.source, parsed).with_code_as(config)
 
 
 def resolve(data: Any, path: Path | str, parsed: Sequence[Override] = ()) -> Config:

@@ -7,14 +7,14 @@ of `convergence --runs`.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 from reslrb_cli.backend.doctor import device_name, memory_bytes
 from reslrb_cli.backend.variant import choose
-from reslrb_cli.config.base import SEED_END
+from reslrb_cli.config.base import SEED_END, code_file
 from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, UNDECIDED, Own, Prb, Ptracer, Trajectory, WalkAd
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import dump, with_integrator
@@ -240,6 +240,11 @@ def with_run(config: Config, **changes: Any) -> Config:
     return config.model_copy(update={"run": config.run.model_copy(update=changes)})
 
 
+def code_files(cases: Iterable[Case]) -> dict[str, Path]:
+    """Return the files of integrators of the user's own among `cases`, by label."""
+    return {case.label: code_file(case.options["file"]) for case in cases if case.type == "custom"}
+
+
 @dataclass(frozen=True, kw_only=True)
 class Measurement:
     """What every measurement by processes has; `memory_limit` is of each, None: none.
@@ -272,7 +277,8 @@ class Measurement:
         """What has to be the same in all sessions, as JSON has it; see `resume_store.settings`."""
         labels = [case.label for case in self.cases]
         options = {"integrators": labels, **self._options(), "memory limit": self.memory_limit}
-        return resume_store.settings(self.config, self.variant, self.device, **options)
+        codes = code_files([*self.cases, *(each for each in vars(self).values() if isinstance(each, Case))])
+        return resume_store.settings(self.config, codes, self.variant, self.device, **options)
 
     def _options(self) -> dict[str, Any]:
         """Those of the command that count among the settings."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +17,10 @@ if TYPE_CHECKING:
     import numpy as np
 
 #: Of what is kept; another one is not gone on from.
-VERSION = 2
+VERSION = 3
+
+#: Where the settings have digests of files.
+FILES = "files"
 
 #: What a setting is called that one side does not have.
 _ABSENT = "not given"
@@ -27,26 +29,21 @@ _ABSENT = "not given"
 _SHOWN = 60
 
 
-def settings(config: Config, variant: str, device: str, **options: Any) -> dict[str, Any]:
-    """What has to be the same in all sessions of a measurement, as JSON has it: `options` are those of the command.
+def settings(config: Config, codes: Mapping[str, Path], variant: str, device: str, **options: Any) -> dict[str, Any]:
+    """Return what has to be the same in all sessions of a measurement, as JSON has it.
 
-    The files of scene and code count by their content, and so does what computes, whose times stand beside each other.
+    `codes` are the files of integrators that the command names, `options` those of the command. Files count by their
+    contents. What computes counts too, since times of all sessions stand beside each other.
     """
-    contents = {"scene.file": config.scene.file}
-    contents |= {key: one.path for key, one in config.codes.items() if one.path is not None}
-    found = {}
-    for key, path in contents.items():
-        try:
-            found[f"content of {key}"] = hashlib.sha256(path.read_bytes()).hexdigest()
-        except OSError:  # the built-in scene, or one whose loading will say what is wrong
-            found[f"content of {key}"] = ""
+    from reslrb_cli.scene.files import file_digests, files_of  # which loads Mitsuba
+
     return {
         "config": parse(dump(config), str(config.source)),
         **options,
         "variant": variant,
         "device": device,
         "versions": versions(),
-        **found,
+        FILES: file_digests({**files_of(config), **codes}),
     }
 
 
@@ -111,8 +108,9 @@ def first_difference(there: Any, here: Any, place: str = "") -> str | None:
         return None
     if there == here:
         return None
-    if place == "content of scene.file":
-        return f"the {place} has changed"
+    if place.startswith(f"{FILES}."):
+        what = "is new" if there == _ABSENT else "has gone" if here == _ABSENT else "has changed"
+        return f"{place.removeprefix(f'{FILES}.')} {what}"
     return f"{place} is {_short(there)} there, {_short(here)} here"
 
 

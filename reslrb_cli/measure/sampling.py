@@ -16,6 +16,7 @@ import numpy as np
 
 from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.gradients import seeds
+from reslrb_cli.measure.methods import code_files
 from reslrb_cli.measure.participants import Participants, Settings
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.optimization.shards import in_order, serially
@@ -54,8 +55,8 @@ def step_as(participants: Participants, steps: Mapping[str, Sequence[Step]]) -> 
 
 def settings(checked: Settings, variant: str, device: str) -> dict[str, Any]:
     """What has to be the same in all sessions."""
-    labels = [case.label for case in checked.integrators]
-    return resume_store.settings(checked.config, variant, device, estimators=labels, spp=checked.spp)
+    labels, codes = [case.label for case in checked.integrators], code_files(checked.integrators)
+    return resume_store.settings(checked.config, codes, variant, device, estimators=labels, spp=checked.spp)
 
 
 #: Seeds, where no number is given: so many of everything, more of what is cheap, as the budget allows.

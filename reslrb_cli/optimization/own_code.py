@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.code import Guard, code_digest, load_named
+from reslrb_cli.config.code import Guard, load_named
 from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.optimizers import Custom
 from reslrb_cli.config.schema import Config
@@ -38,7 +38,8 @@ class OwnLoss:
             code = getattr(self._function, "__code__", None)
             self._file = None if code is None else Path(code.co_filename)
         self._takes_weights: bool | None = None
-        self._token = secrets.token_hex(8)
+        #: Of a function that was handed over, which is like no other; a file has its contents.
+        self.token = "" if self._function is None else secrets.token_hex(8)
         self._even: mi.TensorXf | None = None
 
     def function(self) -> Callable[..., Any]:
@@ -91,10 +92,6 @@ class OwnLoss:
             raise self._wrong(f"returns {loss} of a target and a darker image, not a finite number")
         if not np.isfinite(gradient).all():
             raise self._wrong("has a derivative that is not finite, of a target and a darker image")
-
-    def digest(self) -> str:
-        """The code in short, of which what is measured depends; a function that was handed over is like no other."""
-        return code_digest(self.spec.path) if self.spec.path is not None else self._token
 
     def _check_even(self, weights: mi.TensorXf | None) -> None:
         if weights is None or weights is self._even:

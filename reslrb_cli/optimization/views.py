@@ -12,7 +12,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -280,14 +279,6 @@ class View:
     def kept(self, image: Array) -> Array:
         """An image of the target's shape, 0 where pixels are left out."""
         return image if self.weights is None else np.where(np.array(self.weights) > 0, image, 0)
-
-    def situation(self) -> list[Any]:
-        """Share, exposure and weights in short, as plain values: two views that have the same count the same."""
-        weights = None if self.weights is None else hashlib.blake2b(np.array(self.weights).tobytes()).hexdigest()
-        losses = [loss.model_dump() for loss in losses_of(self.wanted.loss)]
-        loss = (losses[0] if losses else None) if isinstance(self.wanted.loss, LossConfig | None) else losses
-        digests = [own.digest() for own in self.codes]
-        return [self.share, self.held_out, self.wanted.exposure, loss, weights, *digests]
 
     def objective(self, image: mi.TensorXf) -> mi.Float:
         """What the view adds to the loss of all views."""

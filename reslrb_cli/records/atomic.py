@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import IO
 
 from reslrb_cli.errors import ConfigError, is_machine_fault
+from reslrb_cli.records.lock import FolderLock, is_alive
 
 _PART = re.compile(r"\..+\.\d+\.part")
 
@@ -56,13 +57,18 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object], durable: 
 
 
 @contextmanager
-def unfinished_folder(parent: Path) -> Iterator[Path]:
-    """A new folder in `parent`, which the block may rename; else it is removed at its end, with all that is in it."""
+def unfinished_folder(parent: Path, lock: bool = True) -> Iterator[Path]:
+    """Yield a new folder in `parent`, which the block may rename; else remove it at the end, with its content.
+
+    The folder is locked meanwhile: other processes remove an old folder without a lock. With `lock=False` the block
+    locks it.
+    """
     path = parent / f"{FOLDER_PREFIX}{secrets.token_hex(8)}"
     unfinished.add(path)
     try:
         path.mkdir()
-        yield path
+        with FolderLock(path) if lock else contextlib.nullcontext():
+            yield path
     finally:
         shutil.rmtree(path, ignore_errors=True)
         unfinished.discard(path)
@@ -93,17 +99,6 @@ def remove_parts_of(path: Path) -> None:
         if _PART.fullmatch(part.name) and not is_alive(int(part.name.split(".")[-2])):
             with contextlib.suppress(OSError):
                 part.unlink()
-
-
-def is_alive(process: int) -> bool:
-    """Whether there is a process of this number."""
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:  # somebody else's
-        return True
-    return True
 
 
 def _sync_folder(folder: Path) -> None:

@@ -17,8 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from reslrb_cli.records.atomic import is_alive
-
 #: Who reads a folder, or puts its manifest right, has the lock for an instant: no run is refused over that, and no
 #: other reader takes it for a run.
 WAIT_SECONDS, READER_WAIT_SECONDS = 1.0, 0.25
@@ -139,6 +137,17 @@ class Holder:
 
     def __str__(self) -> str:
         return f"process {self.pid} on {self.host}"
+
+
+def is_alive(process: int) -> bool:
+    """Whether there is a process of this number."""
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # somebody else's
+        return True
+    return True
 
 
 def _place(status: os.stat_result) -> tuple[int, int]:

@@ -19,8 +19,11 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter, ValidationError
+
 from reslrb_cli.backend.variant import package_version
 from reslrb_cli.config.files import read_file
+from reslrb_cli.config.yaml_text import format_location
 from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.records import metrics
 from reslrb_cli.records.atomic import remove_parts, write_atomically
@@ -59,9 +62,7 @@ NOT_YET = "not written yet"
 
 def is_complete(content: Mapping[str, Any]) -> bool:
     """Whether a manifest is that of a run that is finished, and came to the end of writing what it found."""
-    missing = content.get("missing")
-    cut_off = isinstance(missing, dict) and NOT_YET in missing.values()
-    return content.get("status") == Status.FINISHED and not cut_off
+    return content.get("status") == Status.FINISHED and NOT_YET not in content.get("missing", {}).values()
 
 
 @dataclass
@@ -136,13 +137,31 @@ PROGRAM = "reslrb"
 MOST_BYTES = 2**24
 
 
+#: Checks the types of the fields, and of what they hold as far as `Manifest` says.
+_CHECK = TypeAdapter(Manifest)
+
+
 def read_content(folder: Path) -> dict[str, Any] | None:
-    """What the manifest in `folder` says; None where there is none that `reslrb` wrote."""
+    """Return the content of the manifest in `folder`, or None where there is none that `reslrb` wrote.
+
+    Fields of earlier versions may be missing; those that are there have the types of `Manifest`. Raises ConfigError,
+    located by the first field of another type.
+    """
     try:
-        content = json.loads(read_file(folder / MANIFEST_FILE, MOST_BYTES))
+        text = read_file(folder / MANIFEST_FILE, MOST_BYTES)
+        content = json.loads(text)
     except (ConfigError, ValueError, RecursionError):
         return None
-    return content if isinstance(content, dict) and content.get("program") == PROGRAM else None
+    if not isinstance(content, dict) or content.get("program") != PROGRAM:
+        return None
+    try:
+        _CHECK.validate_json(text, strict=True)
+    except ValidationError as error:
+        for wrong in error.errors(include_url=False):
+            if wrong["type"] != "missing" or len(wrong["loc"]) > 1:
+                reason = f"is damaged: {wrong['msg'].lower()}; restore the file, or begin a new run"
+                raise ConfigError(folder / MANIFEST_FILE, format_location(wrong["loc"]), reason) from None
+    return content
 
 
 def _write(folder: Path, content: Mapping[str, Any]) -> None:
@@ -155,7 +174,8 @@ REASON = "its process ended before the run did"
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """Return the manifest in `folder`, or None where there is none that `reslrb` wrote.
+    """Return the manifest in `folder`, or None where there is none that `reslrb` wrote. Raises ConfigError as
+    `read_content` does.
 
     One that was left saying `running` by a process that has surely gone says `interrupted`, on the disk too from then
     on, if that can be written to; what the run never finished is removed then.

@@ -165,7 +165,7 @@ class RunFolder:
         try:
             output.mkdir(parents=True, exist_ok=True)
             _remove_left(output)
-            with unfinished_folder(output) as part, contextlib.ExitStack() as stack:
+            with unfinished_folder(output, lock=False) as part, contextlib.ExitStack() as stack:
                 lock = stack.enter_context(FolderLock(part))
                 for entry in SUBFOLDERS:
                     (part / entry).mkdir()

@@ -57,7 +57,7 @@ class Sweep:
     """What a sweep consists of: every combination with every seed; and which runs failed, by name.
 
     `config` is the file that it was made from, `overrides` what was given to `--set`, both as the user wrote them.
-    `codes` are the digests of the files of the user's own code that its runs call, by path.
+    `codes` are the digests of the files of the user's own code that its runs call, by path, `files` of all others.
     """
 
     config: str
@@ -66,6 +66,7 @@ class Sweep:
     seeds: list[int]
     failures: dict[str, Failure] = field(default_factory=dict)
     codes: dict[str, str] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)
     version: int = VERSION
     program: str = __version__
 

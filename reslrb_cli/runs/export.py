@@ -36,7 +36,7 @@ from reslrb_cli.optimization.moving import moves_anything
 from reslrb_cli.records.atomic import write_atomically, writing
 from reslrb_cli.records.images import write_bitmap, write_file, write_image
 from reslrb_cli.records.metrics import finite
-from reslrb_cli.records.run_folder import FABRICATION_FILE, SOLID_PICTURE, exposures
+from reslrb_cli.records.run_folder import FABRICATION_FILE, SOLID_PICTURE, exposures, opened
 from reslrb_cli.scene.export import export_scene
 from reslrb_cli.scene.graph import interpolates_normals
 from reslrb_cli.scene.images import read_image, read_photo
@@ -171,16 +171,17 @@ def is_there(scene: mi.Scene, plan: Fabrication) -> bool:
 
 
 def keep_tolerances(config: Config, run: Path, off: dict[str, dict[str, Any]], say: Say) -> None:
-    """Add what was measured of tolerances to the folder of the run, and draw its page anew, where that can be."""
+    """Add the measured tolerances to the folder of the run and draw its page anew, where no other process works."""
     from reslrb_cli.report.page import write_report
 
     try:
-        if load(run / "config.yaml").fabrication != config.fabrication:
-            raise ValueError("they are of other settings than the run's `fabrication`")
-        numbers = json.loads((run / FABRICATION_FILE).read_text())
-        _write_numbers(run, numbers | {"tolerances": off})
-        write_report(run)
-    except (OSError, ValueError) as error:
+        with opened(run):
+            if load(run / "config.yaml").fabrication != config.fabrication:
+                raise ValueError("they are of other settings than the run's `fabrication`")
+            numbers = json.loads((run / FABRICATION_FILE).read_text())
+            _write_numbers(run, numbers | {"tolerances": off})
+            write_report(run)
+    except (ConfigError, OSError, ValueError) as error:
         say(f"{run}: the page does not show the tolerances: {error}")
     else:
         say(f"{run / 'report.html'}: has them, too")

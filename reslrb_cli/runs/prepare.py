@@ -11,7 +11,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -21,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.backend.doctor import device_name
-from reslrb_cli.config.files import IMAGE_BYTES, read_file
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
@@ -46,6 +44,7 @@ from reslrb_cli.records.metrics import ClampTally, NonFiniteTally, Record, Regul
 from reslrb_cli.records.run_folder import RunFolder
 from reslrb_cli.records.tree import Arrays, Stored, entries, entry, expected
 from reslrb_cli.report.tonemap import exposure_for
+from reslrb_cli.scene.files import file_digests, files_of
 from reslrb_cli.scene.needs import unsupported_part
 from reslrb_cli.scene.visibility import sees_lamps
 
@@ -187,16 +186,8 @@ def settled_of(problem: Problem, variant: str) -> Settled:
 
 
 def digests(config: Config) -> dict[str, str]:
-    """What is in the files that the experiment names, in short, by the keys that name them: scene, cameras, targets."""
-    named: dict[str, Path | None] = {"scene.file": config.scene.file, "scene.cameras": config.scene.cameras}
-    named |= {f"target.file[{place}]": path for place, path in enumerate(config.target.file or ())}
-    named |= {f"views[{place}].target": view.target for place, view in enumerate(config.views or ())}
-    named |= {key: one.path for key, one in config.codes.items()}
-    return {
-        key: hashlib.blake2b(read_file(path, IMAGE_BYTES), digest_size=16).hexdigest()
-        for key, path in named.items()
-        if path is not None and path.is_file()
-    }
+    """Return digests of the files that a run needs to go on; its state has the values that parameters begin with."""
+    return file_digests({key: path for key, path in files_of(config).items() if ".initial." not in key})
 
 
 Array = np.ndarray[Any, Any]

@@ -75,6 +75,14 @@ class Earlier:
         """Whether its loss stood (`run.stop`), and what says so is as it was."""
         return bool(self.stored.read(State).stopped) and not any(key.startswith("run.stop") for key in self.changed)
 
+    def done_line(self, option: str, equals: str) -> str:
+        """Say that nothing is left to do, and which setting goes on; `option` and `equals` are how the user sets it."""
+        iterations = self.config.run.iterations
+        stopped = self.has_stopped and iterations > self.iteration
+        more = f"run.stop{equals}null" if stopped else f"run.iterations{equals}NUMBER"
+        done = f"{self.iteration} of {iterations} iterations"
+        return f"{self.folder.path}: is finished, after {done}; {option} {more} goes on"
+
     def begin(self, variant: str, say: Say, warn: Say) -> Begun:
         """Assemble the problem as it was, and bring it to where it is; a variant must be set.
 
@@ -93,14 +101,12 @@ class Earlier:
         return Begun(course, manifest, lambda: self._take_over(manifest))
 
     def _manifest(self, manifest: Manifest) -> Manifest:
-        before = self.manifest
-        started, resumed = before.get("started"), before.get("resumed")
-        manifest.started = started if isinstance(started, str) else manifest.started
-        manifest.resumed = [each for each in resumed if isinstance(each, dict)] if isinstance(resumed, list) else []
-        manifest.incomplete = list(before.get("incomplete") or ())
-        earlier, here = before.get("versions"), versions()
-        others = {name: [version, here.get(name)] for name, version in earlier.items() if version != here.get(name)} \
-            if isinstance(earlier, dict) else {}  # fmt: skip
+        before, here = self.manifest, versions()
+        manifest.started = before.get("started", manifest.started)
+        manifest.resumed = list(before.get("resumed", []))
+        manifest.incomplete = list(before.get("incomplete", []))
+        earlier = before.get("versions", {})
+        others = {name: [version, here.get(name)] for name, version in earlier.items() if version != here.get(name)}
         if others:
             names = ", ".join(f"{name} {was} then, {is_} now" for name, (was, is_) in others.items())
             self.said.append(f"other versions than those that the run began with: {names}; it may go on differently")

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import IO, Any
 
 from reslrb_cli.config.base import SEED_END
-from reslrb_cli.config.code import code_digest
 from reslrb_cli.config.files import NAME_BYTES, open_file
 from reslrb_cli.config.loader import Override, check_code, dump, loads, parse_override, read_text, replaces
 from reslrb_cli.config.run import folder_name
@@ -39,6 +38,7 @@ from reslrb_cli.records.sweeps import (
     short_keys,
 )
 from reslrb_cli.runs.prepare import changes
+from reslrb_cli.scene.files import digest_of, file_digests, files_of
 
 #: Runs of a sweep, at most: each has a folder, and a line of its page.
 MOST_RUNS = 1000
@@ -126,17 +126,12 @@ def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[s
         settings = {each.key: override.value for each, override in zip(varied, chosen, strict=True)}
         combinations.append(Combination(name, settings))
         configs[name] = config
-    files = {one.path for config in configs.values() for one in config.codes.values() if one.path is not None}
-    codes = {str(file): _digest(path, file) for file in sorted(files)}
-    sweep = Sweep(str(path), list(overrides), combinations, list(range(first, first + seeds)), codes=codes)
-    return Plan(sweep, configs)
-
-
-def _digest(source: object, file: Path) -> str:
-    try:
-        return code_digest(file)
-    except ConfigError as error:
-        raise ConfigError(source, "", f"{file}: {error.message}") from None
+    own = {one.path for config in configs.values() for one in config.codes.values() if one.path is not None}
+    files = own.union(*(files_of(config).values() for config in configs.values()))
+    digests = file_digests({str(file): file for file in sorted(files)})
+    codes = {str(file): digests.pop(str(file)) for file in sorted(own)}
+    run_seeds = list(range(first, first + seeds))
+    return Plan(Sweep(str(path), list(overrides), combinations, run_seeds, codes=codes, files=digests), configs)
 
 
 def _names(varied: Sequence[Varied]) -> list[str]:
@@ -200,7 +195,7 @@ def opened(
             kept = read_sweep(folder)
             if plan is not None:
                 _check_same(folder, kept, plan)
-            _check_codes(folder, kept, allow_code or plan is not None)
+            _check_files(folder, kept, allow_code or plan is not None)
             sweep = _grown(kept, plan.sweep.seeds if plan else None, seeds)
         else:
             _begin(folder, plan)
@@ -275,14 +270,13 @@ def _check_same(folder: Path, kept: Sweep, plan: Plan) -> None:
             raise ConfigError(plan.sweep.config, key, reason)
 
 
-def _check_codes(folder: Path, kept: Sweep, allowed: bool) -> None:
-    """Raise ConfigError where the code that the runs of the sweep call is not to be run, or has changed."""
-    for file, digest in kept.codes.items():
-        if not allowed:
-            raise ConfigError(
-                folder, "", f"would run the code of {file}, with all your rights; --allow-code has it run"
-            )
-        if _digest(folder, Path(file)) != digest:
+def _check_files(folder: Path, kept: Sweep, allowed: bool) -> None:
+    """Raise ConfigError where a file that the runs of the sweep read has changed, or code is not to be run."""
+    for file, digest in (kept.codes | kept.files).items():
+        if file in kept.codes and not allowed:
+            reason = f"would run the code of {file}, with all your rights; --allow-code has it run"
+            raise ConfigError(folder, "", reason)
+        if digest_of(Path(file)) != digest:
             reason = f"has changed since the sweep in {folder} began; put it back, or begin another: -o"
             raise ConfigError(file, "", reason)
 

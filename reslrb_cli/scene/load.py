@@ -14,10 +14,12 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.backend.variant import check_variant
+from reslrb_cli.config.files import as_path
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.cameras import read_cameras, replace_sensors
 from reslrb_cli.scene.catalog import coarse_bits
 from reslrb_cli.scene.extent import doubts
+from reslrb_cli.scene.files import option_texts
 from reslrb_cli.scene.xml.build import Owners, build
 from reslrb_cli.scene.xml.check import check, check_files, resize_films
 from reslrb_cli.scene.xml.mend import mend, refuse, warnings
@@ -53,10 +55,7 @@ def load_scene(
     place; without `warn`, as for a scene that was looked at before, none of this is looked for.
     """
     file = Path(file)
-    texts = {
-        name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in (options or {}).items()
-    }
-    description = read_description(file, texts)
+    description = read_description(file, option_texts(options or {}))
     root = description.root
     if cameras is not None:
         replace_sensors(description, read_cameras(cameras))
@@ -108,7 +107,8 @@ def load_for_script(file: str | os.PathLike[str], keys: Iterable[str] = (), /, *
     BackendError under a variant that reslrb does not work with.
     """
     check_variant(mi.variant())
-    return load_scene(Path(file), options, keys=[keys] if isinstance(keys, str) else keys)
+    path = as_path(file, "file", "the path of a scene file")
+    return load_scene(path, options, keys=[keys] if isinstance(keys, str) else keys)
 
 
 def read_as_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> mi.Scene:

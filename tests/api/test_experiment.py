@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import logging
 import os
+import pickle
 import shutil
 import signal
 import subprocess
@@ -13,6 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -22,7 +25,7 @@ from measure.pretended_steps import Stage
 from runs.going_on import LAMP, work_alone, write_experiment
 
 import reslrb_cli as rl
-from reslrb_cli.config.loader import dump, load
+from reslrb_cli.config.loader import changed, dump, load, with_integrator
 from reslrb_cli.measure.convergence import session
 from reslrb_cli.measure.convergence.session import Session
 from reslrb_cli.measure.methods import Plan
@@ -105,6 +108,9 @@ def itself() -> dict[str, Any]:
             lambda: rl.load("tiny.yaml", {"run.spp": 4, "run": {"iterations": 6}}),
             "overrides: run: replaces what run.spp sets; give it first",
         ),
+        (lambda: rl.load(experiment(), base=3), "base: is 3, not the path of a folder"),  # type: ignore[arg-type]
+        (lambda: rl.load_scene({"type": "scene"}), "file: is {'type': 'scene'}, not the path of a scene file"),  # type: ignore[arg-type]
+        (lambda: rl.load_scene(None), "file: is None, not the path of a scene file"),  # type: ignore[arg-type]
         (lambda: rl.load(None), "experiment: is None, not a file, a mapping or a run's folder"),  # type: ignore[arg-type]
         (lambda: rl.export(None, "made"), "run: is None, not the folder of a run, which `optimize"),  # type: ignore[arg-type]
         (lambda: rl.optimize("tiny.yaml", folder=3), "folder: is 3, not the path of a folder"),  # type: ignore[arg-type]
@@ -123,6 +129,57 @@ def test_errors_are_located(folder: Path, call: Callable[[], Any], line: str) ->
     with pytest.raises(rl.ConfigError) as error:
         call()
     assert str(error.value).startswith(line)
+
+
+def test_every_way_of_change_keeps_the_own_loss_and_the_permission(folder: Path) -> None:
+    given = load("tiny.yaml").with_loss(np.mean).with_code()
+    alone = {"type": "reslrb", "estimator": "gather"}
+    ways = {
+        "overrides": rl.load(given, {"run.spp": 8}),
+        "--set": changed(given, ["run.spp=8"]),
+        "nothing": rl.load(given),
+        "with_code": load("tiny.yaml").with_loss(np.mean).with_code(),
+        "with_loss": load("tiny.yaml").with_code().with_loss(np.mean),
+        "with_integrator": with_integrator(given, alone, "here", {}),
+        "a stage": given.at_stage(0),
+        "exposures": given.with_exposures_fixed(),
+        "model_copy": given.model_copy(update={"variant": "auto"}),
+        "copy": copy.copy(given),
+        "deepcopy": copy.deepcopy(given),
+        "pickle": pickle.loads(pickle.dumps(given)),
+    }
+    for way, config in ways.items():
+        assert (config.own_loss, config.allows_code) == (np.mean, True), way
+    assert rl.load(given, {"run.spp": 8}).source == given.source
+
+
+def test_calls_keep_the_own_loss_and_the_permission(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def own(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
+        return 2 * dr.mean(dr.square(image - target), axis=None)
+
+    config = rl.load("tiny.yaml", {**FAST, "run.measuring": 0, "run.iterations": 1})
+    loss, gradients = rl.gradient(config, spp=8)
+    twice, others = rl.gradient(config.with_loss(own), spp=8)
+    assert twice == pytest.approx(2 * loss)
+    for key, gradient in gradients.items():
+        np.testing.assert_allclose(others[key], 2 * gradient, rtol=1e-4, atol=1e-6)
+    run = rl.optimize(config.with_loss(own), overrides={"run.spp": 8})
+    assert [record.iteration for record in run] == [0]
+    (folder / "own.py").write_text("import drjit as dr\n\n\ndef own(a, b):\n    return dr.mean(a - b, axis=None)\n")
+    named = rl.load(config, {"loss": {"type": "custom", "file": "own.py:own"}})
+    with pytest.raises(rl.ConfigError, match=r"the experiment `load\(\.\.\.\)\.with_code\(\)`$"):
+        rl.gradient(named)
+    assert np.isfinite(rl.gradient(named.with_code(), spp=8)[0])
+    assert rl.optimize(named.with_code(), overrides={"run.spp": 8}).config.allows_code
+    with pytest.raises(rl.ConfigError, match=r"none\.py: no such file"):
+        rl.gradcheck(config.with_code(), integrators="none.py:A")
+
+    def seen(session: Session) -> None:
+        raise LookupError(f"allowed: {session.plan.config.allows_code}")
+
+    monkeypatch.setattr(Session, "run", seen)
+    with pytest.raises(LookupError, match="allowed: True"):
+        rl.convergence(config.with_code(), integrators="own.py:A")
 
 
 # --- looking ----------------------------------------------------------------------------------------------------------

@@ -193,7 +193,7 @@ def test_a_loop_that_is_begun_again_goes_on(experiment: Path, folder: str | None
     assert (run.status, run.iteration) == ("finished", 6)
 
 
-def test_a_run_is_gone_on_with_from_its_folder(experiment: Path) -> None:
+def test_a_run_is_gone_on_with_from_its_folder(experiment: Path, caplog: pytest.LogCaptureFixture) -> None:
     whole = rl.optimize("tiny.yaml", folder="whole", overrides=SET)
     assert len(list(whole)) == 6
     with rl.optimize("tiny.yaml", folder="mine", overrides=SET | {"run.iterations": 3}) as first:
@@ -205,7 +205,10 @@ def test_a_run_is_gone_on_with_from_its_folder(experiment: Path) -> None:
     assert again.folder == Path("mine")
     assert differences(Path("whole"), Path("mine")) == []
 
+    assert caplog.messages == []
     done = rl.optimize(resume="mine")
+    left = "mine: is finished, after 6 of 6 iterations; the override run.iterations: NUMBER goes on"
+    assert [record.message for record in caplog.records if record.levelname == "WARNING"] == [left]
     assert (done.status, list(done), done.folder) == ("finished", [], Path("mine"))
     assert values_equal(done.parameters, again.parameters)
     assert is_free(Path("mine"))

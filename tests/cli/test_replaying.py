@@ -97,7 +97,7 @@ def test_paths_are_of_the_sequence_that_was_measured_to_pay(run, capsys):
         own = problem.integrator.plan(problem.scene, problem.scene.sensors()[0]).sequence
         assert (own is not None) == paid
         assert {samples.plan.sequence for samples, *_ in _parts(problem, problem.views[0], 1)} == {own}
-    for wrong in (None, {"low_discrepancy": "maybe"}, [1]):
+    for wrong in (None, {"low_discrepancy": "maybe"}):
         (run / "manifest.json").write_text(json.dumps(manifest | {"sequence": wrong}))
         assert told(capsys, run) == "manifest.json: sequence: is not whether a sequence paid, as a run writes it"
 
@@ -247,7 +247,7 @@ def test_a_damaged_manifest_is_none(text, run, capsys):
 
 
 MANIFESTS = {
-    "memory is a list": ({"memory": [1]}, "memory.samples_per_pass: is not a number of samples"),
+    "memory is a list": ({"memory": [1]}, "memory: is damaged: input should be an object"),
     "no samples": ({"memory": {"samples_per_pass": 0}}, "memory.samples_per_pass: is not a number of samples"),
     "samples are text": ({"memory": {"samples_per_pass": "4"}}, "memory.samples_per_pass: is not a number of samples"),
 }

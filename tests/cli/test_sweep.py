@@ -91,6 +91,8 @@ def test_names_are_short_safe_and_different(folder):
     ]  # fmt: skip
     values = ["0.1, 0.2", "0.1-0.2", "../x", "A", "a", "x" * 500, "x" * 499 + "y", "ä\u202e"]
     text = json.dumps([{"a": value} for value in values], ensure_ascii=False).replace("\u202e", "\\u202e")
+    scene = Path("scene.xml")
+    scene.write_text(scene.read_text().replace("</scene>", '<string name="unused" value="$a"/></scene>'))
     plan = made(f"scene.options={text}")
     names = [each.name for each in plan.sweep.combinations]
     assert len({name.casefold() for name in names}) == len(values)

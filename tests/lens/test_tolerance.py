@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 from cli.tiny import done, reslrb, settings
 from lens.test_experiment import picture
+from report.measured import make_run
 from skimage.metrics import structural_similarity
 
+from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Fabrication
 from reslrb_cli.lens.solid import as_sheet
 from reslrb_cli.measure import tolerance
@@ -27,6 +29,7 @@ from reslrb_cli.measure.tolerance import (
     where_light_goes,
 )
 from reslrb_cli.records.images import write_file
+from reslrb_cli.records.lock import FolderLock
 from reslrb_cli.report.page import write_report
 from reslrb_cli.runs import export
 
@@ -75,6 +78,21 @@ def folder(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
                 "fabrication.tool_radius=40").output  # fmt: skip
     (folder / "said.txt").write_text(said)
     return folder
+
+
+def test_tolerances_leave_the_folder_of_a_run_at_work_alone(tmp_path: Path) -> None:
+    run, said, off = make_run(tmp_path / "run"), list[str](), {"as planned": {"ssim": 1.0}}
+    (run / "fabrication.json").write_text('{"kind": "lens"}')
+    sections = "scene: {file: a}", "target: {file: a}", "parameters: [{key: a}]", "fabrication: {thickness: 25}"
+    (run / "config.yaml").write_text("\n".join(sections))
+    config = load(run / "config.yaml")
+    with FolderLock(run):
+        export.keep_tolerances(config, run, off, said.append)
+    assert json.loads((run / "fabrication.json").read_text()) == {"kind": "lens"}
+    assert not (run / "report.html").exists()
+    export.keep_tolerances(config, run, off, said.append)
+    assert json.loads((run / "fabrication.json").read_text()) == {"kind": "lens", "tolerances": off}
+    assert ["is in use by a run" in line for line in said] == [True, False]
 
 
 def bench(folder: Path) -> Bench:

@@ -521,7 +521,7 @@ def test_a_scene_that_has_changed_is_another_one(tmp_path: Path) -> None:
     what = sweep(config=loads(CONFIG, tmp_path / "x.yaml"))
     first = again(measure(what))
     (tmp_path / "scene.xml").write_text("<scene></scene>")
-    with pytest.raises(ConfigError, match=r"the content of scene\.file has changed"):
+    with pytest.raises(ConfigError, match=r"another measurement: scene\.file has changed"):
         session(what, first)
 
 

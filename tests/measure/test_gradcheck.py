@@ -43,7 +43,7 @@ from reslrb_cli.measure.references import (
     ptracer_gradient,
     ptracer_image,
 )
-from reslrb_cli.measure.resume_store import Earlier
+from reslrb_cli.measure.resume_store import VERSION, Earlier
 from reslrb_cli.measure.sampling import FEWEST, KIND, Sampling, settings
 from reslrb_cli.measure.scenes import small
 from reslrb_cli.measure.scenes.small import camera, diffuse, lamp, rgb, room, transform
@@ -583,7 +583,7 @@ def test_more_seeds_are_added_to_those_of_the_file(llvm: None, tmp_path: Path) -
 )
 def test_only_the_same_is_gone_on_from(change: dict[str, Any], line: str) -> None:
     what = Settings(loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE), parse_estimators("stack"), 0, 4)
-    head = {"version": 2, "kind": KIND, "settings": settings(what, "llvm_ad_rgb", "")}
+    head = {"version": VERSION, "kind": KIND, "settings": settings(what, "llvm_ad_rgb", "")}
     with pytest.raises(ConfigError) as caught:
         Earlier(KIND, Path("g.jsonl"), head, {}).check(settings(replace(what, **change), "llvm_ad_rgb", ""))
     assert f"--resume: g.jsonl is of another measurement: {line}" in str(caught.value)

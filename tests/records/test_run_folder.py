@@ -5,10 +5,12 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 import threading
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -18,6 +20,7 @@ from reslrb_cli.config.files import NAME_BYTES
 from reslrb_cli.config.run import check_name
 from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.records import manifest as manifests
+from reslrb_cli.records.atomic import unfinished_folder
 from reslrb_cli.records.cache import MOST, PilotCache, cache_folder, key_of
 from reslrb_cli.records.lock import FolderLock, Holder
 from reslrb_cli.records.manifest import MANIFEST_FILE, Manifest, Status, read_manifest
@@ -208,6 +211,19 @@ def test_a_folder_that_a_killed_process_did_not_finish_is_removed_in_time(tmp_pa
         assert names(tmp_path) == [".reslrb-locked", ".reslrb-new", "run"]
 
 
+def test_a_folder_that_takes_long_to_write_is_not_removed(tmp_path):
+    """An export into a folder of runs takes minutes; a run that begins there meanwhile leaves it alone."""
+    with unfinished_folder(tmp_path) as part:
+        (part / "scene.xml").write_text("half")
+        os.utime(part, (1e9, 1e9))
+        create(tmp_path)
+        assert (part / "scene.xml").read_text() == "half"
+        part.rename(tmp_path / "exported")
+    assert names(tmp_path) == ["exported", "run"]
+    with FolderLock(tmp_path / "exported", wait_s=0):
+        pass
+
+
 def test_a_replacement_that_fails_halfway_says_so(tmp_path, monkeypatch):
     create(tmp_path)
     rmtree = shutil.rmtree
@@ -322,6 +338,43 @@ def test_a_reader_who_may_not_write_is_told_the_same(tmp_path, monkeypatch):
     monkeypatch.setattr(manifests, "write_atomically", fail)
     assert read_manifest(tmp_path)["status"] == "interrupted"
     assert stored(tmp_path)["status"] == "running"
+
+
+def damaged(content):
+    """Yield the keys to each field of a manifest, and the manifest with a value of another type there."""
+    for key, value in content.items():
+        for wrong in (None, "text", 5, False, [1], {"a": 1}):
+            if type(wrong) is not type(value):
+                yield (key,), content | {key: wrong}
+        if key == "process":
+            yield from (((key, *keys), content | {key: changed}) for keys, changed in damaged(value))
+
+
+def refusal(folder):
+    """The error of reading the manifest in `folder`; empty where it is read."""
+    try:
+        read_manifest(folder)
+    except ConfigError as error:
+        return str(error)
+    return ""
+
+
+def test_a_damaged_manifest_is_one_located_line(tmp_path):
+    abandoned(tmp_path)
+    whole, counts = stored(tmp_path), Counter()
+    for keys, content in damaged(whole):
+        (tmp_path / MANIFEST_FILE).write_text(json.dumps(content))
+        told = refusal(tmp_path)
+        place = re.escape(f"{tmp_path / MANIFEST_FILE}: {'.'.join(keys)}")
+        assert re.fullmatch(rf"({place}([.\[]\S*)?: is damaged: .+)?", told)
+        counts[keys] += bool(told)
+    del counts["program",]
+    assert min(counts.values()) == 4  # an optional field is None or of one other type
+    assert counts["process", "pid"] == counts["process", "locked"] == counts["results",] == 5
+    of_an_earlier_version = {key: whole[key] for key in ("program", "status")}
+    (tmp_path / MANIFEST_FILE).write_text(json.dumps(of_an_earlier_version))
+    assert refusal(tmp_path) == ""
+    assert read_manifest(tmp_path)["status"] == "interrupted"
 
 
 @pytest.mark.parametrize("status", [Status.FINISHED, Status.INTERRUPTED, Status.FAILED])

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
+from cli.tiny import reslrb
 from report.measured import (
     FLOOR,
     LAMP,
@@ -269,12 +270,10 @@ def damage(folder, change):
 @pytest.mark.parametrize(
     "change",
     [
-        lambda manifest: manifest.update(results=None),
-        lambda manifest: manifest.update(results=[1, 2]),
         lambda manifest: manifest.update(results={"parameters": {"a": 3}, "seen": {"images": {"": 7}}}),
         lambda manifest: manifest.update(results={"parameters": 5, "rmse": 3}),
         lambda manifest: manifest.update(guided={"rows": 3}, memory={"budget": "x"}, scaling=[{}], plan={"rows": "no"}),
-        lambda manifest: manifest.update(status=["x"], versions=7, command_line=5, started=3),
+        lambda manifest: manifest.update(started="soon", views=[{"sensor": "x"}], versions={}),
     ],
 )
 def test_a_damaged_manifest_leaves_the_rest(tmp_path, change):
@@ -283,6 +282,25 @@ def test_a_damaged_manifest_leaves_the_rest(tmp_path, change):
     for page in (page_of(bad), page_of(good, bad)):
         assert "Convergence" in page.sections
     assert page_of(good, bad).row("Run good", "device")[1] == "a machine"
+
+
+@pytest.mark.parametrize(
+    ("change", "place"),
+    [
+        (lambda manifest: manifest.update(results=[1, 2]), "results"),
+        (lambda manifest: manifest["process"].update(pid="12"), "process.pid"),
+        (lambda manifest: manifest.update(process={"locked": False}), "process.host"),
+        (lambda manifest: manifest.update(status=["x"], versions=7, command_line=5, started=3), "status"),
+    ],
+)
+def test_a_manifest_of_other_types_is_one_located_line(tmp_path, change, place):
+    folder = make_run(tmp_path / "bad", iterations=0)
+    damage(folder, lambda manifest: manifest.update(status="running"))
+    damage(folder, change)
+    for command in (("report", folder), ("optimize", "--resume", folder)):
+        result = reslrb(*command)
+        assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1), result.output
+        assert f"{folder}/manifest.json: {place}: is damaged: " in result.stderr
 
 
 def test_damaged_metrics_are_named_and_the_rest_is_drawn(tmp_path):

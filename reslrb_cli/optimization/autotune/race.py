@@ -19,14 +19,12 @@ has more than two values, each takes turns with the best so far.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import mitsuba as mi
@@ -43,6 +41,7 @@ from reslrb_cli.records.cache import PilotCache, key_of
 from reslrb_cli.records.clock import StepClock, StepTimes
 from reslrb_cli.records.decisions import LEAST_IMAGE, Finding
 from reslrb_cli.records.manifest import versions
+from reslrb_cli.scene.files import file_digests, files_of
 from reslrb_cli.statistics import Array, jackknife_variance, sum_of_squares
 
 #: Iterations of the run that what measuring costs is a share of.
@@ -181,20 +180,18 @@ def sets_of(config: Config) -> int:
 
 
 def situation(problem: Problem) -> dict[str, Any]:
-    """Return all that a decision depends on, as plain values."""
+    """Return all that a decision depends on, as plain values: settings, and the contents of the files they name."""
     config = problem.config
-    dump = config.model_dump(mode="json")
-    run = config.step_options() | {"memory_budget": dump["run"]["memory_budget"]}
+    settings = config.model_dump(mode="json", include={"scene", "target", "views", "parameters", "integrator", "loss"})
+    for spec in settings["parameters"]:
+        del spec["learning_rate"]
     return {
-        "scene": hashlib.blake2b(Path(config.scene.file).read_bytes()).hexdigest(),
-        "options": dump["scene"]["options"],
-        "cameras": config.scene.cameras and hashlib.blake2b(config.scene.cameras.read_bytes()).hexdigest(),
+        "settings": settings,
+        "files": file_digests(files_of(config)),
         "sensors": problem.sensors,
-        "views": [view.situation() for view in problem.views],
+        "views": [[view.share, view.held_out, *(own.token for own in view.codes)] for view in problem.views],
         "parameters": {key: list(problem.selection.array(key).shape) for key in problem.selection.keys},
-        "integrator": dump["integrator"],
-        "loss": dump["loss"],
-        "run": run,
+        "run": config.step_options() | {"memory_budget": config.run.memory_budget},
         "versions": versions(),
         "variant": mi.variant(),
         "device": device_name(mi.variant()),

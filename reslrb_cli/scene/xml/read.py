@@ -227,13 +227,14 @@ class Description:
 
     `folders` are those in which the files that it names are looked for, first to last; `variables` are the values of
     its `$name` variables, those that it has itself among them. `hides_emitters`: whether the integrator that it names,
-    of which nothing else is kept, leaves lights out of the picture.
+    of which nothing else is kept, leaves lights out of the picture. `files` are the XML files that were read.
     """
 
     root: Element
     folders: list[Path]
     variables: dict[str, str]
     hides_emitters: bool
+    files: list[Path]
 
     def find_file(self, name: str) -> Path | None:
         """The file or folder that Mitsuba opens by this name: the first in `folders`, or what it says by itself."""
@@ -268,7 +269,7 @@ def read_description(file: Path, options: Mapping[str, str]) -> Description:
     said = [value for child in root.children if child.tag == "integrator" for value in child.walk()]
     # In the spelling of any version.
     hides = any(each.name in ("hide_emitters", "hideEmitters") and each.value.strip() == "true" for each in said)
-    return Description(root, folders, reader.values, hides)
+    return Description(root, folders, reader.values, hides, reader.files)
 
 
 @dataclass
@@ -281,6 +282,7 @@ class _Reader:
     bytes_left: int = field(default_factory=lambda: MAX_BYTES)
     includes: int = 0
     including: int = 0
+    files: list[Path] = field(default_factory=list)
 
     def read(self, file: Path, folders: list[Path], include: Element | None, depth: int = 0) -> Element:
         """The root of `file`, complete. `folders` grows by what its <path> elements name."""
@@ -296,6 +298,7 @@ class _Reader:
             if include is None or error.source != str(file):
                 raise
             raise include.fail("", f"includes {file}, which {error.message}") from None
+        self.files.append(file)
         self.bytes_left -= size
         self.including += 1
         self._put_variables(root)

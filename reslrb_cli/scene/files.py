@@ -1,0 +1,82 @@
+"""The files that an experiment reads, and digests of their contents.
+
+What is kept of an experiment (decisions, measurements, the state of a run) counts for these contents only. Each digest
+reads its whole file: times and sizes could hide a change.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from reslrb_cli.config.files import open_file
+from reslrb_cli.config.schema import Config
+from reslrb_cli.records.run_folder import checkpoint_of
+from reslrb_cli.scene.cameras import read_cameras
+from reslrb_cli.scene.xml.read import read_description
+
+#: Bytes that are read at once.
+_PART = 2**20
+
+
+def option_texts(options: Mapping[str, Any]) -> dict[str, str]:
+    """Return the values of a scene's variables as its file spells them."""
+    return {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in options.items()}
+
+
+def files_of(config: Config) -> dict[str, Path]:
+    """Return every file that an experiment reads, by the setting that leads to it.
+
+    A setting may lead to more than one file: `scene.file (images/wood.png)`. Files that are missing are left out: who
+    loads the experiment says so. Raises ConfigError where a scene, cameras or a run cannot be read.
+    """
+    settings = config.model_dump(exclude={"run"})
+    found = {key: path for key, path in _paths(settings, "") if path.exists()}
+    for key, path in list(found.items()):
+        if path.is_dir():  # of a run, whose values are taken
+            found[key] = checkpoint_of(path)
+    found |= {key: one.path for key, one in config.codes.items() if one.path is not None}
+    beside: list[tuple[str, Path]] = []
+    if config.scene.file.is_file():
+        description = read_description(config.scene.file, option_texts(config.scene.options))
+        beside += [("scene.file", path) for path in description.files]
+        named = (description.find_file(name) for _, _, name in description.named_files())
+        beside += [("scene.file", path) for path in named if path is not None]
+    cameras = config.scene.cameras
+    if cameras is not None and cameras.is_file():
+        beside += [("scene.cameras", camera.image) for camera in read_cameras(cameras)]
+        beside += [("scene.cameras", cameras.with_name("cameras.txt"))]  # of COLMAP
+    for key, path in beside:
+        if path not in (config.scene.file, cameras):
+            folder = found[key].parent
+            name = path.relative_to(folder) if path.is_relative_to(folder) else path
+            found[f"{key} ({name})"] = path
+    return {key: path for key, path in found.items() if path.is_file()}
+
+
+def _paths(value: Any, key: str) -> Iterator[tuple[str, Path]]:
+    """Yield the paths among settings, each with its key as `--set` names it."""
+    if isinstance(value, Path):
+        yield key, value
+    elif isinstance(value, Mapping):
+        for name, each in value.items():
+            yield from _paths(each, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, (list, tuple)):
+        for place, each in enumerate(value):
+            yield from _paths(each, f"{key}[{place}]")
+
+
+def file_digests(files: Mapping[str, Path]) -> dict[str, str]:
+    """Return a digest of the contents of each file, by the same keys. Raises ConfigError."""
+    return {key: digest_of(path) for key, path in files.items()}
+
+
+def digest_of(path: Path) -> str:
+    """Return a digest of the contents of a file. Raises ConfigError, located by the file."""
+    found = hashlib.blake2b(digest_size=16)
+    with open_file(path) as file:
+        while part := file.read(_PART):
+            found.update(part)
+    return found.hexdigest()

@@ -1,0 +1,252 @@
+"""What is kept of an experiment counts for the contents of all files that it reads, whatever their times and sizes."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from cli import tiny
+from cli.tiny import KEY, reslrb, settings
+
+import reslrb_cli as rl
+from reslrb_cli.config.loader import load
+from reslrb_cli.config.schema import Config
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure.methods import Plan, Sweep, parse_cases
+from reslrb_cli.measure.participants import Settings
+from reslrb_cli.measure.resume_store import first_difference
+from reslrb_cli.measure.resume_store import settings as measured_as
+from reslrb_cli.measure.sampling import settings as sampled_as
+from reslrb_cli.optimization.assemble import assemble, assemble_scene
+from reslrb_cli.optimization.autotune.race import situation
+from reslrb_cli.records.cache import PilotCache, key_of
+from reslrb_cli.runs.sweep import make_plan, opened
+from reslrb_cli.scene.files import files_of
+
+#: Every text has a number that is changed: 0.25 becomes 0.75, so that the size stays.
+LIGHTS = """<scene version="3.0.0">
+    <emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>
+    <emitter type="point"><point name="position" x="0" y="1" z="3"/><rgb name="intensity" value="0.25"/></emitter>
+    <shape type="obj"><string name="filename" value="parts/quad.obj"/>
+        <bsdf type="diffuse"><spectrum name="reflectance" filename="parts/grey.spd"/></bsdf></shape>
+    <shape type="sphere"><point name="center" x="-1" y="-1" z="1"/><float name="radius" value="0.25"/>
+        <bsdf type="diffuse"><texture name="reflectance" type="volume">
+            <volume name="volume" type="gridvolume"><string name="filename" value="parts/grid.vol"/></volume>
+        </texture></bsdf></shape>
+    <shape type="sphere"><point name="center" x="1" y="-1" z="1"/><float name="radius" value="0.25"/>
+        <bsdf type="roughconductor"><string name="material" value="Cu"/></bsdf></shape>
+</scene>
+"""
+SPD = "400 {0}\n700 {0}\n"
+OWN = """import drjit as dr
+
+
+def own(image, target, weights):
+    return 0.25 * dr.mean(dr.square(image - target), axis=None)
+"""
+CONFIG = f"""variant: llvm_ad_rgb
+scene: {{file: scene.xml, options: {{bright: 8}}}}
+parameters: [{{key: {KEY}, initial: {{file: start.exr, color_space: linear}}, bounds: [0, 1]}}]
+integrator: {{max_depth: 3, estimator: stack, paths: light, sequence: independent}}
+run: {{iterations: 1, spp: 4, reach_spp: 8, certainty: false, images_every: 0}}
+"""
+PHOTO = """loss: {type: custom, file: own.py:own}
+target: {file: photo.exr, mask: {file: weights.exr, border: false}}
+"""
+CAMERAS = PHOTO.replace("file: photo.exr, ", "")
+
+#: The settings that lead to the files, by file.
+FILES = {
+    "scene.xml": "scene.file",
+    "lights.xml": "scene.file (lights.xml)",
+    "sky.exr": "scene.file (sky.exr)",
+    "poster.exr": "scene.file (poster.exr)",
+    "parts/quad.obj": "scene.file (parts/quad.obj)",
+    "parts/grey.spd": "scene.file (parts/grey.spd)",
+    "parts/grid.vol": "scene.file (parts/grid.vol)",
+    "data/ior/Cu.k.spd": "scene.file (data/ior/Cu.k.spd)",
+    "start.exr": "parameters[0].initial.file",
+    "weights.exr": "target.mask.file",
+    "own.py": "loss.file",
+}
+OF_PHOTO = FILES | {"photo.exr": "target.file[0]"}
+OF_CAMERAS = FILES | {"shots/transforms.json": "scene.cameras", "shots/a.exr": "scene.cameras (a.exr)"}
+
+
+def write_image(path: Path, size: int, seed: int) -> None:
+    mi.Bitmap(np.random.default_rng(seed).uniform(0.1, 0.9, (size, size, 3)).astype(np.float32)).write(str(path))
+
+
+@pytest.fixture
+def folder(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """`photo.yaml` and `cameras.yaml`, which read a file of every kind."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
+    for name in ("parts", "shots", "data/ior"):
+        (tmp_path / name).mkdir(parents=True)
+    scene = tiny.SCENE.replace('value="8, 8, 8"', 'value="$bright"')
+    texts = {
+        "scene.xml": scene.replace("</scene>", '<include filename="lights.xml"/><!-- 0.25 -->\n</scene>'),
+        "lights.xml": LIGHTS,
+        "parts/quad.obj": "v 1 0 0.25\nv 1.5 0 0\nv 1 0.5 0\nf 1 2 3\n",
+        "parts/grey.spd": SPD.format("0.25"),
+        "data/ior/Cu.eta.spd": SPD.format("0.25"),
+        "data/ior/Cu.k.spd": SPD.format("0.25"),
+        "own.py": OWN,
+        "shots/transforms.json": json.dumps({"frames": [{
+            "file_path": "a.exr", "w": 8, "h": 8, "camera_angle_x": 0.8725,
+            "transform_matrix": [[1, 0, 0, 0.25], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]],
+        }]}),
+        "photo.yaml": CONFIG + PHOTO,
+        "cameras.yaml": (CONFIG + CAMERAS).replace("scene: {", "scene: {cameras: shots/transforms.json, "),
+    }  # fmt: skip
+    for name, text in texts.items():
+        Path(name).write_text(text)
+    for seed, (name, size) in enumerate((("sky", 4), ("poster", 4), ("start", 4), ("weights", 8), ("photo", 8))):
+        write_image(Path(f"{name}.exr"), size, seed)
+    write_image(Path("shots/a.exr"), 8, 9)
+    head = b"VOL\3" + struct.pack("<5i6f", 1, 2, 2, 2, 1, 0, 0, 0, 1, 1, 1)
+    Path("parts/grid.vol").write_bytes(head + np.full(8, 0.25, np.float32).tobytes())
+    return tmp_path
+
+
+def change(path: Path) -> Callable[[], object]:
+    """Change a file, whose time stays, and its size if it is no image; returns what changes it back."""
+    data, times = path.read_bytes(), (path.stat().st_atime_ns, path.stat().st_mtime_ns)
+    if path.suffix == ".exr":
+        write_image(path, len(mi.TensorXf(mi.Bitmap(str(path)))), 99)
+    else:
+        pairs = [(b"0.25", b"0.75")] if path.suffix != ".vol" else [(struct.pack("<f", 0.25), struct.pack("<f", 0.75))]
+        path.write_bytes(data.replace(*pairs[0], 1))
+        assert path.stat().st_size == len(data)
+    assert path.read_bytes() != data
+    os.utime(path, ns=times)
+    return lambda: (path.write_bytes(data), os.utime(path, ns=times))
+
+
+CASES = [("photo.yaml", OF_PHOTO), ("cameras.yaml", OF_CAMERAS)]
+
+
+def measurements(config: Config, ours: str = "reslrb:stack", reference: str = "path") -> dict[str, Any]:
+    """What has to be the same for each command to go on, by its name."""
+    cases = parse_cases(ours)
+    shared: dict[str, Any] = {"config": config, "variant": "llvm_ad_rgb", "cases": cases, "objective": "fixed",
+                              "memory_limit": None, "memory": 2**40, "budget_s": 0.0}  # fmt: skip
+    return {
+        "gradcheck": sampled_as(Settings(config, cases, 0), "llvm_ad_rgb", ""),
+        "gradcheck --missing": measured_as(config, {}, "llvm_ad_rgb", ""),
+        "bench": Sweep(**shared, values=[2]).settings(),
+        "convergence": Plan(**shared, reference=parse_cases(reference, deep=False)[0], spps=(4,)).settings(),
+    }
+
+
+@pytest.mark.parametrize(("name", "files"), CASES)
+def test_each_file_is_another_experiment(folder: Path, name: str, files: dict[str, str]) -> None:
+    config = load(name).with_code()
+    problem = assemble_scene(config)
+    assert {str(path.relative_to(folder)): key for key, path in files_of(config).items()} == {
+        **files, "data/ior/Cu.eta.spd": "scene.file (data/ior/Cu.eta.spd)"}  # fmt: skip
+    key, before = key_of(situation(problem)), measurements(config)
+    for file, place in files.items():
+        restore = change(folder / file)
+        assert key_of(situation(problem)) != key, file
+        for command, now in measurements(config).items():
+            assert first_difference(before[command], now) == f"{place} has changed", (file, command)
+        restore()
+    assert key_of(situation(problem)) == key
+    assert measurements(config) == before
+
+
+def test_code_that_a_command_names_counts(folder: Path) -> None:
+    config = load("photo.yaml", ["loss={type: l2}"])
+    named: list[tuple[tuple[str, ...], set[str]]] = [
+        (("prb,own.py:A(x=1)",), {"gradcheck", "bench", "convergence"}), (("prb", "own.py:A(x=1)"), {"convergence"}),
+    ]  # fmt: skip
+    for given, commands in named:
+        before = measurements(config, *given)
+        restore = change(folder / "own.py")
+        found = {name: first_difference(before[name], now) for name, now in measurements(config, *given).items()}
+        assert {name: line for name, line in found.items() if line} == dict.fromkeys(
+            commands, "own.py:A(x=1) has changed"
+        )
+        restore()
+
+
+def test_a_run_goes_on_with_the_files_that_it_began_with(folder: Path) -> None:
+    """But for those of its initial values, which its state has; and whoever begins with its values sees it go on."""
+    list(rl.optimize("photo.yaml", folder="first", overrides={"run.measuring": 0}, allow_code=True))
+    for file, place in OF_PHOTO.items():
+        restore = change(folder / file)
+        if ".initial." not in place:
+            with pytest.raises(ConfigError) as caught:
+                rl.optimize(resume="first", overrides={"run.iterations": 2}, allow_code=True)
+            assert f": {place}: has changed since first began; put it back" in str(caught.value)
+            restore()
+    beside = load("photo.yaml", ["parameters[0].initial={run: first}"])
+    before = measurements(beside)
+    assert len(list(rl.optimize(resume="first", overrides={"run.iterations": 2}, allow_code=True))) == 1
+    for command, now in measurements(beside).items():
+        assert first_difference(before[command], now) == "parameters[0].initial.run has changed", command
+
+
+def test_a_sweep_goes_on_with_the_files_that_it_began_with(folder: Path) -> None:
+    def plan() -> Any:
+        return make_plan(Path("photo.yaml"), ["run.spp=[4, 8]"], 1, [], allow_code=True)
+
+    with opened(Path("s"), plan()):
+        pass
+    for file in OF_PHOTO:
+        restore = change(folder / file)
+        for again in (plan(), None):
+            with pytest.raises(ConfigError, match="has changed since the sweep in s began") as caught:
+                opened(Path("s"), again, allow_code=True).__enter__()
+            assert caught.value.source == str(folder / file)
+        restore()
+    with opened(Path("s"), None, allow_code=True) as kept:
+        assert list(kept.codes) == [str(folder / "own.py")]
+
+
+@pytest.mark.parametrize("files", [("parts/quad.obj",), pytest.param(tuple(OF_PHOTO), marks=pytest.mark.long)])
+def test_no_decision_of_another_experiment_is_taken(folder: Path, files: tuple[str, ...]) -> None:
+    sets = ["run.measuring=1000", "integrator.guiding=auto"]
+    cache = PilotCache(folder / "cache")
+
+    def is_known() -> bool:
+        record = assemble(load("photo.yaml", sets).with_code(), cache=cache, to_run=True).guided
+        assert record is not None
+        return record.cached
+
+    assert [is_known(), is_known()] == [False, True]
+    for file in files:
+        restore = change(folder / file)
+        assert not is_known(), file
+        restore()
+    assert is_known()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("command", [
+    ("gradcheck", "--seeds", "3", "--estimators", "stack"),
+    ("bench", "--max-depth", "2", "--rounds", "3", "--integrators", "reslrb:stack"),
+    ("convergence", "--rounds", "3", "--integrators", "reslrb:stack"),
+])  # fmt: skip
+def test_no_measurement_of_another_experiment_is_gone_on_from(folder: Path, command: tuple[str, ...]) -> None:
+    name, *options = command
+    words = [name, "photo.yaml", *options, *settings("loss={type: l2}"), "--json"]
+    result = reslrb(*words, "first.jsonl")
+    assert result.exit_code in (0, 1), result.output  # so few samples need not agree
+    for file, place in OF_PHOTO.items():
+        if place == "loss.file":
+            continue
+        restore = change(folder / file)
+        result = reslrb(*words, "second.jsonl", "--resume", "first.jsonl")
+        said = f"--resume: first.jsonl is of another measurement: {place} has changed"
+        assert (result.exit_code, result.stderr.splitlines()[-1]) == (2, said), file
+        restore()
