@@ -192,8 +192,8 @@ def test_what_is_noted_finds_the_pixels_that_a_mirror_alone_shows():
 
 @pytest.mark.parametrize("image", ["lamp", "texture"])
 def test_edges_are_no_noise(image: str):
-    """A bright lamp without noise on a noisy floor, or a noisy half beside a clean half with a texture: the gradient has
-    no more variance than with even shares, and with the clean half at most 0.8 of that."""
+    """Beside a bright lamp without noise the gradient has no more variance than with even shares. With a flat noisy
+    half and a clean textured one it has at most 0.8 of that."""
     means, deviations, signal = np.ones((48, 48)), np.full((48, 48), 0.5), np.ones((48, 48))
     if image == "lamp":
         means[20:26, 20:26], deviations[20:26, 20:26], signal[20:26, 20:26] = 50, 0, 0
