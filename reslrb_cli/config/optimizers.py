@@ -287,7 +287,12 @@ class Optimizer(Choice):
 
 class _AdamOptions(Optimizer):
     beta_1: _Decay = Field(default=0.9, description="Decay of the running mean of the gradient.")
-    beta_2: _Decay = Field(default=0.999, description="Decay of the running mean of the squared gradient.")
+    beta_2: _Decay = Field(
+        default=0.9,
+        description="Decay of the running mean of the squared gradient. A larger decay suits textures whose gradients "
+        "are noisy. It also remembers the large gradients of a bad start for longer, and steps stay short meanwhile: "
+        "0.999 for a thousand iterations.",
+    )
     epsilon: Positive = Field(default=1e-8, description="Added to the root of the mean squared gradient.")
 
 

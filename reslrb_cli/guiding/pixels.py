@@ -105,19 +105,26 @@ def wanted(
     `entries` are the numbers that each group of BSDFs, and emission, has derivatives of; the last two are as in
     `samples.passes`.
     """
-    from scipy import ndimage  # here: few commands come here, and all import this module
-
     spp = math.ceil(NOTED_SPP / (1 - light_share)) if plan.weighs else NOTED_SPP
     seed = dr.opaque(mi.UInt32, NOTING_STREAM)
     samples, *_ = passes(plan, scene, sensor, seed, spp, None, None, light_share, emitters)
-    rows = note(samples.sides()[-1])
-    *said, radiance, square = (ndimage.uniform_filter(row, BLOCK, mode="nearest") for row in rows)
-    weight = np.zeros_like(square)
+    return density_of(note(samples.sides()[-1]), entries)
+
+
+def density_of(rows: NDArray[np.float64], entries: list[int]) -> NDArray[np.float32]:
+    """Return the density of camera paths over the pixels (H, W), with mean 1, from the means that `note` returns."""
+    from scipy import ndimage  # here: few commands come here, and all import this module
+
+    # The variance of each pixel first, then the mean over a block: that of a block's pixels together would also count
+    # edges, and the surroundings of a lamp, as noise.
+    variances = np.maximum(rows[-1] - np.square(rows[-2]), 0)
+    *said, variance = (ndimage.uniform_filter(row, BLOCK, mode="nearest") for row in (*rows[:-2], variances))
+    weight = np.zeros_like(variance)
     for K, row in zip(entries, said, strict=True):
         weight += K * np.square(row / row.sum()) if row.sum() > 0 else 0
-    density = np.sqrt(np.maximum(square - np.square(radiance), 0) * weight)
+    density = np.sqrt(variance * weight)
     if not density.sum() > 0:
-        return np.ones_like(square, np.float32)
+        return np.ones_like(variance, np.float32)
     for _ in range(8):  # what is cut off raises all others
         density = np.minimum(density / density.mean(), MOST)
     return np.asarray(density / density.mean(), np.float32)

@@ -75,7 +75,7 @@ def test_defaults(tmp_path: Path) -> None:
     assert config.loss.type == "l2"
     assert config.loss.options() == {}
     assert isinstance(config.optimizer, Adam)
-    assert config.optimizer.own_options() == {"beta_1": 0.9, "beta_2": 0.999, "epsilon": 1e-8}
+    assert config.optimizer.own_options() == {"beta_1": 0.9, "beta_2": 0.9, "epsilon": 1e-8}
     assert (config.run.name, config.run.folder_name) == ("my floor", "my-floor")
     assert (config.run.iterations, config.run.spp, config.run.seed) == (200, 16, 0)
 

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from reslrb_cli.config.optimizers import Adam as AdamSettings
 from reslrb_cli.optimization.loop import SCHEDULES, learning_rate_factor
 from reslrb_cli.optimization.optimizers import OPTIMIZERS, Optimizer, Variable, make_transform
 from reslrb_cli.optimization.precondition import make_smoother
@@ -74,6 +75,18 @@ def test_updates_follow_the_formula(type, options, reference):
         optimizer.step(1.0)
         expected = reference(expected, 2 * (expected - TARGET), state, step, **options)
         np.testing.assert_allclose(np.array(optimizer["p"]), expected, rtol=2e-3, atol=2e-3)
+
+
+def test_adam_as_configured_soon_forgets_a_large_first_gradient():
+    """A value 0.6 away from the minimum, whose first gradient is 100 times larger than the loss says: it arrives within
+    200 steps of 0.02. With a `beta_2` of 0.999 it takes 600."""
+    rate, value = 0.02, mi.TensorXf(np.array([0.8], dtype=np.float32))
+    options = AdamSettings().own_options()
+    optimizer = Optimizer("adam", rate, options, {"p": value}, {"p": None}, {"p": None})
+    for step in range(200):
+        descend(optimizer, lambda p, factor=1.0 if step else 100.0: 2 * factor * (p - 0.2))
+        optimizer.step(1.0)
+    assert abs(float(np.array(optimizer["p"])[0]) - 0.2) < 0.01
 
 
 def test_a_parameter_has_its_own_rate_and_the_schedule_scales_it():
