@@ -13,7 +13,8 @@ that falls by `relative` a window is stopped in at most 5 % of runs, however lon
 
 `find_trend` tests the ranks of all losses, in ten parts (Conover and Iman 1981), by the same line.
 
-- It rose, or fell, if the line does, and if the last tenth of the iterations is on that side of the first.
+- It rose, or fell, if the line does, or if the last tenth of the iterations is surely on that side of the first tenth.
+  Both need the levels of these tenths to agree.
 - It fell, too, if the first three losses are above the second half. Many falls are over within a few iterations.
 - It rose, too, if the first loss is below all others, and surely below the last tenth. Some runs leap at their first
   step, and come down again to a level above their start.
@@ -43,6 +44,9 @@ LEAST_ITERATIONS, LEAST_WINDOW = 20, 5
 
 #: How sure a change has to be (one-sided).
 CONFIDENCE = 0.99
+
+#: The chance that is left to the ends alone: their losses are compared one by one, and may be correlated.
+SURE_ENDS = 1e-4
 
 #: A fall by less than this share of the start counts as none.
 MOST_FALL = 0.25
@@ -98,12 +102,12 @@ def find_trend(values: Sequence[float]) -> Trend | None:
     if series[0] < min(series[1:].min(), end.mean - leap):
         return Trend(Level(float(series[0]), end.error * math.sqrt(width)), end, Change.ROSE, late)
     ranks = _ranks(series)
-    half = _ranks(np.concatenate([series[:EARLY], series[count // 2 :]]))
-    is_late = np.arange(half.size) >= EARLY
+    ends = _apart(series[:width], series[-width:], SURE_ENDS)
     raised = series + MOST_FALL * abs(start.mean) * np.arange(count) / (count - width)
-    if _rises(-half, is_late) or (_rises(_parts(-ranks)) and end.mean < start.mean):
+    falls = ends < 0 or _rises(_parts(-ranks))
+    if _apart(series[:EARLY], series[count // 2 :]) < 0 or (falls and end.mean < start.mean):
         change = Change.FELL
-    elif _rises(_parts(ranks)) and end.mean > start.mean:
+    elif (ends > 0 or _rises(_parts(ranks))) and end.mean > start.mean:
         change = Change.ROSE
     else:
         change = Change.FLAT if _rises(_parts(_ranks(raised))) else Change.UNCLEAR
@@ -148,9 +152,15 @@ def window(iterations: int) -> int:
     return max(iterations // 10, LEAST_WINDOW)
 
 
-def _rises(values: Array, at: Array | None = None) -> bool:
+def _rises(values: Array, at: Array | None = None, chance: float = (1 - CONFIDENCE) / 2) -> bool:
     slope, error = line(values, at)
-    return bool(slope > _quantile(values.size - 2, (1 - CONFIDENCE) / 2) * error)  # of two tests for each change
+    return bool(slope > _quantile(values.size - 2, chance) * error)
+
+
+def _apart(first: Array, last: Array, chance: float = (1 - CONFIDENCE) / 2) -> int:
+    """Whether the last losses are surely above the first (1), or below (-1); else 0."""
+    ranks, is_last = _ranks(np.concatenate([first, last])), np.arange(first.size + last.size) >= first.size
+    return _rises(ranks, is_last, chance) - _rises(-ranks, is_last, chance)
 
 
 def _parts(values: Array) -> Array:
