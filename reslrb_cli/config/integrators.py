@@ -260,7 +260,7 @@ class Prb(Integrator, json_schema_extra=NEEDS_TYPE):
     type: Literal["prb"] = Field(default="prb", description="Mitsuba's path replay backpropagation, from the sensor.")
 
 
-class Projective(Integrator):
+class ProjectiveOptions(Integrator):
     """Options of Mitsuba's projective integrators. They trace from the sensor and differentiate outlines and shadow
     edges of shapes that move. A derivative has three parts, each with its own samples."""
 
@@ -273,14 +273,14 @@ class Projective(Integrator):
     step."""
 
 
-class PrbProjective(Projective, json_schema_extra=NEEDS_TYPE):
+class PrbProjective(ProjectiveOptions, json_schema_extra=NEEDS_TYPE):
     """Mitsuba's path replay backpropagation with the derivatives of outlines and shadow edges."""
 
     type: Literal["prb_projective"] = "prb_projective"
     """Mitsuba's projective path replay, from the sensor."""
 
 
-class DirectProjective(Projective, json_schema_extra=NEEDS_TYPE):
+class DirectProjective(ProjectiveOptions, json_schema_extra=NEEDS_TYPE):
     """Mitsuba's integrator of direct light with the derivatives of outlines and shadow edges."""
 
     type: Literal["direct_projective"] = "direct_projective"

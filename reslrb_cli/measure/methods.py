@@ -39,8 +39,7 @@ from reslrb_cli.records.measurements import Method
 #: Options that a case takes over from the configuration's integrator, where it knows them.
 SHARED = (
     *("rr_depth", "hide_emitters", "samples_per_pass", "attached", "filter_normalization", "attached_sampling"),
-    *("sppc", "sppp", "sppi"),
-    *UNDECIDED,
+    *("sppc", "sppp", "sppi", *UNDECIDED),
 )
 
 #: Options that say which paths there are.
