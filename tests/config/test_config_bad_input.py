@@ -159,7 +159,8 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
     ),
     "target integrator": (
         target("{render: {integrator: {type: path}}}"),
-        "target.render.integrator.type: must be one of reslrb, ptracer, prb, prb_projective, direct_projective, walk_ad, trajectory",
+        "target.render.integrator.type: must be one of reslrb, ptracer, prb, prb_projective, direct_projective, "
+        "walk_ad, trajectory",
     ),
     "sensor negative": (scene("a, sensors: [-1]"), "scene.sensors[0]: must be at least 0"),
     "sensor twice": (scene("a, sensors: [0, 0]"), "scene.sensors: must name each sensor once"),
