@@ -55,6 +55,14 @@ _CAPACITY = must(
     ),
 )
 
+_DIRECT = must(
+    lambda depth: depth == 2,
+    lambda depth: f"must be 2, not {depth}: direct_projective has direct light alone; prb_projective has longer paths",
+)
+
+#: Samples per pixel of one part of a derivative.
+Samples = Annotated[int, Field(ge=0, le=PASS_SAMPLES)]
+
 
 class Integrator(Choice):
     """Options that all integrators share."""
@@ -252,6 +260,35 @@ class Prb(Integrator, json_schema_extra=NEEDS_TYPE):
     type: Literal["prb"] = Field(default="prb", description="Mitsuba's path replay backpropagation, from the sensor.")
 
 
+class ProjectiveOptions(Integrator):
+    """Options of Mitsuba's projective integrators. They trace from the sensor and differentiate outlines and shadow
+    edges of shapes that move. A derivative has three parts, each with its own samples."""
+
+    sppc: Samples | None = None
+    """Samples per pixel of what changes smoothly. 0 leaves that part out. null: those of the step."""
+    sppp: Samples | None = None
+    """Samples per pixel of outlines that the sensor sees. 0 leaves them out. null: those of the step."""
+    sppi: Samples | None = None
+    """Samples per pixel of shadow edges and of all else behind the first surface. 0 leaves them out. null: those of the
+    step."""
+
+
+class PrbProjective(ProjectiveOptions, json_schema_extra=NEEDS_TYPE):
+    """Mitsuba's path replay backpropagation with the derivatives of outlines and shadow edges."""
+
+    type: Literal["prb_projective"] = "prb_projective"
+    """Mitsuba's projective path replay, from the sensor."""
+
+
+class DirectProjective(ProjectiveOptions, json_schema_extra=NEEDS_TYPE):
+    """Mitsuba's integrator of direct light with the derivatives of outlines and shadow edges."""
+
+    type: Literal["direct_projective"] = "direct_projective"
+    """Mitsuba's projective integrator of direct light, from the sensor."""
+    max_depth: Annotated[int, _DIRECT] = Field(default=2, json_schema_extra={"const": 2})
+    """Longest path in segments: direct light has two."""
+
+
 class WalkAd(AttachingTracer, json_schema_extra=NEEDS_TYPE):
     """The light-path walk of `reslrb` under naive reverse-mode differentiation, for comparisons at equal seeds."""
 
@@ -296,7 +333,9 @@ class Own(Integrator, json_schema_extra=NEEDS_TYPE):
         return code_file(self.file)
 
 
-AnyIntegrator = Annotated[Reslrb | Ptracer | Prb | WalkAd | Trajectory | Own, ByType("reslrb")]
+AnyIntegrator = Annotated[
+    Reslrb | Ptracer | Prb | PrbProjective | DirectProjective | WalkAd | Trajectory | Own, ByType("reslrb")
+]
 
 
 def _check_share(paths: str, light_share: float | str) -> None:

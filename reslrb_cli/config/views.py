@@ -38,7 +38,8 @@ class Mask(Section):
     """Image of weights, of the target's size, relative to the config file: 0 leaves a pixel out. Values are taken as
     they stand in it, of 8 and 16 bits as shares of the greatest; of several channels the mean."""
     specular: bool = True
-    """Leave out pixels that see smooth glass or mirrors directly, which light tracing cannot render."""
+    """Leave out pixels that see smooth glass or mirrors directly, which light tracing cannot render. Where shapes move,
+    each iteration finds these pixels anew."""
     border: bool = True
     """Leave out pixels within the reconstruction filter's radius of the film's border, where light tracing is
     darker."""

@@ -1,13 +1,14 @@
 """Integrators to compare with: Mitsuba's own, and the walk of `reslrb` differentiated in other ways.
 
-`Replayed` and `NaiveAD` take Mitsuba's own as a gradient step does. `WalkAd` and `Trajectory` differentiate the walk by
-naive AD, and by Dr.Jit's own reversal.
+`Replayed`, `Projective` and `NaiveAD` take Mitsuba's own as a gradient step does. `WalkAd` and `Trajectory`
+differentiate the walk by naive AD, and by Dr.Jit's own reversal.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -82,6 +83,38 @@ class Replayed(Reversed):
         # Isolated, so that another view's propagation finds the edges above the scene's parameters intact.
         with dr.isolate_grad():
             self.plugin.render_backward(job.scene, job.params, gradient, job.sensor, job.seed, job.spp)
+
+
+class Projective(Replayed):
+    """One of Mitsuba's projective integrators, such as `prb_projective`, as a function of the seed alone."""
+
+    def backward(self, job: Job, gradient: mi.TensorXf) -> None:
+        given = {name: getattr(self.plugin, name) for name in ("sppc", "sppp", "sppi")}
+        # Mitsuba keeps the first step's threshold, so a resumed run would have another one.
+        self.plugin.octree_contruction_thres = 0
+        try:
+            for name, spp in given.items():
+                setattr(self.plugin, name, job.spp if spp is None else spp)
+            # Mitsuba ignores all three if it is given a sample count. It warns of the film's border, and of no shadows.
+            with _no_word_of_signals():
+                super().backward(replace(job, spp=0), gradient)
+        finally:
+            for name, spp in given.items():
+                setattr(self.plugin, name, spp)
+
+    def obstacle(self, scene: mi.Scene, sensors: Iterable[mi.Sensor], moved: Iterable[mi.Object]) -> str | None:
+        """Return why Mitsuba 3.9 gets outlines or shadow edges of what is `moved` wrong, or None."""
+        spot = next((emitter for emitter in scene.emitters() if emitter.class_name() == "SpotLight"), None)
+        if spot is not None and self.plugin.max_depth == 2 and self.plugin.sppi != 0:
+            return f"misses the shadow edges of spot lamps, as {spot.id()} is; take prb_projective"
+        advice = "or set integrator.sppp to 0, which leaves out outlines that the sensor sees"
+        for sensor in sensors if self.plugin.sppp != 0 else ():
+            if sensor.class_name() != "PerspectiveCamera":
+                return f"has outlines for perspective sensors alone, and {sensor.id()} is none; take such, {advice}"
+            rectangle = next((shape for shape in moved if shape.class_name() == "Rectangle"), None)
+            if rectangle is not None:
+                return f"has wrong outlines of rectangles, as {rectangle.id()} is; make it a mesh, {advice}"
+        return None
 
 
 class NaiveAD(Replayed):

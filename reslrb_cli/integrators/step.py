@@ -25,7 +25,7 @@ import mitsuba as mi
 from reslrb_cli.backend.variant import check_variant
 from reslrb_cli.config.files import PASS_SAMPLES, PASSES
 from reslrb_cli.estimators.base import one_of
-from reslrb_cli.integrators.baselines import NaiveAD, Replayed
+from reslrb_cli.integrators.baselines import NaiveAD, Projective, Replayed
 from reslrb_cli.integrators.context import resolve_sensor
 from reslrb_cli.integrators.own import OwnIntegrator
 from reslrb_cli.integrators.plugin import TRACERS, make_tracer
@@ -113,7 +113,9 @@ def interface_of(integrator: StepIntegrator | mi.Integrator) -> StepIntegrator:
     tracer: StepIntegrator | None = getattr(integrator, "tracer", None)  # of the plugins that are made here
     if tracer is not None:
         return tracer
-    return NaiveAD(integrator) if isinstance(integrator, mi.AdjointIntegrator) else Replayed(integrator)
+    if isinstance(integrator, mi.AdjointIntegrator):
+        return NaiveAD(integrator)
+    return Projective(integrator) if hasattr(integrator, "proj_detail") else Replayed(integrator)
 
 
 class Halves:

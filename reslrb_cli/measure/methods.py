@@ -15,7 +15,18 @@ from typing import Any, ClassVar
 from reslrb_cli.backend.doctor import device_name, memory_bytes
 from reslrb_cli.backend.variant import choose
 from reslrb_cli.config.base import SEED_END, code_file
-from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, UNDECIDED, Own, Prb, Ptracer, Trajectory, WalkAd
+from reslrb_cli.config.integrators import (
+    ESTIMATOR_OPTIONS,
+    UNDECIDED,
+    DirectProjective,
+    LightTracerOptions,
+    Own,
+    Prb,
+    PrbProjective,
+    Ptracer,
+    Trajectory,
+    WalkAd,
+)
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import dump, with_integrator
 from reslrb_cli.config.parameters import ByWord, ParameterSpec
@@ -28,7 +39,7 @@ from reslrb_cli.records.measurements import Method
 #: Options that a case takes over from the configuration's integrator, where it knows them.
 SHARED = (
     *("rr_depth", "hide_emitters", "samples_per_pass", "attached", "filter_normalization", "attached_sampling"),
-    *UNDECIDED,
+    *("sppc", "sppp", "sppi", *UNDECIDED),
 )
 
 #: Options that say which paths there are.
@@ -43,7 +54,8 @@ def records_of(paths: str, light_share: Any) -> dict[str, Any]:
 
 def paths_in_records(config: Config) -> dict[str, Any]:
     """Those of an integrator; `auto` where that is left to measurement."""
-    options, usual = config.integrator.options(), "camera" if config.integrator.type == "prb" else "light"
+    options = config.integrator.options()
+    usual = "light" if isinstance(config.integrator, LightTracerOptions) else "camera"
     return records_of(str(options.get("paths", usual)), options.get("light_share", UNDECIDED["light_share"]))
 
 
@@ -55,7 +67,7 @@ PLUGIN_ESTIMATOR = "reservoir"
 
 #: Options of a case that are those of `run`, for itself alone.
 ADJOINT = ("adjoint", "batches", "first_batch")
-_KINDS = (ReslrbConfig, Ptracer, Prb, WalkAd, Trajectory, Own)
+_KINDS = (ReslrbConfig, Ptracer, Prb, PrbProjective, DirectProjective, WalkAd, Trajectory, Own)
 _TYPES = {str(kind.model_fields["type"].default): kind for kind in _KINDS}
 
 #: Options that make an estimator another one, in records.

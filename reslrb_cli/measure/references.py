@@ -45,6 +45,7 @@ def leave_out_border(problem: Problem) -> bool:
         if weights.all():
             continue
         found = True
+        view.fixed = None if view.fixed is None else view.fixed * weights
         if view.weights is not None:
             weights *= np.array(view.weights)[:, :, 0]
         view.see(target, weights)

@@ -226,6 +226,7 @@ def at_stage(problem: Problem, number: int, values: Mapping[str, Array] | None =
         made.apply()
     for view, whole in zip(made.views, problem.views, strict=True):
         _see_coarsely(view, whole, made.scene.sensors()[view.sensor].film())
+        view.follow(made.scene)
     integrator, size = problem.integrator, problem.samples_per_pass
     if isinstance(integrator, LightTracer):
         integrator = integrator.afresh()
@@ -343,8 +344,10 @@ def _places(new: int, old: int, edge_to_edge: bool) -> Array:
 
 def _see_coarsely(view: View, whole: View, film: mi.Film) -> None:
     """Give a view of a smaller film the target of the whole one: means over pixels, by what they weigh."""
-    target = np.array(whole.target, dtype=np.float64)
-    weights = np.ones(target.shape[:2]) if whole.weights is None else np.array(whole.weights, dtype=np.float64)[:, :, 0]
+    target, weights = np.array(whole.target, dtype=np.float64), whole.fixed
+    if weights is None:
+        weights = np.ones(target.shape[:2]) if whole.weights is None else np.array(whole.weights)[:, :, 0]
+    weights = weights.astype(np.float64)
     width, height = (int(n) for n in film.crop_size())
     down, across = target.shape[0] // height, target.shape[1] // width
 
@@ -353,4 +356,6 @@ def _see_coarsely(view: View, whole: View, film: mi.Film) -> None:
 
     total = summed(weights)
     view.masked = whole.masked
-    view.see(summed(weights[:, :, None] * target) / np.maximum(total, 1e-300), total[:, :, 0] / (down * across))
+    coarse = total[:, :, 0] / (down * across)
+    view.see(summed(weights[:, :, None] * target) / np.maximum(total, 1e-300), coarse)
+    view.fixed = None if whole.fixed is None else coarse

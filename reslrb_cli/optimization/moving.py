@@ -15,6 +15,7 @@ import mitsuba as mi
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, UnsupportedScene
+from reslrb_cli.integrators.baselines import Projective
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.optimization.memory import plans
@@ -138,8 +139,15 @@ def check_moving(problem: Problem) -> None:
     config, moved = problem.config, where_moved(problem.selection.params, problem.selection.scene_keys)
     kind, tracer = config.integrator.type, problem.integrator
     if moved and kind in ("prb", "trajectory"):
-        reason = f"{kind} has no derivatives of what moves light, as `{moved[0].key}` does; take reslrb or ptracer"
+        reason = f"{kind} has no derivatives of what moves light, as `{moved[0].key}` does; take reslrb, ptracer or "
+        reason += "prb_projective"
         raise ConfigError(config.source, "integrator.type", reason)
+    if isinstance(tracer, Projective):
+        sensors = [problem.scene.sensors()[index] for index in problem.sensors]
+        wrong = tracer.obstacle(problem.scene, sensors, [item.node for item in moved])
+        if wrong is not None:
+            raise ConfigError(config.source, "integrator.type", wrong)
+        return
     if isinstance(tracer, LightTracer):
         try:
             plans(problem, tracer)

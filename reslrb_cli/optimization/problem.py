@@ -95,9 +95,11 @@ class Problem:
         return {name: None if each is None else each.to_json() for name, each in made.items()}
 
     def apply(self, others: Mapping[str, Any] | None = None) -> None:
-        """Hand the optimiser's values to the scene, or, of the keys in `others`, those."""
+        """Hand the optimiser's values to the scene, or, of the keys in `others`, those; masks follow what moves."""
         values = {key: self.optimizer[key] for key in self.selection.keys}
         self.selection.hand_over({**values, **(others or {})})
+        for view in self.views:
+            view.follow(self.scene)
 
     def afresh(self, values: Mapping[str, Array]) -> Problem:
         """The same as before the first iteration, with these values, as `values` has them; what was learned is

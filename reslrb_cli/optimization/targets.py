@@ -27,6 +27,7 @@ from reslrb_cli.optimization.loading import (
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import Array, Masked, View, Wanted, color_channels
 from reslrb_cli.scene.images import Photo, read_photo, read_weights, turned_line
+from reslrb_cli.scene.needs import scene_needs
 from reslrb_cli.scene.parameters import Selection, set_values
 from reslrb_cli.scene.visibility import interior, sees_specular, spread
 
@@ -164,6 +165,11 @@ def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: C
     if not weights.any():
         advice = "switch kinds off, such as {specular: false}, or set it to none"
         raise ConfigError(config.source, wanted.mask_key, f"leaves nothing to compare ({line}); {advice}")
+    kinds = view.masked.left_out.keys() & {"specular", "mixed"}
+    if kinds and problem.moves and scene_needs(problem.scene, problem.scene.sensors()[view.sensor]).has_delta_lobes:
+        others = {kind: pixels for kind, pixels in view.masked.left_out.items() if kind not in kinds}
+        view.fixed = replace(view.masked, left_out=others).total(target.shape[:2])
+        line = f"{line or f'view {view.sensor}'}; each iteration leaves out glass and mirrors where they are then"
     if line is not None:
         say(line)
     view.see(target, weights)

@@ -35,6 +35,7 @@ from reslrb_cli.optimization.losses import SSIM_SIDE, Loss, best_scale, fitted, 
 from reslrb_cli.optimization.own_code import OwnLoss
 from reslrb_cli.scene.cameras import read_cameras
 from reslrb_cli.scene.parameters import Selection
+from reslrb_cli.scene.visibility import sees_specular
 
 Array = np.ndarray[Any, Any]
 
@@ -211,7 +212,8 @@ class View:
     `made` is the target (H, W, C), without alpha; None until there is one, which `target` raises LookupError for.
     `weights`, of the same shape with a mean of 1, say what its entries count, 0 of those that `masked` leaves out;
     None where all are the same. `fits`: the image is scaled to suit the target (`fitted`, `across` as there). What is
-    `held_out` is not trained on, and has a loss of its own. `codes` are what of the loss users have written.
+    `held_out` is not trained on, and has a loss of its own. `codes` are what of the loss users have written. `fixed`
+    are the weights (H, W) without the mask of glass and mirrors, where that moves (`follow`); None where it does not.
     """
 
     sensor: int
@@ -226,6 +228,7 @@ class View:
     fits: bool = False
     across: bool = False
     codes: list[OwnLoss] = field(default_factory=list)
+    fixed: Array | None = None
 
     @property
     def target(self) -> mi.TensorXf:
@@ -236,12 +239,27 @@ class View:
 
     def see(self, target: Array, weights: Array | None = None) -> None:
         """Take a target (H, W, C), finite where its weights (H, W) are not 0: what they leave out is 0 otherwise."""
-        self.weights = None
         if weights is not None and not np.all(weights == 1):
             target = np.where(np.isfinite(target), target, 0)
-            share = weights / weights.mean(dtype=np.float64)
-            self.weights = to_tensor(np.broadcast_to(share[:, :, None], target.shape))
         self.made = to_tensor(target)
+        self.weigh(weights)
+
+    def weigh(self, weights: Array | None) -> None:
+        """Take weights (H, W) for the target that there is; None weighs all pixels alike."""
+        self.weights = None
+        if weights is not None and not np.all(weights == 1):
+            share = weights / weights.mean(dtype=np.float64)
+            self.weights = to_tensor(np.broadcast_to(share[:, :, None], self.target.shape))
+
+    def follow(self, scene: mi.Scene) -> None:
+        """Leave out the pixels that see glass or mirrors where these are now."""
+        if self.fixed is None:
+            return
+        seen = sees_specular(scene, scene.sensors()[self.sensor])
+        left = [seen.alone] * self.wanted.mask.specular + [seen.mixed] * self.wanted.mask_mixed
+        weights = np.where(np.logical_or.reduce(left), np.float32(0), self.fixed)
+        if weights.any():  # glass before the whole film leaves nothing to go by: the mask stays
+            self.weigh(weights)
 
     def compare(self, image: mi.TensorXf) -> mi.Float:
         """The loss of an image, of width 1, attached; alpha is left out, the view's exposure applied.
@@ -379,6 +397,8 @@ def target_arrays(views: list[View]) -> dict[str, Array]:
         arrays[f"target-{number}"] = np.array(view.target)
         if view.weights is not None:
             arrays[f"weights-{number}"] = np.array(view.weights)
+        if view.fixed is not None:
+            arrays[f"fixed-{number}"] = view.fixed
     return arrays
 
 
@@ -388,3 +408,4 @@ def set_targets(views: list[View], arrays: Mapping[str, Array]) -> None:
         view.made = to_tensor(arrays[f"target-{number}"])
         weights = f"weights-{number}"
         view.weights = to_tensor(arrays[weights]) if weights in arrays else None
+        view.fixed = arrays.get(f"fixed-{number}")

@@ -168,7 +168,8 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
     ),
     "target integrator": (
         target("{render: {integrator: {type: path}}}"),
-        "target.render.integrator.type: must be one of reslrb, ptracer, prb, walk_ad, trajectory",
+        "target.render.integrator.type: must be one of reslrb, ptracer, prb, prb_projective, direct_projective, "
+        "walk_ad, trajectory",
     ),
     "sensor negative": (scene("a, sensors: [-1]"), "scene.sensors[0]: must be at least 0"),
     "sensor twice": (scene("a, sensors: [0, 0]"), "scene.sensors: must name each sensor once"),
@@ -179,7 +180,8 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
     "home of nobody": (scene("~no-such-user-here/a"), "scene.file: must be a path"),
     "unknown integrator": (
         GOOD + "integrator: {type: reslbr}\n",
-        "integrator.type: must be one of reslrb, ptracer, prb, walk_ad, trajectory, custom (did you mean reslrb?)",
+        "integrator.type: must be one of reslrb, ptracer, prb, prb_projective, direct_projective, walk_ad, trajectory, "
+        "custom (did you mean reslrb?)",
     ),
     "type is a list": (GOOD + "integrator: {type: [prb]}\n", "integrator.type: must be one of"),
     "option of another integrator": (

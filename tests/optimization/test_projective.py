@@ -1,0 +1,188 @@
+"""Mitsuba's projective integrators as types: outlines and shadow edges of a box that moves."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from reslrb_cli.cli import main
+from reslrb_cli.config.loader import load
+from reslrb_cli.errors import ConfigError, ExitCode
+from reslrb_cli.integrators.baselines import Projective
+from reslrb_cli.integrators.step import known_step
+from reslrb_cli.measure.methods import parse_cases, paths_in_records
+from reslrb_cli.optimization.assemble import assemble, assemble_scene
+from reslrb_cli.optimization.identifiability import find_reached
+from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.problem import Problem
+
+SCENE = """<scene version="3.0.0">
+    <default name="sensor" value="perspective"/>
+    <sensor type="$sensor" id="camera">
+        <float name="fov" value="45"/>
+        <transform name="to_world"><lookat origin="0, -2.6, 2.6" target="0, 0, 0.1" up="0, 0, 1"/></transform>
+        <film type="hdrfilm">
+            <integer name="width" value="16"/> <integer name="height" value="16"/>
+            <string name="pixel_format" value="rgb"/> <rfilter type="gaussian"/>
+        </film>
+    </sensor>
+    <shape type="rectangle" id="floor">
+        <transform name="to_world"><scale value="3"/></transform>
+        <bsdf type="diffuse"><rgb name="reflectance" value="0.8, 0.7, 0.5"/></bsdf>
+    </shape>
+    <shape type="obj" id="box">
+        <string name="filename" value="box.obj"/> <boolean name="face_normals" value="true"/>
+        <transform name="to_world"><scale value="0.3"/> <translate z="0.3"/></transform>
+        <bsdf type="diffuse"><rgb name="reflectance" value="0.2, 0.3, 0.6"/></bsdf>
+    </shape>
+    <shape type="rectangle" id="lamp">
+        <transform name="to_world">
+            <scale value="0.3"/> <rotate x="1" angle="180"/> <translate x="-1" y="0.5" z="3"/>
+        </transform>
+        <emitter type="area"><rgb name="radiance" value="20, 18, 16"/></emitter>
+    </shape>
+    <emitter type="spot" id="spot">
+        <rgb name="intensity" value="0.001"/>
+        <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="1, 0, 0"/></transform>
+    </emitter>
+</scene>
+"""
+SPOT = SCENE[SCENE.index('    <emitter type="spot"') : SCENE.index("</scene>")]
+FACES = ("1 3 2", "1 4 3", "5 6 7", "5 7 8", "1 2 6", "1 6 5", "2 3 7", "2 7 6", "3 4 8", "3 8 7", "4 1 5", "4 5 8")
+CORNERS = [f"v {x} {y} {z}" for z in (-1, 1) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+CONFIG = """
+variant: llvm_ad_rgb
+scene: {file: scene.xml}
+target: {render: {spp: 512, integrator: {type: prb, max_depth: 3}, parameters: {box.translation: [0.22, -0.12, 0]}}}
+parameters:
+  - motion: {of: box, free: [translation]}
+    learning_rate: 0.03
+integrator: {type: prb_projective, max_depth: 3}
+run: {iterations: 6, spp: 16, final_spp: 16}
+"""
+MOVED = "box.translation"
+
+
+def write_experiment(folder: Path, spot: bool = False) -> Path:
+    (folder / "scene.xml").write_text(SCENE if spot else SCENE.replace(SPOT, ""))
+    (folder / "box.obj").write_text("\n".join([*CORNERS, *(f"f {face}" for face in FACES)]))
+    (folder / "box.yaml").write_text(CONFIG)
+    return folder / "box.yaml"
+
+
+def unguided(problem: Problem) -> Problem:
+    """The problem whose integrator builds no octree: that takes 20 s a step here, and 2.7 GB."""
+    plugin: Any = problem.integrator
+    plugin.plugin.guiding = "none"
+    return problem
+
+
+def gradient(problem: Problem, spp: int = 4) -> np.ndarray:
+    """The gradient of the box's place, (3,), with a fixed dL/dI and seed."""
+    weights = mi.TensorXf(np.random.default_rng(1).normal(size=(16, 16, 3)).astype(np.float32))
+    known_step(problem.integrator, problem.scene, 0, weights, seed=3, spp=spp, params=problem.selection.params)
+    found = np.array(problem.gradients()[MOVED]).ravel()
+    problem.optimizer.clear_gradient(MOVED)
+    return found
+
+
+def test_a_box_moves_to_its_place(tmp_path: Path) -> None:
+    """The picture is by camera paths; light paths alone move the box the other way."""
+    problem = find_reached(unguided(assemble(load(write_experiment(tmp_path), []))))
+    records = list(optimize(problem))
+    errors = [records[0].parameter_rmse, problem.selection.array(MOVED) - [0.22, -0.12, 0]]
+    assert records[-1].loss < 0.5 * records[0].loss
+    assert np.sqrt(np.mean(np.square(errors[1]))) < 0.8 * errors[0]
+
+
+def test_parts_have_their_own_samples_and_steps_no_memory(tmp_path: Path) -> None:
+    path = write_experiment(tmp_path)
+
+    def found(*sets: str, spp: int = 4, threshold: float = 0.0) -> np.ndarray:
+        problem = unguided(assemble_scene(load(path, sets)))
+        plugin: Any = problem.integrator
+        plugin.plugin.octree_contruction_thres = threshold
+        result = gradient(problem, spp)
+        assert plugin.plugin.octree_contruction_thres == 0  # what an earlier step left
+        return result
+
+    smooth = "integrator.sppp=0", "integrator.sppi=0"
+    whole = found()
+    assert np.array_equal(found(threshold=7.0), whole)
+    assert np.array_equal(found("integrator.sppc=4", "integrator.sppp=4", "integrator.sppi=4", spp=8), whole)
+    assert np.array_equal(found("integrator.sppc=8", *smooth), found(*smooth, spp=8))
+    assert not np.array_equal(found("integrator.sppc=8", *smooth), found(*smooth))
+
+
+#: Settings, whether there is a spot lamp, and where the error is and what it holds.
+REFUSED = {
+    "prb": (["integrator.type=prb"], False, "integrator.type", "prb_projective"),
+    "depth": (["integrator={type: direct_projective, max_depth: 3}"], False, "integrator.max_depth", "must be 2"),
+    "spot": (["integrator={type: direct_projective}"], True, "integrator.type", "shadow edges of spot lamps, as spot"),
+    "lens": (["scene.options.sensor=orthographic"], False, "integrator.type", "perspective sensors alone, and camera"),
+    "rectangle": (
+        ["parameters=[{motion: {of: lamp}}]", "target.render.parameters={}"], False, "integrator.type",
+        "wrong outlines of rectangles, as lamp",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_mitsuba_gets_wrong_is_refused(case: str, tmp_path: Path) -> None:
+    sets, spot, key, what = REFUSED[case]
+    with pytest.raises(ConfigError) as error:
+        assemble_scene(load(write_experiment(tmp_path, spot), sets))
+    assert error.value.key == key
+    assert what in error.value.message
+
+
+@pytest.mark.parametrize(
+    ("kind", "spot", "sets"),
+    [
+        ("direct_projective", False, []),
+        ("prb_projective", True, []),
+        ("direct_projective", True, ["integrator.sppi=0"]),
+        ("prb_projective", False, ["scene.options.sensor=orthographic", "integrator.sppp=0"]),
+    ],
+)
+def test_what_mitsuba_gets_right_is_not_refused(kind: str, spot: bool, sets: list[str], tmp_path: Path) -> None:
+    config = load(write_experiment(tmp_path, spot), [f"integrator={{type: {kind}}}", *sets])
+    assert type(assemble_scene(config).integrator) is Projective
+
+
+@pytest.mark.parametrize("kind", ["prb_projective", "direct_projective"])
+def test_measurements_take_them_as_they_take_prb(kind: str, tmp_path: Path) -> None:
+    config = load(write_experiment(tmp_path), ["integrator.sppp=3"])
+    [case] = parse_cases(f"{kind}(sppi=2)")
+    made = case.at(config, 2, known=False)
+    assert (made.integrator.type, *(made.integrator.options()[name] for name in ("sppp", "sppi"))) == (kind, 3, 2)
+    assert paths_in_records(made) == {"paths": "camera", "light_share": None}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["prb_projective", "direct_projective"])
+def test_commands_take_them_as_they_take_prb(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a colour, which has no silhouettes. The few samples may fail a check."""
+    write_experiment(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    sets = ["parameters=[{key: floor.bsdf.reflectance.value}]", "target.render.parameters={}", "integrator.max_depth=2"]
+    common = ["box.yaml", *(word for each in sets for word in ("--set", each))]
+
+    def call(command: str, *words: str) -> int:
+        with pytest.raises(SystemExit) as end:
+            main.main([command, *common, *words])
+        return int(end.value.code or 0)
+
+    own, passes = ["--set", f"integrator.type={kind}"], (0, ExitCode.CHECK_FAILED)
+    assert call("render", *own, "-o", "a.exr", "--spp", "4") == 0
+    assert call("bench", "--max-depth", "2", "--integrators", f"{kind}(sppi=2),prb", "--json", "b.json") == 0
+    words = ["--rounds", "4", "--integrators", f"{kind},prb", "--json", "c.jsonl"]
+    assert call("convergence", *words) in passes
+    lines = [json.loads(line) for line in Path("c.jsonl").read_text().splitlines()]
+    assert kind in [line.get("label") for line in lines if line["kind"] == "method"]
+    assert call("gradcheck", *own, "--estimators", "stack", "--seeds", "2", "--spp", "16") in passes
