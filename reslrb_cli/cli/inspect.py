@@ -6,7 +6,6 @@ what it finds of the scene, its sensors, the plan of a step and the parameters (
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import logging
 from collections.abc import Mapping, Sequence
@@ -29,7 +28,7 @@ from reslrb_cli.records.metrics import finite
 from reslrb_cli.report.format import table
 
 if TYPE_CHECKING:
-    from reslrb_cli.integrators.plan_report import PlanReport
+    from reslrb_cli.integrators.plan_report import PlanRow
     from reslrb_cli.optimization.sensitivity import Conditioning
     from reslrb_cli.scene.catalog import MovableSummary, ParameterInfo, SceneSummary, SensorSummary
     from reslrb_cli.scene.needs import SceneNeeds
@@ -113,19 +112,10 @@ def _needed(needs: SceneNeeds) -> str:
     return ", ".join(name.removeprefix("has_").replace("_", " ") for name in names) or "nothing special"
 
 
-def plan_lines(report: PlanReport) -> list[str]:
-    """The plan as a table: what is needed first."""
-    lines = []
-    if report.kernels is not None:
-        each = " + ".join(map(str, report.kernels))
-        lines.append(f"estimator {report.estimator}, kernels of {each} operations")
-    rows = [["", "", "with", "without", ""]] if report.kernels is not None else []
-    for row in sorted(report.rows, key=lambda row: not row.needed):
-        numbers = (row.operations_with, row.operations_without)
-        counts = [] if report.kernels is None else ["" if number is None else str(number) for number in numbers]
-        why = row.reason + (f" ({row.note})" if row.note else "")
-        rows.append(["needed" if row.needed else "left out", row.feature, *counts, why])
-    return lines + table(rows, "<<>><" if report.kernels is not None else "<")
+def plan_lines(rows: Sequence[PlanRow]) -> list[str]:
+    """Lay out the plan as a table; features that the plan has come first."""
+    ordered = sorted(rows, key=lambda row: not row.needed)
+    return table([("needed" if row.needed else "left out", row.feature, row.reason) for row in ordered])
 
 
 # --- parameters -------------------------------------------------------------------------------------------------------
@@ -212,7 +202,6 @@ SAMPLES = 8
 @overrides_option
 @click.option("--all", "everything", is_flag=True, help="List what cannot be recovered, too.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, with everything, instead of lines.")
-@click.option("--no-counts", is_flag=True, help="Do not compile kernels to count their operations (takes seconds).")
 @click.option(
     "--nonfinite",
     is_flag=True,
@@ -231,7 +220,6 @@ def command(
     overrides: tuple[str, ...],
     everything: bool,
     as_json: bool,
-    no_counts: bool,
     nonfinite: bool,
     conditioning: bool,
     samples: int | None,
@@ -239,9 +227,8 @@ def command(
     """List what of a scene can be recovered, with its current value, and what the scene contains.
 
     PATH is a scene file (XML), a configuration, which need not be complete, or the folder of a run. The keys that are
-    listed first may stand in `parameters` of a configuration; of the others the reasons are given. Where `parameters`
-    are, the plan of a step says which features the scene and the parameters call for and which are left out, with the
-    number of operations that the kernels of a step have with and without each of them.
+    listed first may stand in `parameters` of a configuration; of the others the reasons are given. If the configuration
+    has `parameters`, the plan of a step lists the features that its kernels contain or leave out, and why.
 
     --conditioning says how far apart the parameters' sensitivities lie, where they start: of each the root mean square
     of its values, its gradient and the noise of one step's gradient, the relative change of the image and the curvature
@@ -266,12 +253,12 @@ def command(
     scene = load_configured(config, selects="parameters" not in subject.missing)
     summary = summarise(scene, config.integrator.hide_emitters)
     selection = None if "parameters" in subject.missing else select(config, scene)
-    plan = None if selection is None else make_plan_report(subject, scene, selection, counts=not no_counts)
     edges = [] if selection is None or isinstance(selection, str) else edges_of(scene, selection)
+    plan = None if selection is None else make_plan(subject, scene, selection)
     measured = measure(subject, overrides, samples or SAMPLES) if conditioning else None
     if as_json:
         known = {"run": subject.run, **vars(summary)}
-        known |= {"plan": {"obstacle": plan} if isinstance(plan, str) else plan, "edges": edges}
+        known |= {"plan": {"obstacle": plan} if isinstance(plan, str) else plan and {"rows": plan}, "edges": edges}
         if measured is not None:
             known["conditioning"] = measured.to_json()
         # Objects of the scene are told by their ids.
@@ -358,9 +345,14 @@ def edges_of(scene: Any, selection: Selection) -> list[str]:
     return [item.id for item in moved if item.casts_edges(scene)]
 
 
-def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, counts: bool) -> PlanReport | str:
-    """The plan of a step for the first sensor that is used, or why there is none."""
-    from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, PIXELS, SEQUENCE, report_plan, with_reason
+def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[PlanRow] | str:
+    """Plan a step for the first sensor that is used; return the reason where there is no plan.
+
+    The selected parameters of `scene` track derivatives from then on.
+    """
+    import drjit as dr
+
+    from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, PIXELS, SEQUENCE, plan_rows, with_reason
     from reslrb_cli.integrators.reslrb import Reslrb
     from reslrb_cli.optimization.loading import choose_sensors, pass_spp, paths_of
     from reslrb_cli.optimization.moving import moves_anything
@@ -376,22 +368,26 @@ def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, c
     reasons = {}
     for feature, option in ((GUIDED, "guiding"), (SEQUENCE, "sequence"), (PIXELS, "pixels")):
         options[option], reasons[feature] = sampling_of(subject, option)
-    known = config.adjoint == "batched" or options.get("weight") == "adjoint"
     try:
         [sensor, *_] = sensors = choose_sensors(config, scene)
         options["paths"] = paths_of(config.integrator, scene, sensors, moves_anything(config, selection))
         options |= sides_of(subject, options, reasons)
         integrator = Reslrb.of(**options)
         integrator.expect(pass_spp(config))
-        params, keys = selection.params, selection.scene_keys
-        report = report_plan(integrator, scene, scene.sensors()[sensor], params, keys, known=known, counts=counts)
+        params = selection.params
+        for key in selection.scene_keys:
+            leaf = type(params[key])(dr.detach(params[key]))
+            dr.enable_grad(leaf)
+            params[key] = leaf
+        params.update()
+        rows = plan_rows(integrator.plan(scene, scene.sensors()[sensor], params))
     except (ConfigError, UnsupportedScene) as error:
         return str(error)
     if integrator.paths == "camera":  # where nothing begins at a light, nothing is left to a run
         reasons = {feature: reasons.get(feature, "") for feature in (PATHS_FROM, PIXELS)}
     for feature, why in reasons.items():
-        report = dataclasses.replace(report, rows=with_reason(report.rows, feature, why)) if why else report
-    return report
+        rows = with_reason(rows, feature, why) if why else rows
+    return rows
 
 
 def sides_of(subject: Subject, options: dict[str, Any], reasons: dict[str, str]) -> dict[str, Any]:

@@ -67,7 +67,7 @@ def plan_record(problem: Problem) -> dict[str, Any]:
         found = with_reason(found, PIXELS, f"pixels: auto, {problem.pixels.why()}")
     if problem.sides is not None:
         found = with_reason(found, PATHS_FROM, f"paths: auto, {problem.sides.why()}")
-    rows = [{"feature": row.feature, "needed": row.needed, "reason": row.reason} for row in found]
+    rows = [vars(row) for row in found]
     estimator = type(integrator.estimator).__name__.removesuffix("Estimator").lower()
     assert isinstance(config, ReslrbConfig)
     return {"integrator": config.type, "estimator": estimator, "rows": rows}

@@ -229,7 +229,7 @@ def test_the_other_commands_know_the_names(folder):
         "run: {iterations: 1, spp: 2, reach_spp: 2}\n"
     )
     run_reslrb("render", "lamps.yaml", "-o", "image.exr")
-    assert f"* {key}" in run_reslrb("inspect", "lamps.yaml", "--no-counts")
+    assert f"* {key}" in run_reslrb("inspect", "lamps.yaml")
     assert key in run_reslrb("gradcheck", "lamps.yaml", "--seeds", "3")
     run_reslrb("bench", "lamps.yaml", "--max-depth", "2", "--rounds", "1", "--integrators", "reslrb:stack")
     run_reslrb("optimize", "lamps.yaml", "--quiet")

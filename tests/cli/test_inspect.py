@@ -30,26 +30,16 @@ def plan_lines(text: str) -> list[str]:
 
 
 def test_plan_lists_what_is_needed_and_what_is_left_out():
-    lines = plan_lines(inspect("--no-counts"))
+    lines = plan_lines(inspect())
     assert any(line.split()[:3] == ["needed", "derivatives", "of"] for line in lines)
     assert any("left out" in line and "delta lobes" in line for line in lines)
-    assert not any(word.isdigit() for line in lines for word in line.split()), "counts were asked not to be made"
-
-
-def test_counts_come_in_columns():
-    lines = plan_lines(inspect("--set", "integrator.estimator=stack"))
-    assert "estimator stack" in lines[0]
-    assert lines[1].split() == ["with", "without"]
-    [row] = [line for line in lines if "visible emitters" in line]
-    assert row.index(row.split()[3]) + len(row.split()[3]) == lines[1].index("with") + len("with")
 
 
 def test_plan_as_json():
-    plan = json.loads(inspect("--json", "--no-counts"))["plan"]
+    plan = json.loads(inspect("--json"))["plan"]
     rows = {row["feature"]: row for row in plan["rows"]}
     assert rows["derivatives of BSDFs"]["needed"]
     assert not rows["null surfaces"]["needed"]
-    assert plan["kernels"] is None
 
 
 def test_without_a_plan_the_reason_is_given():
@@ -159,7 +149,7 @@ def test_everything_as_json(scene):
 def test_a_texture_of_8_bits_that_is_selected_is_shown_as_it_is_read(scene):
     config = scene.with_name("c.yaml")
     config.write_text('scene: {file: scene.xml}\nparameters: [{key: "wall.*"}]')
-    found = lines_of("c.yaml", "--no-counts")
+    found = lines_of("c.yaml")
     assert "* wall.reflectance.data 4x4 texels of 3, mean 0.1248, 0.1248 to 0.1248" in found
     assert any(line.startswith("needed derivatives of BSDFs") for line in found)
 
@@ -176,7 +166,7 @@ def test_a_texture_of_8_bits_that_is_selected_is_shown_as_it_is_read(scene):
 )
 def test_a_configuration_need_not_be_complete(scene, text, next_step):
     Path("c.yaml").write_text(f"scene: {{file: scene.xml}}\n{text}\n")
-    found = lines_of("c.yaml", "--no-counts")
+    found = lines_of("c.yaml")
     assert found[-1].startswith(f"next: {next_step}")
     has_parameters = "Sphere_1.*" in text
     assert ("plan" in found) is has_parameters
@@ -186,9 +176,7 @@ def test_a_configuration_need_not_be_complete(scene, text, next_step):
 
 def test_sections_can_be_given_on_the_command_line(scene):
     Path("c.yaml").write_text("scene: {file: scene.xml}")
-    found = lines_of(
-        "c.yaml", "--no-counts", "--set", "parameters=[{key: Envmap_1.scale}]", "--set", "target.file=x.exr"
-    )
+    found = lines_of("c.yaml", "--set", "parameters=[{key: Envmap_1.scale}]", "--set", "target.file=x.exr")
     assert "* Envmap_1.scale 1" in found
     assert found[-1] == "next: `reslrb optimize c.yaml` runs it"
 
@@ -248,7 +236,7 @@ def conditioning(*arguments: str) -> str:
     """What `inspect --conditioning` prints of the stiff lamp, small."""
     small = ["scene.options={resx: 12, resy: 12}", "integrator={max_depth: 2}", "run.spp=32", "target.render.spp=64"]
     sets = [word for each in small for word in ("--set", each)]
-    result = CliRunner().invoke(main, ["inspect", str(STIFF), "--no-counts", "--conditioning", *sets, *arguments])
+    result = CliRunner().invoke(main, ["inspect", str(STIFF), "--conditioning", *sets, *arguments])
     assert result.exit_code == 0, result.output
     return result.stdout
 

@@ -334,7 +334,7 @@ def test_inspect_tells_what_can_be_recovered(experiment, capsys):
     code, out, _ = reslrb(capsys, "inspect", "box.yaml")
     assert code == 0
     assert any(line.split()[:4] == ["*", KEY, "4x4", "texels"] for line in out.splitlines())
-    code, out, _ = reslrb(capsys, "inspect", "box.yaml", "--all", "--no-counts")
+    code, out, _ = reslrb(capsys, "inspect", "box.yaml", "--all")
     assert any("poster_shape.to_world" in line and "is recovered as a motion" in line for line in out.splitlines())
     code, out, _ = reslrb(capsys, "inspect", "box.yaml", "--json")
     parameters = {entry["key"]: entry for entry in json.loads(out)["parameters"]}
@@ -504,7 +504,7 @@ def test_errors_are_one_located_line(tmp_path, llvm, override, line):
 def test_inspect_says_whose_edges_move(tmp_path, llvm):
     path = glass.write_experiment(tmp_path)
     parameters = "parameters=[{motion: {of: [slab, lamp]}}]"
-    output = CliRunner().invoke(main, ["inspect", str(path), "--no-counts", "--set", parameters]).output
+    output = CliRunner().invoke(main, ["inspect", str(path), "--set", parameters]).output
     assert "can be moved: 5" in output
     assert "by motion and heightmap: slab" in output
     assert "silhouettes and shadow edges of slab are not in its derivatives" in output

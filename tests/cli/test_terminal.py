@@ -54,12 +54,12 @@ def experiment(llvm, tmp_path, monkeypatch):
 
 
 def test_inspect(experiment, capsys):
-    code, out, err = reslrb(capsys, "inspect", experiment / "c.yaml", "--no-counts")
+    code, out, err = reslrb(capsys, "inspect", experiment / "c.yaml")
     assert code == 0
     assert not {"\x1b", TURNED} & set(out + err)
     assert "id `pos\\u202eter` cannot stand in a key: named Diffuse_1" in err
     assert "Diffuse_1.reflectance.value" in out
-    code, out, _ = reslrb(capsys, "inspect", experiment / "c.yaml", "--no-counts", "--json")
+    code, out, _ = reslrb(capsys, "inspect", experiment / "c.yaml", "--json")
     assert not {"\x1b", TURNED} & set(out)
     assert "Diffuse_1.reflectance.value" in [entry["key"] for entry in json.loads(out)["parameters"]]
 

@@ -9,13 +9,13 @@ import drjit as dr
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES
+from conformance.operations import LARGE, nothing_is_compiled_without
 from conformance.test_guiding import SPP, guided, learn, sample
-from conformance.test_kernels import Kernels, nothing_is_compiled_without
+from conformance.test_kernels import Kernels
 
 from reslrb_cli.guiding.collect import KEEP, Onward
 from reslrb_cli.guiding.tables import BLUR, FINE, Guiding, Learned, _blurred, grid_for, learnings, most_cells
 from reslrb_cli.integrators import freezing
-from reslrb_cli.integrators.plan_report import GUIDED, LARGE
 from reslrb_cli.measure.gradients import Case, integrator, relative
 from reslrb_cli.transport.guide import Guide, Table, apportion, even_table, make_grid
 from reslrb_cli.transport.plan import GUIDE_UNIFORM, Grid
@@ -502,7 +502,7 @@ def test_what_is_of_other_cells_is_refused_and_changes_nothing(name: str, wrong:
 
 @pytest.mark.usefixtures("llvm")
 def test_without_a_guide_nothing_of_it_is_compiled() -> None:
-    nothing_is_compiled_without(GUIDED, *guided("two_emitters", 0))
+    nothing_is_compiled_without("grid", *guided("two_emitters", 0))
 
 
 @pytest.mark.usefixtures("llvm")

@@ -11,7 +11,6 @@ import pytest
 from conformance.gradient_cases import CASES
 from turns import a_few, taking_turns
 
-from reslrb_cli.integrators.plan_report import FEATURES, count, tracking
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.scene.load import load_scene
 
@@ -59,21 +58,6 @@ def steps_compile_nothing(scene: Case, step: Callable[[int], Any]) -> None:
             scene.set({key: value * shift for key, value in scene.initial.items()})
         found = kernels.new(lambda: step(seed))  # noqa: B023
         assert not found, f"step {seed} compiled kernels of {[k['operation_count'] for k in found]} operations"
-
-
-def nothing_is_compiled_without(name: str, scene: Case, ours: Any, plain: Any) -> None:
-    """Of the feature of this name, which `ours` has and `plain` has not: a step's operations, also with it toggled."""
-    [feature] = [feature for feature in FEATURES if feature.name == name]
-    operations = {}
-    for kind, each in (("on", ours), ("off", plain)):
-        with tracking(scene.params, scene.keys):
-            plan = each.plan(scene.scene, scene.scene.sensors()[0], scene.params)
-            assert feature.needed(plan) == (kind == "on")
-            for toggled in (plan, feature.toggle(plan)):
-                made = "on" if feature.needed(toggled) else "off"
-                operations[kind, made] = sum(count(each, toggled, scene.scene, scene.scene.sensors()[0], known=True))
-    assert operations["on", "on"] == operations["off", "on"]
-    assert operations["on", "off"] == operations["off", "off"] < operations["on", "on"]
 
 
 #: The cases that are run with independent samples too, unless `-m long` asks for all.

@@ -12,14 +12,14 @@ import pytest
 from agreement import compare
 from conformance import attached_cases, moving_lamps, sequence_faults
 from conformance.gradient_cases import CASES
+from conformance.operations import nothing_is_compiled_without
 from conformance.test_guiding import guided, sample, samples
-from conformance.test_kernels import nothing_is_compiled_without, steps_compile_nothing
+from conformance.test_kernels import steps_compile_nothing
 from scipy.stats import qmc
 from turns import a_few
 
 import reslrb_cli
 from reslrb_cli.estimators import ESTIMATORS
-from reslrb_cli.integrators.plan_report import SEQUENCE
 from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 
@@ -199,7 +199,7 @@ def test_a_recorded_step_is_the_step() -> None:
 
 
 def test_with_independent_numbers_nothing_of_it_is_compiled() -> None:
-    nothing_is_compiled_without(SEQUENCE, *both("two_emitters"))
+    nothing_is_compiled_without("sequence", *both("two_emitters"))
 
 
 def test_later_steps_compile_nothing() -> None:

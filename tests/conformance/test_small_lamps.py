@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from conformance.moving import Moving, flat
 from conformance.moving_lamps import over_floor, smooth_weights
+from conformance.operations import count, with_change
 from conformance.test_kernels import Kernels
 from measure.faults import Fault
 from measure.test_mutations import plant
 
-from reslrb_cli.integrators.plan_report import FEATURES, count
 from reslrb_cli.measure.extreme.suite import Exact, ExtremeCase, Stock, run_case
 from reslrb_cli.measure.gradients import Case, integrator, relative
 from reslrb_cli.measure.scenes.analytic import RADIANCE, speck_in_view
@@ -141,14 +141,13 @@ def test_too_many_are_left_to_primary_rays(monkeypatch: pytest.MonkeyPatch):
 
 def test_scenes_without_any_have_no_more_operations():
     """And those with some have."""
-    [feature] = [feature for feature in FEATURES if feature.name == "small lamps in view"]
     operations = {}
     for name, make in {"none": room, "some": two}.items():
         scene = load(make())
         ours = integrator("reslrb", 4, estimator="stack")
         plan = ours.plan(scene, scene.sensors()[0])
-        other = feature.toggle(plan)
-        operations[name] = [sum(count(ours, p, scene, scene.sensors()[0], True)) for p in (plan, other)]
+        other = with_change(plan, small_lamps=() if plan.small_lamps else plan.needs.lamps)
+        operations[name] = [sum(count(ours, p, scene, scene.sensors()[0])) for p in (plan, other)]
     assert operations["none"][0] < operations["none"][1]
     assert operations["some"][0] > operations["some"][1]
 

@@ -126,6 +126,6 @@ def operations(problem: Problem) -> list[int]:
 def inspected(capsys: pytest.CaptureFixture[str], *words: str) -> list[str]:
     capsys.readouterr()
     with pytest.raises(SystemExit) as end:
-        main.main(["inspect", *words, "--no-counts"])
+        main.main(["inspect", *words])
     assert end.value.code == 0
     return capsys.readouterr().out.splitlines()

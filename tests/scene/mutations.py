@@ -191,7 +191,7 @@ def main_loop() -> None:
         start = os.fstat(below.fileno()).st_size
         kind, _, name = line.strip().partition(" ")
         if kind == "scene":
-            answer = call(["inspect", name, "--no-counts"])
+            answer = call(["inspect", name])
         elif kind == "run":
             answer = call(["optimize", name, "--quiet", "--force"])
         elif kind == "resume":

@@ -141,7 +141,7 @@ CONFIG_FILE = "../c.yaml"
         pytest.param(
             [
                 ["inspect", "../scene/scene.xml"],
-                ["inspect", CONFIG_FILE, "--no-counts"],
+                ["inspect", CONFIG_FILE],
                 ["render", CONFIG_FILE, "-o", "image.exr"],
                 ["render", CONFIG_FILE, "-o", "image.exr", "--set", "integrator={type: ptracer, max_depth: 2}"],
                 ["optimize", CONFIG_FILE, "--set", "integrator={type: prb, max_depth: 2}"],

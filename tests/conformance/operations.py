@@ -1,0 +1,93 @@
+"""Operations of a step's kernels, by plan: shows that kernels lack what a scene does not need."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.integrators import reslrb as lt
+from reslrb_cli.integrators.reslrb import Reslrb
+from reslrb_cli.transport.film import film_blocks
+from reslrb_cli.transport.guide import even_table
+from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.samples import passes
+
+PATHS = 64  # traced to have kernels compiled
+LARGE = 100  # operations; smaller kernels develop images and prepare textures
+
+
+def count(integrator: Reslrb, plan: Plan, scene: mi.Scene, sensor: mi.Sensor) -> list[int]:
+    """Count the operations of each large kernel of a step by this plan, with dL/dI known before it."""
+    with dr.suspend_grad():
+        table = None if plan.grid is None else even_table(plan.grid, film_blocks(sensor) if plan.aimed else None)
+        emitters = integrator.preparation.emitters(plan, scene) if plan.weighs else None
+        [samples] = passes(plan, scene, sensor, 0, 1, None, table, integrator.light_share, emitters)
+        camera = samples.camera and replace(samples.camera, width=PATHS)
+        samples = replace(samples, width=PATHS, camera=camera)
+        width, height = (int(n) for n in samples.film.size)
+        gradient = dr.full(mi.TensorXf, 1.0, (height, width, int(samples.film.film.base_channels_count())))
+        dr.make_opaque(gradient)
+    dr.kernel_history_clear()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), dr.suspend_grad():
+        lt.fused(integrator.estimator, [samples], gradient)
+        dr.eval()
+        dr.sync_thread()
+        history = dr.kernel_history((dr.KernelType.JIT,))
+    return [kernel["operation_count"] for kernel in history if kernel["operation_count"] >= LARGE]
+
+
+@contextmanager
+def tracking(params: mi.SceneParameters, keys: Iterable[str]) -> Iterator[None]:
+    """Have parameters `keys` of the scene track derivatives for as long as the context lasts."""
+    values = {key: type(params[key])(dr.detach(params[key])) for key in keys}
+    for key, value in values.items():
+        leaf = type(value)(value)
+        dr.enable_grad(leaf)
+        params[key] = leaf
+    _update(params, values)
+    try:
+        yield
+    finally:
+        for key, value in values.items():
+            params[key] = value
+        _update(params, values)
+
+
+def with_change(plan: Plan, **members: Any) -> Plan:
+    """Return the plan with other values of its members, or of those of its `needs`."""
+    needs = {name: value for name, value in members.items() if hasattr(plan.needs, name)}
+    own = {name: value for name, value in members.items() if name not in needs}
+    return replace(plan, needs=replace(plan.needs, **needs), **own)
+
+
+def nothing_is_compiled_without(feature: str, scene: Any, ours: Any, plain: Any) -> None:
+    """Check that the operations of a step depend on `feature` alone, and are fewer without it.
+
+    `feature` is a member of the plan that is None in the plan of `plain`, and not in that of `ours`.
+    """
+    sensor = scene.scene.sensors()[0]
+    with tracking(scene.params, scene.keys):
+        plans = [each.plan(scene.scene, sensor, scene.params) for each in (ours, plain)]
+        values = [getattr(plan, feature) for plan in plans]
+        assert [value is None for value in values] == [False, True]
+        (present, absent), others = [
+            [sum(count(each, with_change(plan, **{feature: value}), scene.scene, sensor)) for value in values]
+            for each, plan in zip((ours, plain), plans, strict=True)
+        ]
+    assert [present, absent] == others
+    assert absent < present
+
+
+def _update(params: mi.SceneParameters, keys: Iterable[str]) -> None:
+    """Have textures do their work of the first look-up now: the step is not to count it."""
+    params.update()
+    for key in keys:
+        node = params.properties[key][2]
+        if isinstance(node, mi.Texture):
+            node.eval(dr.zeros(mi.SurfaceInteraction3f))
+    dr.eval([params[key] for key in keys])
