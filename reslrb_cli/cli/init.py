@@ -312,15 +312,15 @@ def _why_camera(scene: mi.Scene, sensor: mi.Sensor, hides_emitters: bool, file: 
 
     Raises ConfigError, located in the scene's `file`, where no paths can render it.
     """
-    from reslrb_cli.scene.needs import check_supported, light_obstacle, paths_obstacle
+    from reslrb_cli.scene.needs import check_paths, paths_obstacle
 
     try:
-        check_supported(scene, sensor, hides_emitters)
+        check_paths(scene, sensor, "light", hides_emitters)
     except UnsupportedScene as error:
         obstacles = [paths_obstacle(scene, sensor, kind) for kind in ("both", "camera")]
         if all(obstacles):
             raise ConfigError(file, "", str(error)) from None  # which has words for both
-        return light_obstacle(scene, sensor, hides_emitters) if obstacles[0] else None
+        return paths_obstacle(scene, sensor, "light", hides_emitters) if obstacles[0] else None
     return None
 
 

@@ -26,7 +26,6 @@ from reslrb_cli.scene.grids import make_grid
 from reslrb_cli.scene.load import load_scene, warn_once
 from reslrb_cli.scene.needs import (
     camera_finds_nothing,
-    check_camera_paths,
     check_paths,
     paths_obstacle,
     scaled_emitter,
@@ -183,7 +182,7 @@ def check_integrator(
                 if integrator.type == "ptracer":
                     _warn_of_clipping(config, scene.sensors()[sensor], scene)
             else:
-                check_camera_paths(scene, scene.sensors()[sensor])
+                check_paths(scene, scene.sensors()[sensor], "prb")
     except UnsupportedScene as error:
         raise ConfigError(config.source, "scene.file", str(error)) from error
 

@@ -20,9 +20,8 @@ from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import (
     PrimaryHits,
     SceneNeeds,
-    camera_obstacle,
-    light_obstacle,
     look,
+    paths_obstacle,
     scene_needs,
     unsupported_part,
 )
@@ -293,8 +292,8 @@ def _sensor(scene: Any, index: int, hide_emitters: bool) -> SensorSummary:
         channels=int(film.base_channels_count()),
         needs=scene_needs(scene, sensor),
         view=look(scene, sensor) if unsupported_part(scene, sensor) is None else None,
-        obstacle=light_obstacle(scene, sensor, hide_emitters),
-        camera_obstacle=camera_obstacle(scene, sensor),
+        obstacle=paths_obstacle(scene, sensor, "light", hide_emitters),
+        camera_obstacle=paths_obstacle(scene, sensor, "prb"),
     )
 
 

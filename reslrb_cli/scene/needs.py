@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -52,7 +52,7 @@ _MEDIUM = (
     " a participating medium; no integrator here knows media (nor do Mitsuba's prb, path and ptracer): remove it from "
     "the scene file"
 )
-#: How many see-through surfaces a primary ray is followed through, wherever it is asked what it meets.
+#: Surfaces along a primary ray that `surfaces_met` yields.
 CROSSINGS = 32
 #: Primary rays that look at a scene, along each side of a grid.
 LOOK = 128
@@ -149,21 +149,38 @@ def is_bent(mesh: Any) -> bool:
 
 
 def check_paths(scene: Any, sensor: Any, paths: str, hide_emitters: bool = False) -> None:
-    """Raise UnsupportedScene, with the reason and the way out, where these paths (`light`, `camera`, `both`) cannot
-    render `scene`."""
+    """Raise UnsupportedScene, with the reason and the way out, if these paths cannot render `scene`.
+
+    `paths` is one of those of `paths_obstacle`.
+    """
+    obstacle = paths_obstacle(scene, sensor, paths, hide_emitters)
+    if obstacle is None:
+        return
+    others = {"light": ("both", "camera"), "both": ("light", "camera")}.get(paths, ("light",))
+    reasons = {kind: paths_obstacle(scene, sensor, kind, hide_emitters) for kind in others}
+    kind = next((kind for kind, reason in reasons.items() if reason is None), None)
+    if kind is not None:
+        is_set = paths in ("camera", "both")  # the integrator has the option
+        way = f"take integrator.paths: {kind}" if is_set else f"take integrator: {{type: reslrb, paths: {kind}}}"
+        has_its_own = any(f"; {word} " in obstacle for word in ("give", "let", "take", "remove"))
+        raise UnsupportedScene(f"{obstacle}{', or' if has_its_own else ';'} {way}")
+    other = next((reason for reason in reasons.values() if reason != obstacle), None)
+    raise UnsupportedScene(obstacle + (f"; nor can other paths render it: {other}" if other else ""))
+
+
+def paths_obstacle(scene: Any, sensor: Any, paths: str, hide_emitters: bool = False) -> str | None:
+    """Return the reason why `scene` cannot be rendered for `sensor`; None if it can.
+
+    `paths`: `light`, `camera` or `both`, as `reslrb` has them; `prb`: camera paths of Mitsuba's own integrators.
+    """
     if paths == "light":
-        check_supported(scene, sensor, hide_emitters)
-    elif (obstacle := paths_obstacle(scene, sensor, paths)) is not None:
-        raise UnsupportedScene(obstacle)
-
-
-def paths_obstacle(scene: Any, sensor: Any, paths: str) -> str | None:
-    """The reason why these paths (`camera`, `both`) cannot render `scene`, with the way out; None where they can."""
-    if (obstacle := _film_obstacle(sensor) or camera_obstacle(scene, sensor, beside_light=paths == "both")) is not None:
-        return f"{obstacle}; take integrator.paths: light"
-    if paths == "both" and (obstacle := unsupported_part(scene, sensor) or _unsampled(scene)) is not None:
-        return f"{obstacle}; take integrator.paths: camera"
-    return scaled_emitter(scene) if paths == "both" else None
+        return _light_obstacle(scene, sensor, hide_emitters)
+    if paths == "prb":
+        return _camera_obstacle(scene, sensor)
+    obstacle = _film_obstacle(sensor) or _camera_obstacle(scene, sensor, beside_light=paths == "both")
+    if paths == "both" and obstacle is None:
+        obstacle = unsupported_part(scene, sensor) or _unsampled(scene) or scaled_emitter(scene)
+    return obstacle
 
 
 def scaled_emitter(scene: Any) -> str | None:
@@ -205,7 +222,8 @@ def light_finds_all(scene: Any, sensors: Sequence[Any], hide_emitters: bool) -> 
     if hide_emitters and any(shape.is_emitter() for shape in scene.shapes()):
         return False
     return all(
-        light_obstacle(scene, sensor, hide_emitters) is None and not look(scene, sensor).specular for sensor in sensors
+        paths_obstacle(scene, sensor, "light", hide_emitters) is None and not look(scene, sensor).specular
+        for sensor in sensors
     )
 
 
@@ -214,32 +232,8 @@ def camera_finds_nothing(scene: Any) -> bool:
     return all(emitter.class_name() == "DirectionalArea" for emitter in scene.emitters())
 
 
-def check_supported(scene: Any, sensor: Any, hide_emitters: bool = False) -> None:
-    """Raise UnsupportedScene, with the reason and the way out, where light tracing cannot render `scene`."""
-    if (obstacle := light_obstacle(scene, sensor, hide_emitters)) is not None:
-        kinds = (kind for kind in ("both", "camera") if paths_obstacle(scene, sensor, kind) is None)
-        kind = next(kinds, None)
-        other = camera_obstacle(scene, sensor) if kind is None else None
-        raise UnsupportedScene(_advised(obstacle, other, f"take integrator: {{type: reslrb, paths: {kind}}}"))
-
-
-def check_camera_paths(scene: Any, sensor: Any) -> None:
-    """The same for paths from the sensor: `prb`, and `path`, which has its images."""
-    if (obstacle := camera_obstacle(scene, sensor)) is not None:
-        other = light_obstacle(scene, sensor)
-        raise UnsupportedScene(_advised(obstacle, other, "take integrator.type: reslrb or ptracer"))
-
-
-def _advised(obstacle: str, other: str | None, way: str) -> str:
-    """The obstacle of one kind of paths, with the `way` out that the others are, or else their obstacle, too."""
-    if other is None:
-        has_its_own = any(f"; {word} " in obstacle for word in ("give", "let", "take"))
-        return f"{obstacle}{', or' if has_its_own else ';'} {way}"
-    return obstacle if other == obstacle else f"{obstacle}; nor can paths the other way round render it: {other}"
-
-
-def light_obstacle(scene: Any, sensor: Any, hide_emitters: bool = False) -> str | None:
-    """The reason why light tracing cannot render `scene` for `sensor`; None where it can."""
+def _light_obstacle(scene: Any, sensor: Any, hide_emitters: bool) -> str | None:
+    """Return the reason why light paths cannot render `scene` for `sensor`; None if they can."""
     if (obstacle := unsupported_part(scene, sensor)) is not None:
         return obstacle
     if (obstacle := _unsampled(scene)) is not None:
@@ -277,10 +271,10 @@ def stock_clip(needs: SceneNeeds) -> str | None:
     return None
 
 
-def camera_obstacle(scene: Any, sensor: Any, beside_light: bool = False) -> str | None:
-    """The reason why paths from `sensor` cannot render `scene`, without tracing a ray; None where they can.
+def _camera_obstacle(scene: Any, sensor: Any, beside_light: bool = False) -> str | None:
+    """Return the reason why camera paths cannot render `scene` for `sensor`, without tracing a ray; None if they can.
 
-    `beside_light`: what they cannot find is left to light paths.
+    `beside_light`: light paths add what camera paths cannot find.
     """
     graph = SceneGraph.of(scene)
     if (obstacle := _unknown_part(scene, sensor, graph)) is not None:
@@ -394,20 +388,39 @@ def what_is_seen(scene: Any, sensor: Any, aperture: tuple[float, float] | None =
     ray, _ = sensor_rays(sensor, sensor.shutter_open(), grid(LOOK), lens)
     active = dr.full(mi.Mask, True, LOOK**2)
     smooth, specular, emission = (dr.zeros(mi.Mask, LOOK**2) for _ in range(3))
+    for si, reached in surfaces_met(scene, ray, active):
+        reached = reached & ~smooth  # a mask is smooth, whatever is behind it
+        emission = emission | (reached & dr.any(si.emitter(scene, reached).eval(si, reached) > 0))
+        hit = reached & si.is_valid()
+        flags = si.bsdf().flags()
+        specular = specular | (hit & ~mi.has_flag(flags, mi.BSDFFlags.Smooth) & ~mi.has_flag(flags, mi.BSDFFlags.Null))
+        smooth = smooth | (hit & mi.has_flag(flags, mi.BSDFFlags.Smooth))
+        dr.schedule(smooth, specular, emission)
+    return smooth, specular, emission
+
+
+def surfaces_met(scene: Any, ray: Any, active: Any, random: Any = None) -> Iterator[tuple[Any, Any]]:
+    """Follow rays through see-through surfaces; yield each interaction and the mask of rays that it belongs to.
+
+    The last interaction of a ray that leaves the scene is invalid. With a generator of `random` numbers, rays also
+    follow mirrors and clear glass. Schedule what you collect: one kernel then evaluates it with the next rays.
+    """
     for _ in range(CROSSINGS):
         si = scene.ray_intersect(ray, active)
-        emission |= active & dr.any(si.emitter(scene, active).eval(si, active) > 0)
-        hit = active & si.is_valid()
-        flags = si.bsdf().flags()
-        is_smooth = hit & mi.has_flag(flags, mi.BSDFFlags.Smooth)
-        is_null = hit & ~is_smooth & mi.has_flag(flags, mi.BSDFFlags.Null)
-        smooth |= is_smooth
-        specular |= hit & ~is_smooth & ~is_null
-        ray, active = si.spawn_ray(ray.d), is_null
-        dr.eval(ray, active, smooth, specular, emission)
+        yield si, active
+        bsdf, d = si.bsdf(), ray.d
+        flags, hit = bsdf.flags(), active & si.is_valid()
+        active = hit & mi.has_flag(flags, mi.BSDFFlags.Null)
+        if random is not None:
+            specular = hit & ~active & ~mi.has_flag(flags, mi.BSDFFlags.Smooth)
+            lobe, place = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
+            sample, weight = bsdf.sample(mi.BSDFContext(), si, lobe, place, specular)
+            specular = specular & dr.any(weight > 0)
+            active, d = active | specular, dr.select(specular, si.to_world(sample.wo), d)
+        ray = si.spawn_ray(d)
+        dr.eval(ray, active, random)
         if dr.none(active):
-            break
-    return smooth, specular, emission
+            return
 
 
 def _read_geometry(graph: SceneGraph) -> bool:

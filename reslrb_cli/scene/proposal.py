@@ -22,6 +22,7 @@ from reslrb_cli.scene.catalog import ParameterInfo, list_parameters
 from reslrb_cli.scene.export import LOBES
 from reslrb_cli.scene.graph import SceneGraph, grid, sensor_rays
 from reslrb_cli.scene.images import decode_srgb, read_bitmap
+from reslrb_cli.scene.needs import surfaces_met
 
 Image = np.ndarray[Any, Any]
 
@@ -104,8 +105,6 @@ _BOUNDS = (
     (r"\.value$|\.data$|\.specular$", "[0, 1]"),
 )
 
-#: Surfaces, mirrors and clear glass but for the last, by way of which things are looked for.
-_CROSSINGS = 6
 #: Rays along each axis of the film, by which shares are taken.
 _RAYS = 64
 #: What takes less of the picture is left for later, and so are more parameters than these. A lamp is known by a few
@@ -210,10 +209,9 @@ def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
     # One for each ray: an irradiance meter makes a single direction of a single one, which Dr.Jit fails to compile.
     aperture = dr.opaque(mi.Point2f, 0.5, shape=_RAYS**2)
     ray, _ = sensor_rays(sensor, sensor.shutter_open(), grid(_RAYS), aperture)
-    graph, active, lane = SceneGraph.of(scene), dr.full(mi.Bool, True, _RAYS**2), dr.arange(mi.UInt32, _RAYS**2)
+    graph = SceneGraph.of(scene)
     shares: dict[Any, float] = {}
-    for crossing in range(_CROSSINGS):
-        si = scene.ray_intersect(ray, active)
+    for si, active in surfaces_met(scene, ray, dr.full(mi.Bool, True, _RAYS**2), mi.PCG32(_RAYS**2)):
         emitter = si.emitter(scene, active)  # an area light has a back
         shining = dr.select(dr.any(emitter.eval(si, active) > 0), emitter, dr.zeros(mi.EmitterPtr))
         bsdf = dr.select(active, si.bsdf(), dr.zeros(mi.BSDFPtr))
@@ -227,13 +225,6 @@ def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
                 own = int(np.array(dr.reinterpret_array(mi.UInt32, kind(item)))[0])
                 more = float(numbers[own]) / _RAYS**2 if own < len(numbers) else 0.0
                 shares[item] = min(shares.get(item, 0.0) + more, 1.0)
-        active &= si.is_valid() & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        if dr.none(active):
-            break
-        x, y = (mi.sample_tea_float32(lane, 2 * crossing + k) for k in range(2))
-        sample, weight = bsdf.sample(mi.BSDFContext(), si, x, mi.Point2f(x, y), active)
-        active &= dr.any(weight > 0)
-        ray = mi.RayDifferential3f(si.spawn_ray(si.to_world(sample.wo)))
     for bsdf in graph.of_type(mi.BSDF):  # what is nested is seen with what it is nested in
         shares[bsdf] = max((shares.get(owner, 0.0) for owner in graph.owning_bsdfs(bsdf)), default=0.0)
     return shares

@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.scene.graph import SceneGraph, sensor_rays
-from reslrb_cli.scene.needs import CROSSINGS, LOOK, what_is_seen
+from reslrb_cli.scene.needs import LOOK, surfaces_met, what_is_seen
 
 #: Primary rays are spread over a pixel in so many rows and columns of cells.
 CELLS = 4
@@ -110,19 +110,13 @@ def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
 def _first_surfaces(scene: mi.Scene, ray: mi.Ray3f, count: int) -> tuple[mi.Bool, mi.Bool]:
     """Whether delta lobes are all that a surface has, or some of it, up to the first that is not see-through."""
     lobes = int(mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission)
-    active, alone, mixed = dr.full(mi.Bool, True, count), dr.zeros(mi.Bool, count), dr.zeros(mi.Bool, count)
-    for _ in range(CROSSINGS):
-        si = scene.ray_intersect(ray, active)
-        hit = active & si.is_valid()
+    alone, mixed = dr.zeros(mi.Bool, count), dr.zeros(mi.Bool, count)
+    for si, reached in surfaces_met(scene, ray, dr.full(mi.Bool, True, count)):
         flags = si.bsdf().flags()
-        see_through = hit & mi.has_flag(flags, mi.BSDFFlags.Null)
-        specular = hit & ((flags & lobes) != 0)
-        beside = specular & (see_through | mi.has_flag(flags, mi.BSDFFlags.Smooth))
+        specular = reached & si.is_valid() & ((flags & lobes) != 0)
+        beside = specular & (mi.has_flag(flags, mi.BSDFFlags.Null) | mi.has_flag(flags, mi.BSDFFlags.Smooth))
         alone, mixed = alone | (specular & ~beside), mixed | beside
-        ray, active = si.spawn_ray(ray.d), see_through
-        dr.eval(ray, active, alone, mixed)
-        if dr.none(active):
-            break
+        dr.schedule(alone, mixed)
     return alone, mixed
 
 
@@ -179,32 +173,18 @@ def _mark_seen(
         rows, columns = kept.shape
         x, y = (mi.UInt32(dr.minimum(c * size, size - 1)) for c, size in ((film.x, columns), (film.y, rows)))
         active = dr.gather(mi.UInt32, mi.UInt32(kept.ravel().astype(np.uint32)), y * columns + x) > 0
-    for _ in range(CROSSINGS):
-        si = scene.ray_intersect(ray, active)
-        active &= si.is_valid()
-        bsdf = si.bsdf()
+    for si, reached in surfaces_met(scene, ray, active, random if mirrored else None):
         is_owner = mi.Mask(False)
         for owner in owners:
-            is_owner |= bsdf == mi.BSDFPtr(owner)
+            is_owner |= si.bsdf() == mi.BSDFPtr(owner)
         u, v = (row[0] * si.uv.x + row[1] * si.uv.y + row[2] for row in transform.tolist()[:2])
         cell = mi.Point2f(u, v) * mi.Vector2f(size)
         inside = mi.Vector2f(cell - dr.floor(cell))
         inner = (dr.abs(inside.x - 0.5) < 0.25) & (dr.abs(inside.y - 0.5) < 0.25)
         # Twice, since the remainder of what is below 0 is not above it.
         x, y = ((mi.Int32(dr.floor(c)) % n + n) % n for c, n in zip((cell.x, cell.y), size, strict=True))
-        dr.scatter(seen, mi.UInt32(1), mi.UInt32(y * size[0] + x), active & is_owner & inner)
-        null, d = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null), ray.d
-        if mirrored:
-            specular = active & ~null & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            lobe, place = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
-            sample, weight = bsdf.sample(mi.BSDFContext(), si, lobe, place, specular)
-            specular &= dr.any(weight > 0)
-            null, d = null | specular, dr.select(specular, si.to_world(sample.wo), d)
-        active &= null
-        ray = si.spawn_ray(d)
-        dr.eval(seen, active, ray, random)
-        if dr.none(active):
-            break
+        dr.scatter(seen, mi.UInt32(1), mi.UInt32(y * size[0] + x), reached & si.is_valid() & is_owner & inner)
+        dr.schedule(seen, random)
 
 
 #: Depths that are tried; the last one stands for all light.

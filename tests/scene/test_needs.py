@@ -16,13 +16,12 @@ from reslrb_cli.scene.catalog import summarise
 from reslrb_cli.scene.load import load_scene, warn_once
 from reslrb_cli.scene.needs import (
     CROSSINGS,
-    check_camera_paths,
     check_paths,
-    check_supported,
-    light_obstacle,
     look,
+    paths_obstacle,
     scene_needs,
 )
+from reslrb_cli.scene.proposal import propose
 from reslrb_cli.scene.visibility import (
     DEPTHS,
     LOST,
@@ -53,7 +52,7 @@ def test_plain_scene(make_scene):
     assert needs.environment is None
     absent = ("has_delta_lobes", "has_null", "has_shading_normals", "has_visible_emitters", "thin_lens")
     assert [name for name in (*absent, "moving_shutter", "has_instances") if getattr(needs, name)] == []
-    check_supported(scene, scene.sensors()[0])
+    check_paths(scene, scene.sensors()[0], "light")
 
 
 @pytest.mark.usefixtures("_without_scenes_of_before")
@@ -113,7 +112,7 @@ def test_view(make_scene):
     assert view.emission == pytest.approx(view.nothing)
     scene = make_scene(camera={"type": "perspective", "to_world": far})
     assert look(scene, scene.sensors()[0]).nothing == 1
-    check_supported(scene, scene.sensors()[0])  # black, but rightly so
+    check_paths(scene, scene.sensors()[0], "light")  # black, but rightly so
 
 
 @pytest.mark.usefixtures("_without_scenes_of_before")
@@ -145,7 +144,7 @@ def test_mask_in_front_is_looked_through(make_scene):
 def test_refused(make_scene, changes, hide_emitters, reason):
     scene = make_scene(**changes)
     with pytest.raises(UnsupportedScene, match=reason):
-        check_supported(scene, scene.sensors()[0], hide_emitters)
+        check_paths(scene, scene.sensors()[0], "light", hide_emitters)
 
 
 @pytest.mark.usefixtures("_without_scenes_of_before")
@@ -156,7 +155,7 @@ def test_scaled_emitters_are_refused_from_both_sides(make_scene, plugin):
         return make_scene(beam={"type": plugin, "to_world": turned @ mi.ScalarTransform4f().scale(scale)})
 
     scaled, plain = scene(2.0), scene(1.0)
-    with pytest.raises(UnsupportedScene, match=f"emitter beam is a `{plugin}` with a scale .*; remove the scale$"):
+    with pytest.raises(UnsupportedScene, match=f"a `{plugin}` with a scale .*; remove the scale, or take .*: light$"):
         check_paths(scaled, scaled.sensors()[0], "both")
     check_paths(scaled, scaled.sensors()[0], "camera")
     check_paths(scaled, scaled.sensors()[0], "light")
@@ -166,7 +165,7 @@ def test_scaled_emitters_are_refused_from_both_sides(make_scene, plugin):
 @pytest.mark.usefixtures("_without_scenes_of_before")
 def test_specular_scene_with_a_visible_light(make_scene):
     scene = make_scene(plane={"type": "rectangle", "bsdf": GLASS}, sky={"type": "constant"})
-    check_supported(scene, scene.sensors()[0])
+    check_paths(scene, scene.sensors()[0], "light")
 
 
 @pytest.mark.usefixtures("_without_scenes_of_before")
@@ -207,10 +206,10 @@ def test_fractions_are_of_the_crop_window(make_scene):
 @pytest.mark.usefixtures("_without_scenes_of_before")
 def test_light_that_camera_paths_cannot_find_is_refused_for_prb(make_scene):
     scene = make_scene()
-    check_camera_paths(scene, scene.sensors()[0])
+    check_paths(scene, scene.sensors()[0], "prb")
     scene = make_scene(lamp={"type": "rectangle", "emitter": {"type": "directionalarea"}})
     with pytest.raises(UnsupportedScene, match="`prb` cannot evaluate; take integrator"):
-        check_camera_paths(scene, scene.sensors()[0])
+        check_paths(scene, scene.sensors()[0], "prb")
 
 
 FOG = {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
@@ -235,9 +234,9 @@ REF = {"type": "ref", "id": "group"}
 def test_what_no_integrator_knows_is_refused_alike(make_scene, changes, reason):
     scene = make_scene(**changes)
     said = []
-    for check in (check_supported, check_camera_paths):
+    for paths in ("light", "prb"):
         with pytest.raises(UnsupportedScene, match=reason) as error:
-            check(scene, scene.sensors()[0])
+            check_paths(scene, scene.sensors()[0], paths)
         said.append(str(error.value))
     assert said[0] == said[1]
     assert "integrator.type" not in said[0]
@@ -246,8 +245,8 @@ def test_what_no_integrator_knows_is_refused_alike(make_scene, changes, reason):
 @pytest.mark.usefixtures("_without_scenes_of_before")
 def test_a_medium_that_rays_cannot_meet_is_nobodys(make_scene):
     scene = make_scene(group={"type": "shapegroup", "fog": FOG})
-    check_supported(scene, scene.sensors()[0])
-    check_camera_paths(scene, scene.sensors()[0])
+    check_paths(scene, scene.sensors()[0], "light")
+    check_paths(scene, scene.sensors()[0], "prb")
 
 
 @pytest.mark.usefixtures("_without_scenes_of_before")
@@ -262,14 +261,14 @@ def test_a_medium_that_rays_cannot_meet_is_nobodys(make_scene):
         ({"plane": {"type": "rectangle", "bsdf": GLASS}}, "surface, or take integrator: {type: reslrb, paths: both}"),
         (
             {"camera": {"type": "orthographic"}, "lamp": BEAM},
-            "sensors; nor can paths the other way round.*`prb` cannot",
+            "sensors; nor can other paths render it.*`prb` cannot",
         ),
     ],
 )
 def test_the_way_out_is_named_where_there_is_one(make_scene, changes, way):
     scene = make_scene(**changes)
     with pytest.raises(UnsupportedScene, match=f"{way}[^;]*$"):
-        check_supported(scene, scene.sensors()[0])
+        check_paths(scene, scene.sensors()[0], "light")
 
 
 @pytest.mark.usefixtures("_without_scenes_of_before")
@@ -286,7 +285,7 @@ def test_a_material_is_refused_to_light_paths_that_differs_with_light_and_view_e
         si.wi = wi
         values.append(np.array(material.eval(mi.BSDFContext(), si, wo)).ravel() / np.array(wo.z))
     assert np.allclose(*values, rtol=1e-3) is same
-    assert (light_obstacle(scene, scene.sensors()[0]) is None) is same
+    assert (paths_obstacle(scene, scene.sensors()[0], "light") is None) is same
 
 
 # How deep paths have to be: in a closed sphere that glows, whose light of every depth is known.
@@ -342,6 +341,21 @@ def test_texels_are_seen_through_as_many_surfaces_as_pixels_are(make_scene):
         places = [place.translate([0, 0, 0.2 + 0.01 * number]).scale(9) for number in range(count)]
         scene = make_scene(**{f"veil_{number}": veil | {"to_world": at} for number, at in enumerate(places)})
         assert visible_texels(scene, scene.sensors(), KEY).any() == is_seen
+
+
+@pytest.mark.parametrize(("bsdf", "count"), [({"type": "thindielectric"}, 8), ({"type": "mask", "opacity": 0.2}, 1)])
+def test_proposals_see_through_glass_and_masks(make_scene, bsdf, count):
+    import mitsuba as mi
+
+    place = mi.ScalarTransform4f()
+    inside = {"inside": {"type": "diffuse"}} if bsdf["type"] == "mask" else {}
+    panes = {
+        f"pane_{number}": {
+            "type": "rectangle", "bsdf": bsdf | inside, "to_world": place.translate([0, 0, 0.2 + 0.1 * number]).scale(9)
+        } for number in range(count)
+    }  # fmt: skip
+    [floor] = [item for item in propose(make_scene(**panes), 0) if item.info.key == KEY]
+    assert floor.share > 0.1
 
 
 def test_crop_window_and_orientation(make_scene):

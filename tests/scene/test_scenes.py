@@ -12,7 +12,7 @@ from turns import a_few
 from reslrb_cli.config.loader import load
 from reslrb_cli.integrators.step import make_integrator, render_image
 from reslrb_cli.scene.load import load_scene
-from reslrb_cli.scene.needs import check_supported, look, scene_needs
+from reslrb_cli.scene.needs import check_paths, look, scene_needs
 from reslrb_cli.scene.parameters import select_parameters, set_values
 from reslrb_cli.scene.visibility import visible_texels
 
@@ -110,7 +110,7 @@ def test_mitsuba_alone_loads_and_renders_it(name):
 def test_config_fits_the_scene(name):
     config = load(ROOT / "configs" / f"{name}.yaml", [])
     scene = load_scene(config.scene.file, config.scene.options)
-    check_supported(scene, scene.sensors()[0], config.integrator.hide_emitters)
+    check_paths(scene, scene.sensors()[0], "light", config.integrator.hide_emitters)
     assert select_parameters(scene, config.parameters, config.source).keys
 
 
