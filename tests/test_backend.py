@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from conformance.operations import even_table
 
 from reslrb_cli.backend import doctor, llvm, variant
 from reslrb_cli.backend import probe as probe_module
@@ -24,7 +25,7 @@ from reslrb_cli.backend.shared_library import missing_library
 from reslrb_cli.errors import BackendError, ExitCode
 from reslrb_cli.optimization.views import to_tensor
 from reslrb_cli.records.tree import like
-from reslrb_cli.transport.guide import even_table, make_grid
+from reslrb_cli.transport.guide import make_grid
 
 # The choice of libLLVM: which of several, which ones are refused, and what the user is told.
 

@@ -24,7 +24,6 @@ import numpy as np
 
 from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.transport.aim import Aim
-from reslrb_cli.transport.film import Blocks
 from reslrb_cli.transport.plan import Grid, least_slots
 from reslrb_cli.transport.roulette import Survival
 
@@ -85,12 +84,6 @@ class Table:
             survival or Survival.certain(),
             aim,
         )
-
-
-def even_table(grid: Grid, film: Blocks | None = None) -> Table:
-    """The table of somebody who has learned nothing; paths are aimed at all of the `film`, if any."""
-    aim = None if film is None else Aim.of(film, film.areas())
-    return Table.of(grid, apportion(grid, grid.measures()), aim=aim)
 
 
 @dataclass

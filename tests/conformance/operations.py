@@ -12,13 +12,20 @@ import mitsuba as mi
 
 from reslrb_cli.integrators import reslrb as lt
 from reslrb_cli.integrators.reslrb import Reslrb
-from reslrb_cli.transport.film import film_blocks
-from reslrb_cli.transport.guide import even_table
-from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.aim import Aim
+from reslrb_cli.transport.film import Blocks, film_blocks
+from reslrb_cli.transport.guide import Table, apportion
+from reslrb_cli.transport.plan import Grid, Plan
 from reslrb_cli.transport.samples import passes
 
 PATHS = 64  # traced to have kernels compiled
 LARGE = 100  # operations; smaller kernels develop images and prepare textures
+
+
+def even_table(grid: Grid, film: Blocks | None = None) -> Table:
+    """Return the table of a run that has learned nothing; paths are aimed at all of the `film`, if any."""
+    aim = None if film is None else Aim.of(film, film.areas())
+    return Table.of(grid, apportion(grid, grid.measures()), aim=aim)
 
 
 def count(integrator: Reslrb, plan: Plan, scene: mi.Scene, sensor: mi.Sensor) -> list[int]:

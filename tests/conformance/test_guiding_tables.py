@@ -9,7 +9,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES
-from conformance.operations import LARGE, nothing_is_compiled_without
+from conformance.operations import LARGE, even_table, nothing_is_compiled_without
 from conformance.test_guiding import SPP, guided, learn, sample
 from conformance.test_kernels import Kernels
 
@@ -17,7 +17,7 @@ from reslrb_cli.guiding.collect import KEEP, Onward
 from reslrb_cli.guiding.tables import BLUR, FINE, Guiding, Learned, _blurred, grid_for, learnings, most_cells
 from reslrb_cli.integrators import freezing
 from reslrb_cli.measure.gradients import Case, integrator, relative
-from reslrb_cli.transport.guide import Guide, Table, apportion, even_table, make_grid
+from reslrb_cli.transport.guide import Guide, Table, apportion, make_grid
 from reslrb_cli.transport.plan import GUIDE_UNIFORM, Grid
 from reslrb_cli.transport.roulette import CELLS
 

@@ -272,6 +272,15 @@ def test_the_way_out_is_named_where_there_is_one(make_scene, changes, way):
 
 
 @pytest.mark.usefixtures("_without_scenes_of_before")
+@pytest.mark.parametrize("paths", ["camera", "both"])
+def test_no_way_out_is_named_that_is_blocked(make_scene, paths):
+    scene = make_scene(camera={"type": "orthographic"}, lamp=BEAM)
+    with pytest.raises(UnsupportedScene, match="nor can other paths render it") as error:
+        check_paths(scene, scene.sensors()[0], paths)
+    assert "take integrator" not in str(error.value)
+
+
+@pytest.mark.usefixtures("_without_scenes_of_before")
 @pytest.mark.parametrize(("bsdf", "same"), [("hair", False), ("pplastic", True), ("principled", True)])
 def test_a_material_is_refused_to_light_paths_that_differs_with_light_and_view_exchanged(make_scene, bsdf, same):
     import mitsuba as mi
