@@ -209,15 +209,16 @@ def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
     # One for each ray: an irradiance meter makes a single direction of a single one, which Dr.Jit fails to compile.
     aperture = dr.opaque(mi.Point2f, 0.5, shape=_RAYS**2)
     ray, _ = sensor_rays(sensor, sensor.shutter_open(), grid(_RAYS), aperture)
-    graph = SceneGraph.of(scene)
+    graph, smooth = SceneGraph.of(scene), dr.zeros(mi.Bool, _RAYS**2)
     shares: dict[Any, float] = {}
-    for si, active in surfaces_met(scene, ray, dr.full(mi.Bool, True, _RAYS**2), mi.PCG32(_RAYS**2)):
+    for si, reached in surfaces_met(scene, ray, dr.full(mi.Bool, True, _RAYS**2), mi.PCG32(_RAYS**2)):
+        active = reached & ~smooth  # a mask counts, and nothing behind it
         emitter = si.emitter(scene, active)  # an area light has a back
         shining = dr.select(dr.any(emitter.eval(si, active) > 0), emitter, dr.zeros(mi.EmitterPtr))
         bsdf = dr.select(active, si.bsdf(), dr.zeros(mi.BSDFPtr))
         for pointers, kind, items in (
             (bsdf, mi.BSDFPtr, graph.surface_bsdfs()),
-            (si.shape, mi.ShapePtr, graph.shapes()),
+            (dr.select(active, si.shape, dr.zeros(mi.ShapePtr)), mi.ShapePtr, graph.shapes()),
             (shining, mi.EmitterPtr, scene.emitters()),
         ):
             numbers = np.bincount(np.array(dr.reinterpret_array(mi.UInt32, pointers)))
@@ -225,6 +226,8 @@ def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
                 own = int(np.array(dr.reinterpret_array(mi.UInt32, kind(item)))[0])
                 more = float(numbers[own]) / _RAYS**2 if own < len(numbers) else 0.0
                 shares[item] = min(shares.get(item, 0.0) + more, 1.0)
+        smooth = smooth | (active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
+        dr.schedule(smooth)
     for bsdf in graph.of_type(mi.BSDF):  # what is nested is seen with what it is nested in
         shares[bsdf] = max((shares.get(owner, 0.0) for owner in graph.owning_bsdfs(bsdf)), default=0.0)
     return shares
