@@ -52,7 +52,7 @@ def test_one_page_of_everything(report, tmp_path):
     assert 'http-equiv="refresh"' not in page
     # of runs that never recorded them they are found in the folder
     assert "Errors as people see them" in page
-    assert "ΔE ITP" in page
+    assert "CIEDE2000" in page
 
 
 def test_of_one_run_its_own_page_is_written_anew(report, tmp_path):
