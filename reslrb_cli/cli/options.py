@@ -24,6 +24,7 @@ from click.shell_completion import CompletionItem
 from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.config.loader import load, loads
+from reslrb_cli.config.run import memory_bytes
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.records.atomic import remove_parts_of
@@ -222,20 +223,16 @@ class Factors(click.ParamType):
         return tuple(sorted(factors))
 
 
-_UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
-
-
 class Size(click.ParamType):
     """A number of bytes such as `2GiB`."""
 
     name = "size"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(|k|M|G|Ki|Mi|Gi)B?", str(value).strip())
-        size = 0.0 if match is None else float(match[1]) * _UNITS[match[2]]
-        if not 1 <= size < 2**63:
+        try:
+            return memory_bytes(str(value))
+        except ValueError:
             self.fail(f"`{value}` is no size; write it as in 2GiB or 500MB", param, ctx)
-        return int(size)
 
 
 budget_option = click.option(

@@ -80,7 +80,7 @@ def color_errors(moments: Mapping[str, Array], true: Array, mask: Array | None) 
             pair = _entries(texture, target, mask)
             if pair[0].size:
                 found[moment] = _mean_and_max(ciede2000(*pair))
-    return {"measure": "ciede2000"} | found if found else {}
+    return found
 
 
 def _texture(array: Array) -> Array | None:

@@ -92,7 +92,6 @@ def test_recovered_colours():
     final[0] = 0.9
     mask = np.ones((4, 4), bool)
     found = color_errors({"final": final}, true, mask)
-    assert found["measure"] == "ciede2000"
     assert found["final"]["mean"] == pytest.approx(ciede2000(final[0, 0], true[0, 0]) / 4)
     mask[0] = False
     assert color_errors({"final": final}, true, mask)["final"]["max"] == 0

@@ -153,12 +153,7 @@ def seen_tables(runs: Sequence[Run]) -> Markup:
                 for title, moment in (("start", "initial"), ("end", "final"))
                 if moment in about
             ]
-        # Earlier versions recorded colours of lamps in another measure.
-        colors += [
-            {"run": name, "name": key, "about": about}
-            for key, about in (seen.get("colors") or {}).items()
-            if about.get("measure") == "ciede2000"
-        ]
+        colors += [{"run": name, "name": key, "about": about} for key, about in (seen.get("colors") or {}).items()]
     return lay_out("run.seen", images, colors) if images or colors else Markup()
 
 
