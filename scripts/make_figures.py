@@ -126,9 +126,10 @@ def scene_panels() -> list[tuple[str, Image]]:
 
 
 def encode(image: Image) -> Image:
-    """Linear values as sRGB in [0, 1]."""
-    image = np.clip(image[:, :, :3], 0, 1)
-    return np.where(image <= 0.0031308, 12.92 * image, 1.055 * image ** (1 / 2.4) - 0.055)
+    """Return linear values (H, W, C) as sRGB in [0, 1], without alpha."""
+    from reslrb_cli.report import tonemap
+
+    return tonemap.encode(np.clip(image[:, :, :3], 0, 1))
 
 
 def write_strip(panels: Sequence[tuple[str, Image]], out: Path) -> None:

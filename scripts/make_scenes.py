@@ -17,6 +17,8 @@ import numpy as np
 import OpenEXR
 from PIL import Image as Picture
 
+from reslrb_cli.lens.solid import ply_file
+
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 Image = np.ndarray  # (H, W, 3) float32, linear Rec. 709
 
@@ -303,14 +305,7 @@ def write_ply(path: Path, *arrays: np.ndarray) -> None:
     """Write a triangle mesh as binary PLY: positions, normals, texture coordinates where it has any, and faces."""
     path.parent.mkdir(parents=True, exist_ok=True)
     *vertices, faces = arrays
-    columns = np.hstack(vertices)
-    names = ("x", "y", "z", "nx", "ny", "nz", "u", "v")[: columns.shape[1]]
-    properties = "".join(f"property float {name}\n" for name in names)
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(columns)}\n{properties}"
-    head += f"element face {len(faces)}\nproperty list uchar int vertex_index\nend_header\n"
-    polygons = np.empty(len(faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
-    polygons["count"], polygons["index"] = 3, faces
-    path.write_bytes(head.encode() + columns.astype("<f4").tobytes() + polygons.tobytes())
+    path.write_bytes(ply_file(np.hstack(vertices), faces))
 
 
 if __name__ == "__main__":

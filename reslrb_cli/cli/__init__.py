@@ -35,7 +35,6 @@ _SUMMARIES = {
     "gradcheck": "Compare gradients with references.",
     "convergence": "Measure error against run time.",
     "report": "Write one page about runs and measurements.",
-    "completion": "Print what has a shell complete commands, options and settings.",
     "doctor": "Say which backend is in use, and what is missing.",
 }
 

@@ -33,9 +33,10 @@ def read_luminance(path: Path) -> np.ndarray:
     import numpy as np
 
     from reslrb_cli.lens.surface import is_even
+    from reslrb_cli.records.images import luminance
     from reslrb_cli.scene.images import read_bitmap, read_photo
 
-    image = read_photo(path).image.astype(np.float64) @ np.array([0.2126, 0.7152, 0.0722])
+    image = luminance(read_photo(path).image)
     bitmap = read_bitmap(path, upright=True)
     if bitmap.has_alpha():
         raw = np.array(bitmap)[:, :, -1]

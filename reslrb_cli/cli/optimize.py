@@ -22,7 +22,7 @@ from reslrb_cli.cli.options import (
 )
 from reslrb_cli.cli.terminal import echo, fill
 from reslrb_cli.cluster.connection import Place
-from reslrb_cli.config.files import in_words, rough_duration
+from reslrb_cli.config.files import duration, in_words
 from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
@@ -43,10 +43,10 @@ def show_forecast(config: Config) -> None:
     say = logger.info
     forecast = make_forecast(config, say, PilotCache(), lambda problem: check_missing(problem, logger.warning))
     sums = f"{forecast.iterations} x {1e3 * forecast.iteration_s:.3g} ms"
-    sums += f" + {rough_duration(forecast.start_s)}" if forecast.start_s > 0.01 * forecast.elapsed_s else ""
+    sums += f" + {duration(forecast.start_s)}" if forecast.start_s > 0.01 * forecast.elapsed_s else ""
     text = fill(
         "forecast.txt.j2",
-        {"bytes": in_words, "time": rough_duration},
+        {"bytes": in_words, "time": duration},
         source=config.source,
         forecast=forecast,
         budget=config.run.budget_bytes,

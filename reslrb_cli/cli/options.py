@@ -13,7 +13,7 @@ import re
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -24,6 +24,7 @@ from click.shell_completion import CompletionItem
 from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.config.loader import load, loads
+from reslrb_cli.config.run import memory_bytes
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.records.atomic import remove_parts_of
@@ -163,11 +164,30 @@ class FolderPath(click.Path):
 FOLDER = FolderPath(path_type=Path)
 
 
-def complete_setting(context: click.Context, parameter: click.Parameter, begun: str) -> list[CompletionItem]:
-    """What the key of a setting may go on with, for `--set` and `--vary`."""
-    from reslrb_cli.cli import completion
+def complete_setting(_context: click.Context, _parameter: click.Parameter, start: str) -> list[CompletionItem]:
+    """Return the settings whose keys start with `start`, as `KEY=`; indices may be any number."""
+    plain = re.sub(r"\[\d+\]", "[0]", start)
+    return [CompletionItem(f"{start}{key[len(plain) :]}=") for key in setting_keys() if key.startswith(plain)]
 
-    return completion.complete_setting(context, parameter, begun)
+
+def setting_keys() -> list[str]:
+    """Return every key of the configuration's schema. Lists have one key, of index 0: `parameters[0].bounds`."""
+    schema = Config.model_json_schema()
+    return list(dict.fromkeys(_keys(schema, schema["$defs"], "")))
+
+
+def _keys(schema: Mapping[str, Any], definitions: Mapping[str, Any], at: str) -> Iterator[str]:
+    """Yield the keys below `at` for each alternative in `schema`. At most 6 levels: it may refer to itself."""
+    if "$ref" in schema:
+        schema = definitions[schema["$ref"].rpartition("/")[2]]
+    for alternative in (*schema.get("anyOf", ()), *schema.get("oneOf", ())):
+        yield from _keys(alternative, definitions, at)
+    if "items" in schema:
+        yield from _keys(schema["items"], definitions, f"{at}[0]")
+    for name, value in schema.get("properties", {}).items() if at.count(".") < 5 else ():
+        key = f"{at}.{name}" if at else name
+        yield key
+        yield from _keys(value, definitions, key)
 
 
 #: Type of an option that counts something: samples, depths, seeds. As in a configuration, 31 bits.
@@ -203,20 +223,16 @@ class Factors(click.ParamType):
         return tuple(sorted(factors))
 
 
-_UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
-
-
 class Size(click.ParamType):
     """A number of bytes such as `2GiB`."""
 
     name = "size"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(|k|M|G|Ki|Mi|Gi)B?", str(value).strip())
-        size = 0.0 if match is None else float(match[1]) * _UNITS[match[2]]
-        if not 1 <= size < 2**63:
+        try:
+            return memory_bytes(str(value))
+        except ValueError:
             self.fail(f"`{value}` is no size; write it as in 2GiB or 500MB", param, ctx)
-        return int(size)
 
 
 budget_option = click.option(

@@ -325,7 +325,7 @@ def _end_with_input() -> None:
 
 def _forecast(plan: Plan) -> int:
     """Print how many runs there are, and what those of each combination will take; nothing is written."""
-    from reslrb_cli.config.files import in_words, rough_duration
+    from reslrb_cli.config.files import duration, in_words
     from reslrb_cli.optimization.forecast import make_forecast
     from reslrb_cli.records.cache import PilotCache
     from reslrb_cli.records.sweeps import label
@@ -350,10 +350,10 @@ def _forecast(plan: Plan) -> int:
             total_s += seeds * forecast.whole_s
             rows.append((
                 shorten(label(combination.settings), 60), in_words(forecast.peak),
-                f"{1e3 * forecast.iteration_s:.3g} ms", rough_duration(forecast.whole_s),
-                rough_duration(seeds * forecast.whole_s),
+                f"{1e3 * forecast.iteration_s:.3g} ms", duration(forecast.whole_s),
+                duration(seeds * forecast.whole_s),
             ))  # fmt: skip
     for line in table(rows):
         echo(line)
-    echo(f"time of the whole sweep: about {rough_duration(total_s)}")
+    echo(f"time of the whole sweep: about {duration(total_s)}")
     return ExitCode.DONE

@@ -139,9 +139,16 @@ def _check(path: Path, status: os.stat_result, most: int | None) -> None:
         raise ConfigError(path, "", f"has {in_words(status.st_size)}; more than {in_words(most)} are not read")
 
 
-def rough_duration(seconds: float) -> str:
-    """Seconds in words: `0.4 s`, `12 min`, `5.2 h`, `3.1 days`."""
-    for unit, name in ((86400, "days"), (3600, "h"), (60, "min")):
-        if seconds >= 2 * unit:
-            return f"{seconds / unit:.1f} {name}"
-    return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:.0f} s"
+def duration(seconds: float) -> str:
+    """Return a time in words: `12.3 ms`, `4.56 s`, `3 min 20 s`, `2 h 5 min`, `3.1 days`."""
+    if seconds < 1:
+        return f"{1e3 * seconds:.3g} ms"
+    if seconds < 59.95:
+        return f"{seconds:.3g} s"
+    if seconds >= 2 * 86400:
+        return f"{seconds / 86400:.1f} days"
+    whole = round(seconds)
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    minutes = round(seconds / 60)
+    return f"{minutes // 60} h {minutes % 60} min"

@@ -120,12 +120,6 @@ UNDECIDED: dict[str, str | float] = {
 #: The estimator of `auto`: the only one with derivatives of camera paths and of both `follow` and `stay`.
 AUTO_ESTIMATOR = "stack"
 
-#: What a run's own configuration, which holds every setting, always had; nobody writes all of these by hand.
-_WRITTEN_BEFORE = frozenset(
-    {"max_depth", "rr_depth", "hide_emitters", "attached", "attached_sampling", "estimator"}
-    | {"guiding", "sequence", "freeze"}
-)
-
 #: Every option that says which estimator, and how.
 _ANY_ESTIMATORS = {"estimator", *(option for options in ESTIMATOR_OPTIONS.values() for option in options)}
 
@@ -193,16 +187,6 @@ class Reslrb(AttachingTracer):
     freeze: bool = True
     """Record what a step launches and launch that again, so that its Python runs once, not in every iteration. Not with
     passes, nor with more than 4 million paths, beside which Python does not show."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _as_written(cls, values: Any) -> Any:
-        """What a run folder of before there were `paths`, or `pixels`, says goes on as it was, and so does one of when
-        there was `image`, if that is what all have now."""
-        if isinstance(values, dict) and values.keys() >= _WRITTEN_BEFORE:
-            kept = {name: value for name, value in values.items() if (name, value) != ("image", "all")}
-            return {"paths": UNDECIDED["paths"], "pixels": UNDECIDED["pixels"], **kept}
-        return values
 
     @model_validator(mode="after")
     def _leave_off(self) -> Self:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
 from reslrb_cli.lens import transport
+from reslrb_cli.lens.solid import ply_file
 from reslrb_cli.lens.surface import Array, Rays, Setting, Surface, transmitted
 
 #: Reflectance of the receiver, and its width in pictures.
@@ -77,21 +78,14 @@ def face_ply(setting: Setting, nx: int, ny: int, back: bool = False) -> bytes:
     u, v = np.meshgrid((np.arange(nx) + 0.5) / nx, (np.arange(ny) + 0.5) / ny)
     zero = np.zeros_like(x)
     z, normal = (-setting.thickness, -1.0) if back else (0.0, 1.0)
-    points = np.stack([x, y, zero + z, zero, zero, zero + normal, u, v], axis=-1).reshape(-1, 8).astype("<f4")
+    points = np.stack([x, y, zero + z, zero, zero, zero + normal, u, v], axis=-1).reshape(-1, 8)
     corner = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)).ravel()
     cells = np.concatenate([
         np.stack([corner, corner + 1, corner + nx + 1], 1), np.stack([corner, corner + nx + 1, corner + nx], 1)
     ])  # fmt: skip
     if back:
         cells = cells[:, ::-1]
-    faces: NDArray[Any] = np.empty(len(cells), dtype=[("n", "u1"), ("at", "<i4", 3)])
-    faces["n"], faces["at"] = 3, cells
-    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz", "u", "v"))
-    head = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{names}"
-        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    return head.encode() + points.tobytes() + faces.tobytes()
+    return ply_file(points, cells)
 
 
 def film_size(shape: tuple[int, int], margin: float) -> tuple[int, int]:

@@ -437,14 +437,23 @@ def stl(solid: Solid) -> bytes:
 
 def ply(solid: Solid) -> bytes:
     """Binary PLY, 32-bit floats, in mm."""
-    faces: NDArray[Any] = np.empty(len(solid.triangles), [("n", "u1"), ("at", "<i4", 3)])
-    faces["n"], faces["at"] = 3, solid.triangles
+    return ply_file(solid.points, solid.triangles, "comment millimetres\n")
+
+
+def ply_file(vertices: NDArray[Any], triangles: NDArray[Any], comment: str = "") -> bytes:
+    """Return a binary PLY. `vertices` are positions, normals and texture coordinates (N, 3, 6 or 8), as 32-bit floats.
+
+    `comment` is a line of the header, such as `comment millimetres` with its newline.
+    """
+    names = ("x", "y", "z", "nx", "ny", "nz", "u", "v")[: vertices.shape[1]]
+    faces: NDArray[Any] = np.empty(len(triangles), [("n", "u1"), ("at", "<i4", 3)])
+    faces["n"], faces["at"] = 3, triangles
+    properties = "".join(f"property float {name}\n" for name in names)
     head = (
-        "ply\nformat binary_little_endian 1.0\ncomment millimetres\n"
-        f"element vertex {len(solid.points)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"ply\nformat binary_little_endian 1.0\n{comment}element vertex {len(vertices)}\n{properties}"
         f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
-    return head.encode() + solid.points.astype("<f4").tobytes() + faces.tobytes()
+    return head.encode() + vertices.astype("<f4").tobytes() + faces.tobytes()
 
 
 def obj(solid: Solid) -> bytes:

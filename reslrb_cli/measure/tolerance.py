@@ -19,6 +19,7 @@ import scipy.ndimage
 from reslrb_cli.config.schema import Fabrication
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.lens.solid import Array, Sheet
+from reslrb_cli.records.images import luminance
 
 #: Of the distance, of the index, and in degrees: by how much each is off.
 DISTANCE, INDEX, TURN = 0.02, 0.005, 1.0
@@ -46,12 +47,6 @@ def closed_by_ball(heights: Array, pitch: Sequence[float], radius: float) -> Arr
     lifted = np.pad(heights, [(reach[1],) * 2, (reach[0],) * 2], mode="edge")
     closed = scipy.ndimage.grey_closing(lifted, footprint=far <= radius**2, structure=ball)
     return np.asarray(closed[reach[1] : -reach[1], reach[0] : -reach[0]])
-
-
-def luminance(image: Array) -> Array:
-    """That of an image (H, W, C), (H, W)."""
-    wide = image[:, :, :3].astype(np.float64)
-    return np.asarray(wide @ [0.2126, 0.7152, 0.0722] if wide.shape[2] == 3 else wide[:, :, 0])
 
 
 def figures(image: Array, target: Array) -> dict[str, float]:

@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from reslrb_cli.backend.doctor import resident_paths
 from reslrb_cli.backend.memory import free_bytes, local_bytes
-from reslrb_cli.config.files import in_words, rough_duration
+from reslrb_cli.config.files import duration, in_words
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.integrators import divisors, passes_obstacle
 from reslrb_cli.config.schema import Config
@@ -329,5 +329,5 @@ def outlook(config: Config, scene: mi.Scene, sensors: Sequence[int]) -> str | No
     paths = each * run.iterations
     if paths < MANY_PATHS:
         return None
-    takes = f"{rough_duration(paths / RATE)} at {RATE / 1e6:.0f} million paths a second; --dry-run measures it"
+    takes = f"{duration(paths / RATE)} at {RATE / 1e6:.0f} million paths a second; --dry-run measures it"
     return f"{each:.3g} light paths an iteration, {paths:.3g} in all: the run takes {takes}"

@@ -26,6 +26,7 @@ from reslrb_cli.optimization.loading import (
 )
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import Array, Masked, View, Wanted, color_channels
+from reslrb_cli.records.images import luminance
 from reslrb_cli.scene.images import Photo, read_photo, read_weights, turned_line
 from reslrb_cli.scene.needs import scene_needs
 from reslrb_cli.scene.parameters import Selection, set_values
@@ -92,10 +93,6 @@ def mask_line(name: str, masked: Masked, weights: Array) -> str | None:
     return "; ".join([line + (f": {', '.join(parts)}" if parts else ""), *stay])
 
 
-#: Weights of linear sRGB in luminance, as Mitsuba has them.
-LUMINANCE = np.array([0.212671, 0.715160, 0.072169], dtype=np.float32)
-
-
 def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
     """Read or render every view's target; returns the problem with what that tells of the parameters, its `truth`.
 
@@ -152,7 +149,7 @@ def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: C
     wanted, config = view.wanted, problem.config
     colors = color_channels(problem.scene.sensors()[view.sensor].film())
     if colors == 1 and image.shape[2] >= 3:
-        image = image[:, :, :3] @ LUMINANCE[:, None]
+        image = luminance(image)[:, :, None].astype(np.float32)
     target = image[:, :, :colors]
     render, made_of = config.target.render, "camera"  # a photograph has all light
     if photo is None and render is not None:

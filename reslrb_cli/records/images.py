@@ -24,6 +24,13 @@ from reslrb_cli.records.atomic import write_atomically
 
 Array = np.ndarray[Any, Any]
 
+
+def luminance(image: Array) -> Array:
+    """Return the luminance (H, W) of linear values (H, W, C), by Mitsuba's weights; of one channel, that channel."""
+    wide = image.astype(np.float64)
+    return wide[:, :, :3] @ [0.212671, 0.715160, 0.072169] if image.shape[2] >= 3 else wide[:, :, 0]
+
+
 #: Bytes of such a name. File systems take 255, of which some are for suffixes and for files that are being written.
 MOST_BYTES = 180
 

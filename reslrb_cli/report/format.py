@@ -39,19 +39,6 @@ def interval(value: float, low: float, high: float, digits: int | str) -> str:
     return f"{value:{spec}} [{low:{spec}}, {high:{spec}}]"
 
 
-def duration(seconds: float) -> str:
-    """A time in the units that a person would choose: `12.3 ms`, `4.56 s`, `3 min 20 s`, `2 h 5 min`."""
-    if seconds < 1:
-        return f"{1e3 * seconds:.3g} ms"
-    if seconds < 59.95:
-        return f"{seconds:.3g} s"
-    whole = round(seconds)
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60} s"
-    minutes = round(seconds / 60)
-    return f"{minutes // 60} h {minutes % 60} min"
-
-
 def count(amount: int, what: str) -> str:
     """An amount of things whose plural ends in s."""
     return f"{amount} {what}" if amount == 1 else f"{amount} {what}s"

@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from reslrb_cli.config.files import duration
 from reslrb_cli.measure.optimization_benchmark.rank import Verdict, find_best, ratio
 from reslrb_cli.records.manifest import Status, is_complete
 from reslrb_cli.records.measurements import Band
@@ -23,7 +24,7 @@ from reslrb_cli.records.sweeps import (
     run_name,
     short_keys,
 )
-from reslrb_cli.report.format import count, duration, interval, number, shorten, table
+from reslrb_cli.report.format import count, interval, number, shorten, table
 from reslrb_cli.report.run_summary import units_differ
 from reslrb_cli.report.sources import Run, SweepRuns, is_number
 

@@ -29,12 +29,12 @@ from reslrb_cli.lens.solid import (
     within,
 )
 from reslrb_cli.measure.references import DEEPEST, Situation, ptracer_image
-from reslrb_cli.measure.tolerance import Bench, figures, luminance, where_light_goes
+from reslrb_cli.measure.tolerance import Bench, figures, where_light_goes
 from reslrb_cli.measure.tolerance import tolerances as measure
 from reslrb_cli.optimization.loading import check_integrator, choose_sensors, load_configured, paths_of
 from reslrb_cli.optimization.moving import moves_anything
 from reslrb_cli.records.atomic import write_atomically, writing
-from reslrb_cli.records.images import write_bitmap, write_file, write_image
+from reslrb_cli.records.images import luminance, write_bitmap, write_file, write_image
 from reslrb_cli.records.metrics import finite
 from reslrb_cli.records.run_folder import FABRICATION_FILE, SOLID_PICTURE, exposures, opened
 from reslrb_cli.scene.export import export_scene

@@ -9,7 +9,6 @@ import pytest
 from cli.tiny import write_experiment
 
 from reslrb_cli.cli import main, progress
-from reslrb_cli.report import perceptual
 from reslrb_cli.report.page import values
 from reslrb_cli.report.page.layout import diagram
 from reslrb_cli.report.plots import Curve
@@ -32,9 +31,7 @@ def drawn_once(made: Sequence[Curve], caption: str, label: str) -> str:
 def _own_log_and_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A command logs to the standard error that it finds first, which the next test closes."""
     monkeypatch.setenv("RESLRB_CACHE", str(tmp_path_factory.mktemp("cache")))
-    # HDR-FLIP takes longer than all else that these runs do at their end; tests/report looks at it.
-    monkeypatch.setattr(perceptual, "is_installed", lambda: False)
-    # Neither are diagrams looked at here, but in tests/report too.
+    # tests/report looks at diagrams.
     monkeypatch.setattr(values, "diagram", drawn_once)
     logger = logging.getLogger("reslrb_cli")
     logger.handlers.clear()

@@ -64,7 +64,7 @@ for _type in ("ptracer", "prb", "walk_ad", "trajectory"):
 #: Commands whose help is compared.
 COMMANDS = (
     *("", "inspect", "init", "lens", "optimize", "sweep", "example", "render", "export", "gradcheck", "bench"),
-    *("convergence", "report", "completion", "doctor"),
+    *("convergence", "report", "doctor"),
 )
 #: Tiny measurements, of whose JSON lines the form is compared: names and types, at all depths.
 _TINY = ("--set", "scene.options.size=8", "--set", "run.spp=4")

@@ -151,6 +151,7 @@ def test_what_ends_at_a_low_limit_ended_for_want_of_memory(limit: str, tmp_path:
             "scene.options.colour: the options are",
         ),
         (["--memory-limit", "much"], "`much` is no size"),
+        (["--memory-limit", "2G"], "`2G` is no size; write it as in 2GiB or 500MB"),
         (["--max-depth", "1"], "--max-depth"),
         (["--integrators", "pt"], "--integrators pt: integrator.type"),
         (["--json", "no/such/folder.json"], "--json: cannot write"),

@@ -7,9 +7,10 @@ from typing import Any
 
 import pytest
 
+from reslrb_cli.config.files import duration
 from reslrb_cli.errors import printable
 from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict
-from reslrb_cli.report.format import count, duration, number, shorten, with_error
+from reslrb_cli.report.format import count, number, shorten, with_error
 from reslrb_cli.report.run_summary import last_line, parameter_lines, warnings
 from reslrb_cli.report.tables import suite_table
 
@@ -42,6 +43,7 @@ def test_a_value_with_its_error(value, error, text):
         (59.97, "1 min 0 s"),
         (200, "3 min 20 s"),
         (7500, "2 h 5 min"),
+        (2e6, "23.1 days"),
     ],
 )
 def test_times(seconds, text):

@@ -140,14 +140,10 @@ def _recovered(exposure: object, results: Mapping[str, Any]) -> list[float]:
     return value if isinstance(value, list) else [] if value is None else [value]
 
 
-_MEASURES = {"ciede2000": "CIEDE2000", "itp": "ΔE ITP", "flip": "HDR-FLIP", "absolute": "|image − target|"}
-
-
 def seen_tables(runs: Sequence[Run]) -> Markup:
     """The errors of the images and colours of runs, a line for each at the start and at the end."""
     images: list[dict[str, Any]] = []
     colors: list[dict[str, Any]] = []
-    notes: list[str] = []
     for run in runs:
         seen, name = run.results.get("seen") or {}, run.name if len(runs) > 1 else ""
         for suffix, about in (seen.get("images") or {}).items():
@@ -158,12 +154,7 @@ def seen_tables(runs: Sequence[Run]) -> Markup:
                 if moment in about
             ]
         colors += [{"run": name, "name": key, "about": about} for key, about in (seen.get("colors") or {}).items()]
-        notes += [seen["note"]] if seen.get("note") and seen["note"] not in notes else []
-    if not images and not colors:
-        return Markup()
-    has_flip = any(row["errors"].get("flip") for row in images)
-    measures = {name: title for name, title in _MEASURES.items() if name != "flip" or has_flip}
-    return lay_out("run.seen", images, colors, measures, notes)
+    return lay_out("run.seen", images, colors) if images or colors else Markup()
 
 
 #: Images between the first and the last that are shown of a sensor, at most.

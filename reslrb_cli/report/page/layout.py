@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup, escape
 
-from reslrb_cli.report.format import count, duration, number
+from reslrb_cli.config.files import duration
+from reslrb_cli.report.format import count, number
 from reslrb_cli.report.plots import COLORS, Curve, draw
 
 if TYPE_CHECKING:

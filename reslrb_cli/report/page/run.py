@@ -13,6 +13,7 @@ from typing import Any
 from markupsafe import Markup
 from pydantic import TypeAdapter
 
+from reslrb_cli.config.files import duration
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.clock import SharedTime
 from reslrb_cli.records.decisions import (
@@ -24,7 +25,7 @@ from reslrb_cli.records.decisions import (
 from reslrb_cli.records.images import load_image
 from reslrb_cli.records.measurements import incomplete_records
 from reslrb_cli.records.run_folder import FABRICATION_FILE, SOLID_PICTURE
-from reslrb_cli.report.format import count, duration, number
+from reslrb_cli.report.format import count, number
 from reslrb_cli.report.page.images import image_rows, seen_tables, show, view_table
 from reslrb_cli.report.page.layout import lay_out, soft
 from reslrb_cli.report.page.values import convergence, parameter_table, texture_pictures

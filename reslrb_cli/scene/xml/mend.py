@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from reslrb_cli.backend.installation import is_known
+from reslrb_cli.scene.images import decode_srgb
 from reslrb_cli.scene.xml.read import Description, Element, quoted
 
 #: Lines that one warning names, and warnings of one scene.
@@ -167,8 +168,7 @@ def linear(element: Element) -> str:
     encoded = _floats(hexadecimal(element) if text.strip().startswith("#") else text)
     if len(encoded) not in (1, 3):
         raise element.fail(element.name, f"must be one or three numbers or #rrggbb, not {quoted(text)}")
-    # IEC 61966-2-1
-    return " ".join(f"{c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4:.9g}" for c in encoded)
+    return " ".join(f"{value:.9g}" for value in decode_srgb(np.array(encoded)))
 
 
 def by_wavelength(spectrum: Element, owner: Element) -> dict[str, str]:
