@@ -129,7 +129,7 @@ def _section(name: str, value: dict[str, Any], defs: dict[str, Any], level: int 
 
 def _has_own_section(key: str) -> bool:
     """Others are told apart in the text of their key's type; `target.render.integrator` is as `integrator`."""
-    return key in ("render", "heightmap", "motion", "mask", "precondition", "regularizers", "stages", "stop", "plateau")
+    return key in ("render", "heightmap", "motion", "mask", "precondition", "regularizers", "stages", "stop")
 
 
 def _members(value: dict[str, Any], defs: dict[str, Any]) -> list[dict[str, Any]]:

@@ -194,13 +194,6 @@ class Standing(Section):
     smaller this is, and the more noise losses have, the more windows the test needs."""
 
 
-class Plateau(Standing):
-    """What `schedule: plateau` does where the loss stands; windows begin anew then."""
-
-    factor: Annotated[float, Field(gt=0, lt=1)] = 0.5
-    """What the learning rate is multiplied by, down to `final_fraction` of the first."""
-
-
 def _average(value: Any) -> Any:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise wrong("must be a number of iterations, of 2 or more, or a share of them, above 0 and below 1")
@@ -233,11 +226,10 @@ class Optimizer(Choice):
     `curvature`, for `sgd`: measure the largest curvature of the loss by each parameter, and divide gradients by it. A
     learning rate of 1 is then the step that ends at the bottom in the steepest direction; the default is 0.5."""
     schedule: Literal["constant", "cosine", "exponential", "plateau"] = "constant"
-    """How the learning rate runs from its first value to its last; `plateau`: lower each time that the loss stands."""
+    """How the learning rate runs from its first value to its last. `plateau`: the rate is halved each time that the
+    loss stands, as `run.stop` defines it."""
     final_fraction: float = Field(default=0.01, gt=0, le=1)
     """Last learning rate over the first; only with a schedule other than `constant`."""
-    plateau: Plateau = Plateau()
-    """When a loss stands, and what becomes of the rate then; only with `schedule: plateau`. {}: its defaults."""
     average: Last | None = None
     """The run's result is the mean of the values after the last iterations: of so many, or of a share of all. It has
     less noise than the last values, which stand beside it in `parameters/last/`, and which the run goes on from. Where
@@ -252,8 +244,6 @@ class Optimizer(Choice):
     def _check_schedule(self) -> Self:
         if self.schedule == "constant" and "final_fraction" in self.model_fields_set:
             raise located("final_fraction", "has no effect on a constant learning rate; set `schedule` or remove it")
-        if self.schedule != "plateau" and "plateau" in self.model_fields_set:
-            raise located("plateau", "goes with schedule: plateau; set that or remove it")
         return self
 
     @model_validator(mode="before")
@@ -274,8 +264,6 @@ class Optimizer(Choice):
         values: dict[str, Any] = handler(self)
         if self.schedule == "constant":
             values.pop("final_fraction", None)
-        if self.schedule != "plateau":
-            values.pop("plateau", None)
         if self.average is None:
             values.pop("average", None)
         return values

@@ -67,9 +67,6 @@ class SceneConfig(Section):
     file: ConfigPath = Field(description="Mitsuba scene (XML, versions 0.5 to 3), relative to the config file.")
     options: dict[str, Annotated[bool | int | float | str, BeforeValidator(_scalar)]] = Field(default={})
     """Values of the scene file's `$name` variables."""
-    strict: bool = False
-    """Refuse a scene file in which anything has to be mended or left out before Mitsuba 3 can load it, in place of
-    warning of it."""
     size: Annotated[Size, few("pixels", ": each image of a step takes 12 bytes or more of every one")] | None = None
     """[width, height] of the film of every sensor in pixels, without crop window; null: as the scene file has it. What
     is seen stays the same where the ratio does."""
@@ -373,11 +370,9 @@ class Config(Section):
     def _check_standing(self) -> None:
         """Raise an error, located, where windows of losses hold too few, or an average's iterations are not known."""
         stop, optimizer = self.run.stop, self.optimizer
-        asked = {"run.stop": stop, "optimizer.plateau": optimizer.plateau if optimizer.schedule == "plateau" else None}
-        for key, one in asked.items():
-            if one is not None and self.run.held_out and one.patience < 20:
-                reason = f"must be at least 20, not {one.patience}: held-out views are looked at every 10 iterations"
-                raise located(f"{key}.patience", reason)
+        if stop is not None and self.run.held_out and stop.patience < 20:
+            reason = f"must be at least 20, not {stop.patience}: held-out views are looked at every 10 iterations"
+            raise located("run.stop.patience", reason)
         if stop is not None and optimizer.average is not None:
             raise located(
                 "optimizer.average", "does not go with run.stop, which ends a run nobody knows when; remove one"

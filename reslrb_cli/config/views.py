@@ -24,7 +24,7 @@ from reslrb_cli.config.integrators import AnyIntegrator
 from reslrb_cli.config.optimizers import Losses
 from reslrb_cli.config.parameters import COLOR_SPACE, ColorSpace, Value
 
-_KINDS = ("specular", "border", "clipped", "alpha", "nonfinite")
+_KINDS = ("specular", "border", "clipped", "alpha")
 
 
 class Mask(Section):
@@ -32,6 +32,7 @@ class Mask(Section):
 
     Kinds act on a target that is read from a file. `specular` and `border` are what light tracing lacks: they act where
     one of the run's integrator and the target's traces from the light and the other does not, also on a rendered one.
+    Pixels of a file that are not finite are always left out.
     """
 
     file: ConfigPath | None = None
@@ -47,8 +48,6 @@ class Mask(Section):
     """Leave out pixels of 8 and 16 bit files that are at the greatest value in any channel, and those that the film's
     reconstruction filter mixes with them."""
     alpha: bool = Field(default=True, description="Leave out pixels whose alpha is 0.")
-    nonfinite: bool = True
-    """Leave out pixels that are not finite; false: a file that has any is refused."""
 
 
 def _mask(value: Any) -> Any:
@@ -152,8 +151,6 @@ class TargetConfig(Section):
     """Target image (EXR, PNG, JPG, HDR), or a list with one for each sensor, in their order; relative to the config
     file. It is turned as its EXIF orientation says, unless `scene.cameras` is given."""
     color_space: ColorSpace = Field(default="auto", description=f"{COLOR_SPACE} Only with `file`.")
-    gamma: Positive | None = None
-    """Decode values of 8 and 16 bit files by this power, in place of `color_space`. Only with `file`."""
     truth: bool = False
     """Whether files show the scene with its own values, as pictures of another renderer do: the error of each parameter
     is then known and told. Only with files."""
@@ -161,9 +158,6 @@ class TargetConfig(Section):
     mask: AnyMask = Mask()
     """Pixels that are left out of the loss, and what the others weigh: `auto` (all kinds are left out), `none`, the
     path of an image of weights, alone, or a section that switches kinds off and may add weights."""
-    mask_mixed: bool = False
-    """Leave out, with `specular`, the pixels that see a coat, a blend or a thin pane directly, of whose light light
-    tracing lacks a part; else they stay, and are counted."""
     exposure: Exposures = 1.0
     """What the image is multiplied by before it is compared, target = exposure * image: a number, `auto` (recovered
     with the parameters, one factor), or `per_channel` (recovered, one for each channel, which is white balance), all
@@ -175,12 +169,8 @@ class TargetConfig(Section):
             raise located("", "must have exactly one of `file` and `render`, and has both")
         if self.render is not None and self.color_space != "auto":
             raise located("color_space", "has no effect on a rendered target; it goes with `file`")
-        if self.render is not None and self.gamma is not None:
-            raise located("gamma", "has no effect on a rendered target; it goes with `file`")
         if self.render is not None and self.truth:
             raise located("truth", "is known of a rendered target; it goes with files")
-        if self.gamma is not None and self.color_space != "auto":
-            raise located("gamma", "decodes the file in place of color_space; give one of the two")
         return self
 
     @model_serializer(mode="wrap")
@@ -199,7 +189,6 @@ class ViewSpec(Section):
     target: ConfigPath | None = None
     """Target image, relative to the config file; null: rendered, as `target.render` says."""
     mask: AnyMask | None = Field(default=None, description="As `target.mask`, which it stands in place of.")
-    mask_mixed: bool | None = Field(default=None, description="As `target.mask_mixed`, which it stands in place of.")
     weight: Positive = Field(default=1.0, description="The view's part of the loss, relative to the other views'.")
     exposure: Exposure | None = None
     """As `target.exposure`, but recovered for this view alone where it is not a number."""

@@ -112,7 +112,7 @@ def load_configured(
         if look is not None:
             look(description)
 
-    return load_scene(scene.file, scene.options, scene.strict, scene.size, scene.cameras, see, keys, warn)
+    return load_scene(scene.file, scene.options, scene.size, scene.cameras, see, keys, warn)
 
 
 def selected_keys(config: Config) -> list[str]:

@@ -27,11 +27,15 @@ from reslrb_cli.records.tree import Arrays, entry
 Array = np.ndarray[Any, Any]
 
 
+#: The factor by which a plateau lowers the learning rate.
+FACTOR = 0.5
+
+
 def lowered(optimizer: AnyOptimizer, drops: int) -> float:
-    """What a plateau has made of the rate after so many drops; 1 with other schedules."""
+    """Return the factor of the rate after so many drops of a plateau; 1 with other schedules."""
     if optimizer.schedule != "plateau":
         return 1.0
-    return max(optimizer.plateau.factor**drops, optimizer.final_fraction)
+    return max(FACTOR**drops, optimizer.final_fraction)
 
 
 class Watch:
@@ -53,7 +57,7 @@ class Watch:
         stop, optimizer, done = self.config.run.stop, self.config.optimizer, state.iteration
         began = max(self._first, state.since)
         if optimizer.schedule == "plateau" and lowered(optimizer, state.drops) > optimizer.final_fraction:
-            if self._stands(optimizer.plateau, began, done):
+            if self._stands(stop or Standing(), began, done):
                 return replace(state, drops=state.drops + 1, since=done)
         elif stop is not None and (said := self._stands(stop, began, done)):
             return replace(state, stopped=said)

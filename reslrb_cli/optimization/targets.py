@@ -54,13 +54,10 @@ def mask_of(config: Config, wanted: Wanted, scene: mi.Scene, photo: Photo | None
     mask, sensor, found = wanted.mask, scene.sensors()[wanted.sensor], Masked()
     width, height = (int(n) for n in sensor.film().crop_size())
     if lacking:
-        if mask.specular or wanted.mask_mixed:
+        if mask.specular:
             seen = sees_specular(scene, sensor)
-            if mask.specular:
-                found.left_out["specular"] = seen.alone
-            if wanted.mask_mixed:
-                found.left_out["mixed"] = seen.mixed
-            elif (count := int(seen.mixed.sum())) > 0:
+            found.left_out["specular"] = seen.alone
+            if (count := int(seen.mixed.sum())) > 0:
                 found.stay["mixed"] = count
         if mask.border:
             found.left_out["border"] = ~interior((height, width), sensor)
@@ -70,8 +67,9 @@ def mask_of(config: Config, wanted: Wanted, scene: mi.Scene, photo: Photo | None
             # value. Beside one that is 45 times as bright as white they are half as bright as they should be.
             found.left_out["clipped"] = photo.clipped
             found.left_out["beside"] = spread(photo.clipped, sensor) & ~photo.clipped
-        kinds = {"alpha": photo.transparent, "nonfinite": photo.nonfinite}
-        found.left_out |= {kind: pixels for kind, pixels in kinds.items() if getattr(mask, kind)}
+        if mask.alpha:
+            found.left_out["alpha"] = photo.transparent
+        found.left_out["nonfinite"] = photo.nonfinite
     if mask.file is not None:
         try:
             found.weights = read_weights(mask.file, (width, height), are_upright(config))
@@ -84,7 +82,7 @@ def mask_of(config: Config, wanted: Wanted, scene: mi.Scene, photo: Photo | None
 def mask_line(name: str, masked: Masked, weights: Array) -> str | None:
     """What the user is told of a view's mask, None where nothing is left out, weighed or counted."""
     counts = masked.counts()
-    stay = [f"{count} {WORDS[kind]} and stay (mask_mixed: true leaves them out)" for kind, count in masked.stay.items()]
+    stay = [f"{count} {WORDS[kind]} and stay" for kind, count in masked.stay.items()]
     if not counts and not stay and masked.weights is None:
         return None
     left, total = int((weights == 0).sum()), weights.size
@@ -107,9 +105,8 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
         if wanted.file is None:
             continue
         size = (int(film.crop_size()[0]), int(film.crop_size()[1]))
-        space, gamma, nonfinite = config.target.color_space, config.target.gamma, wanted.mask.nonfinite
         try:
-            photo = read_photo(wanted.file, space, size, gamma, upright, nonfinite=nonfinite)
+            photo = read_photo(wanted.file, config.target.color_space, size, upright, nonfinite=True)
         except ConfigError as error:
             raise ConfigError(config.source, wanted.file_key, error.message) from None
         line = turned_line(wanted.file, upright)

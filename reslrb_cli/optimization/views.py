@@ -97,7 +97,6 @@ class Wanted:
     file: Path | None = None
     file_key: str = "target.file"
     mask: Mask = field(default_factory=Mask)
-    mask_mixed: bool = False
     mask_key: str = "target.mask"
     exposure: float | str = 1.0
     exposure_key: str = SHARED
@@ -129,7 +128,6 @@ def wanted_views(config: Config, scene: mi.Scene) -> list[Wanted]:
                 file=images.get(spec.sensor) if spec.target is None else spec.target,
                 file_key=file_key,
                 mask=target.mask if spec.mask is None else spec.mask,
-                mask_mixed=target.mask_mixed if spec.mask_mixed is None else spec.mask_mixed,
                 mask_key="target.mask" if spec.mask is None else f"{place}.mask",
                 exposure=exposure,
                 exposure_key=SHARED if spec.exposure is None else f"{SHARED}.{spec.sensor}",
@@ -256,8 +254,7 @@ class View:
         if self.fixed is None:
             return
         seen = sees_specular(scene, scene.sensors()[self.sensor])
-        left = [seen.alone] * self.wanted.mask.specular + [seen.mixed] * self.wanted.mask_mixed
-        weights = np.where(np.logical_or.reduce(left), np.float32(0), self.fixed)
+        weights = np.where(seen.alone, np.float32(0), self.fixed)
         if weights.any():  # glass before the whole film leaves nothing to go by: the mask stays
             self.weigh(weights)
 

@@ -356,16 +356,15 @@ def read_photo(
     path: Path,
     color_space: str = "auto",
     size: Size | None = None,
-    gamma: float | None = None,
     upright: bool = True,
     signed: bool = False,
     nonfinite: bool = False,
 ) -> Photo:
     """Read an image file like `read_image`, and mark pixels that are not to be trusted.
 
-    `gamma`, if any, decodes integers in place of `color_space`. `upright` turns the image as its EXIF orientation says,
-    to how a person sees it; `size` is that of the image then. Values may be negative where it is `signed`, and not
-    finite with `nonfinite`. Raises ConfigError, located in the file, also where `gamma` is given for a file of floats.
+    `upright` turns the image as its EXIF orientation says, to how a person sees it; `size` is that of the image then.
+    Values may be negative where it is `signed`, and not finite with `nonfinite`. Raises ConfigError, located in the
+    file.
     """
     bitmap = read_bitmap(path, size, upright)
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
@@ -375,14 +374,10 @@ def read_photo(
     alpha = raw[:, :, -1] if bitmap.has_alpha() else None
     colors = raw if alpha is None else raw[:, :, :-1]
     is_integer = raw.dtype.kind in "ui"
-    if gamma is not None and not is_integer:
-        raise ConfigError(path, "", "holds floats, which are linear: gamma decodes files of 8 and 16 bits")
     bitmap.set_srgb_gamma(False)  # values as they stand in the file; decoded below
     bitmap = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
     image = np.array(bitmap, dtype=np.float32).reshape(height, width, 3)
-    if gamma is not None:
-        image = image**gamma
-    elif color_space == "srgb" or (color_space == "auto" and is_integer):
+    if color_space == "srgb" or (color_space == "auto" and is_integer):
         image = decode_srgb(image)
     finite, nothing = np.isfinite(image), np.zeros((height, width), dtype=bool)
     for bad, what in ((~finite & (not nonfinite), "not finite"), (finite & (image < 0) & (not signed), "negative")):

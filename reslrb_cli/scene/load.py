@@ -22,7 +22,7 @@ from reslrb_cli.scene.extent import doubts
 from reslrb_cli.scene.files import option_texts
 from reslrb_cli.scene.xml.build import Owners, build
 from reslrb_cli.scene.xml.check import check, check_files, resize_films
-from reslrb_cli.scene.xml.mend import mend, refuse, warnings
+from reslrb_cli.scene.xml.mend import mend, warnings
 from reslrb_cli.scene.xml.read import Description, quoted, read_description
 
 logger = logging.getLogger(__name__)
@@ -31,7 +31,6 @@ logger = logging.getLogger(__name__)
 def load_scene(
     file: Path,
     options: Mapping[str, Any] | None = None,
-    strict: bool = False,
     size: tuple[int, int] | None = None,
     cameras: Path | None = None,
     look: Callable[[Description], object] | None = None,
@@ -43,12 +42,12 @@ def load_scene(
     `options` are the values of the file's `$name` variables. Shapes are not merged, so that all parameters keep their
     names, and an object without an id is named by its kind and its number among all of that kind in the file, such as
     `Sphere_3`. What Mitsuba's parser would refuse because another version or an exporter wrote it is mended or left
-    out, with a warning in the log; `strict` has it refused. Those of `cameras`, a file, stand in place of the scene's
-    sensors. The scene's integrator is not loaded: an experiment has its own. Plugins are loaded from Mitsuba's own
-    folder alone. `size` is the (width, height) of all films in pixels, in place of what the files say. `look` sees the
-    description that the scene is built from before anything of it is, and may raise; in the end Mitsuba has a use for
-    every element of that. `keys`, which may be globs, are of parameters that are to have derivatives: bitmaps among
-    them that Mitsuba would keep with 8 or 16 bits are read as floating point.
+    out, with a warning in the log. Those of `cameras`, a file, stand in place of the scene's sensors. The scene's
+    integrator is not loaded: an experiment has its own. Plugins are loaded from Mitsuba's own folder alone. `size` is
+    the (width, height) of all films in pixels, in place of what the files say. `look` sees the description that the
+    scene is built from before anything of it is, and may raise; in the end Mitsuba has a use for every element of that.
+    `keys`, which may be globs, are of parameters that are to have derivatives: bitmaps among them that Mitsuba would
+    keep with 8 or 16 bits are read as floating point.
 
     Raises ConfigError, located in the scene file, where it is missing or wrong, has nothing in it, or no light. Warns,
     too, of a scene that is too far from the origin, or too small, of glass that is too thin, and of faces at the same
@@ -60,16 +59,12 @@ def load_scene(
     if cameras is not None:
         replace_sensors(description, read_cameras(cameras))
     found = mend(description)
-    if strict:
-        refuse(found, root)
     if size is not None:
         resize_films(root, size)
     check(description)
     if look is not None:
         look(description)
     scene, unused = build(description)
-    if strict:
-        refuse(unused, root)
     if not isinstance(scene, mi.Scene):
         raise ConfigError(file, "", "its root is a single object, not a <scene>")
     for objects, wrong in (

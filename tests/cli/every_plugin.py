@@ -404,7 +404,7 @@ that are refused, and a few others, without `-m long`). Written by `python tests
 - **works**: what is said in brackets holds for it. Which of its numbers can be recovered `reslrb inspect` lists.
 - **refused**: with exit code 2 and a line that holds what stands there, by every command. What both refuse, or loading
   does, has to be changed in the scene file.
-- **mended**: read in another form, with that warning (`scene.strict: true` refuses it).
+- **mended**: read in another form, with that warning.
 """
 
 

@@ -90,12 +90,15 @@ def test_a_run_in_stages_is_looked_at_once_it_is_as_configured(tmp_path: Path) -
 
 
 def test_a_plateau_lowers_the_rate_and_only_then_a_run_stops(tmp_path: Path) -> None:
-    plateau = "optimizer={schedule: plateau, final_fraction: 0.2, plateau: {patience: 10, factor: 0.5}}"
-    states = follow(config(tmp_path, plateau, STOP), np.ones(400))
+    plateau = "optimizer={schedule: plateau, final_fraction: 0.2}"
+    states = follow(config(tmp_path, plateau, "run.stop={patience: 10}"), np.ones(400))
     drops = [state.drops for state in states]
     assert [drops.index(number) + 1 for number in (1, 2, 3)] == [30, 60, 90]
     assert [lowered(config(tmp_path, plateau).optimizer, number) for number in range(5)] == [1, 0.5, 0.25, 0.2, 0.2]
-    assert len(states) == 150, "three windows of 20 at the least rate"
+    assert len(states) == 120, "three windows of 10 at the least rate"
+    drops = [state.drops for state in follow(config(tmp_path, plateau), np.ones(400))]
+    assert [drops.index(number) + 1 for number in (1, 2, 3)] == [60, 120, 180], "by windows of 20 without `run.stop`"
+    assert len(drops) == 400
     assert lowered(config(tmp_path).optimizer, 3) == 1
 
 
@@ -119,7 +122,6 @@ def test_an_average_is_that_of_the_last_values(tmp_path: Path) -> None:
     [
         ("run.stop={patience: 4}", "run.stop.patience", "at least 5"),
         ("run.stop={relative: 1}", "run.stop.relative", "below 1"),
-        ("optimizer.plateau={patience: 10}", "optimizer.plateau", "goes with schedule: plateau"),
         ("optimizer.average=1", "optimizer.average", "or a share of them"),
         ("optimizer.average=1.5", "optimizer.average", "or a share of them"),
         ("optimizer.average=true", "optimizer.average", "or a share of them"),
@@ -141,7 +143,7 @@ def test_settings_that_do_not_go_together(tmp_path: Path) -> None:
 
 def test_what_is_not_asked_for_is_not_written(tmp_path: Path) -> None:
     written = config(tmp_path).model_dump()
-    assert not {"average", "plateau"} & set(written["optimizer"])
+    assert "average" not in written["optimizer"]
     assert "stop" not in written["run"]
     asked = config(tmp_path, STOP, "optimizer={schedule: plateau}")
     assert loads(dump(asked), tmp_path / "config.yaml") == asked

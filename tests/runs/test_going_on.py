@@ -96,14 +96,18 @@ CASES: dict[str, list[str]] = {
         "{until: 0.8, film: 0.5, learning_rate: 0.5}]",
         "optimizer.scale=auto",
     ],
-    "plateau": ["optimizer={type: sgd, schedule: plateau, learning_rate: 0.5, plateau: {patience: 5, relative: 0.9}}"],
+    "plateau": [
+        "optimizer={type: sgd, schedule: plateau, learning_rate: 0.5}",
+        "run.stop={patience: 5, relative: 0.9}",
+    ],
     "average": ["optimizer.average=9"],
-    "held out, plateau, average": [
+    "held out, plateau": [
         "scene.sensors=all",
         "run.held_out=[2]",
         "run.iterations=66",
         "run.checkpoint_every={iterations: 6}",
-        "optimizer={schedule: plateau, average: 0.5, plateau: {patience: 20, relative: 0.9}}",
+        "optimizer.schedule=plateau",
+        "run.stop={patience: 20, relative: 0.9}",
         "run.spp=2",
     ],
     "a list of losses, average": [
@@ -115,7 +119,7 @@ CASES: dict[str, list[str]] = {
 FEW = ("pixels", "scale auto, sigmoid, rmsprop", "held out", "shards", "stages", "plateau", "average")
 #: After how many iterations a run is killed, and how many its newest state has then; what certainty asks for is noted
 #: at four fifths of the iterations, which has to be before that.
-KILLED: dict[str, tuple[int, int]] = {"certainty": (23, 20), "held out, plateau, average": (63, 60)}
+KILLED: dict[str, tuple[int, int]] = {"certainty": (23, 20), "held out, plateau": (63, 60)}
 
 
 #: Each a fifth of the run.

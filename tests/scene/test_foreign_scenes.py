@@ -83,7 +83,7 @@ def test_what_is_loaded_is_what_mitsuba_loads(file):
     import mitsuba as mi
 
     size = {"resx": 24, "resy": 24} if 'name="resx"' in file.read_text() else {}
-    stock, ours = mi.load_file(str(file), optimize=False, **size), load_scene(file, size, strict=True)
+    stock, ours = mi.load_file(str(file), optimize=False, **size), load_scene(file, size)
     assert_same(values(ours), values(stock))
     if file.parent.name not in RENDERED:
         return
@@ -124,12 +124,10 @@ def test_variables_includes_and_folders_are_mitsubas(tmp_path):
     file = tmp_path / "scene.xml"
     file.write_text(OLD)
     options = {"angle": "45", "digit": "25"}
-    assert_same(
-        values(load_scene(file, options, strict=True)), values(mi.load_file(str(file), optimize=False, **options))
-    )
+    assert_same(values(load_scene(file, options)), values(mi.load_file(str(file), optimize=False, **options)))
 
 
-@pytest.mark.parametrize("name", ["path", "parallel", "optimize", "file", "strict", "options", "self", "kwargs"])
+@pytest.mark.parametrize("name", ["path", "parallel", "optimize", "file", "options", "self", "kwargs"])
 def test_any_name_is_a_variable(tmp_path, name):
     file = write(tmp_path, shape=f'<shape type="sphere"><float name="radius" value="${name}"/></shape>')
     assert values(load_scene(file, {name: 3}))["Sphere_1.to_world"][0, 0, 0] == 3
@@ -219,10 +217,6 @@ def test_what_is_mended_is_said_with_its_line(tmp_path, caplog, part, text, said
     assert list(found) == list(expected)
     for key, value in expected.items():
         np.testing.assert_allclose(found[key], value, atol=1e-6, err_msg=key)
-    with pytest.raises(ConfigError) as error:
-        load_scene(file, strict=True)
-    wrong, _, done = said.rpartition(": ")
-    assert str(error.value) == f"{file}:{LINES[part]}: {wrong}; with scene.strict: false it would be {done}"
     assert file.read_bytes() == before
 
 
@@ -231,8 +225,6 @@ def test_what_is_left_out_is_named_as_the_file_has_it(tmp_path, caplog):
     load_scene(file)
     [record] = caplog.records
     assert record.getMessage() == f"{file}:6: hdrfilm has no parameter `highQualityEdges` in Mitsuba 3: left out"
-    with pytest.raises(ConfigError, match=f"{file}:6: `highQualityEdges` is spelled as before Mitsuba 2; with"):
-        load_scene(file, strict=True)
 
 
 def test_one_line_for_one_kind_of_thing(tmp_path, caplog):
@@ -262,7 +254,7 @@ def test_colours_in_hexadecimal(tmp_path):
 
 def test_the_scenes_own_integrator_is_not_loaded(tmp_path, caplog):
     file = write(tmp_path, integrator='<integrator type="guided_path"><integrator type="nonsense"/></integrator>')
-    assert load_scene(file, strict=True).integrator() is None
+    assert load_scene(file).integrator() is None
     assert not caplog.records
 
 
@@ -293,9 +285,10 @@ def test_files_are_found_where_backslashes_part_folders(tmp_path, caplog):
 
 
 @pytest.mark.parametrize("text", ["<!-- - -- what a -- rule -->", "<!-- \n -->", "Tom & Jerry", "<!DOCTYPE scene>"])
-def test_what_mitsubas_parser_lets_pass(tmp_path, text):
+def test_what_mitsubas_parser_lets_pass(tmp_path, text, caplog):
     head = text + PARTS["head"] if "DOCTYPE" in text else PARTS["head"] + text
-    load_scene(write(tmp_path, head=head), strict=True)
+    load_scene(write(tmp_path, head=head))
+    assert not caplog.records
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
@@ -411,16 +404,12 @@ def test_a_material_has_the_colour_of_the_same_spectrum_written_inline(tmp_path:
     np.testing.assert_array_equal(found, inline)
 
 
-def test_it_is_said_where_and_refused_where_nothing_is_to_be_mended(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_mended_spectrum_is_named_with_its_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     file = write_spectrum(tmp_path, IRREGULAR.format('name="reflectance"'))
     with caplog.at_level(logging.WARNING):
         load_scene(file)
     line = f"{file}:3: RGB variants have no spectrum `irregular`: read as the colour of it"
     assert [record.getMessage() for record in caplog.records] == [line]
-    with pytest.raises(ConfigError, match="RGB variants have no spectrum `irregular`"):
-        load_scene(file, strict=True)
 
 
 @pytest.mark.parametrize(

@@ -68,14 +68,6 @@ def warnings(notes: Sequence[Note], root: Element) -> list[str]:
     return lines
 
 
-def refuse(notes: Sequence[Note], root: Element) -> None:
-    """Raise ConfigError for the first of `notes`, if there is any."""
-    if notes:
-        more = f" (and {len(notes) - 1} more)" if len(notes) > 1 else ""
-        first = _in_order(notes, root)[0]
-        raise first.element.fail("", f"{first.wrong}; with scene.strict: false it would be {first.done}{more}")
-
-
 #: Spellings of elements.
 ELEMENTS = {"lookAt": "lookat", "srgb": "rgb"}
 _BEFORE_04 = "an element of Mitsuba before 0.4, whose axes pointed elsewhere; save the scene with Mitsuba 0.6"
