@@ -28,7 +28,7 @@ def test_its_commands_run_at_the_smallest_sizes(tmp_path: Path, llvm: str) -> No
     said = (tmp_path / "summary.md").read_text()
     assert re.findall(r"^### (\w+): exit code 0 after", said, re.MULTILINE) == NAMES
     assert re.match(r"Commit \w{12}(-dirty)?, llvm_ad_rgb, ", said)
-    assert said.count("5 of 5 comparisons hold") == 2
+    assert len(re.findall(r"^(\d+) of \1 comparisons hold", said, re.MULTILINE)) == 2
     assert "1 passed" in said
     for record in ("bench.jsonl", "gradcheck.jsonl", "gradcheck_moving.jsonl", "demo/metrics.jsonl"):
         assert (tmp_path / record).stat().st_size > 0

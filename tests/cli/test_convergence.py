@@ -205,7 +205,7 @@ def test_an_interrupt_keeps_what_is_done(folder: Path) -> None:
         (("--runs", "2", "--rates", "1,3,1.0"), "names a factor twice"),
         (("--runs", "2", "--rates", "fast"), "'fast' is not a valid float"),
         (("--runs", "2", "--integrators", "reslrb:stack,path"), "--integrators path: integrator.type: must be one of"),
-        (("--integrators", "reslrb:auto"), "`auto` measures which to take"),
+        (("--integrators", "reslrb:auto"), "`auto` is for whole runs; take `stack`"),
     ],
 )
 def test_bad_input_of_runs_is_one_located_line(

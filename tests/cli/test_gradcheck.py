@@ -47,12 +47,12 @@ def test_a_table_and_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str
     files = ["--json", str(json_file), "--markdown", str(markdown), "--images", str(maps)]
     assert call(*SMALL, "--seeds", "8", "--estimators", "stack,event(capacity=2)", *files) == 0
     rows = read(json_file)
-    assert [list(row) for row in rows] == [KEYS] * 9
+    assert [list(row) for row in rows] == [KEYS] * 11
     assert [(row["parameter"], row["estimator"], row["reference"], row["kind"]) for row in rows] == [
         (None, None, "ptracer", "image"),
         *(
             (KEY, *pair, "equal_seeds" if pair == ("stack", "walk_ad") else "expectation")
-            for group in (("finite_difference", "forward_mode"), ("walk_ad", "ptracer"))
+            for group in (("finite_difference", "forward_mode", "unguided"), ("walk_ad", "ptracer"))
             for pair in itertools.product(("stack", "event(capacity=2)"), group)
         ),
     ]
@@ -60,8 +60,8 @@ def test_a_table_and_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str
     lines = capsys.readouterr().out.splitlines()
     assert lines[1] == "the built-in Cornell box, film 24x24, 4 spp (2304 paths a seed), max_depth 3, no roulette"
     assert lines[2].split()[:3] == ["parameter", "integrator", "reference"]
-    assert lines[-1] == "9 of 9 comparisons hold, 0 fail"
-    assert len(markdown.read_text().splitlines()) == 11
+    assert lines[-1] == "11 of 11 comparisons hold, 0 fail"
+    assert len(markdown.read_text().splitlines()) == 13
     assert sorted(path.name for path in maps.iterdir()) == [
         f"white.reflectance.data-reslrb-{estimator}-{reference}.{suffix}"
         for estimator in ("event_capacity=2", "stack")
@@ -179,5 +179,5 @@ def test_ctrl_c_prints_what_is_done() -> None:
 def test_a_budget_that_suffices_for_nothing_is_no_check_that_holds(capsys: pytest.CaptureFixture[str]) -> None:
     assert call(*SMALL, "--budget", "0", "--estimators", "stack") == 1
     lines = capsys.readouterr().out.splitlines()
-    assert lines[-2] == "0 of 5 comparisons hold, 0 fail, 5 leave the question open"
+    assert lines[-2] == "0 of 6 comparisons hold, 0 fail, 6 leave the question open"
     assert lines[-1] == "open: 5 not measured: the budget was spent; allow more with --budget"

@@ -360,7 +360,9 @@ def test_ctrl_c_leaves_a_complete_run_folder(experiment):
     out, err = run.communicate(timeout=60)
     assert run.returncode == 130, err
     assert "Traceback" not in err
-    assert "runs/box/report.html" in out.splitlines()[-1]
+    told, advice = out.splitlines()[-2:]
+    assert "runs/box/report.html" in told
+    assert advice == "next: `reslrb optimize --resume runs/box` goes on from here"
     assert names("runs/box") == FOLDER
     manifest, records = read_manifest_optimize("runs/box"), read_metrics("runs/box")
     assert manifest["status"] == "interrupted"

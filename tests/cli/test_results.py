@@ -109,7 +109,9 @@ def test_a_loss_that_does_not_fall_is_said_plainly(capsys):
 def test_a_parameter_that_got_worse_is_said_plainly(capsys):
     """Far too large a learning rate, from close to the truth."""
     wall = f"parameters=[{{key: {WALL}, initial: 0.42, bounds: [0, 1]}}]"
-    last, out, results = optimize(capsys, wall, "optimizer.learning_rate=30", "run.iterations=30")
+    last, out, results = optimize(
+        capsys, wall, "optimizer.learning_rate=30", "optimizer.beta_2=0.999", "run.iterations=30"
+    )
     pair = results["parameter_rmse"][WALL]
     assert pair["final"] > 2 * pair["initial"]
     assert f"; {WALL} got worse (RMSE {pair['initial']:.3g} to {pair['final']:.3g})" in last

@@ -280,7 +280,7 @@ def test_the_budget_is_kept_and_used(tmp_path: Path) -> None:
     [
         ("reslrb:stack(max_depth=3)", "all share one max_depth; take --set integrator.max_depth=3"),
         ("reslrb:stack(adjoint=batched)", "has no effect where dL/dI is known; change --objective"),
-        ("reslrb:auto", "`auto` measures which to take"),
+        ("reslrb:auto", "`auto` is for whole runs; take `stack`"),
         ("path", "integrator.type: must be one of"),
     ],
 )
