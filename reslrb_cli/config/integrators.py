@@ -180,7 +180,7 @@ class Reslrb(AttachingTracer):
     """Number of camera paths in each pixel. `even`: the same in all pixels. `measured`: a quarter is spread evenly. The
     other paths go to the pixels whose noise weighs most in the gradient, by the curvature of the loss, 0 in pixels that
     are left out. A few paths through each pixel measure this before the first iteration, at the parameters' initial
-    values. Textures gain most, such as one that only a mirror shows; a few colours may lose. `auto`: `measured` where
+    values. A texture that only a mirror shows gains most; a few colours may lose. `auto`: `measured` where
     there are camera paths, the loss is `l2`, and the measurement takes at most 2 % of the run's samples. The default is
     `auto` with estimator `auto`, and `even` with an estimator that you name."""
     freeze: bool = True
