@@ -179,11 +179,12 @@ class Reslrb(AttachingTracer):
     before the first iteration, show that it pays here. Left out it is `auto` with estimator `auto`, and `independent`
     with one that is named."""
     pixels: Literal["auto", "even", "measured"] = "auto"
-    """How camera paths are shared out over the pixels. `even`: as many to each; `measured`: a quarter of them so, and
-    the others to pixels whose noise weighs most in the gradient, such as those of a mirror that alone shows a wall, as
-    a few paths through each find before the first iteration, at the parameters' initial values. `auto`: `measured`,
-    where there are camera paths, the loss is `l2`, no pixels are left out, and a run is so long that this takes no
-    share of it that counts. Left out it is `auto` with estimator `auto`, and `even` with one that is named."""
+    """Number of camera paths in each pixel. `even`: the same in all pixels. `measured`: a quarter is spread evenly. The
+    other paths go to the pixels whose noise weighs most in the gradient, by the curvature of the loss, 0 in pixels that
+    are left out. A few paths through each pixel measure this before the first iteration, at the parameters' initial
+    values. A texture that only a mirror shows gains most; a few colours may lose. `auto`: `measured` where
+    there are camera paths, the loss is `l2`, and the measurement takes at most 2 % of the run's samples. The default is
+    `auto` with estimator `auto`, and `even` with an estimator that you name."""
     freeze: bool = True
     """Record what a step launches and launch that again, so that its Python runs once, not in every iteration. Not with
     passes, nor with more than 4 million paths, beside which Python does not show."""

@@ -7,14 +7,15 @@ BSDF that is differentiated, as in `collect.py`,
 
     G = sum_i C_i n_i        n_i: how many factors of contribution C_i are this BSDF's;  n = 1 of emission
 
-Near the end of a run dL/dI is mostly noise, in proportion to that of the pixel, I, and so is the gradient: of pixels
-with n_j paths each its variance has parts
+Near the end of a run dL/dI is mostly noise: w_j times the noise of the pixel, I_j. w_j is the curvature of the loss, 0
+in a pixel that is left out. With n_j paths in pixel j the variance of the gradient has parts
 
-    Var(I_j) (E G_j)^2 / n_j        which is least, at equal sums of n_j, for  n_j ~ sd(I_j) E|G_j|
+    w_j^2 Var(I_j) (E G_j)^2 / n_j        The sum is least, at equal sums of n_j, for  n_j ~ w_j sd(I_j) E|G_j|.
 
-Of several groups the variances are added up, each over the square of its whole gradient, sum_j E|G_j|, and times the
-number K of its entries: a texture's are each known from K times fewer pixels than a colour is. A rare bright path would
-draw all others to its pixel: means are over blocks of pixels, and none has more than MOST times the mean.
+The variances of several groups are added up. Each is divided by the square of the group's whole gradient,
+sum_j w_j E|G_j|, and multiplied by the number K of its entries: each texel is known from K times fewer pixels than a
+colour is. A rare bright path would draw all others to its pixel: means are over blocks of pixels, and none has more
+than MOST times the mean.
 """
 
 from __future__ import annotations
@@ -98,31 +99,38 @@ def noted_part(paths: float, spp: float) -> float | None:
 
 def wanted(
     plan: Plan, scene: mi.Scene, sensor: mi.Sensor, entries: list[int], light_share: float,
-    emitters: EmitterDensities | None,
+    emitters: EmitterDensities | None, curvature: NDArray[np.floating] | None = None,
 ) -> NDArray[np.float32]:  # fmt: skip
-    """How camera paths are to be shared out over the pixels (H, W), a density with mean 1, as the scene is now.
+    """Return the density of camera paths over the pixels (H, W), with mean 1, as the scene is now.
 
-    `entries` are the numbers that each group of BSDFs, and emission, has derivatives of; the last two are as in
-    `samples.passes`.
+    `entries` are the numbers that each group of BSDFs, and emission, has derivatives of. `light_share` and `emitters`
+    are as in `samples.passes`, and `curvature` (H, W) is the loss's, None where all pixels have the same.
     """
     spp = math.ceil(NOTED_SPP / (1 - light_share)) if plan.weighs else NOTED_SPP
     seed = dr.opaque(mi.UInt32, NOTING_STREAM)
     samples, *_ = passes(plan, scene, sensor, seed, spp, None, None, light_share, emitters)
-    return density_of(note(samples.sides()[-1]), entries)
+    return density_of(note(samples.sides()[-1]), entries, curvature)
 
 
-def density_of(rows: NDArray[np.float64], entries: list[int]) -> NDArray[np.float32]:
-    """Return the density of camera paths over the pixels (H, W), with mean 1, from the means that `note` returns."""
+def density_of(
+    rows: NDArray[np.float64], entries: list[int], curvature: NDArray[np.floating] | None = None
+) -> NDArray[np.float32]:
+    """Return the density of camera paths over the pixels (H, W), with mean 1, from the means that `note` returns and
+    the loss's curvature (H, W)."""
     from scipy import ndimage  # here: few commands come here, and all import this module
 
     # The variance of each pixel first, then the mean over a block: that of a block's pixels together would also count
-    # edges, and the surroundings of a lamp, as noise.
-    variances = np.maximum(rows[-1] - np.square(rows[-2]), 0)
+    # edges, and the surroundings of a lamp, as noise. The curvature comes before the mean, too: the noise of a lamp's
+    # edge counts little in relative_l2, and nothing where it is left out.
+    w = np.ones_like(rows[-1]) if curvature is None else curvature
+    variances = np.square(w) * np.maximum(rows[-1] - np.square(rows[-2]), 0)
     *said, variance = (ndimage.uniform_filter(row, BLOCK, mode="nearest") for row in (*rows[:-2], variances))
     weight = np.zeros_like(variance)
     for K, row in zip(entries, said, strict=True):
-        weight += K * np.square(row / row.sum()) if row.sum() > 0 else 0
-    density = np.sqrt(variance * weight)
+        whole = np.sum(w * row)
+        weight += K * np.square(row / whole) if whole > 0 else 0
+    # The filter's running sums leave values just below 0 where there is nothing.
+    density = np.where(w > 0, np.sqrt(np.maximum(variance, 0) * weight), 0)
     if not density.sum() > 0:
         return np.ones_like(variance, np.float32)
     for _ in range(8):  # what is cut off raises all others

@@ -178,13 +178,13 @@ class LightTracer:
                 known[number] = self.note_pixels(job)
         return preparation.shares(number, known[number], (int(size[0]), int(size[1]))) if number in known else None
 
-    def note_pixels(self, job: Job) -> NDArray[np.float32]:
-        """How the camera paths of a job's sensor are to be shared out over its pixels (H, W), a density with mean 1, as
-        the scene is now (`pixels.py`). Its own seed and samples play no part."""
+    def note_pixels(self, job: Job, curvature: NDArray[np.floating] | None = None) -> NDArray[np.float32]:
+        """Return the density of camera paths over the pixels (H, W) of a job's sensor, with mean 1, as the scene is now
+        and for a loss of this `curvature` (H, W) (`pixels.py`). The job's seed and samples play no part."""
         plan = self.preparation.plan(job.scene, job.sensor, job.params)
         entries = self.preparation.entries(plan, job.params)
         with dr.suspend_grad():
-            return wanted(plan, job.scene, job.sensor, entries, *self._sides(plan, job.scene))
+            return wanted(plan, job.scene, job.sensor, entries, *self._sides(plan, job.scene), curvature)
 
     def learn(self, job: Job, gradient: mi.TensorXf) -> None:
         """Have the tables learn, where they are due to, from other samples than those of the job; dL/dI is known.

@@ -19,7 +19,9 @@ from reslrb_cli.optimization.assemble import assemble, assemble_scene
 from reslrb_cli.optimization.autotune import race, sampling
 from reslrb_cli.optimization.autotune.sampling import FEWER, FIRST_SHARE, MORE, CameraPilot, with_sides
 from reslrb_cli.optimization.loading import paths_of
+from reslrb_cli.optimization.losses import make_loss
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.views import View
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.decisions import PathsRecord
 from reslrb_cli.records.manifest import read_manifest
@@ -260,22 +262,37 @@ def test_targets_and_images_have_the_same_light(integrator: str):
     assert not view.masked.left_out
 
 
-def test_paths_are_shared_out_where_dL_dI_is_as_noisy_as_the_pixel(monkeypatch: pytest.MonkeyPatch):
-    """By `l2` on a whole image, and not where the loss counts bright pixels less, or pixels are left out."""
+def test_auto_shares_paths_out_by_l2_alone(monkeypatch: pytest.MonkeyPatch):
+    """Also with a mask; the pixels that are left out have no extra paths, nor by a loss for which the user asks."""
     monkeypatch.setattr(sampling, "noted_part", lambda paths, spp: 0.01)
     weights = np.ones((32, 32, 3), np.float32)
     weights[:4] = 0
     mi.Bitmap(weights).write("weights.exr")
-    for settings, shared in (
-        ([], True), (["loss={type: relative_l2}"], False), (["loss=[{type: l2}, {type: ssim, weight: 0.1}]"], False),
-        (["target.mask={file: weights.exr}"], False),
+    mask, relative, densities = "target.mask={file: weights.exr}", "loss={type: relative_l2}", []
+    for pixels, settings, shared in (
+        ("auto", [], True), ("auto", [mask], True), ("measured", [relative, mask], True), ("auto", [relative], False),
+        ("auto", ["loss=[{type: l2}, {type: ssim, weight: 0.1}]"], False),
     ):  # fmt: skip
-        problem = assemble(
-            load("tiny.yaml", ["integrator={estimator: stack, paths: both, pixels: auto}", *SMALL, *settings])
-        )
-        assert problem.pixels is not None
-        assert problem.pixels.measured is shared
+        integrator = f"integrator={{estimator: stack, paths: both, pixels: {pixels}}}"
+        problem = assemble(load("tiny.yaml", [integrator, *SMALL, *settings]))
+        assert (problem.pixels is None) == (pixels == "measured")
+        assert problem.pixels is None or problem.pixels.measured is shared
         assert problem.integrator.preparation.shares_out is shared
+        densities += [problem.integrator.preparation.given[0]] if shared else []
+        assert not shared or bool(densities[-1][:4].any()) == (mask not in settings)
+    assert not np.allclose(densities[1], densities[2], rtol=0.1)
+
+
+@pytest.mark.parametrize("epsilon", [0.01, 0.3])
+def test_the_curvature_of_relative_l2_is_one_over_the_square_of_the_target(epsilon: float):
+    """In a grey target; in coloured ones the bright channels count, which have most of the noise."""
+    view = View(0, make_loss("relative_l2", epsilon=epsilon))
+    target, weights = np.geomspace(0.01, 1e8, 24).reshape(4, 6, 1).repeat(3, 2), np.ones((4, 6))
+    weights[1, :3] = 0
+    view.see(target, weights)
+    expected = weights / (np.square(target[:, :, 0]) + epsilon)
+    np.testing.assert_allclose(sampling._curvature(view, True), expected / expected.mean(), rtol=1e-4)
+    np.testing.assert_allclose(sampling._curvature(view, False), weights / weights.mean(), rtol=1e-4)
 
 
 def test_a_memory_budget_knows_of_pixels_that_are_shared_out():

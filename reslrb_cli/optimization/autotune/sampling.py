@@ -38,6 +38,7 @@ from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.optimization.autotune import race
 from reslrb_cli.optimization.decisions import Allowance
+from reslrb_cli.optimization.losses import QUADRATIC, l2
 from reslrb_cli.optimization.memory import pixels_of
 from reslrb_cli.optimization.moving import is_attached
 from reslrb_cli.optimization.problem import Problem
@@ -93,8 +94,10 @@ def settle_paths(tuner: race.Tuner) -> None:
 
 
 def settle_pixels(tuner: race.Tuner) -> None:
-    """Have the camera paths of an integrator whose paths are settled shared out over the pixels, where that is wanted,
-    or left to be decided and no share of the run that counts: by the parameters' values at the start."""
+    """Share the camera paths of the problem's integrator out over the pixels, by the parameters' values at the start.
+
+    The configuration asks for it, or leaves it to `_whether_pixels`. The kinds of paths have to be settled.
+    """
     problem = tuner.problem
     tracer, asked = problem.integrator, problem.config.integrator.options().get("pixels", "even")
     if asked == "even" or not isinstance(tracer, Tracer) or tracer.paths == "light":
@@ -107,21 +110,33 @@ def settle_pixels(tuner: race.Tuner) -> None:
     problem.apply()
     scene, params = problem.scene, problem.selection.params
     jobs = {view.sensor: Job(scene, scene.sensors()[view.sensor], mi.UInt32(0), 0, params) for view in problem.trained}
-    noted = {str(sensor): tracer.note_pixels(job) for sensor, job in jobs.items()}
+    known = all(loss.type in QUADRATIC for loss in problem.config.losses)
+    curvatures = {view.sensor: _curvature(view, known) for view in problem.trained}
+    noted = {str(sensor): tracer.note_pixels(job, curvatures[sensor]) for sensor, job in jobs.items()}
     tuner.take(integrator=tracer.shared_out(noted))
     tuner.set_aside(sum(map(PixelShares.bytes, pixels_of(scene, list(jobs)))))
 
 
-def _whether_pixels(problem: Problem) -> PixelsRecord:
-    """Whether a run has so many paths that those which are noted are few beside them, and their kernel, too.
+def _curvature(view: View, known: bool) -> Array:
+    """Return the curvature (H, W) of the loss in each pixel, with a mean of 1; where it is not `known`, that of l2.
 
-    What is noted takes dL/dI for as noisy as the pixel. By a loss that counts bright pixels less, or with a mask, too
-    many paths would go to what counts little: the bright surroundings of a lamp.
+    Pixels that are left out have 0. Noise is taken to be as large in each channel as the target is.
+    """
+    target, loss = np.array(view.target), view.loss if known else l2
+    change = np.abs(target) + 1e-3
+    change_of_slope = slope(lambda image: loss(image, view.target, view.weights), target + change)
+    curvature = np.linalg.norm(change_of_slope, axis=2) / np.linalg.norm(change, axis=2)
+    return np.asarray(curvature / curvature.mean())
+
+
+def _whether_pixels(problem: Problem) -> PixelsRecord:
+    """Decide whether `auto` shares camera paths out: the loss is l2 alone, and the run has so many paths that the noted
+    ones, and their kernel, take a small part of it.
+
+    A mirror room by relative_l2 has twice the variance with shares in some of its colours (docs/method.md).
     """
     if any(loss.type != "l2" for loss in problem.config.losses):
         return PixelsRecord(measured=False, note="left alone where the loss is not l2 alone")
-    if any(view.weights is not None for view in problem.trained):
-        return PixelsRecord(measured=False, note="left alone where pixels of the target are left out or weighed")
     run, films = problem.config.run, pixels_of(problem.scene, [view.sensor for view in problem.trained])
     each = run.iterations * run.spp * len(problem.drawn(0)) / len(films)
     part = noted_part(each * sum(films), each)
