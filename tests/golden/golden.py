@@ -98,14 +98,16 @@ main.main(sys.argv[1:], prog_name="reslrb")
 
 
 def machine() -> str:
-    """What bits depend on: the processor and the version of libLLVM."""
+    """Return what bits depend on: the processor, by its name, family and model, and the version of libLLVM."""
     sys.path.insert(0, str(ROOT))
     import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before Dr.Jit
 
-    words = reslrb("doctor").stdout
-    cpu = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    words, about = reslrb("doctor").stdout, Path("/proc/cpuinfo").read_text()
+    # Names such as "AMD EPYC" are those of several generations, which compute other bits.
+    found = [re.search(rf"^{name}\s*:\s*(.+)$", about, re.MULTILINE) for name in ("model name", "cpu family", "model")]
+    name, family, model = (each[1] if each else "unknown" for each in found)
     version = re.search(r"libLLVM[^\n]*?(\d+\.\d+\.\d+)", words)
-    return f"{cpu[1] if cpu else 'unknown'}, libLLVM {version[1] if version else 'unknown'}"
+    return f"{name}, family {family}, model {model}, libLLVM {version[1] if version else 'unknown'}"
 
 
 def reslrb(*words: str, alone: bool = False) -> subprocess.CompletedProcess[str]:
