@@ -10,23 +10,12 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 from reslrb_cli.backend.doctor import device_name, memory_bytes
 from reslrb_cli.backend.variant import choose
 from reslrb_cli.config.base import SEED_END, code_file
-from reslrb_cli.config.integrators import (
-    ESTIMATOR_OPTIONS,
-    UNDECIDED,
-    DirectProjective,
-    LightTracerOptions,
-    Own,
-    Prb,
-    PrbProjective,
-    Ptracer,
-    Trajectory,
-    WalkAd,
-)
+from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, UNDECIDED, AnyIntegrator, LightTracerOptions
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import dump, with_integrator
 from reslrb_cli.config.parameters import ByWord, ParameterSpec
@@ -67,8 +56,7 @@ PLUGIN_ESTIMATOR = "reservoir"
 
 #: Options of a case that are those of `run`, for itself alone.
 ADJOINT = ("adjoint", "batches", "first_batch")
-_KINDS = (ReslrbConfig, Ptracer, Prb, PrbProjective, DirectProjective, WalkAd, Trajectory, Own)
-_TYPES = {str(kind.model_fields["type"].default): kind for kind in _KINDS}
+_TYPES = {str(kind.model_fields["type"].default): kind for kind in get_args(get_args(AnyIntegrator)[0])}
 
 #: Options that make an estimator another one, in records.
 _ESTIMATOR_OPTIONS = {option for options in ESTIMATOR_OPTIONS.values() for option in options} - {"capacity"}

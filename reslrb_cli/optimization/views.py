@@ -31,7 +31,7 @@ from reslrb_cli.config.views import Mask, ViewSpec
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.protocol import first_channels, halves_of, whole_of
 from reslrb_cli.optimization.loading import choose_sensors
-from reslrb_cli.optimization.losses import SSIM_SIDE, Loss, best_scale, fitted, make_loss, weighted
+from reslrb_cli.optimization.losses import SSIM_SIDE, Loss, best_scale, fitted, l2, make_loss, weighted
 from reslrb_cli.optimization.own_code import OwnLoss
 from reslrb_cli.scene.cameras import read_cameras
 from reslrb_cli.scene.parameters import Selection
@@ -275,6 +275,17 @@ class View:
             return loss(image, target)
         # Whatever stands in a pixel that is left out, also if it is not finite, has neither loss nor derivative.
         return loss(dr.select(self.weights > 0, image, target), target, self.weights)
+
+    def curvature(self, known: bool) -> Array:
+        """Return the curvature (H, W) of the loss in each pixel, with a mean of 1; where it is not `known`, that of l2.
+
+        Pixels that are left out have 0. Noise is taken to be as large in each channel as the target is.
+        """
+        target, loss = np.array(self.target), self.loss if known else l2
+        change = np.abs(target) + 1e-3
+        change_of_slope = slope(lambda image: loss(image, self.target, self.weights), target + change)
+        curvature = np.linalg.norm(change_of_slope, axis=2) / np.linalg.norm(change, axis=2)
+        return np.asarray(curvature / curvature.mean())
 
     def scale(self, image: mi.TensorXf) -> float:
         """What an image as in `compare` is multiplied by, beside the exposure: 1, unless it is `fitted`."""

@@ -291,8 +291,8 @@ def test_the_curvature_of_relative_l2_is_one_over_the_square_of_the_target(epsil
     weights[1, :3] = 0
     view.see(target, weights)
     expected = weights / (np.square(target[:, :, 0]) + epsilon)
-    np.testing.assert_allclose(sampling._curvature(view, True), expected / expected.mean(), rtol=1e-4)
-    np.testing.assert_allclose(sampling._curvature(view, False), weights / weights.mean(), rtol=1e-4)
+    np.testing.assert_allclose(view.curvature(True), expected / expected.mean(), rtol=1e-4)
+    np.testing.assert_allclose(view.curvature(False), weights / weights.mean(), rtol=1e-4)
 
 
 def test_a_memory_budget_knows_of_pixels_that_are_shared_out():

@@ -99,9 +99,10 @@ class Tuner:
             expected = replace(memory.expected_bytes, fixed=memory.expected_bytes.fixed + size)
             self.take(memory=replace(memory, expected_bytes=expected))
 
-    def tell(self, *records: Finding | None) -> None:
-        """Say what was decided, where something was: in one line all that there was no time to measure."""
-        verbose, found = logger.isEnabledFor(logging.DEBUG), [each for each in records if each is not None]
+    def tell(self) -> None:
+        """Say the decisions that were taken; all that there was no time to measure are one line."""
+        decided = self.problem.sides, self.problem.guided, self.problem.sequence, self.problem.pixels
+        verbose, found = logger.isEnabledFor(logging.DEBUG), [each for each in decided if each is not None]
         brief = [each for each in found if each in self._unmeasured and not verbose]
         if brief and self.problem.allowance is not None:
             self.say(f"{self.problem.allowance.note()}: {', '.join(each.decision() for each in brief)}")
@@ -285,23 +286,6 @@ def _log_variances(gradients: Sequence[Gradients], scales: dict[str, float]) -> 
     return math.log(whole / (count - 1)), np.log(without / (count - 2))
 
 
-class Race:
-    """What measuring has cost so far."""
-
-    def __init__(self) -> None:
-        self._spent_ms = self._compile_ms = 0.0
-
-    def _spend(self, step: Step, first: bool = False) -> Step:
-        """Count a step; of a `first` one, which had its kernels compiled, times tell nothing else."""
-        self._spent_ms += 0.0 if first else step.wall_ms
-        self._compile_ms += step.compile_ms + (step.wall_ms if first else 0.0)
-        return step
-
-    def _cost(self) -> dict[str, Any]:
-        """Of the record."""
-        return {"measure_s": self._spent_ms / 1e3, "compile_s": self._compile_ms / 1e3}
-
-
 # --- two ways in turns ------------------------------------------------------------------------------------------------
 
 #: Fewer rounds than these say nothing.
@@ -361,7 +345,7 @@ Take = Callable[[bool, int, int], Step]
 Learn = Callable[[int, int], Step]
 
 
-class Turns(Race, Generic[Record]):
+class Turns(Generic[Record]):
     """One decision, by steps that `take` takes, and walks that `learn` does, where a table has yet to learn. `views` is
     how many times the views of an iteration are those of a step here, `share` what of ITERATIONS this may cost, and
     `most` what of them the least number of rounds may, where that is more."""
@@ -373,7 +357,7 @@ class Turns(Race, Generic[Record]):
     def __init__(
         self, take: Take, sizes: Sizes, views: float, share: float, most: float = 0.0, learn: Learn | None = None
     ) -> None:
-        super().__init__()
+        self._spent_ms = self._compile_ms = 0.0
         self._take, self._learn, self._sizes, self._views = take, learn, sizes, views
         self._share, self._most = share, max(share, most)
         self._apart = self.APART and sizes.alone
@@ -497,5 +481,12 @@ class Turns(Race, Generic[Record]):
         return self._decide(other, images, found | {"share": self._spent_ms / (ITERATIONS * self._iteration_ms)})
 
     def _found(self, note: str) -> dict[str, Any]:
-        """What all records of decisions by turns hold."""
-        return {"rounds": len(self._steps[True]), "spp": self._sizes.trial, "note": note, **self._cost()}
+        """Return the fields that all records of decisions by turns have."""
+        cost = {"measure_s": self._spent_ms / 1e3, "compile_s": self._compile_ms / 1e3}
+        return {"rounds": len(self._steps[True]), "spp": self._sizes.trial, "note": note, **cost}
+
+    def _spend(self, step: Step, first: bool = False) -> Step:
+        """Count the time of a step. A `first` step compiles kernels, so all of its time counts as compilation."""
+        self._spent_ms += 0.0 if first else step.wall_ms
+        self._compile_ms += step.compile_ms + (step.wall_ms if first else 0.0)
+        return step

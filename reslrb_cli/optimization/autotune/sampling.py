@@ -38,7 +38,7 @@ from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.optimization.autotune import race
 from reslrb_cli.optimization.decisions import Allowance
-from reslrb_cli.optimization.losses import QUADRATIC, l2
+from reslrb_cli.optimization.losses import QUADRATIC
 from reslrb_cli.optimization.memory import pixels_of
 from reslrb_cli.optimization.moving import is_attached
 from reslrb_cli.optimization.problem import Problem
@@ -78,8 +78,7 @@ def settle(problem: Problem, say: race.Say, cache: PilotCache | None = None) -> 
     settle_paths(tuner)
     settle_pixels(tuner)
     settle_sampling(tuner)
-    problem = tuner.problem
-    tuner.tell(problem.sides, problem.guided, problem.sequence, problem.pixels)
+    tuner.tell()
     return tuner.problem
 
 
@@ -111,22 +110,10 @@ def settle_pixels(tuner: race.Tuner) -> None:
     scene, params = problem.scene, problem.selection.params
     jobs = {view.sensor: Job(scene, scene.sensors()[view.sensor], mi.UInt32(0), 0, params) for view in problem.trained}
     known = all(loss.type in QUADRATIC for loss in problem.config.losses)
-    curvatures = {view.sensor: _curvature(view, known) for view in problem.trained}
+    curvatures = {view.sensor: view.curvature(known) for view in problem.trained}
     noted = {str(sensor): tracer.note_pixels(job, curvatures[sensor]) for sensor, job in jobs.items()}
     tuner.take(integrator=tracer.shared_out(noted))
     tuner.set_aside(sum(map(PixelShares.bytes, pixels_of(scene, list(jobs)))))
-
-
-def _curvature(view: View, known: bool) -> Array:
-    """Return the curvature (H, W) of the loss in each pixel, with a mean of 1; where it is not `known`, that of l2.
-
-    Pixels that are left out have 0. Noise is taken to be as large in each channel as the target is.
-    """
-    target, loss = np.array(view.target), view.loss if known else l2
-    change = np.abs(target) + 1e-3
-    change_of_slope = slope(lambda image: loss(image, view.target, view.weights), target + change)
-    curvature = np.linalg.norm(change_of_slope, axis=2) / np.linalg.norm(change, axis=2)
-    return np.asarray(curvature / curvature.mean())
 
 
 def _whether_pixels(problem: Problem) -> PixelsRecord:
