@@ -159,9 +159,9 @@ def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: C
     if not weights.any():
         advice = "switch kinds off, such as {specular: false}, or set it to none"
         raise ConfigError(config.source, wanted.mask_key, f"leaves nothing to compare ({line}); {advice}")
-    kinds = view.masked.left_out.keys() & {"specular", "mixed"}
-    if kinds and problem.moves and scene_needs(problem.scene, problem.scene.sensors()[view.sensor]).has_delta_lobes:
-        others = {kind: pixels for kind, pixels in view.masked.left_out.items() if kind not in kinds}
+    masked = "specular" in view.masked.left_out
+    if masked and problem.moves and scene_needs(problem.scene, problem.scene.sensors()[view.sensor]).has_delta_lobes:
+        others = {kind: pixels for kind, pixels in view.masked.left_out.items() if kind != "specular"}
         view.fixed = replace(view.masked, left_out=others).total(target.shape[:2])
         line = f"{line or f'view {view.sensor}'}; each iteration leaves out glass and mirrors where they are then"
     if line is not None:
