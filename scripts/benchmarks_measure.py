@@ -83,7 +83,7 @@ def experiment_record(experiment: str) -> str:
 
 def _all() -> list[Measurement]:
     commands = {
-        "depth": "bench --max-depth 128",
+        "depth": "bench --max-depth 128 --budget 480",
         "spp": "bench --sweep spp --values 1,4,16,64 --integrators ptracer,reslrb:reservoir,reslrb:stack --budget 120",
         "moving": _GLASS,
     }
