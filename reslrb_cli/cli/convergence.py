@@ -15,20 +15,20 @@ import click
 
 from reslrb_cli.cli.options import (
     COUNT,
+    Command,
     Counts,
     Factors,
     Keeper,
     allow_code_option,
     budget_option,
+    check_writable,
     exit_code,
     experiment_arguments,
-    files_of,
     is_given,
-    look_at,
+    json_option,
     measuring,
     memory_limit_option,
     origin_of,
-    resume_option,
 )
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.optimizers import loss_words
@@ -44,13 +44,8 @@ if TYPE_CHECKING:
     from reslrb_cli.records.measurements import MethodRecord, RunBestRecord, RunMethodRecord, RunPointRecord
 
 
-def measure_runs(
-    plan: RunsPlan, resumed: Path | None, json_file: Path | None, plot_file: Path | None, began: float
-) -> int:
-    """Measure, print, write and draw; returns the exit code. `began` is when the command was called, by `monotonic`.
-
-    `resumed` is the JSON file that is gone on from, if any.
-    """
+def measure_runs(plan: RunsPlan, json_file: Path | None, began: float) -> int:
+    """Measure, print and write; return the exit code. `began` is when the command was called, by `monotonic`."""
     from reslrb_cli.measure.optimization_benchmark.rank import outcome
     from reslrb_cli.measure.optimization_benchmark.session import RunsSession
     from reslrb_cli.records.measurements import SummaryRecord
@@ -63,7 +58,7 @@ def measure_runs(
         runs_notes,
     )
 
-    with measuring(RunsSession, plan, resumed, began, "run") as (session, interrupts):
+    with measuring(RunsSession, plan, json_file, began, "run") as (session, interrupts):
         table = runs_columns(list(plan.names))
         points = [point for run in session.members for point in run.points]  # of earlier sessions
 
@@ -99,12 +94,6 @@ def measure_runs(
             echo(table.line(runs_cells(record)))
         for line in [*runs_notes(records), *(best.line for best in bests), sentence]:
             echo(line)
-    if plot_file is not None and points:
-        from reslrb_cli.report.plots import plot_runs
-
-        title = f"{plan.device}, {plan.variant}\n{_runs_conditions(plan, session)}"
-        plot_runs(points, session.facts.get("error_of", ""), plot_file, title)
-        look_at(plot_file)
     return _runs_exit_code(records, interrupts.requested)
 
 
@@ -133,7 +122,7 @@ def _runs_exit_code(records: list[RunMethodRecord], interrupted: bool = False) -
 MOST_RUNS = 100
 
 
-@click.command("convergence")
+@click.command("convergence", cls=Command)
 @experiment_arguments
 @click.option("--integrators", metavar="LIST",
               help="What to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)], separated by commas; OPTION is one of the "
@@ -151,32 +140,27 @@ MOST_RUNS = 100
                    "compared at its best.")  # fmt: skip
 @budget_option
 @click.option("--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
-              help="Number of turns of each, whatever time they take, those of --resume included: the same steps on "
-                   "every machine.")  # fmt: skip
+              help="Number of turns of each, whatever time they take, those in the file of --json included: the same "
+                   "steps on every machine.")  # fmt: skip
 @click.option("--spp", "spps", type=Counts(), metavar="LIST",
               help="Samples per pixel of a step, several to compare, e.g. 4,16,64; default: run.spp.")  # fmt: skip
 @click.option("--reference", metavar="METHOD",
               help="What errors are taken from: the mean of many steps of this one. Default: reslrb:stack with paths "
                    "from both sides, half of each, where CONFIG allows that.")  # fmt: skip
 @allow_code_option
-@resume_option
 @memory_limit_option
-@click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False),
-              help="Write one object a line: points, methods and references.")  # fmt: skip
-@click.option("--plot", "plot_file", type=click.Path(path_type=Path, dir_okay=False),
-              help="PNG of error against run time; default: beside the JSON file.")  # fmt: skip
+@json_option
 def command(
     config_file: Path, overrides: tuple[str, ...], integrators: str | None, objective: str, runs: int | None,
     rates: tuple[float, ...] | None, budget: float, rounds: int | None, spps: tuple[int, ...] | None,
-    reference: str | None, allow_code: bool, resumed: Path | None, memory_limit: int | None, json_file: Path | None,
-    plot_file: Path | None,
+    reference: str | None, allow_code: bool, memory_limit: int | None, json_file: Path | None,
 ) -> int:  # fmt: skip
     """Measure how fast the error of each method falls on CONFIG, at its initial values, seen through its first sensor.
 
     Each method takes steps of run.spp samples per pixel in a process of its own, all in turn. Errors are relative to
     the size of what is estimated; a slope of -1/2 is what independent samples have. Efficiency is 1 / (relative
-    variance * seconds). Ctrl-C keeps what is done, and what --json has written can be gone on from, however the process
-    ended. docs/convergence.md explains the columns.
+    variance * seconds). Ctrl-C keeps what is done. The same command again goes on from what --json has written, however
+    the process ended. docs/convergence.md explains the columns.
     """
     began = time.monotonic()
     from reslrb_cli.backend.installation import load_packages
@@ -193,8 +177,8 @@ def command(
     elif rates is not None:
         raise ConfigError("--rates", "", "are those of whole optimisations; add --runs N")
     usual = DEFAULTS[objective] if runs is None else DEFAULT
-    named = compared(integrators, reference, usual, _settings_of(resumed))
-    json_file, plot_file = files_of(resumed, json_file, plot_file)
+    named = compared(integrators, reference, usual)
+    check_writable("--json", json_file)
     settings: dict[str, Any] = {
         **machine_of(config, memory_limit),
         "config": config,
@@ -207,28 +191,12 @@ def command(
     if runs is not None:
         whole = RunsPlan(**settings, runs=runs, rates=rates or ())
         whole.check()
-        return measure_runs(whole, resumed, json_file, plot_file, began)
+        return measure_runs(whole, json_file, began)
     plan = Plan(**settings)
     plan.check()
-    results, conditions, interrupted = _run(plan, resumed, json_file, began)
-    if plot_file is not None and results.points:
-        from reslrb_cli.report.plots import plot_convergence
-
-        title = f"{plan.device}, {plan.variant}\n{conditions}"
-        plot_convergence(results.points, results.methods, plot_file, title)
-        look_at(plot_file)
+    results, interrupted = _run(plan, json_file, began)
     done = any(record.relative_rmse is not None for record in results.methods)
     return exit_code(interrupted, done, {record.status for record in results.methods})
-
-
-def _settings_of(resumed: Path | None) -> dict[str, Any]:
-    """The settings of what is gone on from; nothing where there is none. Raises ConfigError."""
-    if resumed is None:
-        return {}
-    from reslrb_cli.records.measurement_files import read_samples, samples_file
-
-    found = read_samples(samples_file(resumed))[0].get("settings")
-    return found if isinstance(found, dict) else {}
 
 
 def _refuse_with_runs() -> None:
@@ -242,8 +210,8 @@ def _refuse_with_runs() -> None:
             raise ConfigError(f"--{name}", "", f"does not go with --runs: {reason}")
 
 
-def _run(plan: Plan, resumed: Path | None, json_file: Path | None, began: float) -> tuple[Results, str, bool]:
-    """Measure, print and write; returns the results, the conditions in words, and whether the user interrupted."""
+def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[Results, bool]:
+    """Measure, print and write; return the results, and whether the user interrupted."""
     from reslrb_cli.measure.convergence.judgement import Judgement
     from reslrb_cli.measure.convergence.session import Session
     from reslrb_cli.measure.convergence.setup import Role
@@ -255,7 +223,7 @@ def _run(plan: Plan, resumed: Path | None, json_file: Path | None, began: float)
         result_lines,
     )
 
-    with measuring(Session, plan, resumed, began, "round") as (session, interrupts):
+    with measuring(Session, plan, json_file, began, "round") as (session, interrupts):
         origin = origin_of(plan.variant)
         keeper = Keeper(json_file, origin, lambda: [], lambda: result_lines(Judgement(session).results()), session.kept)
         table: Columns | None = None
@@ -285,7 +253,7 @@ def _run(plan: Plan, resumed: Path | None, json_file: Path | None, began: float)
         for note in notes([record for record in results.methods if record.parameter in shown]):
             echo(note)
         echo(closing_sentence(results.methods))
-        return results, _conditions(plan, session), interrupts.requested
+        return results, interrupts.requested
 
 
 def _table(session: Session) -> Columns:

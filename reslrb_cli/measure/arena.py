@@ -47,7 +47,7 @@ class Arena(Generic[Measured, Worker]):
     """Workers under way, `members`; what they write goes to `folder`, which is the caller's to remove.
 
     `facts` are the referee's; of the budget `spent_s` have gone before. What an `earlier` session has measured counts,
-    and is gone on from. Raises ConfigError where that is of another measurement, or leaves nothing to do.
+    and is gone on from. Raises ConfigError where that is of another measurement.
     """
 
     #: The most rounds.
@@ -83,7 +83,7 @@ class Arena(Generic[Measured, Worker]):
     def _set_up(self, earlier: Earlier | None) -> int:
         """Begin what a kind of session has beside all this, with what it has of an earlier one.
 
-        Returns how many depths there are to share the time. Raises ConfigError where there is nothing to add.
+        Returns how many depths there are to share the time. Raises ConfigError.
         """
         raise NotImplementedError
 

@@ -7,7 +7,7 @@ of `convergence --runs`.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, get_args
@@ -445,13 +445,10 @@ class Side:
     rate: float | None = None
 
 
-def compared(integrators: str | None, reference: str | None, usual: str, before: Mapping[str, Any]) -> dict[str, Any]:
-    """What a `Plan` compares, and takes errors from: lists as written, or None for those of `before`, or the `usual`.
-
-    `before` are the settings of what is gone on from, whose defaults may have been others. Raises ConfigError.
-    """
-    cases = parse_cases(integrators or ",".join(before.get("integrators", ())) or usual, deep=False)
-    stands = parse_cases(reference or before.get("reference") or REFERENCE, "--reference", deep=False)
+def compared(integrators: str | None, reference: str | None, usual: str) -> dict[str, Any]:
+    """Return what a `Plan` compares, and takes errors from: lists as written, or the `usual`. Raises ConfigError."""
+    cases = parse_cases(integrators or usual, deep=False)
+    stands = parse_cases(reference or REFERENCE, "--reference", deep=False)
     if len(stands) != 1:
         raise ConfigError("--reference", "", "errors are taken from one method; name one")
     return {"cases": cases, "reference": stands[0], "default": integrators is None}

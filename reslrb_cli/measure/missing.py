@@ -166,8 +166,8 @@ ESTIMATOR = "stack"
 class MissingCheck:
     """The experiment, loaded; a variant must be set. dL/dI is that of its loss at the initial values, held fixed.
 
-    With an `earlier` session seeds are added to its own; `count` is then that of all. Raises ConfigError, also where
-    there is nothing to add, and UnsupportedScene.
+    With an `earlier` session seeds are added to its own; `count` is then that of all. Raises ConfigError and
+    UnsupportedScene.
     """
 
     def __init__(
@@ -191,10 +191,6 @@ class MissingCheck:
         self._directions = all_directions(self.case, problem.selection, count_of_each, count_of_each)
         #: By parameter, as far as they have been looked at, in the order of `case.keys`.
         self._found: dict[str, Missing] = {} if earlier is None else self._restore(earlier)
-        if earlier is not None and count is not None and len(self._found) == len(self.case.keys):
-            least = min(found.count for found in self._found.values())
-            if least >= count:
-                raise earlier.complete(f"{least} seeds", "more with --seeds")
 
     def conditions(self) -> str:
         """What is measured, in one line."""

@@ -1,7 +1,9 @@
-"""Going on from what an earlier session has measured: the same experiment, measured in the same way."""
+"""Samples on file: what an earlier call measured of the same experiment, in the same way, is not measured again."""
 
 from __future__ import annotations
 
+import functools
+import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,6 +31,15 @@ _ABSENT = "not given"
 _SHOWN = 60
 
 
+@functools.cache
+def program() -> dict[str, str]:
+    """Return the versions that a figure depends on, and a digest of this program's code, which may be under work."""
+    code = hashlib.blake2b(digest_size=16)
+    for path in sorted(Path(__file__).parent.parent.rglob("*.py")):
+        code.update(path.read_bytes())
+    return {**versions(), "code": code.hexdigest()}
+
+
 def settings(config: Config, codes: Mapping[str, Path], variant: str, device: str, **options: Any) -> dict[str, Any]:
     """Return what has to be the same in all sessions of a measurement, as JSON has it.
 
@@ -42,21 +53,21 @@ def settings(config: Config, codes: Mapping[str, Path], variant: str, device: st
         **options,
         "variant": variant,
         "device": device,
-        "versions": versions(),
+        "versions": program(),
         FILES: file_digests({**files_of(config), **codes}),
     }
 
 
 class Earlier:
-    """What an earlier session has kept: a `head`, which JSON can hold, and `arrays`; `source` is the file's name.
+    """Samples that lie beside the file of `--json`, `source`: a `head`, which JSON can hold, and `arrays`.
 
-    `kind` says what was measured. Raises ConfigError where that, or the version of what is kept, is another.
+    Raises ConfigError where they are of another `kind` of measurement, or were written by another version.
     """
 
     def __init__(self, kind: str, source: Path, head: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
         self.source, self.head, self.arrays = source, head, arrays
         if head.get("version") != VERSION:
-            raise ConfigError("--resume", "", f"{source} was written by another version")
+            raise self.other("it was written by another version")
         if head.get("kind") != kind:
             raise self.other(f"it is of `{head.get('kind')}`, this is `{kind}`")
 
@@ -68,28 +79,25 @@ class Earlier:
 
     @classmethod
     def read(cls, kind: str, json_file: Path | None, now: Mapping[str, Any] | None = None) -> Earlier | None:
-        """What lies beside a JSON file that another call has written; None for no file.
+        """Return the samples beside a JSON file that an earlier call wrote; None where there are none.
 
-        Raises ConfigError, also where its settings are not those of `now`, if these are known yet.
+        Raises ConfigError, also where their settings are not those of `now`, if these are known yet.
         """
-        if json_file is None:
+        if json_file is None or not json_file.is_file() or not samples_file(json_file).exists():
             return None
         earlier = cls(kind, json_file, *read_samples(samples_file(json_file)))
         if now is not None:
             earlier.check(now)
         return earlier
 
-    def error(self, reason: str) -> ConfigError:
-        """What is raised where it cannot be gone on from."""
-        return ConfigError("--resume", "", f"{self.source} {reason}")
-
     def other(self, reason: str) -> ConfigError:
-        """The same where it is of another measurement."""
-        return self.error(f"is of another measurement: {reason}")
+        """Return the error of samples of another measurement, which are not overwritten."""
+        advice = "remove the file, or name another one"
+        return ConfigError("--json", "", f"{self.source} is of another measurement: {reason}; {advice}")
 
     def complete(self, what: str, advice: str) -> ConfigError:
-        """The same where it has `what` is asked for; `advice` says how to ask for more."""
-        return self.error(f"has {what} already; name {advice}")
+        """Return the error where the file has `what` is asked for; `advice` says how to ask for more."""
+        return ConfigError("--json", "", f"{self.source} has {what} already; name {advice}")
 
 
 def head(kind: str, settings: Mapping[str, Any], **content: Any) -> dict[str, Any]:

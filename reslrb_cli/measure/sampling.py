@@ -91,7 +91,7 @@ class Sampling:
     def __init__(
         self, settings: Settings, now: Callable[[], float] = time.monotonic, earlier: Earlier | None = None
     ) -> None:
-        self._now, self.settings, self._earlier = now, settings, earlier
+        self._now, self.settings = now, settings
         self._start = now() - settings.spent_s
         self._end = self._start + settings.budget_s
         self.participants = Participants(settings)
@@ -112,15 +112,9 @@ class Sampling:
         self._first_s: dict[tuple[str, bool], float] = {}  # how long a first sample took, at most, by kind
 
     def expect(self, names: Iterable[Name]) -> None:
-        """Say what will be asked for, so that each has its share of the time.
-
-        Raises ConfigError where an earlier session has all of it.
-        """
+        """Say what will be asked for, so that each has its share of the time."""
         self._expected = list(dict.fromkeys(names))
         self._to_do = list(self._expected)
-        counts = [self._before.get(name, 0) for name in self._to_do]
-        if self._earlier is not None and counts and min(counts) >= (self.settings.seeds or math.inf):
-            raise self._earlier.complete(f"{min(counts)} seeds", "more with --seeds")
 
     def kept(self, settings: dict[str, Any]) -> Kept | None:
         """What a later session, of the same `settings`, needs to go on; None where nothing has been sampled."""

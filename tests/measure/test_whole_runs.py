@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -38,11 +38,20 @@ from reslrb_cli.optimization.loop import learning_rate_factor
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import target_arrays
 from reslrb_cli.records.measurement_files import read_samples, write_samples
-from reslrb_cli.records.measurements import BenchStatus
+from reslrb_cli.records.measurements import Band, BenchStatus, RunPointRecord
 from reslrb_cli.report.convergence_tables import best_line, runs_cells, runs_closing_sentence, runs_columns, runs_notes
-from reslrb_cli.report.plots import curve, plot_runs
 
 # Whole optimisations at equal wall time: with pretended processes of known cost and known losses.
+
+
+def curve(points: Sequence[RunPointRecord], of: str) -> list[tuple[float, Band]]:
+    """Times and bands of one method, over those of its runs that have a value of the field `of` at each time."""
+    found: dict[float, list[float]] = {}
+    for point in points:
+        value = getattr(point, of)
+        if value is not None:
+            found.setdefault(point.elapsed_s, []).append(value)
+    return [(time, band) for time in sorted(found) if (band := Band.of(found[time])) is not None]
 
 
 def iterations_by(seconds: float, played: Pretence) -> int:
@@ -257,8 +266,6 @@ def test_records_and_lines(tmp_path: Path) -> None:
     table = runs_columns(["ptracer", "reslrb:stack"])
     assert "1 run" in table.line(runs_cells(record))
     assert len(table.head()) <= 140
-    plot_runs(points, "RMSE", tmp_path / "a $ x.png", "x_$1\ny")
-    assert (tmp_path / "a $ x.png").read_bytes().startswith(b"\x89PNG")
 
 
 # What a whole run decides by measurement before its first iteration, as `optimize` does; times of steps are given.
@@ -545,7 +552,7 @@ def test_a_budget_without_room_for_one_seed_says_what_it_takes(tmp_path: Path) -
 )
 def test_only_the_same_is_gone_on_from(tmp_path: Path, change: dict[str, Any], line: str) -> None:
     earlier = again(play_again(tmp_path / "a", Stage(), plan(runs=1))[0], tmp_path / "c.samples.npz")
-    with pytest.raises(ConfigError, match=re.escape(f"--resume: c.jsonl is of another measurement: {line}")):
+    with pytest.raises(ConfigError, match=re.escape(f"--json: c.jsonl is of another measurement: {line}")):
         play_again(tmp_path / "b", Stage(), plan(**({"runs": 2} | change)), earlier)
     with pytest.raises(ConfigError, match=r"c\.jsonl has 1 run of each already; name more with --runs"):
         play_again(tmp_path / "b", Stage(), plan(runs=1), earlier)

@@ -39,8 +39,6 @@ class Session(Arena[Plan, Member]):
     def _set_up(self, earlier: Earlier | None) -> int:
         self.rounds = self._before = 0 if earlier is None else earlier.head["rounds"]
         self.judges: dict[str, Member] = {}
-        if earlier is not None and self.plan.rounds is not None and self.rounds >= self.plan.rounds:
-            raise earlier.complete(f"{self.rounds} rounds", "more with --rounds")
         return 1
 
     def slices(self) -> dict[str, slice]:
@@ -155,8 +153,9 @@ class Session(Arena[Plan, Member]):
             "mode": {"fixed": "known"}.get(objective, objective),
             "purpose": f"convergence, {role.value} {method.label}",
         }
+        has_all = plan.rounds is not None and self._before >= plan.rounds
         member = Member(
-            process=self._start(first, "sampled_steps"),
+            process=None if has_all else self._start(first, "sampled_steps"),
             may_refuse=role is Role.INDEPENDENT or (role is Role.CASE and plan.default),
             role=role,
             method=method,

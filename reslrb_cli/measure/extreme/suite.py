@@ -28,7 +28,6 @@ from reslrb_cli.measure.references import Situation, prb_image
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.scenes.analytic import KnownScene
 from reslrb_cli.measure.scenes.moving import Move, moving_case
-from reslrb_cli.records.manifest import versions
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
 
@@ -248,7 +247,7 @@ def settings(estimators: Sequence[str] | None, seeds: int | None, variant: str, 
         "--seeds": "as the cases have it" if seeds is None else seeds,
         "variant": variant,
         "device": device,
-        "versions": versions(),
+        "versions": resume_store.program(),
     }
 
 

@@ -41,7 +41,7 @@ def bench(objects: Sequence[Entry]) -> tuple[Markup, int]:
         others = [other for other in varied if other != name]
         chosen = [entry for entry in entries if all(entry.get(other) == usual[other] for other in others)]
         drawn = [
-            ("", diagram(_curves(chosen, labels, label, name, what), SWEPT[name], words, log_x=2))
+            ("", diagram(curves_of(chosen, labels, label, name, what), SWEPT[name], words, log_x=2))
             for what, words in (("step_ms", "time of a step (ms)"), ("peak_mib", "peak memory (MiB)"))
         ]
         at = ", ".join(f"{SWEPT[other]} {number(usual[other])}" for other in others)
@@ -65,7 +65,7 @@ def _with_sizes(entry: Entry) -> dict[str, Any]:
     return {"pixels": pixels, "texels": entry.get("texels")} | dict(entry)
 
 
-def _curves(entries: Sequence[Entry], labels: Sequence[str], naming: Naming, x: str, y: str) -> list[Curve]:
+def curves_of(entries: Sequence[Entry], labels: Sequence[str], naming: Naming, x: str, y: str) -> list[Curve]:
     """A curve for each label, of the figures `y` over `x`; of those that are spreads the medians, with a band."""
     curves = []
     for place, name in enumerate(labels):
@@ -132,7 +132,7 @@ def method_label(entry: Entry, with_spp: bool = False) -> str:
 
 def _error_diagram(points: Sequence[Entry], labels: Sequence[str], what: str, naming: Naming) -> tuple[str, Markup]:
     floors = sorted(value for entry in points if is_number(value := entry.get("reference_rmse")) and value > 0)
-    curves = _curves(points, labels, naming, "elapsed_s", "relative_rmse")
+    curves = curves_of(points, labels, naming, "elapsed_s", "relative_rmse")
     drawing = diagram(curves, "time (s)", "relative error", 10, floors[len(floors) // 2 :][:1])
     return {"all": "all parameters", "image": "the image"}.get(what, key(what)), drawing
 
@@ -147,7 +147,7 @@ def whole_runs(points: Sequence[Entry], methods: Sequence[Entry], naming: Naming
             if is_number(entry.get(of)) and is_number(entry.get("elapsed_s")):
                 found.setdefault((naming(entry), float(entry["elapsed_s"])), []).append(float(entry[of]))
         spreads = [{"name": name, "s": time, of: asdict(Spread.of(values))} for (name, time), values in found.items()]
-        curves = _curves(spreads, labels, itemgetter("name"), "s", of)
+        curves = curves_of(spreads, labels, itemgetter("name"), "s", of)
         drawn.append((words, diagram(curves, "time of a run (s)", words)))
     rows = [{"name": naming(entry), "entry": entry} for entry in methods]
     return lay_out("legend", labels) + lay_out("diagrams", drawn) + lay_out("measured.runs", rows, bool(points))
