@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,13 +13,16 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.manifest import versions
-from reslrb_cli.records.measurement_files import read_samples, samples_file
+from reslrb_cli.records.measurement_files import Kept, read_samples, samples_file
 
 if TYPE_CHECKING:
     import numpy as np
 
+#: What samples are of, in words: an integrator, a parameter.
+Name = tuple[str, ...]
+
 #: Of what is kept; another one is not gone on from.
-VERSION = 3
+VERSION = 4
 
 #: Where the settings have digests of files.
 FILES = "files"
@@ -90,6 +93,11 @@ class Earlier:
             earlier.check(now)
         return earlier
 
+    @property
+    def samples(self) -> dict[Name, np.ndarray]:
+        """The samples by name, (N, ...), in the order of their seeds."""
+        return {tuple(name): self.arrays[f"samples/{number}"] for number, name in enumerate(self.head["samples"])}
+
     def other(self, reason: str) -> ConfigError:
         """Return the error of samples of another measurement, which are not overwritten."""
         advice = "remove the file, or name another one"
@@ -103,6 +111,17 @@ class Earlier:
 def head(kind: str, settings: Mapping[str, Any], **content: Any) -> dict[str, Any]:
     """The head of what is kept."""
     return {"version": VERSION, "kind": kind, "settings": settings, **content}
+
+
+def kept(
+    kind: str, settings: Mapping[str, Any], samples: Mapping[Any, Sequence[np.ndarray]], **content: Any
+) -> Kept | None:
+    """Return what a file keeps of samples, by `Name` and in the order of their seeds; None where there are none."""
+    import numpy as np  # whoever asks for help of a command has no need of it
+
+    taken = {name: rows for name, rows in samples.items() if len(rows)}
+    arrays = {f"samples/{number}": np.stack(rows) for number, rows in enumerate(taken.values())}
+    return (head(kind, settings, samples=list(taken), **content), arrays) if taken else None
 
 
 def first_difference(there: Any, here: Any, place: str = "") -> str | None:

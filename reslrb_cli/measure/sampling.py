@@ -99,8 +99,7 @@ class Sampling:
         #: Parameters, by way, of whose directions the steps have been chosen: differences go on with the same ones.
         self._chosen: list[str] = []
         if earlier is not None:
-            names = enumerate(earlier.head["samples"])
-            self._samples = {(kind, of): list(earlier.arrays[f"samples/{k}"]) for k, (kind, of) in names}
+            self._samples = {(kind, of): list(rows) for (kind, of), rows in earlier.samples.items()}
             step_as(self.participants, earlier.head["steps"])
             self._chosen = list(earlier.head["steps"])
         self._before = {name: len(samples) for name, samples in self._samples.items()}
@@ -118,14 +117,7 @@ class Sampling:
 
     def kept(self, settings: dict[str, Any]) -> Kept | None:
         """What a later session, of the same `settings`, needs to go on; None where nothing has been sampled."""
-        found = {name: np.stack(rows) for name, rows in self._samples.items() if rows}
-        if not found:
-            return None
-        steps = {
-            key: [list(one) for one in chosen] for key, chosen in steps_of(self.participants, self._chosen).items()
-        }
-        arrays = {f"samples/{number}": rows for number, rows in enumerate(found.values())}
-        return resume_store.head(KIND, settings, samples=list(found), steps=steps), arrays
+        return resume_store.kept(KIND, settings, self._samples, steps=steps_of(self.participants, self._chosen))
 
     def take(self, name: Name, stop: Callable[[], bool], say: Callable[[str], None]) -> bool:
         """Take the samples of `name`, where that was not done yet; whether there are enough to compare.
