@@ -7,7 +7,6 @@ measured, then has one object a line, and stands on the disk while they go on.
 from __future__ import annotations
 
 import errno
-import math
 import os
 import re
 import shutil
@@ -207,22 +206,6 @@ class Counts(click.ParamType):
         return tuple(counts)
 
 
-class Factors(click.ParamType):
-    """Different positive factors, such as `0.3,1,3`; they come in ascending order."""
-
-    name = "list"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
-        parts: list[Any] = str(value).split(",")
-        factors = [float(click.FLOAT.convert(part, param, ctx)) for part in parts]
-        for factor in factors:
-            if not (math.isfinite(factor) and factor > 0):
-                self.fail(f"{factor:g} is no factor above 0", param, ctx)
-        if len(set(factors)) < len(factors):
-            self.fail(f"`{value}` names a factor twice", param, ctx)
-        return tuple(sorted(factors))
-
-
 class Size(click.ParamType):
     """A number of bytes such as `2GiB`."""
 
@@ -234,6 +217,13 @@ class Size(click.ParamType):
         except ValueError:
             self.fail(f"`{value}` is no size; write it as in 2GiB or 500MB", param, ctx)
 
+
+#: What to do in place of an option that was removed.
+REMOVED = {
+    "--runs": "was removed; compare whole runs by `reslrb sweep CONFIG --seeds N --set run.max_seconds=S "
+    "--vary 'integrator=[prb, reslrb:stack]'`",
+    "--rates": "was removed; try learning rates by `reslrb sweep CONFIG --vary 'optimizer.learning_rate=[0.03, 0.1]'`",
+}
 
 budget_option = click.option(
     "--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",

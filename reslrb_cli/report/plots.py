@@ -1,4 +1,4 @@
-"""Measurements as pictures: what a bench, a convergence or whole optimisations came to, and maps of gradients."""
+"""Measurements as pictures: what a bench or a convergence came to, and maps of gradients."""
 
 from __future__ import annotations
 
@@ -13,13 +13,11 @@ import numpy as np
 from reslrb_cli.errors import one_line
 from reslrb_cli.records.images import bounded, file_stem, write_layers
 from reslrb_cli.records.measurements import (
-    Band,
     BenchRecord,
     BenchStatus,
     GradcheckRecord,
     MethodRecord,
     PointRecord,
-    RunPointRecord,
 )
 from reslrb_cli.report.format import shorten
 from reslrb_cli.report.tables import integrator_name, reference_name
@@ -241,31 +239,6 @@ def _draw_errors(
     axis.set(xlabel="seconds", ylabel="relative RMSE")
     axis.set_title(shorten(key, 48), fontsize="small", loc="left", parse_math=False)
     axis.grid(True, which="both", alpha=0.25)
-
-
-def plot_runs(points: Sequence[RunPointRecord], error_of: str, path: Path, title: str) -> None:
-    """Write a PNG; a second panel for the error, which `error_of` names, where it is known."""
-    panels = [("loss", "loss"), ("parameter_error", error_of)] if error_of else [("loss", "loss")]
-    figure = _figure((1.0 + 6.2 * len(panels), 5.2))
-    labels = list(dict.fromkeys(point.method.label for point in points))
-    for axis, (of, name) in zip(figure.subplots(1, len(panels), squeeze=False).ravel(), panels, strict=True):
-        curves = []
-        for place, label in enumerate(labels):
-            along = curve([point for point in points if point.method.label == label], of)
-            ends = [band.low for _, band in along], [band.high for _, band in along]
-            curves.append(Curve(label, [time for time, _ in along], [band.median for _, band in along], place, ends))
-        _draw_panel(axis, curves, "seconds of a run, all costs counted", name)
-    _save(figure, path, title)
-
-
-def curve(points: Sequence[RunPointRecord], of: str) -> list[tuple[float, Band]]:
-    """Times and bands of one method, over those of its runs that have a value of the field `of` at each time."""
-    found: dict[float, list[float]] = {}
-    for point in points:
-        value = getattr(point, of)
-        if value is not None:
-            found.setdefault(point.elapsed_s, []).append(value)
-    return [(time, band) for time in sorted(found) if (band := Band.of(found[time])) is not None]
 
 
 #: z at the ends of the scale.
