@@ -11,7 +11,6 @@ import click
 
 from reslrb_cli.cli.options import (
     COUNT,
-    Command,
     Counts,
     Keeper,
     allow_code_option,
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
 INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,trajectory"
 
 
-@click.command("bench", cls=Command)
+@click.command("bench")
 @optional_experiment_arguments
 @click.option("--sweep", "swept", type=click.Choice(["depth", "spp", "film", "texture"]), default="depth",
               show_default=True,

@@ -1,30 +1,23 @@
-"""`reslrb convergence`: error of the gradient, or of the image, against run time.
-
-With `--runs` it is whole optimisations, printed and written as they come (`measure_runs`).
-"""
+"""`reslrb convergence`: error of the gradient, or of the image, against run time."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from reslrb_cli.cli.options import (
     COUNT,
-    Command,
     Counts,
-    Factors,
     Keeper,
     allow_code_option,
     budget_option,
     check_writable,
     exit_code,
     experiment_arguments,
-    is_given,
     json_option,
     measuring,
     memory_limit_option,
@@ -32,97 +25,16 @@ from reslrb_cli.cli.options import (
 )
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.optimizers import loss_words
-from reslrb_cli.errors import ConfigError, ExitCode
-from reslrb_cli.report.format import WITHOUT_BORDER, Columns, count
+from reslrb_cli.report.format import WITHOUT_BORDER, Columns
 
 if TYPE_CHECKING:
     from reslrb_cli.measure.convergence.judgement import Results
     from reslrb_cli.measure.convergence.session import Session
-    from reslrb_cli.measure.methods import Plan, RunsPlan
-    from reslrb_cli.measure.optimization_benchmark.session import RunsSession
-    from reslrb_cli.records.measurement_files import Line
-    from reslrb_cli.records.measurements import MethodRecord, RunBestRecord, RunMethodRecord, RunPointRecord
+    from reslrb_cli.measure.methods import Plan
+    from reslrb_cli.records.measurements import MethodRecord
 
 
-def measure_runs(plan: RunsPlan, json_file: Path | None, began: float) -> int:
-    """Measure, print and write; return the exit code. `began` is when the command was called, by `monotonic`."""
-    from reslrb_cli.measure.optimization_benchmark.rank import outcome
-    from reslrb_cli.measure.optimization_benchmark.session import RunsSession
-    from reslrb_cli.records.measurements import SummaryRecord
-    from reslrb_cli.report.convergence_tables import (
-        best_line,
-        run_cells,
-        runs_cells,
-        runs_closing_sentence,
-        runs_columns,
-        runs_notes,
-    )
-
-    with measuring(RunsSession, plan, json_file, began, "run") as (session, interrupts):
-        table = runs_columns(list(plan.names))
-        points = [point for run in session.members for point in run.points]  # of earlier sessions
-
-        def show(point: RunPointRecord) -> None:
-            if point.elapsed_s == session.limit_s:
-                echo(table.line(run_cells(point, session.run_of(point).first_s)))
-
-        def found() -> tuple[list[RunMethodRecord], list[RunBestRecord], str]:
-            now = outcome(session.members, session.limit_s, plan.names)
-            bests = [replace(record, line=best_line(record)) for record in now.bests]
-            return now.methods, bests, runs_closing_sentence(now.loss, now.error, session.limit_s)
-
-        def outcome_lines() -> list[Line]:
-            records, bests, sentence = found()
-            return [*records, *bests, SummaryRecord(sentence)]
-
-        keeper = Keeper(json_file, origin_of(plan.variant), lambda: points, outcome_lines, session.kept)
-        headed = False
-        for point in session.run():
-            if not headed:
-                headed = True
-                echo(_runs_conditions(plan, session))
-                echo(table.head())
-                for other in points:
-                    show(other)
-            points.append(point)
-            show(point)
-            keeper.refresh()
-        keeper.finish([*points, *outcome_lines()])
-        records, bests, sentence = found()
-        echo(table.head())
-        for record in records:
-            echo(table.line(runs_cells(record)))
-        for line in [*runs_notes(records), *(best.line for best in bests), sentence]:
-            echo(line)
-    return _runs_exit_code(records, interrupts.requested)
-
-
-def _runs_conditions(plan: RunsPlan, session: RunsSession) -> str:
-    """What was measured, in one line."""
-    optimizer, facts = plan.config.optimizer, session.facts
-    parts = [
-        str(plan.config.source),
-        f"{count(plan.runs, 'seed')}, {session.limit_s:.3g} s each",
-        f"loss {loss_words(plan.config.loss)}",
-        f"{optimizer.type} at {optimizer.learning_rate:g}" + "".join(f", x {rate:g}" for rate in plan.rates),
-        facts.get("pictures", ""),
-        facts.get("error_of", ""),
-        WITHOUT_BORDER if facts.get("masked") else "",
-    ]
-    return ", ".join(part for part in parts if part)
-
-
-def _runs_exit_code(records: list[RunMethodRecord], interrupted: bool = False) -> ExitCode:
-    """A comparison in which something was optimised is done; else what kept it from that decides."""
-    done = any(record.iterations is not None and record.iterations.high > 0 for record in records)
-    return exit_code(interrupted, done, {record.status for record in records})
-
-
-#: The most seeds of --runs.
-MOST_RUNS = 100
-
-
-@click.command("convergence", cls=Command)
+@click.command("convergence")
 @experiment_arguments
 @click.option("--integrators", metavar="LIST",
               help="What to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)], separated by commas; OPTION is one of the "
@@ -132,12 +44,6 @@ MOST_RUNS = 100
 @click.option("--objective", type=click.Choice(["fixed", "loss", "image"]), default="fixed", show_default=True,
               help="fixed: the gradient with dL/dI held at that of a reference image; loss: the gradient of CONFIG's "
                    "loss, by run.adjoint; image: the image.")  # fmt: skip
-@click.option("--runs", type=click.IntRange(min=1, max=MOST_RUNS), metavar="N",
-              help="Whole optimisations in place of gradients: N seeds by each method, at equal wall time, all costs "
-                   "counted. Default list: ptracer, prb, reslrb:stack, reslrb:auto, also on light paths.")  # fmt: skip
-@click.option("--rates", type=Factors(), metavar="LIST",
-              help="With --runs: each method tries its learning rates times each of these, e.g. 0.3,1,3, and is "
-                   "compared at its best.")  # fmt: skip
 @budget_option
 @click.option("--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
               help="Number of turns of each, whatever time they take, those in the file of --json included: the same "
@@ -151,9 +57,9 @@ MOST_RUNS = 100
 @memory_limit_option
 @json_option
 def command(
-    config_file: Path, overrides: tuple[str, ...], integrators: str | None, objective: str, runs: int | None,
-    rates: tuple[float, ...] | None, budget: float, rounds: int | None, spps: tuple[int, ...] | None,
-    reference: str | None, allow_code: bool, memory_limit: int | None, json_file: Path | None,
+    config_file: Path, overrides: tuple[str, ...], integrators: str | None, objective: str, budget: float,
+    rounds: int | None, spps: tuple[int, ...] | None, reference: str | None, allow_code: bool,
+    memory_limit: int | None, json_file: Path | None,
 ) -> int:  # fmt: skip
     """Measure how fast the error of each method falls on CONFIG, at its initial values, seen through its first sensor.
 
@@ -167,47 +73,26 @@ def command(
     from reslrb_cli.config.loader import check_code, load
 
     load_packages()  # before what follows asks for them
-    from reslrb_cli.measure.methods import DEFAULT, DEFAULTS, Plan, RunsPlan, compared, machine_of
+    from reslrb_cli.measure.methods import DEFAULTS, Plan, compared, machine_of
 
     config = load(config_file, overrides).with_code(allow_code)
-    if objective == "loss" or runs is not None:
+    if objective == "loss":
         check_code(config)
-    if runs is not None:
-        _refuse_with_runs()
-    elif rates is not None:
-        raise ConfigError("--rates", "", "are those of whole optimisations; add --runs N")
-    usual = DEFAULTS[objective] if runs is None else DEFAULT
-    named = compared(integrators, reference, usual)
+    named = compared(integrators, reference, DEFAULTS[objective])
     check_writable("--json", json_file)
-    settings: dict[str, Any] = {
+    plan = Plan(
         **machine_of(config, memory_limit),
-        "config": config,
         **named,
-        "objective": objective if runs is None else "loss",
-        "budget_s": budget,
-        "rounds": rounds,
-        "spps": spps or (),
-    }
-    if runs is not None:
-        whole = RunsPlan(**settings, runs=runs, rates=rates or ())
-        whole.check()
-        return measure_runs(whole, json_file, began)
-    plan = Plan(**settings)
+        config=config,
+        objective=objective,
+        budget_s=budget,
+        rounds=rounds,
+        spps=spps or (),
+    )
     plan.check()
     results, interrupted = _run(plan, json_file, began)
     done = any(record.relative_rmse is not None for record in results.methods)
     return exit_code(interrupted, done, {record.status for record in results.methods})
-
-
-def _refuse_with_runs() -> None:
-    """Raise ConfigError where an option was given that whole runs have no use for."""
-    why = {
-        "objective": "runs have the configuration's own loss",
-        "rounds": "runs have a time, not a number of turns; take --budget",
-    }
-    for name, reason in why.items():
-        if is_given(name):
-            raise ConfigError(f"--{name}", "", f"does not go with --runs: {reason}")
 
 
 def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[Results, bool]:

@@ -18,7 +18,6 @@ from reslrb_cli.backend.installation import load_packages
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.cli.options import (
     COUNT,
-    Command,
     Keeper,
     allow_code_option,
     allowance,
@@ -166,7 +165,7 @@ def _case_line(case: str, rows: list[GradcheckRecord]) -> str:
 logger = logging.getLogger(__name__)
 
 
-@click.command("gradcheck", cls=Command)
+@click.command("gradcheck")
 @optional_experiment_arguments
 @click.option("--suite", type=click.Choice(["extreme"]),
               help="Run scenes of its own in place of CONFIG: extreme, those in which gradients break.")  # fmt: skip

@@ -7,7 +7,6 @@ measured, then has one object a line, and stands on the disk while they go on.
 from __future__ import annotations
 
 import errno
-import math
 import os
 import re
 import shutil
@@ -49,26 +48,6 @@ if TYPE_CHECKING:
 def origin_of(variant: str) -> Origin:
     """What this process measures on, under `variant`."""
     return Origin(device_name(variant), variant)
-
-
-#: What to do instead of options that are gone.
-REMOVED = {
-    "--markdown": "`reslrb report FILE -o page.html` has the table of what --json FILE wrote",
-    "--plot": "`reslrb report FILE -o page.html` draws what --json FILE wrote",
-    "--resume": "name the file with --json, which goes on from what is in it",
-}
-
-
-class Command(click.Command):
-    """A command that says what to do instead of an option that is gone."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        try:
-            return super().parse_args(ctx, args)
-        except click.NoSuchOption as error:
-            if error.option_name in REMOVED:
-                raise ConfigError(error.option_name, "", f"was removed; {REMOVED[error.option_name]}") from None
-            raise
 
 
 class Keeper:
@@ -237,22 +216,6 @@ class Counts(click.ParamType):
         return tuple(counts)
 
 
-class Factors(click.ParamType):
-    """Different positive factors, such as `0.3,1,3`; they come in ascending order."""
-
-    name = "list"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
-        parts: list[Any] = str(value).split(",")
-        factors = [float(click.FLOAT.convert(part, param, ctx)) for part in parts]
-        for factor in factors:
-            if not (math.isfinite(factor) and factor > 0):
-                self.fail(f"{factor:g} is no factor above 0", param, ctx)
-        if len(set(factors)) < len(factors):
-            self.fail(f"`{value}` names a factor twice", param, ctx)
-        return tuple(sorted(factors))
-
-
 class Size(click.ParamType):
     """A number of bytes such as `2GiB`."""
 
@@ -264,6 +227,16 @@ class Size(click.ParamType):
         except ValueError:
             self.fail(f"`{value}` is no size; write it as in 2GiB or 500MB", param, ctx)
 
+
+#: What to do in place of an option that was removed.
+REMOVED = {
+    "--runs": "was removed; compare whole runs by `reslrb sweep CONFIG --seeds N --set run.max_seconds=S "
+    "--vary 'integrator=[prb, reslrb:stack]'`",
+    "--markdown": "was removed; `reslrb report FILE -o page.html` has the table of what --json FILE wrote",
+    "--plot": "was removed; `reslrb report FILE -o page.html` draws what --json FILE wrote",
+    "--resume": "was removed here; name the file with --json, which goes on from what is in it",
+    "--rates": "was removed; try learning rates by `reslrb sweep CONFIG --vary 'optimizer.learning_rate=[0.03, 0.1]'`",
+}
 
 budget_option = click.option(
     "--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",

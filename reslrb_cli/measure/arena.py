@@ -1,4 +1,4 @@
-"""Workers that take turns: what `bench`, `convergence` and its `--runs` have in common, from their start to their end.
+"""Workers that take turns: what `bench` and `convergence` have in common, from their start to their end.
 
 As they take turns, one computing at a time, a drift of the machine hits all alike. One more worker may be there for all
 of them, the referee: it makes what they are compared by, and nothing is measured where it fails.
@@ -189,10 +189,6 @@ def load(does: str) -> Begin:
         from reslrb_cli.measure.stepper import begin_steps
 
         return begin_steps
-    if does in ("surveyed", "sampled_steps"):
-        from reslrb_cli.measure.convergence.setup import begin_sampling, begin_survey
+    from reslrb_cli.measure.convergence.setup import begin_sampling, begin_survey
 
-        return begin_survey if does == "surveyed" else begin_sampling
-    from reslrb_cli.measure.optimization_benchmark.evaluate import begin_judging, begin_run
-
-    return begin_judging if does == "judged_runs" else begin_run
+    return begin_survey if does == "surveyed" else begin_sampling

@@ -103,10 +103,6 @@ class Earlier:
         advice = "remove the file, or name another one"
         return ConfigError("--json", "", f"{self.source} is of another measurement: {reason}; {advice}")
 
-    def complete(self, what: str, advice: str) -> ConfigError:
-        """Return the error where the file has `what` is asked for; `advice` says how to ask for more."""
-        return ConfigError("--json", "", f"{self.source} has {what} already; name {advice}")
-
 
 def head(kind: str, settings: Mapping[str, Any], **content: Any) -> dict[str, Any]:
     """The head of what is kept."""

@@ -75,7 +75,7 @@ def plan_record(problem: Problem) -> dict[str, Any]:
 
 #: Settings that decide nothing of what the iterations until then were. All others would make it another run.
 MAY_CHANGE = re.compile(
-    r"run\.(iterations|name|output|checkpoint_every|images_every|certainty|on_nonfinite|stop)(\..*)?"
+    r"run\.(iterations|name|output|checkpoint_every|images_every|certainty|on_nonfinite|stop|max_seconds)(\..*)?"
     r"|optimizer\.learning_rate|parameters\[\d+\]\.learning_rate(\..*)?"
 )
 
@@ -315,7 +315,7 @@ class Course:
 
     def _take(self, record: Record) -> None:
         self.last = record
-        if self.problem.config.optimizer.schedule == "plateau":
+        if self.problem.config.optimizer.schedule == "plateau" or self.problem.config.run.max_seconds is not None:
             self.certainty.rates.append(record.lr / self.problem.config.optimizer.learning_rate)
         self.results.add(record)
         self.nonfinite.add(record)

@@ -17,6 +17,7 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.stages import Stages
 from reslrb_cli.optimization.state import Settled, State
 from reslrb_cli.optimization.state import load as load_state
+from reslrb_cli.optimization.stopping import OUT_OF_TIME
 from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, PREVIOUS_FILE_NAME, STATE_FILE, open_state
 from reslrb_cli.records.manifest import Manifest, is_complete, now, versions
 from reslrb_cli.records.metrics import Record, cut_back, read_records
@@ -73,14 +74,17 @@ class Earlier:
 
     @property
     def has_stopped(self) -> bool:
-        """Whether its loss stood (`run.stop`), and what says so is as it was."""
-        return bool(self.stored.read(State).stopped) and not any(key.startswith("run.stop") for key in self.changed)
+        """Whether its loss stood (`run.stop`) or its time was up (`run.max_seconds`), and that setting is as it was."""
+        ends = ("run.stop", "run.max_seconds")
+        return bool(self.stored.read(State).stopped) and not any(key.startswith(ends) for key in self.changed)
 
     def done_line(self, option: str, equals: str) -> str:
         """Say that nothing is left to do, and which setting goes on; `option` and `equals` are how the user sets it."""
         iterations = self.config.run.iterations
-        stopped = self.has_stopped and iterations > self.iteration
-        more = f"run.stop{equals}null" if stopped else f"run.iterations{equals}NUMBER"
+        stopped = iterations > self.iteration and self.stored.read(State).stopped
+        more = f"run.iterations{equals}NUMBER"
+        if stopped:
+            more = f"run.max_seconds{equals}NUMBER" if stopped.startswith(OUT_OF_TIME) else f"run.stop{equals}null"
         done = f"{self.iteration} of {iterations} iterations"
         return f"{self.folder.path}: is finished, after {done}; {option} {more} goes on"
 

@@ -152,8 +152,8 @@ def test_what_ends_at_a_low_limit_ended_for_want_of_memory(limit: str, tmp_path:
         (["--max-depth", "1"], "--max-depth"),
         (["--integrators", "pt"], "--integrators pt: integrator.type"),
         (["--json", "no/such/folder.json"], "--json: cannot write"),
-        (["--plot", "a.png"], "--plot: was removed; `reslrb report FILE -o page.html` draws what --json FILE wrote"),
-        (["--resume=a"], "--resume: was removed; name the file with --json, which goes on from what is in it"),
+        (["--plot", "a.png"], "--plot was removed; `reslrb report FILE -o page.html` draws what --json FILE wrote"),
+        (["--resume=a"], "--resume was removed here; name the file with --json, which goes on from what is in it"),
         (["--resum", "a"], "bench: No such option"),
     ],
 )

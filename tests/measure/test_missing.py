@@ -240,7 +240,7 @@ def test_the_command_and_more_seeds(
     [
         (["--missing"], "--missing: needs a CONFIG"),
         (["CONFIG", "--missing", "--estimators", "stack"], "--estimators: does not go with --missing"),
-        (["CONFIG", "--missing", "--markdown", "a.md"], "--markdown: was removed; `reslrb report FILE"),
+        (["CONFIG", "--missing", "--markdown", "a.md"], "--markdown was removed; `reslrb report FILE"),
         (["CONFIG", "--directions", "2"], "--directions: goes with --missing alone"),
     ],
 )
