@@ -10,13 +10,12 @@ import json
 import os
 import re
 import shlex
-import shutil
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ import yaml
 ROOT = Path(__file__).resolve().parent.parent
 RECORDS = ROOT / "docs" / "benchmarks"
 PAPER = ROOT / "docs" / "paper"
-#: The page that `gradcheck --suite extreme` writes. Its record only counts the comparisons, which are thousands.
+#: The page of the extreme suite. Its record only counts the comparisons, which are thousands.
 EXTREME = ROOT / "docs" / "extreme.md"
 #: The code that every figure depends on, and the code that the figures of a command depend on besides.
 CODE = tuple(f"reslrb_cli/{name}" for name in ("backend", "scene", "transport", "estimators", "guiding", "integrators"))
@@ -87,7 +86,7 @@ def _all() -> list[Measurement]:
         "spp": "bench --sweep spp --values 1,4,16,64 --integrators ptracer,reslrb:reservoir,reslrb:stack --budget 120",
         "moving": _GLASS,
     }
-    commands["extreme"] = f"gradcheck --suite extreme --markdown {EXTREME.relative_to(ROOT)}"
+    commands["extreme"] = "gradcheck --suite extreme"
     commands |= {f"gradcheck_{name}": f"gradcheck configs/{name}.yaml --seeds 16" for name in CHECKED}
     for name in EXPERIMENTS:
         commands[experiment_record(name)] = f"optimize configs/{name}.yaml"
@@ -182,15 +181,86 @@ def measure(measurement: Measurement) -> None:
         lines = run_lines(folder / "run") if kind == "optimize" else _read(record)
         lines[0] |= {"command": measurement.command, "seconds": round(seconds, 1)} | tree
         if measurement.name == "extreme":
+            EXTREME.write_text(extreme_page(lines), encoding="utf-8")
             holds = [line["holds"] for line in lines if "verdict" in line]
             counts = {"comparisons": len(holds), "hold": holds.count(True), "fail": holds.count(False)}
             lines = [lines[0], {"kind": "suite"} | counts]
         RECORDS.mkdir(exist_ok=True)
         text = "".join(json.dumps(line) + "\n" for line in lines)
         measurement.file.write_text(text, encoding="utf-8")
-        picture = record.with_suffix(".png")
-        if measurement.name == "depth" and picture.exists():
-            shutil.copy(picture, ROOT / "docs" / "images" / "bench.png")
+        if measurement.name == "depth":
+            draw_bench(lines, ROOT / "docs" / "images" / "bench.png")
+
+
+def draw_bench(lines: Sequence[Mapping[str, Any]], picture: Path) -> None:
+    """Draw time and memory of a step against path depth, from the lines of a record."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from reslrb_cli.report.page.measured import curves_of, label
+    from reslrb_cli.report.plots import draw
+
+    origin, rows = lines[0], [line for line in lines[1:] if line["status"] == "ok"]
+    figure = Figure(figsize=(11.0, 4.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    shown = {"time of a step (ms)": "step_ms", "peak memory (MiB)": "peak_mib"}
+    for axis, (words, figures) in zip(figure.subplots(1, 2), shown.items(), strict=True):
+        draw(axis, curves_of(rows, list(dict.fromkeys(map(label, rows))), label, "max_depth", figures), 2)
+        axis.legend(fontsize="small")
+        axis.set(xlabel="path depth", ylabel=words)
+        axis.grid(True, which="both", alpha=0.25)
+    figure.suptitle(f"{origin['device']}, {origin['variant']}", fontsize="medium")
+    figure.savefig(picture, dpi=150)
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table with a heading for each column."""
+    lines = ["|".join(f" {cell} " if cell else " " for cell in cells) for cells in [head, *rows]]
+    lines.insert(1, "|".join("---" for _ in head))
+    return "\n".join(f"|{line}|" for line in lines)
+
+
+def extreme_page(lines: Sequence[Mapping[str, Any]]) -> str:
+    """Return the page of the extreme suite, from the lines of its file: a row for each case, a column by estimator."""
+    from reslrb_cli.measure.extreme import CASES
+
+    origin, records = lines[0], [line for line in lines if "verdict" in line]
+    z, distance = (max(record[limit] or 0.0 for record in records) for limit in ("z_max_limit", "relative_l2_limit"))
+    estimators = list(dict.fromkeys(record["estimator"] for record in records))
+    rows = []
+    for case in dict.fromkeys(record["case"] for record in records):
+        own = [record for record in records if record["case"] == case]
+        kinds = {image: dict.fromkeys(record["reference"] for record in own if (record["kind"] == "image") is image)
+                 for image in (False, True)}  # fmt: skip
+        references = [*kinds[False], *(f"image: {name}" for name in kinds[True])]
+        cells = [_suite_cell([record for record in own if record["estimator"] == name]) for name in estimators]
+        named = ", ".join(references).replace("finite_difference", "differences")
+        rows.append([f"`{case}`", CASES[case].about, named, str(own[0]["seeds"]), *cells])
+    return (
+        "# The extreme suite\n\n"
+        "Scenes in which gradients of light paths break, each with a reference. Written by\n\n"
+        "    scripts/benchmarks measure extreme\n\n"
+        f"on {origin['device']}, {origin['variant']}.\n"
+        "Under each estimator stand the largest deviation in standard errors of all comparisons over many seeds\n"
+        f"(limit {z:.1f}, the same for all), the largest relative L2 distance at equal seeds (limit {distance:.0e}),\n"
+        "and each comparison that does not hold or stays open. References and verdicts: docs/gradcheck.md.\n\n"
+        f"{table(('case', 'what it is about', 'references', 'seeds', *estimators), rows)}\n"
+    )
+
+
+def _suite_cell(records: Sequence[Mapping[str, Any]]) -> str:
+    """Return the largest figures of an estimator in one case, and the verdicts that are not `holds`."""
+    if not records:
+        return "-"
+    held = [record["z_max"] for record in records if record["z_max"] is not None and record["verdict"] == "holds"]
+    equal = [record["relative_l2"] or 0.0 for record in records if record["relative_l2_limit"] is not None]
+    parts = ([f"{max(held):.1f}"] if held else []) + ([f"{max(equal):.0e}"] if equal else [])
+    for record in records:
+        if record["verdict"] != "holds":
+            which = (record["parameter"] or record["kind"]).split(".")
+            name = which[-2] if len(which) > 1 and which[-1] in ("value", "data") else which[-1]
+            parts.append(f"**{record['verdict'].replace('_', ' ')}: {name}**")
+    return ", ".join(dict.fromkeys(parts)) or "exact"
 
 
 def run_lines(folder: Path) -> list[dict[str, Any]]:

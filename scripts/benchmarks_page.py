@@ -29,6 +29,7 @@ from benchmarks_measure import (
     experiment_record,
     measure,
     stale,
+    table,
 )
 
 Row = Mapping[str, Any]
@@ -90,13 +91,6 @@ def measured_at(origins: Mapping[str, Row]) -> str:
         names.setdefault(commit_of(origin), []).append(f"`{name}`")
     parts = [commit if len(names) == 1 else f"{commit}: {', '.join(of)}" for commit, of in names.items()]
     return fill(f"Measured at {'; '.join(parts)}.", WIDTH, break_long_words=False, break_on_hyphens=False)
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table with a heading for each column."""
-    lines = ["|".join(f" {cell} " if cell else " " for cell in cells) for cells in [head, *rows]]
-    lines.insert(1, "|".join("---" for _ in head))
-    return "\n".join(f"|{line}|" for line in lines)
 
 
 def name_of(row: Row) -> str:

@@ -15,7 +15,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks_measure import code_state
+from benchmarks_measure import code_state, draw_bench
 from paper_command import figure_parser
 from paper_room import ROOM, room_config
 
@@ -36,23 +36,20 @@ def main(arguments: list[str]) -> int:
         with tempfile.TemporaryDirectory(prefix="reslrb-figure6-") as folder:
             room_config(options.room, Path(folder), [])
             command = [sys.executable, "-m", "reslrb_cli", "bench", "room.yaml", "--set", "integrator.rr_depth=100000"]
-            file = options.folder.absolute() / "figure6.jsonl"
+            record, file = Path(folder) / "record.jsonl", options.folder / "figure6.jsonl"
             chosen = [] if any(word.partition("=")[0] == "--values" for word in others) else [*DEPTHS]
-            command += [*BENCH.split(), *chosen, "--json", str(file), *others]
-            code = subprocess.run(command, cwd=folder, check=False).returncode  # its pictures name room.yaml alone
-        if file.exists():
-            _name_the_command(file, others)
+            command += [*BENCH.split(), *chosen, "--json", str(record), *others]
+            code = subprocess.run(command, cwd=folder, check=False).returncode
+            if record.exists():
+                lines = [json.loads(line) for line in record.read_text(encoding="utf-8").splitlines()]
+                # The command saw an experiment that is gone now.
+                lines[0] |= {"command": ["scripts/paper", "figure6", "ROOM", *others]} | code_state()
+                file.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+                draw_bench(lines, file.with_suffix(".png"))
         return code
     except (ReslrbError, OSError) as error:
         print(one_line(f"figure6: {error}"), file=sys.stderr)
         return int(getattr(error, "exit_code", 1))
-
-
-def _name_the_command(file: Path, others: list[str]) -> None:
-    """Have the record say what does it again: `reslrb bench` saw an experiment that is gone now."""
-    first, _, rest = file.read_text(encoding="utf-8").partition("\n")
-    origin = json.loads(first) | {"command": ["scripts/paper", "figure6", "ROOM", *others]} | code_state()
-    file.write_text(f"{json.dumps(origin)}\n{rest}", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -16,10 +16,10 @@ from reslrb_cli.config.integrators import Prb, Ptracer, WalkAd
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import loads
 from reslrb_cli.config.schema import Config
-from reslrb_cli.integrators.step import known_step
 from reslrb_cli.measure.participants import ALIKE, NEVER
+from reslrb_cli.measure.stepper import Steps
 from reslrb_cli.measure.workers import Begun
-from reslrb_cli.optimization.assemble import assemble, assemble_scene
+from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.views import to_tensor
 from reslrb_cli.records.clock import peak_mib, reset_peak
 from reslrb_cli.records.measurements import Reference
@@ -77,23 +77,15 @@ class Held:
     """Takes gradients with respect to the first parameter, through the first sensor; `adjoint` is dL/dI (H, W, C)."""
 
     def __init__(self, config: Config, adjoint: np.ndarray) -> None:
-        self.problem = assemble_scene(config.with_exposures_fixed())
-        self.key = self.problem.selection.keys[0]
+        self.steps = Steps(config)
+        self.key = self.steps.problem.selection.keys[0]
         self.adjoint = to_tensor(adjoint)
 
     def gradient(self, seed: int, spp: int) -> np.ndarray:
         """One gradient, of the parameter's shape."""
-        problem = self.problem
-        problem.apply()
-        for key in problem.selection.keys:
-            dr.clear_grad(problem.optimizer[key])
-        params = problem.selection.params
-        step = known_step(
-            problem.integrator, problem.scene, problem.sensors[0], self.adjoint, seed=seed, spp=spp, params=params
-        )
-        gradients = problem.gradients()
-        dr.eval(step.image, gradients)
-        return np.array(gradients[self.key], np.float32).reshape(problem.selection.array(self.key).shape)
+        gradients, _ = self.steps.gradient(seed, self.adjoint, spp)
+        shape = self.steps.problem.selection.array(self.key).shape
+        return np.array(gradients[self.key], np.float32).reshape(shape)
 
 
 def begin_holding(first: dict[str, Any]) -> Begun:

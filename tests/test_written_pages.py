@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import benchmarks_measure
 import benchmarks_page as pages
@@ -14,6 +15,8 @@ import paper_page
 import pytest
 from benchmarks_measure import MEASUREMENTS, OTHERS, RECORDS, ROOT, Measurement
 from benchmarks_page import main, read
+
+from reslrb_cli.measure.extreme import CASES
 
 TINY = ("bench", "--values", "2", "--integrators", "reslrb:stack", "--rounds", "1", "--set", "scene.options.size=8",
         "--set", "run.spp=1")  # fmt: skip
@@ -245,6 +248,8 @@ def test_a_measurement_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert record.origin["seconds"] > 0
     assert {name: record.origin[name] for name in ("commit", "clean")} == benchmarks_measure.code_state()
     assert [row["status"] for row in record.rows] == ["ok"]
+    benchmarks_measure.draw_bench([record.origin, *record.rows], tmp_path / "tiny.png")
+    assert (tmp_path / "tiny.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(SystemExit, match="exit code 2; its record is left as it was"):
         benchmarks_measure.measure(Measurement("tiny", ("bench", "--nonsense")))
     assert read(tmp_path / "tiny.jsonl") == record
@@ -254,6 +259,25 @@ def test_wrong_names_are_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["measure", "dept"]) == 2
     assert "there is no measurement `dept`; did you mean depth?" in capsys.readouterr().err
     assert main(["write", "depth"]) == 2
+
+
+def test_the_page_of_the_extreme_suite_has_a_line_for_each_case_and_a_column_for_each_estimator() -> None:
+    def record(case: str, estimator: str, z_max: float, verdict: str = "holds") -> dict[str, Any]:
+        return {"case": case, "parameter": "floor.reflectance.data", "estimator": estimator, "kind": "expectation",
+                "reference": "ptracer", "seeds": 8, "verdict": verdict, "z_max": z_max, "z_max_limit": 5.9,
+                "relative_l2": None, "relative_l2_limit": None}  # fmt: skip
+
+    first, second, *_ = CASES.values()
+    records = [record(first.name, "gather", 2.0), record(first.name, "stack", 1.0), record(second.name, "stack", 3.0),
+               record(second.name, "stack", 9.0, "fails")]  # fmt: skip
+    page = benchmarks_measure.extreme_page([{"kind": "origin", "device": "a CPU", "variant": "v"}, *records])
+    assert "(limit 5.9, the same for all)" in page
+    assert page.splitlines()[-4:] == [
+        "| case | what it is about | references | seeds | gather | stack |",
+        "|---|---|---|---|---|---|",
+        f"| `{first.name}` | {first.about} | ptracer | 8 | 2.0 | 1.0 |",
+        f"| `{second.name}` | {second.about} | ptracer | 8 | - | 3.0, **fails: reflectance** |",
+    ]
 
 
 def test_the_readme_says_of_the_extreme_suite_what_its_page_and_record_do(folder: Path) -> None:

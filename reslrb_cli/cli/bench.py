@@ -15,16 +15,15 @@ from reslrb_cli.cli.options import (
     Keeper,
     allow_code_option,
     budget_option,
+    check_writable,
     exit_code,
-    files_of,
     is_given,
-    look_at,
+    json_option,
     measuring,
     memory_limit_option,
     optional_experiment_arguments,
     origin_of,
     read_or_box,
-    resume_option,
 )
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.errors import ConfigError
@@ -62,36 +61,25 @@ INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,
 @memory_limit_option
 @budget_option
 @click.option("--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
-              help="Number of steps of each, whatever time they take, those of --resume included.")  # fmt: skip
-@resume_option
-@click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False),
-              help="Write one object a line, as results come.")  # fmt: skip
-@click.option("--plot", "plot_file", type=click.Path(path_type=Path, dir_okay=False),
-              help="PNG of time and memory against what is varied; default: beside the JSON file.")  # fmt: skip
+              help="Number of steps of each, with those in the file of --json, whatever time they take.")  # fmt: skip
+@json_option
 def command(
     config_file: Path | None, overrides: tuple[str, ...], swept: str, values: tuple[int, ...] | None, max_depth: int,
     integrators: str | None, objective: str, allow_code: bool, memory_limit: int | None,
-    budget: float, rounds: int | None, resumed: Path | None, json_file: Path | None, plot_file: Path | None,
+    budget: float, rounds: int | None, json_file: Path | None,
 ) -> int:  # fmt: skip
     """Measure time and peak memory of gradient steps against path depth, or what else --sweep names.
 
     A step is image, loss and gradient of every parameter of CONFIG, seen through its first sensor. Without CONFIG the
     scene is a Cornell box (--set scene.options.size=64, run.spp=4, ...). Each integrator runs in processes of its own;
-    one that runs out of memory is recorded as out_of_memory, and the rest goes on. Ctrl-C keeps what is done, and what
-    --json has written can be gone on from, however the process ended.
+    one that runs out of memory is recorded as out_of_memory, and the rest goes on. Ctrl-C keeps what is done. The same
+    command again goes on from what --json has written, however the process ended.
     """
     began = time.monotonic()
     from reslrb_cli.backend.installation import load_packages
 
     load_packages()  # before what follows asks for them
-    from reslrb_cli.measure.methods import (
-        SWEPT,
-        Sweep,
-        depths,
-        machine_of,
-        parse_cases,
-        usual_values,
-    )
+    from reslrb_cli.measure.methods import Sweep, depths, machine_of, parse_cases, usual_values
     from reslrb_cli.records.measurements import BenchStatus
 
     config = read_or_box(config_file, overrides).with_code(allow_code)
@@ -99,7 +87,7 @@ def command(
         reason = "goes with --sweep depth" if values is None else "does not go with --values"
         raise ConfigError("--max-depth", "", f"{reason}; take --set integrator.max_depth={max_depth}")
     cases = parse_cases(integrators or INTEGRATORS, deep=swept == "depth")
-    json_file, plot_file = files_of(resumed, json_file, plot_file)
+    check_writable("--json", json_file)
     sweep = Sweep(
         **machine_of(config, memory_limit),
         config=config,
@@ -112,19 +100,12 @@ def command(
         swept=swept,
     )
     sweep.check()
-    results, interrupted = _run(sweep, resumed, json_file, began)
-    if plot_file is not None and results:
-        from reslrb_cli.report.plots import plot_bench
-
-        series = [(case.label, [(r.value, r.record) for r in results if r.case == case]) for case in cases]
-        abscissa = "path depth" if swept == "depth" else SWEPT[swept]
-        plot_bench(series, plot_file, f"{sweep.device}\n{_conditions(config, sweep)}", abscissa)
-        look_at(plot_file)
+    results, interrupted = _run(sweep, json_file, began)
     states = {result.record.status for result in results}
     return exit_code(interrupted, BenchStatus.OK in states, states)
 
 
-def _run(sweep: Sweep, resumed: Path | None, json_file: Path | None, began: float) -> tuple[list[Result], bool]:
+def _run(sweep: Sweep, json_file: Path | None, began: float) -> tuple[list[Result], bool]:
     """Measure, print and write; returns all results, and whether the user interrupted."""
     from reslrb_cli.measure.bench import Bench
     from reslrb_cli.report.tables import bench_cells, bench_columns
@@ -141,7 +122,7 @@ def _run(sweep: Sweep, resumed: Path | None, json_file: Path | None, began: floa
         return [row.record for row in session.results(done)]
 
     say = logging.getLogger(__name__).info
-    with measuring(Bench, sweep, resumed, began, "round", say) as (session, interrupts):
+    with measuring(Bench, sweep, json_file, began, "round", say) as (session, interrupts):
         keeper = Keeper(json_file, origin_of(sweep.variant), lambda: lines(True), lambda: lines(False), session.kept)
         echo(_conditions(sweep.config, sweep))
         echo(table.head())

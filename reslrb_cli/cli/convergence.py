@@ -1,136 +1,37 @@
-"""`reslrb convergence`: error of the gradient, or of the image, against run time.
-
-With `--runs` it is whole optimisations, printed and written as they come (`measure_runs`).
-"""
+"""`reslrb convergence`: error of the gradient, or of the image, against run time."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from reslrb_cli.cli.options import (
     COUNT,
     Counts,
-    Factors,
     Keeper,
     allow_code_option,
     budget_option,
+    check_writable,
     exit_code,
     experiment_arguments,
-    files_of,
-    is_given,
-    look_at,
+    json_option,
     measuring,
     memory_limit_option,
     origin_of,
-    resume_option,
 )
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.optimizers import loss_words
-from reslrb_cli.errors import ConfigError, ExitCode
-from reslrb_cli.report.format import WITHOUT_BORDER, Columns, count
+from reslrb_cli.report.format import WITHOUT_BORDER, Columns
 
 if TYPE_CHECKING:
     from reslrb_cli.measure.convergence.judgement import Results
     from reslrb_cli.measure.convergence.session import Session
-    from reslrb_cli.measure.methods import Plan, RunsPlan
-    from reslrb_cli.measure.optimization_benchmark.session import RunsSession
-    from reslrb_cli.records.measurement_files import Line
-    from reslrb_cli.records.measurements import MethodRecord, RunBestRecord, RunMethodRecord, RunPointRecord
-
-
-def measure_runs(
-    plan: RunsPlan, resumed: Path | None, json_file: Path | None, plot_file: Path | None, began: float
-) -> int:
-    """Measure, print, write and draw; returns the exit code. `began` is when the command was called, by `monotonic`.
-
-    `resumed` is the JSON file that is gone on from, if any.
-    """
-    from reslrb_cli.measure.optimization_benchmark.rank import outcome
-    from reslrb_cli.measure.optimization_benchmark.session import RunsSession
-    from reslrb_cli.records.measurements import SummaryRecord
-    from reslrb_cli.report.convergence_tables import (
-        best_line,
-        run_cells,
-        runs_cells,
-        runs_closing_sentence,
-        runs_columns,
-        runs_notes,
-    )
-
-    with measuring(RunsSession, plan, resumed, began, "run") as (session, interrupts):
-        table = runs_columns(list(plan.names))
-        points = [point for run in session.members for point in run.points]  # of earlier sessions
-
-        def show(point: RunPointRecord) -> None:
-            if point.elapsed_s == session.limit_s:
-                echo(table.line(run_cells(point, session.run_of(point).first_s)))
-
-        def found() -> tuple[list[RunMethodRecord], list[RunBestRecord], str]:
-            now = outcome(session.members, session.limit_s, plan.names)
-            bests = [replace(record, line=best_line(record)) for record in now.bests]
-            return now.methods, bests, runs_closing_sentence(now.loss, now.error, session.limit_s)
-
-        def outcome_lines() -> list[Line]:
-            records, bests, sentence = found()
-            return [*records, *bests, SummaryRecord(sentence)]
-
-        keeper = Keeper(json_file, origin_of(plan.variant), lambda: points, outcome_lines, session.kept)
-        headed = False
-        for point in session.run():
-            if not headed:
-                headed = True
-                echo(_runs_conditions(plan, session))
-                echo(table.head())
-                for other in points:
-                    show(other)
-            points.append(point)
-            show(point)
-            keeper.refresh()
-        keeper.finish([*points, *outcome_lines()])
-        records, bests, sentence = found()
-        echo(table.head())
-        for record in records:
-            echo(table.line(runs_cells(record)))
-        for line in [*runs_notes(records), *(best.line for best in bests), sentence]:
-            echo(line)
-    if plot_file is not None and points:
-        from reslrb_cli.report.plots import plot_runs
-
-        title = f"{plan.device}, {plan.variant}\n{_runs_conditions(plan, session)}"
-        plot_runs(points, session.facts.get("error_of", ""), plot_file, title)
-        look_at(plot_file)
-    return _runs_exit_code(records, interrupts.requested)
-
-
-def _runs_conditions(plan: RunsPlan, session: RunsSession) -> str:
-    """What was measured, in one line."""
-    optimizer, facts = plan.config.optimizer, session.facts
-    parts = [
-        str(plan.config.source),
-        f"{count(plan.runs, 'seed')}, {session.limit_s:.3g} s each",
-        f"loss {loss_words(plan.config.loss)}",
-        f"{optimizer.type} at {optimizer.learning_rate:g}" + "".join(f", x {rate:g}" for rate in plan.rates),
-        facts.get("pictures", ""),
-        facts.get("error_of", ""),
-        WITHOUT_BORDER if facts.get("masked") else "",
-    ]
-    return ", ".join(part for part in parts if part)
-
-
-def _runs_exit_code(records: list[RunMethodRecord], interrupted: bool = False) -> ExitCode:
-    """A comparison in which something was optimised is done; else what kept it from that decides."""
-    done = any(record.iterations is not None and record.iterations.high > 0 for record in records)
-    return exit_code(interrupted, done, {record.status for record in records})
-
-
-#: The most seeds of --runs.
-MOST_RUNS = 100
+    from reslrb_cli.measure.methods import Plan
+    from reslrb_cli.records.measurements import MethodRecord
 
 
 @click.command("convergence")
@@ -143,107 +44,59 @@ MOST_RUNS = 100
 @click.option("--objective", type=click.Choice(["fixed", "loss", "image"]), default="fixed", show_default=True,
               help="fixed: the gradient with dL/dI held at that of a reference image; loss: the gradient of CONFIG's "
                    "loss, by run.adjoint; image: the image.")  # fmt: skip
-@click.option("--runs", type=click.IntRange(min=1, max=MOST_RUNS), metavar="N",
-              help="Whole optimisations in place of gradients: N seeds by each method, at equal wall time, all costs "
-                   "counted. Default list: ptracer, prb, reslrb:stack, reslrb:auto, also on light paths.")  # fmt: skip
-@click.option("--rates", type=Factors(), metavar="LIST",
-              help="With --runs: each method tries its learning rates times each of these, e.g. 0.3,1,3, and is "
-                   "compared at its best.")  # fmt: skip
 @budget_option
 @click.option("--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
-              help="Number of turns of each, whatever time they take, those of --resume included: the same steps on "
-                   "every machine.")  # fmt: skip
+              help="Number of turns of each, whatever time they take, those in the file of --json included: the same "
+                   "steps on every machine.")  # fmt: skip
 @click.option("--spp", "spps", type=Counts(), metavar="LIST",
               help="Samples per pixel of a step, several to compare, e.g. 4,16,64; default: run.spp.")  # fmt: skip
 @click.option("--reference", metavar="METHOD",
               help="What errors are taken from: the mean of many steps of this one. Default: reslrb:stack with paths "
                    "from both sides, half of each, where CONFIG allows that.")  # fmt: skip
 @allow_code_option
-@resume_option
 @memory_limit_option
-@click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False),
-              help="Write one object a line: points, methods and references.")  # fmt: skip
-@click.option("--plot", "plot_file", type=click.Path(path_type=Path, dir_okay=False),
-              help="PNG of error against run time; default: beside the JSON file.")  # fmt: skip
+@json_option
 def command(
-    config_file: Path, overrides: tuple[str, ...], integrators: str | None, objective: str, runs: int | None,
-    rates: tuple[float, ...] | None, budget: float, rounds: int | None, spps: tuple[int, ...] | None,
-    reference: str | None, allow_code: bool, resumed: Path | None, memory_limit: int | None, json_file: Path | None,
-    plot_file: Path | None,
+    config_file: Path, overrides: tuple[str, ...], integrators: str | None, objective: str, budget: float,
+    rounds: int | None, spps: tuple[int, ...] | None, reference: str | None, allow_code: bool,
+    memory_limit: int | None, json_file: Path | None,
 ) -> int:  # fmt: skip
     """Measure how fast the error of each method falls on CONFIG, at its initial values, seen through its first sensor.
 
     Each method takes steps of run.spp samples per pixel in a process of its own, all in turn. Errors are relative to
     the size of what is estimated; a slope of -1/2 is what independent samples have. Efficiency is 1 / (relative
-    variance * seconds). Ctrl-C keeps what is done, and what --json has written can be gone on from, however the process
-    ended. docs/convergence.md explains the columns.
+    variance * seconds). Ctrl-C keeps what is done. The same command again goes on from what --json has written, however
+    the process ended. docs/convergence.md explains the columns.
     """
     began = time.monotonic()
     from reslrb_cli.backend.installation import load_packages
     from reslrb_cli.config.loader import check_code, load
 
     load_packages()  # before what follows asks for them
-    from reslrb_cli.measure.methods import DEFAULT, DEFAULTS, Plan, RunsPlan, compared, machine_of
+    from reslrb_cli.measure.methods import DEFAULTS, Plan, compared, machine_of
 
     config = load(config_file, overrides).with_code(allow_code)
-    if objective == "loss" or runs is not None:
+    if objective == "loss":
         check_code(config)
-    if runs is not None:
-        _refuse_with_runs()
-    elif rates is not None:
-        raise ConfigError("--rates", "", "are those of whole optimisations; add --runs N")
-    usual = DEFAULTS[objective] if runs is None else DEFAULT
-    named = compared(integrators, reference, usual, _settings_of(resumed))
-    json_file, plot_file = files_of(resumed, json_file, plot_file)
-    settings: dict[str, Any] = {
+    named = compared(integrators, reference, DEFAULTS[objective])
+    check_writable("--json", json_file)
+    plan = Plan(
         **machine_of(config, memory_limit),
-        "config": config,
         **named,
-        "objective": objective if runs is None else "loss",
-        "budget_s": budget,
-        "rounds": rounds,
-        "spps": spps or (),
-    }
-    if runs is not None:
-        whole = RunsPlan(**settings, runs=runs, rates=rates or ())
-        whole.check()
-        return measure_runs(whole, resumed, json_file, plot_file, began)
-    plan = Plan(**settings)
+        config=config,
+        objective=objective,
+        budget_s=budget,
+        rounds=rounds,
+        spps=spps or (),
+    )
     plan.check()
-    results, conditions, interrupted = _run(plan, resumed, json_file, began)
-    if plot_file is not None and results.points:
-        from reslrb_cli.report.plots import plot_convergence
-
-        title = f"{plan.device}, {plan.variant}\n{conditions}"
-        plot_convergence(results.points, results.methods, plot_file, title)
-        look_at(plot_file)
+    results, interrupted = _run(plan, json_file, began)
     done = any(record.relative_rmse is not None for record in results.methods)
     return exit_code(interrupted, done, {record.status for record in results.methods})
 
 
-def _settings_of(resumed: Path | None) -> dict[str, Any]:
-    """The settings of what is gone on from; nothing where there is none. Raises ConfigError."""
-    if resumed is None:
-        return {}
-    from reslrb_cli.records.measurement_files import read_samples, samples_file
-
-    found = read_samples(samples_file(resumed))[0].get("settings")
-    return found if isinstance(found, dict) else {}
-
-
-def _refuse_with_runs() -> None:
-    """Raise ConfigError where an option was given that whole runs have no use for."""
-    why = {
-        "objective": "runs have the configuration's own loss",
-        "rounds": "runs have a time, not a number of turns; take --budget",
-    }
-    for name, reason in why.items():
-        if is_given(name):
-            raise ConfigError(f"--{name}", "", f"does not go with --runs: {reason}")
-
-
-def _run(plan: Plan, resumed: Path | None, json_file: Path | None, began: float) -> tuple[Results, str, bool]:
-    """Measure, print and write; returns the results, the conditions in words, and whether the user interrupted."""
+def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[Results, bool]:
+    """Measure, print and write; return the results, and whether the user interrupted."""
     from reslrb_cli.measure.convergence.judgement import Judgement
     from reslrb_cli.measure.convergence.session import Session
     from reslrb_cli.measure.convergence.setup import Role
@@ -255,7 +108,7 @@ def _run(plan: Plan, resumed: Path | None, json_file: Path | None, began: float)
         result_lines,
     )
 
-    with measuring(Session, plan, resumed, began, "round") as (session, interrupts):
+    with measuring(Session, plan, json_file, began, "round") as (session, interrupts):
         origin = origin_of(plan.variant)
         keeper = Keeper(json_file, origin, lambda: [], lambda: result_lines(Judgement(session).results()), session.kept)
         table: Columns | None = None
@@ -285,7 +138,7 @@ def _run(plan: Plan, resumed: Path | None, json_file: Path | None, began: float)
         for note in notes([record for record in results.methods if record.parameter in shown]):
             echo(note)
         echo(closing_sentence(results.methods))
-        return results, _conditions(plan, session), interrupts.requested
+        return results, interrupts.requested
 
 
 def _table(session: Session) -> Columns:

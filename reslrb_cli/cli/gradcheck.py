@@ -24,11 +24,12 @@ from reslrb_cli.cli.options import (
     check_writable,
     cluster_option,
     is_given,
+    json_option,
     look_at,
     optional_experiment_arguments,
     origin_of,
+    read_earlier,
     read_or_box,
-    resume_option,
 )
 from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.cluster.connection import Place
@@ -36,7 +37,7 @@ from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
 from reslrb_cli.config.loader import check_code
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.measure.methods import PATHS_OPTIONS, parse_estimators
-from reslrb_cli.measure.resume_store import Earlier, settings
+from reslrb_cli.measure.resume_store import settings
 from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verdict
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ if TYPE_CHECKING:
 
 #: Options that say something about comparisons, of which `--missing` makes none.
 COMPARING = {"suite": "--suite", "cases": "--case", "estimators": "--estimators", "integrators": "--integrators",
-             "markdown_file": "--markdown", "folder": "--images"}  # fmt: skip
+             "folder": "--images"}  # fmt: skip
 
 #: Options that mean nothing without a configuration, as of a suite.
 CONFIGURED = {"config_file": "CONFIG", "overrides": "--set", "budget": "--budget", "spp": "--spp", "folder": "--images"}
@@ -59,13 +60,13 @@ def _given(options: dict[str, str]) -> str | None:
 
 def run_missing(
     config: Config, variant: str, budget: float, seeds: int | None, spp: int | None, along: int | None,
-    json_file: Path | None, resumed: Path | None,
+    json_file: Path | None,
 ) -> int:  # fmt: skip
     """Measure, print and write; returns the exit code. `variant` must be set."""
     from reslrb_cli.measure.missing import KIND, MissingCheck
 
     to_keep = settings(config, {}, variant, device_name(variant), spp=spp, directions=along)
-    check = MissingCheck(config, budget, seeds, spp, along, Earlier.read(KIND, resumed, to_keep))
+    check = MissingCheck(config, budget, seeds, spp, along, read_earlier(KIND, json_file, to_keep))
     echo(check.conditions())
     records: list[MissingRecord] = []
     keeper = Keeper(
@@ -81,12 +82,11 @@ def run_missing(
 
 
 def run_suite_command(
-    names: tuple[str, ...], estimators: str | None, seeds: int | None, json_file: Path | None,
-    markdown_file: Path | None, resumed: Path | None, place: Place | None,
-) -> int:  # fmt: skip
-    """Run the cases of these names, all where there is none; print a line for each, write the files.
+    names: tuple[str, ...], estimators: str | None, seeds: int | None, json_file: Path | None, place: Place | None
+) -> int:
+    """Run the cases of these names, all where there is none; print a line for each, write the file.
 
-    Cases that the file `resumed` has are not run again. At a `place` its workers run them.
+    Cases that the file has are not run again. At a `place` its workers run them.
     """
     chosen = _estimators(estimators)
     variant = set_variant("auto")
@@ -99,14 +99,11 @@ def run_suite_command(
         if name not in CASES:
             near = difflib.get_close_matches(name, list(CASES), n=1, cutoff=0)
             raise ConfigError("--case", "", f"there is no case `{name}`; did you mean {near[0]}?")
-    machine = f"{device_name(variant)}, {variant}"
     to_keep = suite.settings(chosen, seeds, variant, device_name(variant))
-    earlier = Earlier.read(suite.KIND, resumed, to_keep)
+    earlier = read_earlier(suite.KIND, json_file, to_keep)
     done = {} if earlier is None else suite.restore(earlier)
     to_do = [name for name in names or CASES if name not in done]
-    if earlier is not None and not to_do:
-        raise earlier.complete("all these cases", "others with --case")
-    echo(machine)
+    echo(f"{device_name(variant)}, {variant}")
     for case, rows in done.items():
         echo(_case_line(case, rows))
 
@@ -129,9 +126,6 @@ def run_suite_command(
         keeper.finish(lines())
     for line in summary_lines(lines()):
         echo(line)
-    if markdown_file is not None:
-        about = {name: case.about for name, case in CASES.items()}
-        markdown_file.write_text(_document(lines(), about, machine), encoding="utf-8")
     return ExitCode.INTERRUPTED if interrupted else _exit_code(lines())
 
 
@@ -168,22 +162,6 @@ def _case_line(case: str, rows: list[GradcheckRecord]) -> str:
     return f"{case:<40}  max |z| {z:4.1f}  equal seeds {distance:.0e}  {holds} of {len(rows)}{left}  {verdict}"
 
 
-def _document(records: list[GradcheckRecord], about: dict[str, str], machine: str) -> str:
-    """The page that `--markdown` writes."""
-    from reslrb_cli.report.tables import limits, suite_table
-
-    z, distance = limits(records)
-    return (
-        "# The extreme suite\n\n"
-        "Scenes in which gradients of light paths break, each with a reference. Written by\n\n"
-        "    reslrb gradcheck --suite extreme --markdown docs/extreme.md\n\n"
-        f"on {machine}. Under each estimator stand the largest deviation in standard errors of all comparisons over\n"
-        f"many seeds (limit {z:.1f}, the same for all), the largest relative L2 distance at equal seeds (limit\n"
-        f"{distance:.0e}), and what does not hold or stays open. References and verdicts: docs/gradcheck.md.\n\n"
-        f"{suite_table(records, about)}"
-    )
-
-
 logger = logging.getLogger(__name__)
 
 
@@ -203,10 +181,10 @@ logger = logging.getLogger(__name__)
               help="Time for the whole, loading and compiling included; it decides how many seeds there are. What it "
                    "does not suffice for is named, with what it would take.")  # fmt: skip
 @click.option("--seeds", type=click.IntRange(min=3, max=COUNT.max), metavar="N",
-              help="Number of seeds, whatever time they take, those of --resume included.")  # fmt: skip
+              help="Number of seeds, whatever time they take, those in the file of --json included.")  # fmt: skip
 @allow_code_option
 @cluster_option("Have samples, or the cases of a suite, taken by others", "the result is that of one process")
-@resume_option
+@json_option
 @click.option("--spp", type=COUNT,
               help="Samples per pixel of one gradient. Default: 65536 light paths, no more than run.spp.")  # fmt: skip
 @click.option("--missing", is_flag=True,
@@ -214,18 +192,14 @@ logger = logging.getLogger(__name__)
                    "silhouettes, edges of shadows and light that leaves the film make up.")  # fmt: skip
 @click.option("--directions", type=click.IntRange(min=1, max=64), metavar="N",
               help="With --missing: along how many directions of each parameter. Default: 3.")  # fmt: skip
-@click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False),
-              help="Write one object a line, one for each comparison.")  # fmt: skip
-@click.option("--markdown", "markdown_file", type=click.Path(path_type=Path, dir_okay=False),
-              help="Write the table as Markdown.")  # fmt: skip
 @click.option("--images", "folder", type=click.Path(path_type=Path, file_okay=False),
               help="Write maps of the gradients of textures, their references and z into this folder, as PNG and as "
                    "layers of EXR files.")  # fmt: skip
 def command(
     config_file: Path | None, overrides: tuple[str, ...], suite: str | None, cases: tuple[str, ...],
     estimators: str | None, integrators: str | None, budget: float, seeds: int | None, allow_code: bool,
-    cluster: str | None, resumed: Path | None, spp: int | None, missing: bool, directions: int | None,
-    json_file: Path | None, markdown_file: Path | None, folder: Path | None,
+    cluster: str | None, json_file: Path | None, spp: int | None, missing: bool, directions: int | None,
+    folder: Path | None,
 ) -> int:  # fmt: skip
     """Compare the gradients of every parameter of CONFIG with references, at its initial values.
 
@@ -240,7 +214,7 @@ def command(
     from reslrb_cli.measure.participants import settings_of
     from reslrb_cli.measure.sampling import KIND
     from reslrb_cli.measure.sampling import settings as settings_to_keep
-    from reslrb_cli.report.tables import markdown_table, summary_lines
+    from reslrb_cli.report.tables import summary_lines
 
     if missing and (option := _given(COMPARING)):
         raise ConfigError(option, "", "does not go with --missing, which compares no estimators; leave out one")
@@ -251,14 +225,12 @@ def command(
     place = None if cluster is None else Place.parse(cluster)
     if missing and place is not None:
         raise ConfigError("--cluster", "", "does not go with --missing, which shares nothing out; leave out one")
-    json_file = json_file or resumed
     check_writable("--json", json_file)
-    check_writable("--markdown", markdown_file)
     if suite is not None:
         if option := _given(CONFIGURED):
             reason = f"{option} has no effect on a suite, whose cases have their own; remove it"
             raise ConfigError("--suite", "", reason)
-        return run_suite_command(cases, estimators, seeds, json_file, markdown_file, resumed, place)
+        return run_suite_command(cases, estimators, seeds, json_file, place)
     if cases:
         raise ConfigError("--case", "", "names a case of a suite; take --suite extreme with it")
     config = read_or_box(config_file, overrides).with_code(allow_code)
@@ -266,7 +238,7 @@ def command(
         check_code(config)
         variant = set_variant(config.variant)
         echo(f"{device_name(variant)}, {variant}")
-        return run_missing(config, variant, budget, seeds, spp, directions, json_file, resumed)
+        return run_missing(config, variant, budget, seeds, spp, directions, json_file)
     _check_folder(folder)
     checked = settings_of(config, estimators, budget, seeds, spp, time.monotonic() - began, integrators)
     if place is not None:
@@ -276,7 +248,7 @@ def command(
         place.check()
     variant = set_variant(config.variant)
     to_keep = settings_to_keep(checked, variant, device_name(variant))
-    check = Gradcheck(checked, earlier=Earlier.read(KIND, resumed, to_keep))
+    check = Gradcheck(checked, earlier=read_earlier(KIND, json_file, to_keep))
     echo(f"{device_name(variant)}, {variant}; {allowance(budget, seeds, 'seed')}")
     echo(check.conditions())
     with contextlib.ExitStack() as stack:
@@ -294,8 +266,6 @@ def command(
         with Interrupts() as interrupts:
             for line in look_into(check, records, lambda: interrupts.requested, logger.info):
                 echo(line)
-    if markdown_file is not None:
-        markdown_file.write_text(markdown_table(records), encoding="utf-8")
     nothing = all(record.verdict in (Verdict.NOT_MEASURED, Verdict.NO_REFERENCE) for record in records)
     if interrupted:
         return ExitCode.INTERRUPTED

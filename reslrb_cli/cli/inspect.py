@@ -241,12 +241,13 @@ def command(
     config = subject.config
     if conditioning and subject.missing:
         raise ConfigError(path, subject.missing[0], "missing; --conditioning measures a complete experiment")
-    start_variant(config)
     if nonfinite:
+        if overrides:
+            raise ConfigError("--set", "", "does not go with --nonfinite, which traces the run's own step again")
         from reslrb_cli.cli.nonfinite import show_offenders
 
         return show_offenders(config, as_json)
-
+    start_variant(config)
     from reslrb_cli.optimization.loading import load_configured
     from reslrb_cli.scene.catalog import summarise
 

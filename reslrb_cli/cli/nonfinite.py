@@ -4,34 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+import logging
+from typing import TYPE_CHECKING
 
 import click
-import mitsuba as mi
-import numpy as np
 
 from reslrb_cli.cli.terminal import echo
-from reslrb_cli.config.integrators import UNDECIDED
-from reslrb_cli.config.loader import with_integrator
-from reslrb_cli.config.optimizers import AS_CONFIGURED
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
-from reslrb_cli.optimization.assemble import assemble_scene, at_stage
-from reslrb_cli.optimization.autotune.sampling import as_decided, with_sides
-from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.state import guiding_of, restore_tables
-from reslrb_cli.optimization.views import color_channels, to_tensor
-from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, NonFiniteStep, load_nonfinite
-from reslrb_cli.records.decisions import GuidedRecord, PathsRecord, SequenceRecord
-from reslrb_cli.records.manifest import MANIFEST_FILE as MANIFEST
+from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.metrics import finite
 from reslrb_cli.records.run_folder import RunFolder
-from reslrb_cli.scene.images import read_bitmap
 
 if TYPE_CHECKING:
     from reslrb_cli.measure.nonfinite_trace import Offender
@@ -40,146 +24,26 @@ if TYPE_CHECKING:
 OPTION = "--nonfinite"
 
 
-@dataclass
-class Replay:
-    """A problem whose parameters and targets are those of the step of `iteration`."""
-
-    problem: Problem
-    iteration: int
-
-
-def load_replay(config: Config) -> Replay:
-    """The replay of the run in whose folder `config` lies. Raises ConfigError where there is none.
-
-    What lies in the folder may be damaged, or of another run: whatever is read is checked against the configuration.
-    """
-    path = config.source.parent
-    manifest = read_manifest(path)
-    if manifest is None:
+def show_offenders(config: Config, as_json: bool) -> int:
+    """Print where the run of `config` first met a value that is not finite; exit code 1 where it does not again."""
+    run = config.source.parent
+    if read_manifest(run) is None:
         raise ConfigError(config.source, OPTION, "is not in a run folder; give the config.yaml of a run")
-    folder = RunFolder(path)
-    saved = load_nonfinite(folder.checkpoint)
-    if saved is None:
+    if not (RunFolder(run).checkpoint / NONFINITE_FILE_NAME).exists():
         raise ConfigError(config.source, OPTION, "this run met no value that was not finite")
     if config.codes:
         raise ConfigError(config.source, OPTION, f"runs no code of your own, which {next(iter(config.codes))} names")
-    iteration, values = saved.iteration, saved.parameters
-    archive, written = folder.checkpoint / NONFINITE_FILE_NAME, path / MANIFEST
-    guided = _guided(config, manifest, written)
-    if not 0 <= iteration < config.run.iterations:
-        raise ConfigError(archive, "iteration", f"is {iteration}; the run has {config.run.iterations} iterations")
-    config = _settled(config, manifest, written)
-    number = config.stage_number(iteration / config.run.iterations)
-    coarse = config.stage(number).grain != AS_CONFIGURED.grain
-    with _fitting(archive, config):
-        problem = assemble_scene(config, values=None if coarse else values)
-    integrator, size = problem.integrator, problem.samples_per_pass
-    if manifest.get("memory"):
-        size = _samples_per_pass(manifest["memory"], written)
-        integrator = integrator.with_options(samples_per_pass=size, freeze=integrator.freeze)
-    if manifest.get("paths"):
-        integrator = with_sides(integrator, PathsRecord.from_json(manifest["paths"]))
-    integrator = as_decided(integrator, guided, None)
-    if saved.shares:
-        integrator = integrator.shared_out(saved.shares)
-    problem = replace(problem, guided=guided, integrator=integrator, samples_per_pass=size)
-    for view in problem.views:
-        suffix = "" if len(problem.views) == 1 else f"-{view.sensor}"
-        view.made = _read_image(folder.images / f"target{suffix}.exr", problem, view.sensor)
-        weights = folder.images / f"weights{suffix}.exr"
-        view.weights = _read_image(weights, problem, view.sensor) if weights.exists() else None
-    if coarse:
-        with _fitting(archive, config):
-            problem = at_stage(problem, number, values)
-    else:
-        problem = replace(problem, config=config.at_stage(number))
-    _teach(problem, saved, archive)
-    return Replay(problem, iteration)
-
-
-@contextmanager
-def _fitting(archive: Path, config: Config) -> Iterator[None]:
-    """Raise ConfigError where the values in the archive are not the experiment's."""
-    try:
-        yield
-    except ValueError as error:
-        raise ConfigError(archive, "", f"does not fit to {config.source}: {error}") from None
-
-
-@contextmanager
-def _as_written(path: Path, place: str, what: str) -> Iterator[None]:
-    """Raise ConfigError where the entry at `place` of the manifest at `path` is not what a run writes."""
-    try:
-        yield
-    except (AttributeError, KeyError, TypeError, ValueError):  # pydantic's error is a ValueError
-        raise ConfigError(path, place, f"is not {what}, as a run writes it") from None
-
-
-def _settled(config: Config, manifest: dict[str, Any], path: Path) -> Config:
-    """Return the configuration with the paths and the sequence that the run decided on."""
-    options = config.integrator.options()
-    if manifest.get("paths"):
-        with _as_written(path, "paths", "which paths paid"):
-            sides = PathsRecord.from_json(manifest["paths"])
-        options |= {"paths": sides.paths, "light_share": sides.light_share or UNDECIDED["light_share"]}
-        config = with_integrator(config, {"type": config.integrator.type} | options, str(path), {})
-    if options.get("sequence") == "auto":
-        with _as_written(path, "sequence", "whether a sequence paid"):
-            options["sequence"] = SequenceRecord.from_json(manifest["sequence"]).setting
-        config = with_integrator(config, {"type": config.integrator.type} | options, str(path), {})
-    return config
-
-
-def _guided(config: Config, manifest: dict[str, Any], path: Path) -> GuidedRecord | None:
-    """Whether guided emission was measured to pay, by the manifest at `path`; None where that was not measured."""
-    if config.integrator.options().get("guiding") != "auto" or manifest.get("guided") is None:
-        return None
-    with _as_written(path, "guided", "whether guiding paid"):
-        return GuidedRecord.from_json(manifest["guided"])
-
-
-def _teach(problem: Problem, saved: NonFiniteStep, archive: Path) -> None:
-    """Have the tables of a guided run's integrator know what they knew when the step began."""
-    if guiding_of(problem) is None:
-        return
-    if saved.calls is None:
-        raise ConfigError(archive, "calls", "is missing: what the paths of a guided step were drawn from")
-    wrong = restore_tables(problem, saved.calls, saved.learned)
-    if wrong is not None:
-        raise ConfigError(archive, wrong, "is not what was learned of this scene")
-
-
-def _samples_per_pass(memory: Any, path: Path) -> int:
-    count = memory.get("samples_per_pass") if isinstance(memory, dict) else None
-    if type(count) is not int or not 1 <= count < 2**31:
-        raise ConfigError(path, "memory.samples_per_pass", "is not a number of samples, as a run writes it")
-    return count
-
-
-def _read_image(path: Path, problem: Problem, sensor: int) -> mi.TensorXf:
-    """The target, or its weights, that a run wrote. Raises ConfigError where it is not one for this sensor."""
-    film = problem.scene.sensors()[sensor].film()
-    width, height = film.crop_size()
-    array = np.array(read_bitmap(path, (int(width), int(height))), dtype=np.float32)
-    array = array if array.ndim == 3 else array[:, :, None]
-    colors = color_channels(film)
-    if array.shape[2] != colors:
-        raise ConfigError(path, "", f"must have the film's channels; its own: {array.shape[2]}, the film's: {colors}")
-    return to_tensor(array)
-
-
-def show_offenders(config: Config, as_json: bool) -> int:
-    """Print where the run of `config` first met a value that is not finite; exit code 1 where it does not again."""
     from reslrb_cli.measure.nonfinite_trace import find_offenders
+    from reslrb_cli.runs.resume import problem_before_nonfinite
 
-    replay = load_replay(config)
-    found = find_offenders(replay.problem, replay.iteration)
+    problem, iteration = problem_before_nonfinite(run, logging.getLogger(__name__).info)
+    found = find_offenders(problem, iteration)
     if as_json:
-        report = {"iteration": replay.iteration, "offenders": [dataclasses.asdict(entry) for entry in found]}
+        report = {"iteration": iteration, "offenders": [dataclasses.asdict(entry) for entry in found]}
         click.echo(json.dumps(finite(report, str), indent=2, allow_nan=False))
     else:
-        lines = [line for entry in found for line in offender_lines(entry, replay.iteration)]
-        for line in lines or [f"iteration {replay.iteration}: all is finite this time"]:
+        lines = [line for entry in found for line in offender_lines(entry, iteration)]
+        for line in lines or [f"iteration {iteration}: all is finite this time"]:
             echo(line)
     return ExitCode.DONE if found else ExitCode.CHECK_FAILED
 

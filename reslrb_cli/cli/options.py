@@ -7,7 +7,6 @@ measured, then has one object a line, and stands on the disk while they go on.
 from __future__ import annotations
 
 import errno
-import math
 import os
 import re
 import shutil
@@ -43,6 +42,7 @@ from reslrb_cli.records.measurements import BenchStatus
 if TYPE_CHECKING:
     from reslrb_cli.measure.arena import Arena
     from reslrb_cli.measure.methods import Measurement
+    from reslrb_cli.measure.resume_store import Earlier
 
 
 def origin_of(variant: str) -> Origin:
@@ -51,7 +51,7 @@ def origin_of(variant: str) -> Origin:
 
 
 class Keeper:
-    """Keeps a JSON file, and beside it what can be gone on from, so that a process that is killed loses seconds.
+    """Keeps a JSON file, and the samples beside it, so that a process that is killed loses seconds.
 
     `origin` is the first line, `final` has the other ones that no later one changes, `provisional` the rest, as of now;
     `kept` what a later session needs, None where there is nothing yet. Where no file is asked for nothing is done.
@@ -86,7 +86,7 @@ class Keeper:
         """Write all `lines`, none of which changes any more. Raises OSError."""
         if self._file is not None:
             if not self._write(lines):
-                echo("what was sampled is too large to be kept: --resume cannot go on from it")
+                echo("the samples are too large to be kept: the same command would measure all of it again")
             self._file.close()
 
     def _write(self, final: Sequence[Line], provisional: Sequence[Line] = ()) -> bool:
@@ -108,18 +108,17 @@ A = TypeVar("A", bound="Arena[Any, Any]")
 
 @contextmanager
 def measuring(
-    kind: type[A], plan: Measurement, resumed: Path | None, began: float, of: str,
+    kind: type[A], plan: Measurement, json_file: Path | None, began: float, of: str,
     say: Callable[[str], None] = echo,
 ) -> Iterator[tuple[A, Interrupts]]:  # fmt: skip
     """A session that measures `plan`, and the user's wish to stop; neither its folder nor its workers outlive it.
 
-    It goes on from the JSON file `resumed`, if any. `began` is when the command was called, by `monotonic`; rounds are
-    made `of` what allowance names. Raises ConfigError.
+    It goes on from the samples of `json_file`, if any. `began` is when the command was called, by `monotonic`; rounds
+    are made `of` what allowance names. Raises ConfigError.
     """
     from reslrb_cli.measure.processes import abandon_all
-    from reslrb_cli.measure.resume_store import Earlier
 
-    earlier = Earlier.read(plan.KIND, resumed)
+    earlier = read_earlier(plan.KIND, json_file)
     with tempfile.TemporaryDirectory(prefix="reslrb-measuring-") as name:
 
         def tidy() -> None:
@@ -131,6 +130,16 @@ def measuring(
             session = kind(plan, Path(name), lambda: interrupts.requested, say, spent_s=spent_s, earlier=earlier)
             echo(f"{plan.device}, {plan.variant}; {allowance(plan.budget_s, plan.rounds, of)}")
             yield session, interrupts
+
+
+def read_earlier(kind: str, json_file: Path | None, now: Mapping[str, Any] | None = None) -> Earlier | None:
+    """Return the samples on file, as `Earlier.read` has them, and say that they count."""
+    from reslrb_cli.measure.resume_store import Earlier
+
+    earlier = Earlier.read(kind, json_file, now)
+    if earlier is not None:
+        echo(f"samples in {samples_file(earlier.source)} count, and are not taken again")
+    return earlier
 
 
 def look_at(path: Path) -> None:
@@ -207,22 +216,6 @@ class Counts(click.ParamType):
         return tuple(counts)
 
 
-class Factors(click.ParamType):
-    """Different positive factors, such as `0.3,1,3`; they come in ascending order."""
-
-    name = "list"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
-        parts: list[Any] = str(value).split(",")
-        factors = [float(click.FLOAT.convert(part, param, ctx)) for part in parts]
-        for factor in factors:
-            if not (math.isfinite(factor) and factor > 0):
-                self.fail(f"{factor:g} is no factor above 0", param, ctx)
-        if len(set(factors)) < len(factors):
-            self.fail(f"`{value}` names a factor twice", param, ctx)
-        return tuple(sorted(factors))
-
-
 class Size(click.ParamType):
     """A number of bytes such as `2GiB`."""
 
@@ -234,6 +227,16 @@ class Size(click.ParamType):
         except ValueError:
             self.fail(f"`{value}` is no size; write it as in 2GiB or 500MB", param, ctx)
 
+
+#: What to do in place of an option that was removed.
+REMOVED = {
+    "--runs": "was removed; compare whole runs by `reslrb sweep CONFIG --seeds N --set run.max_seconds=S "
+    "--vary 'integrator=[prb, reslrb:stack]'`",
+    "--markdown": "was removed; `reslrb report FILE -o page.html` has the table of what --json FILE wrote",
+    "--plot": "was removed; `reslrb report FILE -o page.html` draws what --json FILE wrote",
+    "--resume": "was removed here; name the file with --json, which goes on from what is in it",
+    "--rates": "was removed; try learning rates by `reslrb sweep CONFIG --vary 'optimizer.learning_rate=[0.03, 0.1]'`",
+}
 
 budget_option = click.option(
     "--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
@@ -259,15 +262,15 @@ def overrides_option(function: Callable[..., Any]) -> Callable[..., Any]:
     )(function)
 
 
-def resume_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add `--resume` (`resumed`) to a command that measures."""
+def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add `--json` (`json_file`) to a command that measures."""
     return click.option(
-        "--resume",
-        "resumed",
+        "--json",
+        "json_file",
         type=click.Path(path_type=Path, dir_okay=False),
         metavar="FILE",
-        help="Go on from what another call has written with --json FILE, all else as it was; that call may also have "
-        "been killed. FILE is written anew unless --json names another.",
+        help="Write one object a line, as results come, and the samples beside it. What FILE has of the same "
+        "measurement is not measured again.",
     )(function)
 
 
@@ -287,16 +290,6 @@ def allow_code_option(function: Callable[..., Any]) -> Callable[..., Any]:
         help="Run the files of Python code that CONFIG or a list names (type: custom, FILE.py:NAME), with all your "
         "rights.",
     )(function)
-
-
-def files_of(resumed: Path | None, json_file: Path | None, plot_file: Path | None) -> tuple[Path | None, Path | None]:
-    """The files of `--json` and `--plot`, by default that of `--resume` and one beside it. Raises ConfigError."""
-    json_file = json_file or resumed
-    if json_file is not None and plot_file is None:
-        plot_file = json_file.with_suffix(".png")
-    for option, path in (("--json", json_file), ("--plot", plot_file)):
-        check_writable(option, path)
-    return json_file, plot_file
 
 
 def allowance(budget_s: float, number: int | None, of: str) -> str:

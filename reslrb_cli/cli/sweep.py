@@ -16,6 +16,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections import deque
 from collections.abc import Sequence
@@ -72,7 +73,8 @@ _PROGRAM = "sys.argv[0] = 'reslrb'; from reslrb_cli.cli.sweep import follow; fol
     multiple=True,
     metavar="KEY=[VALUE, ...]",
     shell_complete=complete_setting,
-    help="A setting, as of --set, and its values, a list in YAML. May be repeated: all combinations are run.",
+    help="A setting, as of --set, and its values, a list in YAML. May be repeated: all combinations are run. A value "
+    "of `integrator` may be TYPE[:ESTIMATOR][(OPTION=VALUE,...)].",
 )
 @click.option(
     "--seeds",
@@ -159,10 +161,11 @@ def command(
 def _run(folder: Path, sweep: Sweep, json_file: Path | None, quiet: bool, verbose: bool) -> int:
     """Do what is left of the sweep, keep its page, and say what it came to."""
     from reslrb_cli.backend.installation import load_packages
+    from reslrb_cli.config.loader import load
 
     load_packages()  # images are read by Mitsuba
     from reslrb_cli.records.measurement_files import LineFile, LivePage
-    from reslrb_cli.records.sweeps import PAGE_FILE, Failure, label, run_name
+    from reslrb_cli.records.sweeps import PAGE_FILE, Failure, config_file, label, run_name
     from reslrb_cli.report.page import write_page
     from reslrb_cli.report.sources import read_sweep_runs
     from reslrb_cli.report.sweep import lines, run_records
@@ -190,7 +193,8 @@ def _run(folder: Path, sweep: Sweep, json_file: Path | None, quiet: bool, verbos
                 break
             if not quiet:
                 echo(f"run {number} of {len(runs)}: {label(combination.settings)}, seed {seed}")
-            code, line = call(command_of(folder, sweep, combination, seed), interrupts, verbose)
+            timed = load(config_file(folder, combination)).run.max_seconds is not None
+            code, line = call(command_of(folder, sweep, combination, seed), interrupts, verbose, fresh=timed)
             if interrupted := code == ExitCode.INTERRUPTED or (interrupts.requested and code != ExitCode.DONE):
                 break
             if code == ExitCode.MACHINE:
@@ -234,15 +238,33 @@ def _json_lines(source: SweepRuns) -> list[Line]:
 # --- one run, in a process of its own ---------------------------------------------------------------------------------
 
 
-def call(arguments: Sequence[str], interrupts: Interrupts, verbose: bool = False) -> tuple[int, str]:
+def call(
+    arguments: Sequence[str], interrupts: Interrupts, verbose: bool = False, fresh: bool = False
+) -> tuple[int, str]:
     """Call `reslrb` with these arguments in a process of its own; its exit code, and the line that says how it ended.
 
     The first signal that `interrupts` notes is passed on to it; one more, and it ends with this process. What it says
-    is shown with `verbose`, and else its warnings are in its folder.
+    is shown with `verbose`, and else its warnings are in its folder. A `fresh` process finds no kernels and no
+    decisions of earlier runs: runs of equal time pay for their own.
     """
+    if fresh:
+        with tempfile.TemporaryDirectory(prefix="reslrb-sweep-", ignore_cleanup_errors=True) as folder:
+            caches = dict.fromkeys(("DRJIT_CACHE_DIR", "OPTIX_CACHE_PATH", "RESLRB_CACHE"), folder)
+            return _call(arguments, interrupts, verbose, {**os.environ, **caches, "CUDA_CACHE_DISABLE": "1"})
+    return _call(arguments, interrupts, verbose, None)
+
+
+def _call(
+    arguments: Sequence[str], interrupts: Interrupts, verbose: bool, environment: dict[str, str] | None
+) -> tuple[int, str]:
     program = [*python_command(_PROGRAM), str(os.getpid()), *arguments]
     process = subprocess.Popen(
-        program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True
+        program,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
+        env=environment,
     )
     assert process.stdout is not None
     assert process.stdin is not None

@@ -133,6 +133,12 @@ class RunConfig(Section):
     output: WorkPath = Field(default=Path("runs"), validate_default=True)
     """Folder of the run folders, relative to the working directory."""
     iterations: Count = Field(default=200, description="Optimisation steps.")
+    max_seconds: Positive | None = None
+    """End the run before its last iteration, as finished, when these seconds are over. They count measuring what is
+    `auto`, compiling, steps and updates; they do not count loading, targets and saved images. The last iteration is the
+    one after which the mean iteration would take too long; the first one is always completed. `optimizer.schedule` ends
+    with the time or with the iterations, whichever comes first. Not with `stages` and `optimizer.average`. null: no
+    limit."""
     spp: Count = Field(default=16, description="Samples per pixel and step.")
     seed: Seed = Field(default=0, description="Seed of the run; every other seed is made from it.")
     adjoint: Literal["auto", "correlated", "independent", "batched", "others"] = "auto"

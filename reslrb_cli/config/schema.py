@@ -373,9 +373,13 @@ class Config(Section):
         if stop is not None and self.run.held_out and stop.patience < 20:
             reason = f"must be at least 20, not {stop.patience}: held-out views are looked at every 10 iterations"
             raise located("run.stop.patience", reason)
-        if stop is not None and optimizer.average is not None:
+        if self.run.max_seconds is not None and self.run.stages:
+            reason = "does not go with run.stages, which are shares of run.iterations; remove one"
+            raise located("run.max_seconds", reason)
+        ends = "run.stop" if stop is not None else "run.max_seconds" if self.run.max_seconds is not None else ""
+        if ends and optimizer.average is not None:
             raise located(
-                "optimizer.average", "does not go with run.stop, which ends a run nobody knows when; remove one"
+                "optimizer.average", f"does not go with {ends}, which ends a run nobody knows when; remove one"
             )
 
     def _check_samples(self) -> None:

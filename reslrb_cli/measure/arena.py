@@ -1,4 +1,4 @@
-"""Workers that take turns: what `bench`, `convergence` and its `--runs` have in common, from their start to their end.
+"""Workers that take turns: what `bench` and `convergence` have in common, from their start to their end.
 
 As they take turns, one computing at a time, a drift of the machine hits all alike. One more worker may be there for all
 of them, the referee: it makes what they are compared by, and nothing is measured where it fails.
@@ -47,7 +47,7 @@ class Arena(Generic[Measured, Worker]):
     """Workers under way, `members`; what they write goes to `folder`, which is the caller's to remove.
 
     `facts` are the referee's; of the budget `spent_s` have gone before. What an `earlier` session has measured counts,
-    and is gone on from. Raises ConfigError where that is of another measurement, or leaves nothing to do.
+    and is gone on from. Raises ConfigError where that is of another measurement.
     """
 
     #: The most rounds.
@@ -83,7 +83,7 @@ class Arena(Generic[Measured, Worker]):
     def _set_up(self, earlier: Earlier | None) -> int:
         """Begin what a kind of session has beside all this, with what it has of an earlier one.
 
-        Returns how many depths there are to share the time. Raises ConfigError where there is nothing to add.
+        Returns how many depths there are to share the time. Raises ConfigError.
         """
         raise NotImplementedError
 
@@ -189,10 +189,6 @@ def load(does: str) -> Begin:
         from reslrb_cli.measure.stepper import begin_steps
 
         return begin_steps
-    if does in ("surveyed", "sampled_steps"):
-        from reslrb_cli.measure.convergence.setup import begin_sampling, begin_survey
+    from reslrb_cli.measure.convergence.setup import begin_sampling, begin_survey
 
-        return begin_survey if does == "surveyed" else begin_sampling
-    from reslrb_cli.measure.optimization_benchmark.evaluate import begin_judging, begin_run
-
-    return begin_judging if does == "judged_runs" else begin_run
+    return begin_survey if does == "surveyed" else begin_sampling

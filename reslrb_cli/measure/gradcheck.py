@@ -145,8 +145,7 @@ class Gradcheck:
     ) -> Iterator[Result]:
         """Measure and compare, row by row; once `stop()`, only what has been measured is compared.
 
-        Of what the budget did not suffice for the records say so. `between` is called after each sample. Raises
-        ConfigError where an earlier session has all that is asked for.
+        Of what the budget did not suffice for the records say so. `between` is called after each sample.
         """
         self._sampling.between = between
         self._sampling.expect(name for row in self.rows for name in self._needs(row))

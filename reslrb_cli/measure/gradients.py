@@ -211,6 +211,14 @@ def natural_bounds(kind: str, values: np.ndarray) -> tuple[float, float]:
     return (0.0, np.inf) if np.all(values >= 0) else (-np.inf, np.inf)
 
 
+def extrapolated(near: np.ndarray, far: np.ndarray) -> np.ndarray:
+    """Return differences by a step and by twice that, D(h) and D(2 h), without their error of h^2.
+
+    E(h) = (4 D(h) - D(2 h)) / 3 (L. F. Richardson, 1911).
+    """
+    return np.asarray(near + (near - far) / 3)
+
+
 def embed(case: Case, key: str, row: np.ndarray) -> np.ndarray:
     """A row of one parameter among zeros for the others."""
     whole = np.zeros(case.size)

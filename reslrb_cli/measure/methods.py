@@ -1,24 +1,22 @@
 """The methods that measurements compare (`Case`), and what these measure, as their options say it. Knows no Mitsuba.
 
-A list is written as `ptracer,reslrb:reservoir(capacity=4)`. `Sweep` is of `bench`, `Plan` of `convergence`, `RunsPlan`
-of `convergence --runs`.
+A list is written as `ptracer,reslrb:reservoir(capacity=4)`. `Sweep` is of `bench`, `Plan` of `convergence`.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, get_args
 
 from reslrb_cli.backend.doctor import device_name, memory_bytes
 from reslrb_cli.backend.variant import choose
-from reslrb_cli.config.base import SEED_END, code_file
+from reslrb_cli.config.base import code_file
 from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, UNDECIDED, AnyIntegrator, LightTracerOptions
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import dump, with_integrator
-from reslrb_cli.config.parameters import ByWord, ParameterSpec
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse
 from reslrb_cli.errors import ConfigError
@@ -432,26 +430,10 @@ class Plan(Measurement):
         return Method(label, case.type, estimator, capacity, adjoint, spp, **paths_in_records(config))
 
 
-#: What is compared where the user names nothing.
-DEFAULT = "ptracer,prb,reslrb:stack,reslrb:auto(paths=light),reslrb:auto"
-
-
-@dataclass(frozen=True)
-class Side:
-    """What has runs of its own: a case, samples per pixel, and what learning rates are multiplied by, None: nothing."""
-
-    case: Case
-    spp: int
-    rate: float | None = None
-
-
-def compared(integrators: str | None, reference: str | None, usual: str, before: Mapping[str, Any]) -> dict[str, Any]:
-    """What a `Plan` compares, and takes errors from: lists as written, or None for those of `before`, or the `usual`.
-
-    `before` are the settings of what is gone on from, whose defaults may have been others. Raises ConfigError.
-    """
-    cases = parse_cases(integrators or ",".join(before.get("integrators", ())) or usual, deep=False)
-    stands = parse_cases(reference or before.get("reference") or REFERENCE, "--reference", deep=False)
+def compared(integrators: str | None, reference: str | None, usual: str) -> dict[str, Any]:
+    """Return what a `Plan` compares, and takes errors from: lists as written, or the `usual`. Raises ConfigError."""
+    cases = parse_cases(integrators or usual, deep=False)
+    stands = parse_cases(reference or REFERENCE, "--reference", deep=False)
     if len(stands) != 1:
         raise ConfigError("--reference", "", "errors are taken from one method; name one")
     return {"cases": cases, "reference": stands[0], "default": integrators is None}
@@ -465,75 +447,3 @@ def machine_of(config: Config, memory_limit: int | None) -> dict[str, Any]:
         raise ConfigError("--memory-limit", "", f"bounds address space, which says nothing of {variant}'s memory")
     limit = memory_limit or (None if on_gpu else memory)
     return {"variant": variant, "memory": memory, "memory_limit": limit, "device": device_name(variant)}
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunsPlan(Plan):
-    """What is measured; see `Plan`. `runs` is the number of seeds, which all methods have in common.
-
-    `reference` is what renders the images that losses are taken of. Each method has runs with all its learning rates
-    times each of `rates`, of which its best then counts; without any, with those of the configuration.
-    """
-
-    runs: int = 3
-    rates: Sequence[float] = ()
-
-    KIND = "convergence --runs"
-
-    def _options(self) -> dict[str, Any]:
-        return {"reference": self.reference.label, "spp": list(self.spps), "rates": list(self.rates)}
-
-    def settings(self) -> dict[str, Any]:
-        """What has to be the same in all sessions; files of such runs name the variant with the device, always have."""
-        return super().settings() | {"device": f"{self.device}, {self.variant}"}
-
-    @property
-    def sides(self) -> list[Side]:
-        """What has runs of its own, all rates of a method beside each other."""
-        return [Side(case, spp, rate) for case, spp in self.entries for rate in self.rates or (None,)]
-
-    @property
-    def names(self) -> dict[str, str]:
-        """The method's label by that of each of its rates."""
-        return {self.method_of(side).label: self.method_of(replace(side, rate=None)).label for side in self.sides}
-
-    @property
-    def seeds(self) -> list[int]:
-        """`run.seed` of each run: that of the configuration, and those after it."""
-        return [(self.config.run.seed + number) % SEED_END for number in range(self.runs)]
-
-    def config_of(self, case: Case, spp: int) -> Config:
-        """The experiment with the integrator of a case, which may be `auto`, and so many samples per pixel.
-
-        Raises ConfigError.
-        """
-        return case.at(with_run(self.config, spp=spp), self.config.integrator.max_depth, False, auto=True)
-
-    def config_at(self, side: Side) -> Config:
-        """The experiment as a side has it. Raises ConfigError."""
-        config = self.config_of(side.case, side.spp)
-        return config if side.rate is None else at_rate(config, side.rate)
-
-    def method_of(self, side: Side) -> Method:
-        """How a side stands in records."""
-        config = self.config_of(side.case, side.spp)
-        method = self.method(side.case, config, side.spp, known=False, reference=False)
-        return method if side.rate is None else replace(method, label=f"{method.label}, rates x {side.rate:g}")
-
-
-def at_rate(config: Config, factor: float) -> Config:
-    """The experiment with every learning rate, the optimiser's and those of single parameters, times `factor`."""
-    optimizer = config.optimizer.model_copy(update={"learning_rate": config.optimizer.learning_rate * factor})
-    parameters = [_at_rate(spec, factor) for spec in config.parameters]
-    return config.model_copy(update={"optimizer": optimizer, "parameters": parameters})
-
-
-def _at_rate(spec: ParameterSpec, factor: float) -> ParameterSpec:
-    rate: Any = spec.learning_rate
-    if rate is None:  # the optimiser's
-        return spec
-    if isinstance(rate, ByWord):
-        rate = rate.model_copy(update={word: value * factor for word, value in rate.words().items()})
-    else:
-        rate = rate * factor
-    return spec.model_copy(update={"learning_rate": rate})

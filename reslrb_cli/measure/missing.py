@@ -5,14 +5,11 @@ difference and g_k the attached gradient's,
 
     m_k = F_k - g_k,   share = sqrt(sum_k m_k^2 / sum_k F_k^2)
 
-D(h), the difference by a step h, is wrong by c h^2 + ..., which two steps cancel (L. F. Richardson, 1911):
-
-    E(h) = (4 D(h) - D(2 h)) / 3
-
-Of steps that halve, the one is taken around which E changes least: at larger ones E is truncated, at smaller ones it is
-lost in rounding, which is the same for all seeds where it is the scene that is rounded, or in paths that flip. By how
-much E changes there counts as error where it stands out of its noise. What noise adds to the squares is subtracted; the
-standard error is that of the mean over seeds. `MissingCheck` is `gradcheck --missing` on an experiment.
+Two steps cancel what a difference is wrong by: E(h), `extrapolated`. Steps are halved, and the step around which E
+changes least is taken. At larger steps E is truncated. At smaller ones it is lost in rounding, which is the same for
+all seeds where it is the scene that is rounded, or in paths that flip. By how much E changes there counts as error
+where it stands out of its noise. What noise adds to the squares is subtracted; the standard error is that of the mean
+over seeds. `MissingCheck` is `gradcheck --missing` on an experiment.
 
 `check_missing` measures the same share before a run's first iteration, of the run's own samples, by a step or two.
 """
@@ -39,6 +36,7 @@ from reslrb_cli.measure.gradients import (
     Direction,
     all_directions,
     embed,
+    extrapolated,
     moves_light,
     seeds,
     smooth_rows,
@@ -46,7 +44,7 @@ from reslrb_cli.measure.gradients import (
 from reslrb_cli.measure.methods import parse_estimators
 from reslrb_cli.measure.participants import MOVING_DIRECTIONS, NEVER, PATHS
 from reslrb_cli.measure.references import ends
-from reslrb_cli.measure.resume_store import Earlier, head
+from reslrb_cli.measure.resume_store import Earlier, kept
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import take_gradient, unrecorded
@@ -96,9 +94,9 @@ class Missing:
     def share(self) -> tuple[float, float] | None:
         """The share and its standard error; None where the differences are not told from 0."""
         near, far, farthest = np.stack(self.differences, 1)
-        whole = _extrapolate(near, far)
+        whole = extrapolated(near, far)
         missing = whole - np.stack(self.ours)
-        change, noise = _mean(whole - _extrapolate(far, farthest))
+        change, noise = _mean(whole - extrapolated(far, farthest))
         left = np.square(np.where(np.abs(change) > NOTHING * noise, change, 0))
         return share_of(whole, missing, left)
 
@@ -131,8 +129,7 @@ def _with_step(case: Case, differenced: Any, direction: Direction, spp: int) -> 
     steps = [STEPS[0] / 2**number for number in range(HALVINGS)]
     pilot = seeds(PILOT_SEEDS, 9)
     found = np.transpose([_differences(case, differenced, direction, steps, seed, spp) for seed in pilot])
-    extrapolated = _extrapolate(found[1:], found[:-1])
-    change, noise = _mean(np.diff(extrapolated, axis=0).T)
+    change, noise = _mean(np.diff(extrapolated(found[1:], found[:-1]), axis=0).T)
     # From step to step; one that agrees with both its neighbours is no coincidence.
     changed = np.abs(change) + noise
     return replace(direction, step=steps[2 + int(np.argmin(changed[:-1] + changed[1:]))])
@@ -142,10 +139,6 @@ def _differences(
     case: Case, differenced: Any, direction: Direction, steps: Sequence[float], seed: int, spp: int
 ) -> list[float]:
     return [case.difference(differenced, direction.vector, seed, spp, step, direction.sides) for step in steps]
-
-
-def _extrapolate(near: np.ndarray, far: np.ndarray) -> np.ndarray:
-    return np.asarray(near + (near - far) / 3)
 
 
 def _mean(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -166,8 +159,8 @@ ESTIMATOR = "stack"
 class MissingCheck:
     """The experiment, loaded; a variant must be set. dL/dI is that of its loss at the initial values, held fixed.
 
-    With an `earlier` session seeds are added to its own; `count` is then that of all. Raises ConfigError, also where
-    there is nothing to add, and UnsupportedScene.
+    With an `earlier` session seeds are added to its own; `count` is then that of all. Raises ConfigError and
+    UnsupportedScene.
     """
 
     def __init__(
@@ -191,10 +184,6 @@ class MissingCheck:
         self._directions = all_directions(self.case, problem.selection, count_of_each, count_of_each)
         #: By parameter, as far as they have been looked at, in the order of `case.keys`.
         self._found: dict[str, Missing] = {} if earlier is None else self._restore(earlier)
-        if earlier is not None and count is not None and len(self._found) == len(self.case.keys):
-            least = min(found.count for found in self._found.values())
-            if least >= count:
-                raise earlier.complete(f"{least} seeds", "more with --seeds")
 
     def conditions(self) -> str:
         """What is measured, in one line."""
@@ -219,25 +208,17 @@ class MissingCheck:
     def kept(self, settings: Mapping[str, Any]) -> Kept | None:
         """What a later session, of the same `settings`, needs to go on; None where nothing has been sampled."""
         taken = {key: found for key, found in self._found.items() if found.count}
-        if not taken:
-            return None
         steps = {key: [direction.step for direction in found.directions] for key, found in taken.items()}
-        arrays = {f"ours/{place}": np.stack(found.ours) for place, found in enumerate(taken.values())}
-        arrays |= {f"differences/{place}": np.stack(found.differences) for place, found in enumerate(taken.values())}
-        return head(KIND, settings, steps=steps), arrays
+        samples = {("ours", key): found.ours for key, found in taken.items()}
+        samples |= {("differences", key): found.differences for key, found in taken.items()}
+        return kept(KIND, settings, samples, steps=steps)
 
     def _restore(self, earlier: Earlier) -> dict[str, Missing]:
-        """What an earlier session has found, around its own steps. Raises ConfigError where it is none of that."""
-        try:
-            found = {}
-            for place, (key, steps) in enumerate(earlier.head["steps"].items()):
-                along = [replace(one, step=float(h)) for one, h in zip(self._directions[key], steps, strict=True)]
-                ours, differences = (earlier.arrays[f"{name}/{place}"] for name in ("ours", "differences"))
-                if differences.shape != (len(ours), 3, len(along)) or ours.shape[1:] != (len(along),):
-                    raise ValueError("of another shape")
-                found[key] = Missing(along, list(ours), list(differences))
-        except (AttributeError, KeyError, TypeError, ValueError):
-            raise earlier.other("its samples are damaged") from None
+        """Return what an earlier session has found, around its own steps."""
+        found, samples = {}, earlier.samples
+        for key, steps in earlier.head["steps"].items():
+            along = [replace(one, step=float(h)) for one, h in zip(self._directions[key], steps, strict=True)]
+            found[key] = Missing(along, list(samples["ours", key]), list(samples["differences", key]))
         return found
 
     def _measure(self, key: str, end: float, stop: Callable[[], bool], between: Callable[[], None]) -> None:

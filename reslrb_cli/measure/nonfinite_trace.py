@@ -454,9 +454,11 @@ def _parts(
     given = problem.config.integrator.options()
     names = ("max_depth", "rr_depth", "hide_emitters", "sequence")
     shared = {name: given[name] for name in names if name in given}
+    own = problem.integrator
+    if shared.get("sequence") == "auto" and isinstance(own, Reslrb):  # which the run decided
+        shared["sequence"] = "independent" if own.plan(scene, sensor).sequence is None else "low_discrepancy"
     tracer = Reslrb.of(estimator="gather", **shared)
-    if isinstance(problem.integrator, Reslrb):
-        own = problem.integrator
+    if isinstance(own, Reslrb):
         tracer.have_paths(own.paths, own.light_share, own.preparation.whole)
     # Of what moves light, contributions alone are looked at: `gather` has no derivatives of it.
     params = None if is_attached(problem) else problem.selection.params

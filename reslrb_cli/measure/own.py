@@ -104,7 +104,7 @@ def _cost(check: Gradcheck, label: str, stop: Callable[[], bool]) -> str:
         for seed in seeds(measured, 5):
             _check(stop)
             begin = time.perf_counter()
-            rows.append(_gradient(parts, integrator, seed))
+            rows.append(parts.gradient(integrator, seed))
             times.append(time.perf_counter() - begin)
             if len(times) >= LEAST_SEEDS and sum(times) > COST_SECONDS:
                 break
@@ -128,11 +128,6 @@ def _ours(parts: Participants, label: str, **other: int) -> StepIntegrator:
     """The reference: `reslrb` by the same kind of paths, with `other` depths."""
     options = parts.options_of(label) | other
     return make_integrator("reslrb", estimator="stack", **parts.ways[label].options, **options)
-
-
-def _gradient(parts: Participants, integrator: StepIntegrator, seed: int) -> Array:
-    options = {"step": parts.case.known_step} if parts.known else {}
-    return parts.case.gradient(integrator, seed, parts.spp, **options)
 
 
 class Looking:
@@ -170,8 +165,8 @@ class Looking:
         """Of each parameter that the reference has a gradient of."""
         self._measure("gradients", other)
         own, ours = self._pair(**other)
-        reference = np.stack([_gradient(self.parts, ours, seed) for seed in self._each(2 * self._seeds, 6)])
-        mine = np.stack([_gradient(self.parts, own, seed) for seed in self._each(self._seeds, 5)])
+        reference = np.stack([self.parts.gradient(ours, seed) for seed in self._each(2 * self._seeds, 6)])
+        mine = np.stack([self.parts.gradient(own, seed) for seed in self._each(self._seeds, 5)])
         found = {}
         for key, place in self.parts.case.places.items():
             first, second = np.split(reference[:, place], 2)

@@ -361,7 +361,7 @@ class Participants:
         if kind == "gradient":
             if of in (_alike(label, Reference.UNGUIDED) for label in self.unguided):
                 self._teach(of)
-            return self._gradient(of, seed)
+            return self.gradient(self.integrators[of], seed)
         if kind == "image":
             image = self.case.image(self.integrators[of], seed, self.spp)
             if self.masked:
@@ -375,9 +375,10 @@ class Participants:
         tracer = self.integrators[ours[0] if ours else way.named("walk_ad")]
         return np.array([self.case.tangent(tracer, d.vector, seed, self.spp) for d in self.directions[of]])
 
-    def _gradient(self, of: str, seed: int) -> np.ndarray:
+    def gradient(self, integrator: StepIntegrator, seed: int) -> np.ndarray:
+        """Return the gradient of all parameters in a row, by a step such as the experiment takes."""
         options = {"step": self.case.known_step} if self.known else {}
-        return self.case.gradient(self.integrators[of], seed, self.spp, **options)
+        return self.case.gradient(integrator, seed, self.spp, **options)
 
     def _teach(self, of: str) -> None:
         """Teach the tables of a guided integrator once, and hold them: each sample depends on its seed alone."""
@@ -386,7 +387,7 @@ class Participants:
         guiding = tracer.preparation.guiding
         if guiding is not None and not guiding.held:
             for lesson in seeds(LESSONS, 8):
-                self._gradient(of, lesson)
+                self.gradient(tracer, lesson)
             guiding.held = True
 
 

@@ -3,10 +3,9 @@
 Each public function after `of_gradient` returns why one does not count, or None where it does. docs/method.md,
 Baselines, has the reasons.
 
-Two things come before: `leave_out_border` leaves out the film's border where paths from the camera and paths from the
-lights are compared, since light tracing loses there what samples just outside of the film would have added
-(`scene.visibility.interior`; `divides_by_film` says whose pixels lose nothing); `known_gradient` recognises scenes
-whose gradient is known in closed form.
+Two things come before. Light tracing loses along the film's border what samples just outside of the film would have
+added; `divides_by_film` says whose pixels lose nothing. `known_gradient` recognises scenes whose gradient is known in
+closed form.
 """
 
 from __future__ import annotations
@@ -25,7 +24,6 @@ from reslrb_cli.records.measurements import Reference
 from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import PrimaryHits, SceneNeeds, look, scene_needs, stock_clip
-from reslrb_cli.scene.visibility import interior
 
 #: References that trace paths from the sensor.
 CAMERA_PATHS = (Reference.PRB, Reference.PATH)
@@ -34,22 +32,6 @@ CAMERA_PATHS = (Reference.PRB, Reference.PATH)
 def divides_by_film(paths: str) -> bool:
     """Whether images by these paths (`loading.paths_of`) lose nothing along the film's border, as those of `path`."""
     return paths != "light"
-
-
-def leave_out_border(problem: Problem) -> bool:
-    """Have the losses of a problem, which has its targets, leave out pixels along the border; whether there are any."""
-    found = False
-    for view in problem.views:
-        target = np.array(view.target)
-        weights = interior(target.shape, problem.scene.sensors()[view.sensor]).astype(np.float32)
-        if weights.all():
-            continue
-        found = True
-        view.fixed = None if view.fixed is None else view.fixed * weights
-        if view.weights is not None:
-            weights *= np.array(view.weights)[:, :, 0]
-        view.see(target, weights)
-    return found
 
 
 def known_gradient(at: Situation, sensor: mi.Sensor, key: str, weights: np.ndarray) -> np.ndarray | None:

@@ -1,8 +1,10 @@
-"""Going on from what an earlier session has measured: the same experiment, measured in the same way."""
+"""Samples on file: what an earlier call measured of the same experiment, in the same way, is not measured again."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+import hashlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,13 +13,16 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.manifest import versions
-from reslrb_cli.records.measurement_files import read_samples, samples_file
+from reslrb_cli.records.measurement_files import Kept, read_samples, samples_file
 
 if TYPE_CHECKING:
     import numpy as np
 
+#: What samples are of, in words: an integrator, a parameter.
+Name = tuple[str, ...]
+
 #: Of what is kept; another one is not gone on from.
-VERSION = 3
+VERSION = 4
 
 #: Where the settings have digests of files.
 FILES = "files"
@@ -27,6 +32,15 @@ _ABSENT = "not given"
 
 #: Characters that are shown of a setting.
 _SHOWN = 60
+
+
+@functools.cache
+def program() -> dict[str, str]:
+    """Return the versions that a figure depends on, and a digest of this program's code, which may be under work."""
+    code = hashlib.blake2b(digest_size=16)
+    for path in sorted(Path(__file__).parent.parent.rglob("*.py")):
+        code.update(path.read_bytes())
+    return {**versions(), "code": code.hexdigest()}
 
 
 def settings(config: Config, codes: Mapping[str, Path], variant: str, device: str, **options: Any) -> dict[str, Any]:
@@ -42,21 +56,21 @@ def settings(config: Config, codes: Mapping[str, Path], variant: str, device: st
         **options,
         "variant": variant,
         "device": device,
-        "versions": versions(),
+        "versions": program(),
         FILES: file_digests({**files_of(config), **codes}),
     }
 
 
 class Earlier:
-    """What an earlier session has kept: a `head`, which JSON can hold, and `arrays`; `source` is the file's name.
+    """Samples that lie beside the file of `--json`, `source`: a `head`, which JSON can hold, and `arrays`.
 
-    `kind` says what was measured. Raises ConfigError where that, or the version of what is kept, is another.
+    Raises ConfigError where they are of another `kind` of measurement, or were written by another version.
     """
 
     def __init__(self, kind: str, source: Path, head: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
         self.source, self.head, self.arrays = source, head, arrays
         if head.get("version") != VERSION:
-            raise ConfigError("--resume", "", f"{source} was written by another version")
+            raise self.other("it was written by another version")
         if head.get("kind") != kind:
             raise self.other(f"it is of `{head.get('kind')}`, this is `{kind}`")
 
@@ -68,33 +82,42 @@ class Earlier:
 
     @classmethod
     def read(cls, kind: str, json_file: Path | None, now: Mapping[str, Any] | None = None) -> Earlier | None:
-        """What lies beside a JSON file that another call has written; None for no file.
+        """Return the samples beside a JSON file that an earlier call wrote; None where there are none.
 
-        Raises ConfigError, also where its settings are not those of `now`, if these are known yet.
+        Raises ConfigError, also where their settings are not those of `now`, if these are known yet.
         """
-        if json_file is None:
+        if json_file is None or not json_file.is_file() or not samples_file(json_file).exists():
             return None
         earlier = cls(kind, json_file, *read_samples(samples_file(json_file)))
         if now is not None:
             earlier.check(now)
         return earlier
 
-    def error(self, reason: str) -> ConfigError:
-        """What is raised where it cannot be gone on from."""
-        return ConfigError("--resume", "", f"{self.source} {reason}")
+    @property
+    def samples(self) -> dict[Name, np.ndarray]:
+        """The samples by name, (N, ...), in the order of their seeds."""
+        return {tuple(name): self.arrays[f"samples/{number}"] for number, name in enumerate(self.head["samples"])}
 
     def other(self, reason: str) -> ConfigError:
-        """The same where it is of another measurement."""
-        return self.error(f"is of another measurement: {reason}")
-
-    def complete(self, what: str, advice: str) -> ConfigError:
-        """The same where it has `what` is asked for; `advice` says how to ask for more."""
-        return self.error(f"has {what} already; name {advice}")
+        """Return the error of samples of another measurement, which are not overwritten."""
+        advice = "remove the file, or name another one"
+        return ConfigError("--json", "", f"{self.source} is of another measurement: {reason}; {advice}")
 
 
 def head(kind: str, settings: Mapping[str, Any], **content: Any) -> dict[str, Any]:
     """The head of what is kept."""
     return {"version": VERSION, "kind": kind, "settings": settings, **content}
+
+
+def kept(
+    kind: str, settings: Mapping[str, Any], samples: Mapping[Any, Sequence[np.ndarray]], **content: Any
+) -> Kept | None:
+    """Return what a file keeps of samples, by `Name` and in the order of their seeds; None where there are none."""
+    import numpy as np  # whoever asks for help of a command has no need of it
+
+    taken = {name: rows for name, rows in samples.items() if len(rows)}
+    arrays = {f"samples/{number}": np.stack(rows) for number, rows in enumerate(taken.values())}
+    return (head(kind, settings, samples=list(taken), **content), arrays) if taken else None
 
 
 def first_difference(there: Any, here: Any, place: str = "") -> str | None:

@@ -91,7 +91,7 @@ class Sampling:
     def __init__(
         self, settings: Settings, now: Callable[[], float] = time.monotonic, earlier: Earlier | None = None
     ) -> None:
-        self._now, self.settings, self._earlier = now, settings, earlier
+        self._now, self.settings = now, settings
         self._start = now() - settings.spent_s
         self._end = self._start + settings.budget_s
         self.participants = Participants(settings)
@@ -99,8 +99,7 @@ class Sampling:
         #: Parameters, by way, of whose directions the steps have been chosen: differences go on with the same ones.
         self._chosen: list[str] = []
         if earlier is not None:
-            names = enumerate(earlier.head["samples"])
-            self._samples = {(kind, of): list(earlier.arrays[f"samples/{k}"]) for k, (kind, of) in names}
+            self._samples = {(kind, of): list(rows) for (kind, of), rows in earlier.samples.items()}
             step_as(self.participants, earlier.head["steps"])
             self._chosen = list(earlier.head["steps"])
         self._before = {name: len(samples) for name, samples in self._samples.items()}
@@ -112,26 +111,13 @@ class Sampling:
         self._first_s: dict[tuple[str, bool], float] = {}  # how long a first sample took, at most, by kind
 
     def expect(self, names: Iterable[Name]) -> None:
-        """Say what will be asked for, so that each has its share of the time.
-
-        Raises ConfigError where an earlier session has all of it.
-        """
+        """Say what will be asked for, so that each has its share of the time."""
         self._expected = list(dict.fromkeys(names))
         self._to_do = list(self._expected)
-        counts = [self._before.get(name, 0) for name in self._to_do]
-        if self._earlier is not None and counts and min(counts) >= (self.settings.seeds or math.inf):
-            raise self._earlier.complete(f"{min(counts)} seeds", "more with --seeds")
 
     def kept(self, settings: dict[str, Any]) -> Kept | None:
         """What a later session, of the same `settings`, needs to go on; None where nothing has been sampled."""
-        found = {name: np.stack(rows) for name, rows in self._samples.items() if rows}
-        if not found:
-            return None
-        steps = {
-            key: [list(one) for one in chosen] for key, chosen in steps_of(self.participants, self._chosen).items()
-        }
-        arrays = {f"samples/{number}": rows for number, rows in enumerate(found.values())}
-        return resume_store.head(KIND, settings, samples=list(found), steps=steps), arrays
+        return resume_store.kept(KIND, settings, self._samples, steps=steps_of(self.participants, self._chosen))
 
     def take(self, name: Name, stop: Callable[[], bool], say: Callable[[str], None]) -> bool:
         """Take the samples of `name`, where that was not done yet; whether there are enough to compare.

@@ -100,7 +100,7 @@ def _peak(problem: Problem, spp: int) -> int:
 def trial(problem: Problem, spp: int) -> Iterator[Problem]:
     """The problem before its first iteration, of `spp` samples per pixel; then the scene is as it was."""
     run = problem.config.run
-    enough = {"spp": spp, "iterations": max(run.iterations, WARM_UP + MOST), "stages": []}  # of a run of two, too
+    enough = {"spp": spp, "iterations": max(run.iterations, WARM_UP + MOST), "stages": [], "max_seconds": None}
     config = problem.config.model_copy(update={"run": run.model_copy(update=enough)})
     try:
         yield replace(problem.afresh(problem.values()), config=config)
@@ -203,7 +203,11 @@ def make_forecast(
     steps, scratch, integrator = measure_steps(problem), 0, problem.integrator
     if isinstance(integrator, Reslrb):  # of all paths that are traced at a time
         scratch = max(integrator.scratch_bytes(plan) for plan in plans(problem, integrator)) * resident_paths()
-    run, measured = config.run, (problem.sides, problem.guided, problem.sequence)
+    run = config.run
+    iterations = run.iterations
+    if run.max_seconds is not None:
+        left_s = run.max_seconds - problem.measured_s - steps.start_s
+        iterations = min(iterations, max(int(left_s / max(steps.iteration_s, 1e-6)), 1))
     parts = _parts(problem)
     rest = max(steps.peak - sum(parts.values()), 0)
     parts["images of a step, gradients, what is kept of paths (reservoir)"] = rest
@@ -215,9 +219,9 @@ def make_forecast(
         parts=parts,
         scratch=scratch,
         free=free_bytes(mi.variant()),
-        iterations=run.iterations,
+        iterations=iterations,
         before_s=before_s,
-        measuring_s=sum(each.measure_s + each.compile_s for each in measured if each and not each.cached),
+        measuring_s=problem.measured_s,
         kept=cache is not None and cache.keeps,
         target_s=image_s * config.target.render.spp * views if config.target.render else 0.0,
         images_s=image_s * images * views,

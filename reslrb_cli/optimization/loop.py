@@ -32,7 +32,7 @@ from reslrb_cli.optimization.sensitivity import measure_curvatures, rescale
 from reslrb_cli.optimization.shards import add_gradient, scaled
 from reslrb_cli.optimization.stages import Stages
 from reslrb_cli.optimization.state import State, put, standing
-from reslrb_cli.optimization.stopping import Watch, lowered
+from reslrb_cli.optimization.stopping import Watch, lowered, out_of_time, time_share
 from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record, Regularized
 from reslrb_cli.seeds import seed
@@ -65,21 +65,15 @@ HELD_OUT_EVERY = 10
 Told = Callable[[Findings], None]
 
 
-def step(
-    problem: Problem,
-    state: State,
-    on_nonfinite: Told = lambda found: None,
-    progress: Callable[[], float] = lambda: 0.0,
-) -> tuple[State, Record]:
+def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None) -> tuple[State, Record]:
     """Make the iteration that follows `state`; return the state that it leaves, and its record.
 
     It is a step (image, loss and gradient of every sensor; the loss is the mean over the sensors) and an update. From
     equal states equal ones follow: a problem that stands elsewhere is brought to `state` first, and stands at what is
     returned afterwards. What is not finite reaches no parameter; what happens instead, and when a run is to end
     (`State.end`), is in `nonfinite`. `on_nonfinite` is told of it before the update, while the scene is as it was in
-    the step. `optimizer.scale: auto` measures before the first iteration, and `elapsed_s` counts that. Where a time
-    may end the run, `progress` says what share of it has gone (0 to 1): the schedule is as far as that, or as the
-    iterations.
+    the step. `optimizer.scale: auto` measures before the first iteration, and `elapsed_s` counts that. The schedule
+    follows the iterations or the time (`run.max_seconds`), whichever is further.
     """
     config, optimizer, iteration = problem.config, problem.optimizer, state.iteration
     if optimizer.stands_at is not state:
@@ -100,7 +94,11 @@ def step(
         problem.pace
         * lowered(config.optimizer, state.drops)
         * learning_rate_factor(
-            config.optimizer.schedule, iteration, config.run.iterations, config.optimizer.final_fraction, progress()
+            config.optimizer.schedule,
+            iteration,
+            config.run.iterations,
+            config.optimizer.final_fraction,
+            time_share(problem.limit_s, state),
         )
     )
     with clock.counted():
@@ -118,21 +116,20 @@ def step(
         problem.hold_apart()
         problem.apply()
     standstill = state.standstill + 1 if held or found.updates else 0
-    state = standing(
-        problem,
-        replace(
-            state,
-            iteration=iteration + 1,
-            elapsed_s=clock.elapsed_s,
-            peak_mib=max(state.peak_mib, peak_mib(dr.backend_v(loss))),
-            standstill=standstill,
-            scaling=scaling,
-            clamp=clamp,
-            clamp_sums=clamp_sums,
-            end=why_end(config.run.on_nonfinite, found, standstill),
-            gradients=gradients,
-        ),
+    state = replace(
+        state,
+        iteration=iteration + 1,
+        elapsed_s=clock.elapsed_s,
+        first_s=state.first_s if iteration else clock.elapsed_s,
+        peak_mib=max(state.peak_mib, peak_mib(dr.backend_v(loss))),
+        standstill=standstill,
+        scaling=scaling,
+        clamp=clamp,
+        clamp_sums=clamp_sums,
+        end=why_end(config.run.on_nonfinite, found, standstill),
+        gradients=gradients,
     )
+    state = standing(problem, replace(state, stopped=out_of_time(problem.limit_s, state)))
     return state, Record(
         iteration=iteration,
         loss=value,
@@ -156,11 +153,7 @@ def step(
 
 
 def iterate(
-    stages: Stages,
-    state: State,
-    on_nonfinite: Told = lambda found: None,
-    progress: Callable[[], float] = lambda: 0.0,
-    watch: Watch | None = None,
+    stages: Stages, state: State, on_nonfinite: Told = lambda found: None, watch: Watch | None = None
 ) -> Iterator[tuple[State, Record]]:
     """Make the iterations from `state` to the last of the run, each as `step` does, of the problem of its stage.
 
@@ -170,21 +163,19 @@ def iterate(
     reset_peak()
     watch = Watch(stages.whole.config) if watch is None else watch
     while state.iteration < stages.whole.config.run.iterations and not state.stopped:
-        problem, state = stages.enter(state, progress)
-        state, record = step(problem, state, on_nonfinite, progress)
+        problem, state = stages.enter(state)
+        state, record = step(problem, state, on_nonfinite)
         problem.optimizer.stands_at = state = watch.after(state, record)
         yield state, record
         if state.end:
             raise NonFinite(state.end)
 
 
-def optimize(
-    problem: Problem, on_nonfinite: Told = lambda found: None, progress: Callable[[], float] = lambda: 0.0
-) -> Iterator[Record]:
+def optimize(problem: Problem, on_nonfinite: Told = lambda found: None) -> Iterator[Record]:
     """The records of all iterations of `problem` from where it stands; the parameters are updated when one is
     yielded."""
     stages = Stages(problem)
-    for state, record in iterate(stages, standing(problem), on_nonfinite, progress):
+    for state, record in iterate(stages, standing(problem), on_nonfinite):
         stages.bring(state)
         yield record
 

@@ -198,6 +198,18 @@ class Problem:
         return counts
 
     @property
+    def measured_s(self) -> float:
+        """Seconds that this run has spent on decisions by measurement; those of an earlier run do not count."""
+        made = (self.sides, self.guided, self.sequence, self.pixels)
+        return sum(each.measure_s + each.compile_s for each in made if each is not None and not each.cached)
+
+    @property
+    def limit_s(self) -> float | None:
+        """Seconds that the iterations may take, by `run.max_seconds`; None without a limit."""
+        limit = self.config.run.max_seconds
+        return None if limit is None else limit - self.measured_s
+
+    @property
     def sensors(self) -> list[int]:
         """The index of each view's sensor."""
         return [view.sensor for view in self.views]

@@ -15,7 +15,6 @@ so that what is too fine for the stage stays as it was (Brandt 1977, the full ap
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -91,16 +90,15 @@ class Stages:
         config = problem.config.model_copy(update={"run": run})
         return replace(problem, config=config, regularizers=weights, pace=stage.learning_rate)
 
-    def enter(self, state: State, progress: Callable[[], float] = lambda: 0.0) -> tuple[Problem, State]:
+    def enter(self, state: State) -> tuple[Problem, State]:
         """The problem that the iteration after `state` works on, and the state as that begins with it."""
-        problem, self.begun = self._entered(state, progress)
+        problem, self.begun = self._entered(state)
         return problem, self.begun
 
-    def _entered(self, state: State, progress: Callable[[], float]) -> tuple[Problem, State]:
+    def _entered(self, state: State) -> tuple[Problem, State]:
         if not self.last:
             return self.whole, state
-        share = max(state.iteration / self.whole.config.run.iterations, progress())
-        number = self.whole.config.stage_number(share)
+        number = self.whole.config.stage_number(state.iteration / self.whole.config.run.iterations)
         if state.iteration:
             number = max(number, state.stage)  # a run that goes on for longer does not go back
         if number == state.stage:

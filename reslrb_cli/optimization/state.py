@@ -51,8 +51,9 @@ class State:
     them; in a file as they are shown, and as `halo` where that is less. `stage` is the number of the stage whose
     problem it is a state of, and `base` the run's values when that began, of one with a problem of its own (`stages`).
     `drops` are those of a rate that a plateau has lowered, `since` the iterations before the last of them; `stopped`
-    says why the run ends with it as finished, and `end` why it fails, "" where it does not. `gradients` are those of
-    the step that led to it, as `values` are, for whoever looks at them.
+    says why the run ends with it as finished, and `end` why it fails, "" where it does not. `first_s` is `elapsed_s`
+    after the first iteration. `gradients` are those of the step that led to it, as `values` are, for whoever looks at
+    them.
     """
 
     iteration: Count
@@ -67,6 +68,7 @@ class State:
     drops: Count = 0
     since: Count = 0
     stopped: str = ""
+    first_s: Number = 0.0
     values: Arrays = field(default_factory=dict, metadata=entry("parameter", "finite"))
     halo: Arrays = field(default_factory=dict, metadata=entry("parameter with halo", "finite"))
     moments: Arrays = field(default_factory=dict, metadata=entry("optimizer"))

@@ -1,5 +1,5 @@
-"""When a loss stands: what ends a run early (`run.stop`), and lowers its rate (`optimizer.schedule: plateau`); and the
-mean of its last values (`optimizer.average`).
+"""When a loss stands: what ends a run early (`run.stop`), and lowers its rate (`optimizer.schedule: plateau`); the time
+of a run (`run.max_seconds`); and the mean of its last values (`optimizer.average`).
 
 A loss has windows of `patience` iterations, one after another, and is tested at the end of each: it stands where it is
 shown to fall by less than `relative` a window (`trend.stands`). Where views are held out, the test takes their loss,
@@ -36,6 +36,25 @@ def lowered(optimizer: AnyOptimizer, drops: int) -> float:
     if optimizer.schedule != "plateau":
         return 1.0
     return max(FACTOR**drops, optimizer.final_fraction)
+
+
+#: How `State.stopped` begins where `run.max_seconds` ended the run.
+OUT_OF_TIME = "the time is up"
+
+
+def time_share(limit_s: float | None, state: State) -> float:
+    """Return the share of a run's time that has passed since its first iteration, which compiles; 0 without a limit."""
+    if limit_s is None or not state.iteration:
+        return 0.0
+    return min((state.elapsed_s - state.first_s) / max(limit_s - state.first_s, 1e-9), 1.0)
+
+
+def out_of_time(limit_s: float | None, state: State) -> str:
+    """Say that an iteration as long as the mean of those after the first would exceed the limit; "" if it would not."""
+    mean_s = (state.elapsed_s - state.first_s) / max(state.iteration - 1, 1)
+    if limit_s is None or state.elapsed_s + mean_s <= limit_s:
+        return ""
+    return f"{OUT_OF_TIME}, after {state.elapsed_s:.3g} s of iterations"
 
 
 class Watch:

@@ -9,7 +9,7 @@ array has to fill its entry to the byte. No entry's name is ever the name of a f
 `state.npz`      the newest state; `iteration`, `parameter/<key>`, what else the iterations carry on as arrays, and
                  `state`, the rest of it as JSON
 `previous.npz`   the state before that
-`nonfinite.npz`  parameters in the first iteration with a value that was not finite, and what guided emission knew then
+`nonfinite.npz`  the state with which the first iteration began that met a value that was not finite
 """
 
 from __future__ import annotations
@@ -191,12 +191,13 @@ def save_checkpoint(
     parameters: Mapping[str, Array],
     others: Mapping[str, Array],
     values: Mapping[str, Any] | None = None,
+    name: str = STATE_FILE,
 ) -> None:
     """Write the state after `iteration` updates into `folder`, atomically and durably.
 
     Its entries are `iteration`, `parameter/<key>`, `others` by their names, and, as JSON, `values`, what there is
     besides. The state before is kept as `previous.npz`; should the disk have no room for three, until the new one is
-    there. Raises OSError, and then the state before is still there.
+    there. A file of another `name` is written beside both. Raises OSError, and then the state before is still there.
     """
     entries: dict[str, Array] = {"iteration": np.array(iteration)}
     entries |= {f"parameter/{key}": value for key, value in parameters.items()}
@@ -204,12 +205,14 @@ def save_checkpoint(
     if values is not None:
         text = json.dumps({"format": FORMAT, "iteration": iteration, **values}, allow_nan=False)
         entries["state"] = np.frombuffer(text.encode(), np.uint8)
-    path, previous = folder / STATE_FILE, folder / PREVIOUS_FILE_NAME
-    _keep(path, previous)
+    path, previous = folder / name, folder / PREVIOUS_FILE_NAME
+    if name == STATE_FILE:
+        _keep(path, previous)
     try:
         write_archive(path, entries, durable=True)
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT) or not (path.exists() and previous.exists()):
+        full = name == STATE_FILE and error.errno in (errno.ENOSPC, errno.EDQUOT)
+        if not (full and path.exists() and previous.exists()):
             raise
         previous.unlink()
         write_archive(path, entries, durable=True)
@@ -263,55 +266,3 @@ def _refuse(word: str) -> Any:
 def newest_checkpoint(folder: Path) -> Path | None:
     """The newest state in `folder`, which may be damaged; None where there is none."""
     return next((path for name in (STATE_FILE, PREVIOUS_FILE_NAME) if (path := folder / name).exists()), None)
-
-
-@dataclass(frozen=True)
-class NonFiniteStep:
-    """A step that met a value that is not finite: its `iteration`, from 0, and the parameters' values, finite or not.
-
-    `calls` is, of each sensor that guided emission had learned of, by its number, how many gradients that had had, and
-    `learned` what it knew, by `<sensor>/<what>`; None of a run that is not guided. `shares` (H, W) say by sensor how
-    camera paths were shared out over the pixels.
-    """
-
-    iteration: int
-    parameters: Mapping[str, Array]
-    calls: Mapping[str, int] | None = None
-    learned: Mapping[str, Array] = field(default_factory=dict)
-    shares: Mapping[str, Array] = field(default_factory=dict)
-
-
-def save_nonfinite(folder: Path, step: NonFiniteStep) -> None:
-    """Write it into `folder`: `iteration`, `parameter/<key>`, `calls` (N, 2) with `guiding/<sensor>/<what>`, and
-    `pixels/<sensor>`."""
-    arrays: dict[str, Any] = {"iteration": np.array(step.iteration)}
-    arrays |= {f"parameter/{key}": value for key, value in step.parameters.items()}
-    arrays |= {f"pixels/{number}": density for number, density in step.shares.items()}
-    if step.calls is not None:
-        arrays["calls"] = np.array([[int(name), count] for name, count in step.calls.items()]).reshape(-1, 2)
-        arrays["calls"] = arrays["calls"].astype(np.int64)
-        arrays |= {f"guiding/{name}": value for name, value in step.learned.items()}
-    write_archive(folder / NONFINITE_FILE_NAME, arrays)
-
-
-def load_nonfinite(folder: Path) -> NonFiniteStep | None:
-    """What `save_nonfinite` wrote into `folder`; None where there is nothing.
-
-    Raises ConfigError, located in the file, where it cannot be read, is damaged, or is nothing that a run wrote.
-    """
-    path = folder / NONFINITE_FILE_NAME
-    if not os.path.lexists(path):
-        return None
-    with Archive(path, whole=False) as archive:
-        keys = archive.names("parameter/")
-        iteration = int(archive.array("iteration", (), "i"))
-        parameters = {key: archive.array(f"parameter/{key}", values="any") for key in keys}
-        shares = {number: archive.array(f"pixels/{number}", kind="f") for number in archive.names("pixels/")}
-        if "calls" not in archive.heads:
-            return NonFiniteStep(iteration, parameters, shares=shares)
-        calls = archive.array("calls", kind="i")
-        if calls.ndim != 2 or calls.shape[1] != 2 or (calls < 0).any():
-            raise ConfigError(path, "calls", "is not the gradients of sensors by their numbers, as a run writes it")
-        learned = {name: archive.array(f"guiding/{name}", kind="f") for name in archive.names("guiding/")}
-        counts = {str(number): int(count) for number, count in calls}
-        return NonFiniteStep(iteration, parameters, counts, learned, shares)

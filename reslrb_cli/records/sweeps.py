@@ -35,6 +35,9 @@ MOST_BYTES = 2**22
 #: What a combination may be called: the name of a folder, and no way out of it.
 _NAME = re.compile(r"[\w+=-][\w.+=-]*")
 
+#: A method such as `reslrb:stack(paths=both)`: YAML would quote it in a list, though it need not.
+_METHOD = re.compile(r"[A-Za-z][\w./-]*:\w[\w=().-]*")
+
 
 @dataclass(frozen=True)
 class Combination:
@@ -102,6 +105,8 @@ def in_words(value: Any) -> str:
         return "[" + ", ".join(map(in_words, value)) + "]"
     if isinstance(value, float):
         return short if float(short := f"{value:g}") == value else repr(value)
+    if isinstance(value, str) and _METHOD.fullmatch(value):
+        return value
     text: str = yaml.safe_dump([value], default_flow_style=True, width=2**16, allow_unicode=True)
     return " ".join(text.split())[1:-1]
 
@@ -191,7 +196,12 @@ class SweepRunRecord(Line):
 
 @dataclass(frozen=True)
 class SweepRowRecord(Line):
-    """What the finished runs of one combination came to, `runs` of `of`: medians, the least and the greatest."""
+    """What the finished runs of one combination came to, `runs` of `of`: medians, the least and the greatest.
+
+    `loss_ratio` and `error_ratio` are the median over that of the first combination that can be compared, with the 95 %
+    interval of a bootstrap over the seeds. Combinations that differ in learning rates alone are compared at their best
+    rate, which alone has a ratio. None of fewer than 5 seeds.
+    """
 
     KIND: ClassVar[str] = "sweep_row"
 
@@ -200,10 +210,13 @@ class SweepRowRecord(Line):
     runs: int
     of: int
     failed: int
+    iterations: Band | None
     loss: Band | None
     error: Band | None
     elapsed_s: Band | None
     peak_mib: Band | None
+    loss_ratio: Range | None = None
+    error_ratio: Range | None = None
     message: str = ""
 
 
@@ -211,9 +224,10 @@ class SweepRowRecord(Line):
 class SweepBestRecord(Line):
     """Which combination has the lowest median `of` what (`loss` or `error`), over `seeds` seeds that all have.
 
-    From those `tied` it is not told, those it `beats` it is, by Wilcoxon's test of signed ranks, in pairs of the same
-    seed. `second` has the next median, `ratio` is that of the best over it, with the 95 % interval of a bootstrap over
-    the seeds, None of fewer than 5 of them. `line` is the record in words.
+    Combinations that differ in learning rates alone are compared at their best rate. From those `tied` it is not told,
+    those it `beats` it is, by Wilcoxon's test of signed ranks, in pairs of the same seed. `second` has the next median,
+    `ratio` is that of the best over it, with the 95 % interval of a bootstrap over the seeds, None of fewer than 5 of
+    them. `line` is the record in words.
     """
 
     KIND: ClassVar[str] = "sweep_best"

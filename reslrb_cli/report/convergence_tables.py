@@ -1,4 +1,4 @@
-"""Convergence and whole optimisations as aligned tables, and what they come to in a sentence."""
+"""A convergence as an aligned table, and the sentence that it comes to."""
 
 from __future__ import annotations
 
@@ -6,21 +6,16 @@ import math
 from collections.abc import Sequence
 
 from reslrb_cli.measure.convergence.judgement import Results
-from reslrb_cli.measure.optimization_benchmark.rank import ALPHA, Verdict
 from reslrb_cli.records.measurement_files import Line
 from reslrb_cli.records.measurements import (
     TARGETS,
-    Band,
     BenchStatus,
     MethodRecord,
     Range,
     ReferenceRecord,
-    RunBestRecord,
-    RunMethodRecord,
-    RunPointRecord,
     SummaryRecord,
 )
-from reslrb_cli.report.format import Columns, count, interval, number, shorten
+from reslrb_cli.report.format import Columns, interval, number, shorten
 
 #: Characters that a parameter's key may take.
 KEY_WIDTH = 28
@@ -147,68 +142,3 @@ def _ratio(one: MethodRecord, other: MethodRecord) -> tuple[float, float, float]
 
 def _times(one: MethodRecord, other: MethodRecord) -> str:
     return interval(*_ratio(one, other), 2)
-
-
-def runs_columns(labels: Sequence[str]) -> Columns:
-    """The columns of whole optimisations, whose first fits `labels`."""
-    titles = ("", "seed", "iterations", "first s", "loss", "error")
-    return Columns(titles, (max(map(len, labels), default=0), 8, 20, 20, 30, 30), "<>")
-
-
-def run_cells(point: RunPointRecord, first_s: float | None) -> tuple[str, ...]:
-    """The line of one run, at the end of its time."""
-    return (point.method.label, str(point.seed), str(point.iteration), number(first_s, 3), number(point.loss, 4),
-            number(point.parameter_error, 4))  # fmt: skip
-
-
-def runs_cells(record: RunMethodRecord) -> tuple[str, ...]:
-    """The line of one method: medians, and the least and the greatest of its runs."""
-    if record.runs == 0:
-        return record.method.label, "", "not measured" if record.status is BenchStatus.OK else record.status.value
-    return (record.method.label, count(record.runs, "run"), band(record.iterations, 3), band(record.first_s, 3),
-            band(record.loss, 4), band(record.parameter_error, 4))  # fmt: skip
-
-
-def band(value: Band | None, digits: int) -> str:
-    """A median with its band; nothing for None."""
-    return "" if value is None else interval(value.median, value.low, value.high, digits)
-
-
-def best_line(record: RunBestRecord) -> str:
-    """A method at its best in one line."""
-    words = f"{'loss' if record.of == 'loss' else 'error'} of {record.at or record.label}: {band(record.value, 4)}"
-    if record.at is not None:
-        words += ", the best of its rates"
-        words += ", and the outermost that was tried" if record.outermost else ""
-    if record.ratio is not None:
-        words += f"; {_range(record.ratio)} times that of {record.to}{' at its best' if record.at else ''}"
-    return words
-
-
-def runs_notes(records: Sequence[RunMethodRecord]) -> list[str]:
-    """What ended before its time, one line a method."""
-    return [f"{record.method.label}: {record.message}" for record in records if record.message]
-
-
-def runs_closing_sentence(loss: Verdict | None, error: Verdict | None, limit_s: float) -> str:
-    """Which method is the best for this scene at the end of the time of a run, by the loss and by the error."""
-    if loss is None:
-        return "Nothing can be said of which method is the best: none came to an iteration and to the end of its time."
-    sentence = f"After {number(limit_s, 3)} s of each run, all costs counted: " + _of(loss, "the loss")
-    if error is not None:
-        sentence += "; " + _of(error, "the error of the parameters")
-    if not (loss.tied or loss.beats):
-        return sentence + "."
-    sentence += f". Told apart by the Mann-Whitney test at {ALPHA:.0%}, corrected for the number of methods"
-    return sentence + (f"; so few runs are too few for that, {loss.enough} of each could do." if loss.too_few else ".")
-
-
-def _of(verdict: Verdict, what: str) -> str:
-    words = f"best by {what} is {verdict.best}"
-    if not (verdict.tied or verdict.beats):
-        return f"{words}, the only one that was measured"
-    if verdict.tied:
-        words += f", tied with {', '.join(verdict.tied)}"
-    if verdict.beats:
-        words += f", ahead of {', '.join(verdict.beats)}"
-    return words

@@ -1,4 +1,4 @@
-"""Measurements as pictures: what a bench, a convergence or whole optimisations came to, and maps of gradients."""
+"""Curves of the pages' diagrams, and maps of gradients."""
 
 from __future__ import annotations
 
@@ -12,16 +12,7 @@ import numpy as np
 
 from reslrb_cli.errors import one_line
 from reslrb_cli.records.images import bounded, file_stem, write_layers
-from reslrb_cli.records.measurements import (
-    Band,
-    BenchRecord,
-    BenchStatus,
-    GradcheckRecord,
-    MethodRecord,
-    PointRecord,
-    RunPointRecord,
-)
-from reslrb_cli.report.format import shorten
+from reslrb_cli.records.measurements import GradcheckRecord
 from reslrb_cli.report.tables import integrator_name, reference_name
 from reslrb_cli.report.tonemap import color_map
 
@@ -44,8 +35,7 @@ LEAST_LOG, MOST_LABELLED = 5.0, 300.0
 class Curve:
     """One curve: points (x, y), those that are None or not finite left out. `place` chooses its colour and its dashes.
 
-    `band` has the ends of each point's interval, where there are such. `points`: each point has a mark;
-    `dashed`: it is drawn in dashes, whatever its place.
+    `band` has the ends of each point's interval, where there are such. `points`: each point has a mark.
     """
 
     name: str
@@ -54,7 +44,6 @@ class Curve:
     place: int = 0
     band: tuple[Sequence[float | None], Sequence[float | None]] | None = None
     points: bool = False
-    dashed: bool = False
 
     def known(self) -> Array:
         """Its points as (N, 2)."""
@@ -94,7 +83,7 @@ def _draw(axis: Any, curve: Curve) -> None:
     xs, ys = _thinned(points, points_together(len(points)))
     marker = "o" if curve.points or len(xs) == 1 else ""
     again, place = divmod(curve.place, len(COLORS))
-    style = "--" if again or curve.dashed else "-"
+    style = "--" if again else "-"
     axis.plot(xs, ys, linewidth=1.5, color=COLORS[place], marker=marker, markersize=4, linestyle=style,
               label=curve.name)  # fmt: skip
     if curve.band is not None:
@@ -129,143 +118,6 @@ def _figure(inches: tuple[float, float]) -> Figure:
     figure = Figure(figsize=inches, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
-
-
-def _save(figure: Figure, path: Path, title: str) -> None:
-    """Write it as a PNG."""
-    figure.suptitle(title, fontsize="medium", parse_math=False)  # a path may hold a $
-    figure.savefig(path, format="png", dpi=150)
-
-
-#: What one curve is drawn from: a label, and records by the value of what was swept.
-Series = tuple[str, Sequence[tuple[int, BenchRecord]]]
-
-
-def plot_bench(series: Sequence[Series], path: Path, title: str, abscissa: str = "path depth") -> None:
-    """Write a PNG with one curve for each of the series; bands go from the least to the greatest step time.
-
-    Where a case ran out of memory or failed, a cross stands above the diagram of memory at that value.
-    """
-    figure = _figure((11.0, 4.6))
-    time_axis, memory_axis = figure.subplots(1, 2)
-    times, peaks, ends = [], [], set()
-    for k, (label, records) in enumerate(series):
-        done = [(x, step, record.peak_mib) for x, record in records if (step := record.step_ms) is not None]
-        xs, band = [x for x, _, _ in done], ([step.min for _, step, _ in done], [step.max for _, step, _ in done])
-        times.append(Curve(label, xs, [step.median for _, step, _ in done], k, band, points=True))
-        peaks.append(Curve(label, xs, [peak for _, _, peak in done], k, points=True))
-        ended = [(x, record.status) for x, record in records if record.status is not BenchStatus.OK]
-        for x, _ in ended:  # crosses above the diagram, a little apart where several cases ended at one value
-            memory_axis.plot([x * 2 ** (0.06 * k)], [1.025], "x", color=COLORS[k % len(COLORS)], markersize=8,
-                             transform=memory_axis.get_xaxis_transform(), clip_on=False)  # fmt: skip
-        ends |= {status.value.replace("_", " ") for _, status in ended}
-    for axis, curves, label in ((time_axis, times, "time of a step (ms)"), (memory_axis, peaks, "peak memory (MiB)")):
-        _draw_panel(axis, curves, abscissa, label)
-        axis.set_xscale("log", base=2)
-        axis.set_xticks(sorted({x for _, records in series for x, _ in records}))
-        axis.xaxis.set_major_formatter("{x:g}")
-    if ends:
-        memory_axis.set_title(f"×: {' or '.join(sorted(ends))}", fontsize="small", loc="left")
-    _save(figure, path, title)
-
-
-def _draw_panel(axis: Any, curves: Sequence[Curve], caption: str, label: str) -> None:
-    known = [curve for curve in curves if len(curve.known())]
-    if known:
-        draw(axis, known)
-        axis.legend(fontsize="small")
-    axis.set(xlabel=caption, ylabel=label)
-    axis.grid(True, which="both", alpha=0.25)
-
-
-#: Panels at most: all together, and the first parameters.
-PANELS = 6
-COLUMNS = 3
-
-#: Points of fewer averages are hollow: they scatter.
-FEW = 4
-
-
-def plot_convergence(
-    points: Sequence[PointRecord], methods: Sequence[MethodRecord], path: Path, title: str
-) -> None:  # fmt: skip
-    """Write a PNG; the reference's own standard error is a dashed line, and biased methods say so in the legend."""
-    keys = panels([record.parameter for record in methods])
-    columns = min(len(keys), COLUMNS)
-    rows = -(-len(keys) // columns)
-    figure = _figure((1.0 + 6.2 * columns, 1.0 + 4.4 * rows))
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    labels = list(dict.fromkeys(record.method.label for record in methods))
-    for axis, key in zip(axes, keys, strict=False):
-        _draw_errors(axis, key, labels, points, methods)
-    for axis in axes[len(keys) :]:
-        axis.set_visible(False)
-    axes[0].legend(fontsize="small")
-    _save(figure, path, title)
-
-
-def panels(parameters: Sequence[str]) -> list[str]:
-    """What is drawn: all together first; a single parameter is all there is."""
-    keys = sorted(dict.fromkeys(parameters), key=lambda key: key != "all")
-    return keys[: 1 if len(keys) == 2 and keys[0] == "all" else PANELS]
-
-
-def _draw_errors(
-    axis: Any, key: str, labels: Sequence[str], points: Sequence[PointRecord], methods: Sequence[MethodRecord]
-) -> None:
-    drawn = False
-    floor = next((point.reference_rmse for point in points if point.parameter == key), None)
-    for k, label in enumerate(labels):
-        record = next((m for m in methods if m.parameter == key and m.method.label == label), None)
-        curve = [p for p in points if p.parameter == key and p.method.label == label and p.relative_rmse is not None]
-        if record is None or not curve:
-            continue
-        drawn = True
-        name, color = f"{label} (biased)" if record.biased else label, COLORS[k % len(COLORS)]
-        times, errors = [p.elapsed_s for p in curve], [p.relative_rmse for p in curve]
-        _draw(axis, Curve(name, times, errors, k, points=True, dashed=bool(record.biased)))
-        few = [p for p in curve if p.repeats < FEW]
-        axis.plot([p.elapsed_s for p in few], [p.relative_rmse for p in few], "o", color=color, markersize=4,
-                  markerfacecolor="white")  # fmt: skip
-        # Where the variance of single steps says that averages lead, without a bias.
-        if record.relative_rmse is not None and record.step_s is not None:
-            ends = [times[0], times[-1]]
-            line = [record.relative_rmse * (time / record.step_s) ** -0.5 for time in ends]
-            axis.plot(ends, line, color=color, linewidth=0.8, linestyle=":")
-    if floor is not None:
-        axis.axhline(floor, color="0.4", linestyle=(0, (6, 3)), linewidth=1.0)
-        axis.annotate(" standard error of the reference", (0, floor), xycoords=("axes fraction", "data"),
-                      va="bottom", fontsize="x-small", color="0.4")  # fmt: skip
-    if drawn:
-        axis.set(xscale="log", yscale="log")
-    axis.set(xlabel="seconds", ylabel="relative RMSE")
-    axis.set_title(shorten(key, 48), fontsize="small", loc="left", parse_math=False)
-    axis.grid(True, which="both", alpha=0.25)
-
-
-def plot_runs(points: Sequence[RunPointRecord], error_of: str, path: Path, title: str) -> None:
-    """Write a PNG; a second panel for the error, which `error_of` names, where it is known."""
-    panels = [("loss", "loss"), ("parameter_error", error_of)] if error_of else [("loss", "loss")]
-    figure = _figure((1.0 + 6.2 * len(panels), 5.2))
-    labels = list(dict.fromkeys(point.method.label for point in points))
-    for axis, (of, name) in zip(figure.subplots(1, len(panels), squeeze=False).ravel(), panels, strict=True):
-        curves = []
-        for place, label in enumerate(labels):
-            along = curve([point for point in points if point.method.label == label], of)
-            ends = [band.low for _, band in along], [band.high for _, band in along]
-            curves.append(Curve(label, [time for time, _ in along], [band.median for _, band in along], place, ends))
-        _draw_panel(axis, curves, "seconds of a run, all costs counted", name)
-    _save(figure, path, title)
-
-
-def curve(points: Sequence[RunPointRecord], of: str) -> list[tuple[float, Band]]:
-    """Times and bands of one method, over those of its runs that have a value of the field `of` at each time."""
-    found: dict[float, list[float]] = {}
-    for point in points:
-        value = getattr(point, of)
-        if value is not None:
-            found.setdefault(point.elapsed_s, []).append(value)
-    return [(time, band) for time in sorted(found) if (band := Band.of(found[time])) is not None]
 
 
 #: z at the ends of the scale.

@@ -182,7 +182,7 @@ def _read_file(path: Path, name: str, tell: Tell | None) -> Measurements:
 
 def _kind(entry: Mapping[str, Any]) -> str | None:
     """Which command wrote a line; None where that cannot be told."""
-    if entry.get("kind") in ("point", "method", "run_point", "run_method"):
+    if entry.get("kind") in ("point", "method"):
         return "convergence"
     if entry.get("kind") == "missing" or {"reference", "verdict"} <= set(entry):
         return "gradcheck"

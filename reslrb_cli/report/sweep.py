@@ -6,13 +6,16 @@ Losses are those of the runs' final images: of `run.final_spp` samples and, of o
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from scipy import stats
+
 from reslrb_cli.config.files import duration
-from reslrb_cli.measure.optimization_benchmark.rank import Verdict, find_best, ratio
 from reslrb_cli.records.manifest import Status, is_complete
-from reslrb_cli.records.measurements import Band
+from reslrb_cli.records.measurements import Band, Range
 from reslrb_cli.records.sweeps import (
     Combination,
     Sweep,
@@ -31,6 +34,7 @@ from reslrb_cli.report.sources import Run, SweepRuns, is_number
 #: Settings by which losses become those of something else, so that they are not compared, and such for errors.
 OTHER_LOSS = ("loss", "views", "target", "scene", "parameters", "run.final_spp", "run.held_out")
 OTHER_ERROR = ("scene", "parameters")
+OTHERS = {"loss": OTHER_LOSS, "error": OTHER_ERROR}
 
 #: Characters of a setting's value in the table, and of a combination in a line.
 VALUE_WIDTH, LABEL_WIDTH = 32, 60
@@ -81,19 +85,26 @@ def _error(run: Run, relative: bool) -> float | None:
 
 def row_records(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[SweepRowRecord]:
     """What the finished runs of each combination came to."""
-    return [_row(combination, [run for run in runs if run.settings == combination.settings])
-            for combination in sweep.combinations]  # fmt: skip
+    ratios = {of: _ratios(sweep, runs, of) for of in OTHERS}
+    return [
+        _row(each, [run for run in runs if run.settings == each.settings],
+             ratios["loss"].get(each.name), ratios["error"].get(each.name))
+        for each in sweep.combinations
+    ]  # fmt: skip
 
 
-def _row(combination: Combination, runs: Sequence[SweepRunRecord]) -> SweepRowRecord:
+def _row(
+    combination: Combination, runs: Sequence[SweepRunRecord], loss_ratio: Range | None, error_ratio: Range | None
+) -> SweepRowRecord:
     done, failed = [run for run in runs if run.is_done], [run for run in runs if run.status == "failed"]
 
     def band(name: str) -> Band | None:
         return Band.of([value for run in done if (value := getattr(run, name)) is not None])
 
     return SweepRowRecord(
-        combination.name, combination.settings, len(done), len(runs), len(failed), band("loss"), band("error"),
-        band("elapsed_s"), band("peak_mib"), f"seed {failed[0].seed}: {failed[0].message}" if failed else "",
+        combination.name, combination.settings, len(done), len(runs), len(failed), band("iterations"), band("loss"),
+        band("error"), band("elapsed_s"), band("peak_mib"), loss_ratio, error_ratio,
+        f"seed {failed[0].seed}: {failed[0].message}" if failed else "",
     )  # fmt: skip
 
 
@@ -106,24 +117,25 @@ def best_records(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[SweepBest
     Combinations with a run that failed, or has no such figure, are left out: what is left of them are the lucky ones.
     """
     found = []
-    for of, others in (("loss", OTHER_LOSS), ("error", OTHER_ERROR)):
-        if incomparable(sweep, others):
-            continue
-        values = _paired(sweep, runs, of)
-        verdict = find_best(values, paired=True) if len(values) > 1 else None
+    for of in OTHERS:
+        groups = _groups(sweep, _paired(sweep, runs, of))
+        verdict = find_best({name: rows[0] for name, rows in groups.items()}) if len(groups) > 1 else None
         if verdict is not None:
-            found.append(_best(of, verdict, values, {each.name: label(each.settings) for each in sweep.combinations}))
+            found.append(_best(of, verdict, groups, {each.name: label(each.settings) for each in sweep.combinations}))
     return found
 
 
 def incomparable(sweep: Sweep, others: Sequence[str]) -> str:
-    """The first setting that is varied and one of `others`, or below one; empty where there is none."""
-    return next((key for key in sweep.keys if any(f"{key}.".startswith((f"{o}.", f"{o}[")) for o in others)), "")
+    """Return the first setting that is varied and one of `others`, or below one, but no learning rate; "" for none."""
+    keys = [key for key in sweep.keys if not is_rate(key)]
+    return next((key for key in keys if any(f"{key}.".startswith((f"{o}.", f"{o}[")) for o in others)), "")
 
 
 def _paired(sweep: Sweep, runs: Sequence[SweepRunRecord], of: str) -> dict[str, list[float]]:
     """The values of each combination by its name, one a seed, over the seeds that all have; without those that failed,
-    or that have none."""
+    or that have none. Nothing where they cannot be compared."""
+    if incomparable(sweep, OTHERS[of]):
+        return {}
     found: dict[str, dict[int, float]] = {}
     for combination in sweep.combinations:
         own = [run for run in runs if run.settings == combination.settings]
@@ -134,10 +146,40 @@ def _paired(sweep: Sweep, runs: Sequence[SweepRunRecord], of: str) -> dict[str, 
     return {name: [values[seed] for seed in seeds] for name, values in found.items()} if seeds else {}
 
 
-def _best(of: str, verdict: Verdict, values: dict[str, list[float]], labels: dict[str, str]) -> SweepBestRecord:
-    second = min((name for name in values if name != verdict.best), key=lambda name: Band.of(values[name]).median)  # type: ignore[union-attr]
+def _groups(sweep: Sweep, values: Mapping[str, list[float]]) -> dict[str, list[list[float]]]:
+    """Group combinations that differ in learning rates alone: the values of each, by the name of the best, that first.
+
+    Where nothing but learning rates is varied, each combination is a group.
+    """
+    others = [key for key in sweep.keys if not is_rate(key)] or sweep.keys
+    found: dict[str, list[str]] = {}
+    for each in sweep.combinations:
+        if each.name in values:
+            found.setdefault(label({key: each.settings[key] for key in others}), []).append(each.name)
+    ordered = [sorted(names, key=lambda name: float(np.median(values[name]))) for names in found.values()]
+    return {names[0]: [values[name] for name in names] for names in ordered}
+
+
+def is_rate(key: str) -> bool:
+    """Whether a setting is a learning rate."""
+    return key.endswith("learning_rate")
+
+
+def _ratios(sweep: Sweep, runs: Sequence[SweepRunRecord], of: str) -> dict[str, Range]:
+    """Return the ratios to the first group, by the name of the best combination of each other group."""
+    groups = _groups(sweep, _paired(sweep, runs, of))
+    first = next(iter(groups.values()), [])
+    found = {name: ratio(rows, first) for name, rows in list(groups.items())[1:]}
+    return {name: each for name, each in found.items() if each is not None}
+
+
+def _best(
+    of: str, verdict: Verdict, groups: Mapping[str, list[list[float]]], labels: dict[str, str]
+) -> SweepBestRecord:
+    values = {name: rows[0] for name, rows in groups.items()}
+    second = min((name for name in values if name != verdict.best), key=lambda name: float(np.median(values[name])))
     seeds = len(values[verdict.best])
-    apart = ratio([values[verdict.best]], [values[second]])
+    apart = ratio(groups[verdict.best], groups[second])
     what = f"lowest median {FIGURES[of]}: {shorten(labels[verdict.best], LABEL_WIDTH)}"
     pairs = f"in pairs of {count(seeds, 'seed')}"
     tied = ", ".join(shorten(labels[name], LABEL_WIDTH) for name in verdict.tied[:MOST_NAMED])
@@ -156,16 +198,119 @@ def _best(of: str, verdict: Verdict, values: dict[str, list[float]], labels: dic
     return SweepBestRecord(of, verdict.best, second, verdict.tied, verdict.beats, seeds, apart, f"{what}; {says}")
 
 
+#: Fewer seeds than these say nothing of how far a median of theirs may be off.
+LEAST_SEEDS = 5
+
+#: Times that seeds are drawn anew, and what they are drawn by: the same runs have the same interval.
+RESAMPLES, RESAMPLED_BY = 4000, 15
+
+#: What share of the resamples an interval holds.
+CONFIDENCE = 0.95
+
+
+def ratio(own: Sequence[Sequence[float]], base: Sequence[Sequence[float]]) -> Range | None:
+    """Return the least median over the seeds among some rows of values, over that of others, and its 95 % interval.
+
+    Rows are learning rates, columns seeds, the same seeds for all. The interval is the bootstrap's: seeds are drawn
+    anew for all rows together, and the best rates are chosen anew each time, so that it includes the luck of choosing
+    the best of several. None of fewer than LEAST_SEEDS, and where a median is not finite, or 0.
+    """
+    seeds = min((len(values) for values in (*own, *base)), default=0)
+    if seeds < LEAST_SEEDS or not (own and base):
+        return None
+    drawn = np.random.default_rng(RESAMPLED_BY).integers(seeds, size=(RESAMPLES, seeds))
+    sides = [np.array([values[:seeds] for values in side], dtype=np.float64) for side in (own, base)]
+    found = [float(np.median(side, axis=1).min()) for side in sides]
+    if not all(math.isfinite(value) and value > 0 for value in found):
+        return None
+    lowest = [np.median(side[:, drawn], axis=2).min(axis=0) for side in sides]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratios = lowest[0] / lowest[1]
+    if np.isnan(ratios).any():
+        return None
+    low, high = np.quantile(ratios, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method="nearest")
+    return Range(found[0] / found[1], float(low), float(high))
+
+
+#: The probability that among equal combinations any is told apart from the best.
+ALPHA = 0.05
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The combination of the lowest median, those `tied` with it, and those that it `beats`, the lowest first.
+
+    `too_few`: there are so few seeds that the test could not have told any apart; `enough` seeds could.
+    """
+
+    best: str
+    tied: list[str]
+    beats: list[str]
+    too_few: bool
+    enough: int
+
+
+def find_best(values: Mapping[str, Sequence[float]]) -> Verdict | None:
+    """Find which has the lowest median, and which are tied with it; None where there is nothing to compare.
+
+    Values at the same place are of the same seed. Those are tied whose values Wilcoxon's test of the signed ranks of
+    the differences does not tell from the best's: two-sided, at ALPHA over the number of the others.
+    """
+    if not values:
+        return None
+    order = sorted(values, key=lambda name: float(np.median(values[name])))
+    best, others = order[0], order[1:]
+    level = ALPHA / max(len(others), 1)
+    apart = [name for name in others if _signed_ranks(values[best], values[name]) < level]
+    enough = next(count for count in range(2, 1000) if _least_p(count) < level)
+    can_tell = _least_p(len(values[best])) < level
+    tied = [name for name in others if name not in apart]
+    return Verdict(best, tied, apart, bool(others) and not can_tell, enough)
+
+
+def _signed_ranks(one: Sequence[float], other: Sequence[float]) -> float:
+    """Two-sided, but where the pairs have the other one lower, whatever the medians: then 1."""
+    differences = np.subtract(one, other, dtype=np.float64)
+    if not differences.any():
+        return 1.0
+    return min(2.0 * float(stats.wilcoxon(differences, alternative="less").pvalue), 1.0)
+
+
+def _least_p(pairs: int) -> float:
+    """The least probability that the test can find with so many pairs."""
+    return 2.0 ** (1 - pairs)
+
+
 def notes(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
     """What a reader of the table has to know: what is not compared, and what failed."""
     lines = []
     if key := incomparable(sweep, OTHER_LOSS):
         lines.append(f"losses of different `{key}` are not of the same, and not compared")
+    elif key := incomparable(sweep, ("integrator",)):
+        lines.append(f"losses of different `{key}` are of images that each renders itself, with its own noise and what "
+                     "its paths lack: compare errors, or raise run.final_spp")  # fmt: skip
+    lines += _outermost(sweep, runs)
     failed = [run for run in runs if run.status == "failed"]
     lines += [f"{run.name} failed: {run.message}" for run in failed[:MOST_NAMED]]
     if len(failed) > MOST_NAMED:
         lines.append(f"and so did {len(failed) - MOST_NAMED} more")
     return lines
+
+
+def _outermost(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
+    """Return a line for each best learning rate beyond which no other one was tried: a better one may lie there."""
+    found: dict[str, None] = {}
+    rates = [key for key in sweep.keys if is_rate(key)]
+    for of in OTHERS if rates else ():
+        bests = list(_groups(sweep, _paired(sweep, runs, of)))
+        if rates == sweep.keys:
+            bests = [record.best for record in best_records(sweep, runs) if record.of == of]
+        for key, each in ((key, each) for key in rates for each in sweep.combinations if each.name in bests):
+            tried = [other.settings[key] for other in sweep.combinations]
+            if all(is_number(value) for value in tried) and each.settings[key] in (min(tried), max(tried)):
+                best = shorten(label(each.settings), LABEL_WIDTH)
+                found[f"{best}: this {key} is the best by {of}, and the outermost that was tried"] = None
+    return list(found)
 
 
 # --- the table on the terminal ----------------------------------------------------------------------------------------
@@ -181,23 +326,38 @@ def figures_of(runs: Sequence[SweepRunRecord]) -> dict[str, str]:
     return found
 
 
+#: What the columns of ratios are called.
+RATIOS = {"loss_ratio": "loss ratio", "error_ratio": "error ratio"}
+RATIOS_LINE = "ratios: medians over that of the first line that can be compared, with 95 % intervals (bootstrap)"
+
+
+def row_figures(records: Sequence[SweepRowRecord], runs: Sequence[SweepRunRecord]) -> dict[str, str]:
+    """What columns of the figures of combinations are called: also iterations where they differ, and known ratios."""
+    found = {"iterations": "iterations"} if len({run.iterations for run in runs if run.is_done}) > 1 else {}
+    ratios = {name: title for name, title in RATIOS.items() if any(getattr(record, name) for record in records)}
+    return found | figures_of(runs) | ratios
+
+
 def lines(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
     """The table, a line for each combination, which is the best, and what else is to be known."""
-    keys, figures, short = sweep.keys, figures_of(runs), short_keys(sweep.keys)
+    records = row_records(sweep, runs)
+    keys, figures, short = sweep.keys, row_figures(records, runs), short_keys(sweep.keys)
     rows: list[tuple[str, ...]] = [(*(short[key] for key in keys), "runs", *figures.values())]
-    for row in row_records(sweep, runs):
+    for row in records:
         values = [shorten(in_words(row.settings[key]), VALUE_WIDTH) for key in keys]
         bands = [cell(name, getattr(row, name)) for name in figures]
         rows.append((*values, f"{row.runs} of {row.of}" + (f", {row.failed} failed" if row.failed else ""), *bands))
     told = table(rows)
     told.append("medians over the seeds, in brackets the least and the greatest")
+    told += [RATIOS_LINE] if RATIOS.keys() & figures.keys() else []
     return [*told, *(best.line for best in best_records(sweep, runs)), *notes(sweep, runs)]
 
 
-def cell(name: str, band: Band | None) -> str:
-    """The median of a figure, and the ends of its band, where these differ."""
+def cell(name: str, band: Band | Range | None) -> str:
+    """The median of a figure, or a ratio, and the ends of its band or interval, where these differ."""
     if band is None:
         return ""
     write = {"elapsed_s": duration, "peak_mib": lambda size: f"{number(size)} MiB"}.get(name, lambda v: number(v, 4))
-    return write(band.median) if band.low == band.high else \
-        f"{write(band.median)} [{write(band.low)}, {write(band.high)}]"  # fmt: skip
+    middle = band.median if isinstance(band, Band) else band.value
+    return write(middle) if band.low == band.high else \
+        f"{write(middle)} [{write(band.low)}, {write(band.high)}]"  # fmt: skip

@@ -37,7 +37,7 @@ from reslrb_cli.optimization.stopping import Averaged, Watch, average_begins
 from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
 from reslrb_cli.optimization.views import view_records
 from reslrb_cli.records.cache import PilotCache
-from reslrb_cli.records.checkpoint import save_checkpoint
+from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, save_checkpoint
 from reslrb_cli.records.clock import SharedTime
 from reslrb_cli.records.manifest import Manifest
 from reslrb_cli.records.metrics import ClampTally, NonFiniteTally, Record, RegularizedTally
@@ -75,7 +75,7 @@ def plan_record(problem: Problem) -> dict[str, Any]:
 
 #: Settings that decide nothing of what the iterations until then were. All others would make it another run.
 MAY_CHANGE = re.compile(
-    r"run\.(iterations|name|output|checkpoint_every|images_every|certainty|on_nonfinite|stop)(\..*)?"
+    r"run\.(iterations|name|output|checkpoint_every|images_every|certainty|on_nonfinite|stop|max_seconds)(\..*)?"
     r"|optimizer\.learning_rate|parameters\[\d+\]\.learning_rate(\..*)?"
 )
 
@@ -315,7 +315,7 @@ class Course:
 
     def _take(self, record: Record) -> None:
         self.last = record
-        if self.problem.config.optimizer.schedule == "plateau":
+        if self.problem.config.optimizer.schedule == "plateau" or self.problem.config.run.max_seconds is not None:
             self.certainty.rates.append(record.lr / self.problem.config.optimizer.learning_rate)
         self.results.add(record)
         self.nonfinite.add(record)
@@ -338,14 +338,23 @@ class Course:
 
     def save(self, folder: Path) -> int:
         """Keep it in `folder` as it was after its last whole iteration; return how many it had. Raises OSError."""
+        save_checkpoint(folder, self.done, {}, *self._entries(self.state.on_file(self.stages.at(self.state.stage))))
+        return self.done
+
+    def save_begun(self, folder: Path) -> None:
+        """Keep the state with which the iteration at work began, for `inspect --nonfinite`. Raises OSError."""
+        begun = self.stages.begun
+        assert begun is not None, "an iteration is at work"
+        found = self._entries(begun.on_file(self.stages.now))
+        save_checkpoint(folder, begun.iteration, {}, *found, name=NONFINITE_FILE_NAME)
+
+    def _entries(self, state: State) -> tuple[Arrays, dict[str, Any]]:
+        """Return what a file has of the course at a state, as `tree.entries` has it."""
         met = Met(
             self.results.images["initial"], self.certainty.noted, self.best.least, self.last, self.shared,
             self.best_values(), self.certainty.squares, self.certainty.last_steps(),
         )  # fmt: skip
-        found, values = entries(self._settled, self.state.on_file(self.stages.at(self.state.stage)), met,
-                                self.average)  # fmt: skip
-        save_checkpoint(folder, self.done, {}, found, values)
-        return self.done
+        return entries(self._settled, state, met, self.average)
 
     def restore(self, stored: Stored, records: Sequence[Record]) -> None:
         """Go on from what was stored, and from the records of all iterations until then.

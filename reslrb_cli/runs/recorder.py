@@ -24,16 +24,14 @@ from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.nonfinite import Findings
 from reslrb_cli.optimization.problem import Problem, saved_spp
 from reslrb_cli.optimization.sensitivity import curvature_line, step_line
-from reslrb_cli.optimization.state import State, noted_of
+from reslrb_cli.optimization.state import State
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
 from reslrb_cli.records.atomic import Reserve, remove_parts, size_of
 from reslrb_cli.records.checkpoint import (
     NONFINITE_FILE_NAME,
     STATE_FILE,
-    NonFiniteStep,
     newest_checkpoint,
-    save_nonfinite,
 )
 from reslrb_cli.records.images import PARAMETERS_FILE as PARAMETERS_FILE_NAME
 from reslrb_cli.records.images import load_image, write_image, write_mask, write_parameters
@@ -321,12 +319,7 @@ class Recording:
         """Keep what the first step that met a value that is not finite began with, and say how to look into it."""
         if self._saved_nonfinite:
             return
-        stages, state = self.course.stages, self.course.stages.begun
-        assert state is not None, "an iteration is at work"
-        # What guided emission knew before this iteration, which may have taught it more.
-        noted = noted_of(stages.now)
-        step = NonFiniteStep(found.iteration, stages.now.values(), state.guiding, state.learned, noted)
-        save_nonfinite(self.folder.checkpoint, step)
+        self.course.save_begun(self.folder.checkpoint)
         self._saved_nonfinite = True
         if self.problem.config.run.on_nonfinite != "stop":  # which says so when it ends
             logger.warning(f"{found}; {self._where()}")

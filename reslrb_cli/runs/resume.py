@@ -8,12 +8,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
+from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.config.loader import OVERRIDDEN, Override, changed, dump, load, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.stages import Stages
 from reslrb_cli.optimization.state import Settled, State
-from reslrb_cli.records.checkpoint import PREVIOUS_FILE_NAME, STATE_FILE, open_state
+from reslrb_cli.optimization.state import load as load_state
+from reslrb_cli.optimization.stopping import OUT_OF_TIME
+from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, PREVIOUS_FILE_NAME, STATE_FILE, open_state
 from reslrb_cli.records.manifest import Manifest, is_complete, now, versions
 from reslrb_cli.records.metrics import Record, cut_back, read_records
 from reslrb_cli.records.run_folder import (
@@ -60,10 +65,7 @@ class Earlier:
     @property
     def variant(self) -> str:
         """The variant that the run began with, whatever `auto` would choose here. Raises ConfigError."""
-        variant = self.settled.variant
-        if variant not in VARIANTS:
-            raise self.stored.wrong("variant", "is none of those that a run can have")
-        return variant
+        return _variant_of(self.stored)
 
     @property
     def is_done(self) -> bool:
@@ -72,14 +74,17 @@ class Earlier:
 
     @property
     def has_stopped(self) -> bool:
-        """Whether its loss stood (`run.stop`), and what says so is as it was."""
-        return bool(self.stored.read(State).stopped) and not any(key.startswith("run.stop") for key in self.changed)
+        """Whether its loss stood (`run.stop`) or its time was up (`run.max_seconds`), and that setting is as it was."""
+        ends = ("run.stop", "run.max_seconds")
+        return bool(self.stored.read(State).stopped) and not any(key.startswith(ends) for key in self.changed)
 
     def done_line(self, option: str, equals: str) -> str:
         """Say that nothing is left to do, and which setting goes on; `option` and `equals` are how the user sets it."""
         iterations = self.config.run.iterations
-        stopped = self.has_stopped and iterations > self.iteration
-        more = f"run.stop{equals}null" if stopped else f"run.iterations{equals}NUMBER"
+        stopped = iterations > self.iteration and self.stored.read(State).stopped
+        more = f"run.iterations{equals}NUMBER"
+        if stopped:
+            more = f"run.max_seconds{equals}NUMBER" if stopped.startswith(OUT_OF_TIME) else f"run.stop{equals}null"
         done = f"{self.iteration} of {iterations} iterations"
         return f"{self.folder.path}: is finished, after {done}; {option} {more} goes on"
 
@@ -180,6 +185,31 @@ def open_earlier(run: Path, wanted: Path | Config | None, overrides: Sequence[st
             else:
                 check_writable(folder)
         yield earlier
+
+
+def _variant_of(stored: Stored) -> str:
+    variant = stored.read(Settled).variant
+    if variant not in VARIANTS:
+        raise stored.wrong("variant", "is none of those that a run can have")
+    return variant
+
+
+def problem_before_nonfinite(run: Path, say: Say) -> tuple[Problem, int]:
+    """Return the problem as the first iteration began that met a value that is not finite, and that iteration, from 0.
+
+    Sets the run's variant. The run may be at work: nothing is locked. Raises ConfigError and UnsupportedScene.
+    """
+    with contextlib.ExitStack() as stack:
+        stored = Stored(*open_state(RunFolder(run).checkpoint / NONFINITE_FILE_NAME))
+        stack.callback(stored.archive.close)
+        set_variant(_variant_of(stored))
+        settled = stored.read(Settled)
+        config = loads(settled.config, run / "config.yaml")
+        _check_files(settled.files, config, run)
+        stages = Stages(assemble(config, say, settled=stored))
+        state = load_state(stages.at(stored.read(State).stage), stored, stages.whole)
+        problem, state = stages.enter(state)
+        return problem, state.iteration
 
 
 def _read_state(folder: RunFolder, said: list[str]) -> Stored:

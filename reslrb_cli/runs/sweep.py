@@ -22,6 +22,7 @@ from reslrb_cli.config.run import folder_name
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import Location, format_location
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault, one_line
+from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.records.atomic import remove_parts_of, write_atomically
 from reslrb_cli.records.checkpoint import newest_checkpoint
 from reslrb_cli.records.lock import FolderLock, InUse
@@ -111,13 +112,13 @@ def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[s
         product = " x ".join(map(str, [*sizes, f"{seeds} seeds"]))
         raise ConfigError("--vary", "", f"{product} are {count} runs; a sweep has at most {MOST_RUNS}")
     text = read_text(path, str(path))
-    first = loads(text, path, [*overrides, *(each.overrides[0] for each in varied)]).run.seed
+    first = _with_chosen(text, path, overrides, [each.overrides[0] for each in varied], allow_code).run.seed
     if first + seeds > SEED_END:
         raise ConfigError("--seeds", "", f"leads beyond {SEED_END - 1}, from run.seed: {first} on")
     combinations, configs = [], {}
     names = _names(varied)
     for name, chosen in zip(names, itertools.product(*(each.overrides for each in varied)), strict=True):
-        config = loads(text, path, [*overrides, *chosen]).with_code(allow_code)
+        config = _with_chosen(text, path, overrides, chosen, allow_code)
         check_code(config)
         open_file(config.scene.file).close()
         if config.run.seed != first:
@@ -132,6 +133,25 @@ def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[s
     codes = {str(file): digests.pop(str(file)) for file in sorted(own)}
     run_seeds = list(range(first, first + seeds))
     return Plan(Sweep(str(path), list(overrides), combinations, run_seeds, codes=codes, files=digests), configs)
+
+
+def _with_chosen(
+    text: str, path: Path, overrides: Sequence[str], chosen: Sequence[Override], allow_code: bool
+) -> Config:
+    """Return the experiment with one value of each setting that is varied. Raises ConfigError.
+
+    A text as the value of `integrator` is a method as `convergence --integrators` has it: it keeps the depth and the
+    shared options of the experiment's own integrator.
+    """
+    methods = [each for each in chosen if each.location == ("integrator",) and isinstance(each.value, str)]
+    others = [each for each in chosen if each not in methods]
+    config = loads(text, path, [*overrides, *others]).with_code(allow_code)
+    for each in methods:
+        cases = parse_cases(each.value, "--vary integrator", deep=False)
+        if len(cases) > 1:
+            raise ConfigError(each.label, "", "names several integrators in one value; write [prb, reslrb:stack]")
+        config = cases[0].at(config, config.integrator.max_depth, known=False, auto=True)
+    return config
 
 
 def _names(varied: Sequence[Varied]) -> list[str]:
@@ -158,7 +178,7 @@ def _named(value: Any) -> str:
         return "-".join(first + [f"{key}={_named(each)}" for key, each in value.items() if key != "type"])
     if isinstance(value, list):
         return "-".join(map(_named, value))
-    return in_words(value)
+    return value if isinstance(value, str) else in_words(value)
 
 
 def _bounded(name: str) -> str:

@@ -1,4 +1,4 @@
-"""`reslrb convergence` from the command line, of gradients and (`--runs`) of whole runs."""
+"""`reslrb convergence` from the command line."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from cli.tiny import KEY, ROOT, write_experiment
 from compilation import search_path
 
 from reslrb_cli.cli import main
-from reslrb_cli.measure.optimization_benchmark.rank import POINTS
+from reslrb_cli.measure.processes import Process
 from reslrb_cli.records.measurements import TARGETS
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -46,7 +45,9 @@ def read(path: Path) -> list[dict]:
     return lines[1:]
 
 
-def test_a_scene_from_end_to_end(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_scene_from_end_to_end(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Each exact method agrees with ptracer, and the error of averages falls as it should."""
     names = ["ptracer", "reslrb:reservoir(capacity=2)"]
     args = ["--integrators", ",".join(names), "--rounds", "16", "--json", "out/c.jsonl", "--set", "run.spp=16"]
@@ -73,11 +74,17 @@ def test_a_scene_from_end_to_end(folder: Path, capsys: pytest.CaptureFixture[str
     assert (reference["label"], reference["bias_reference"], reference["biased"]) == (
         "reslrb:stack(paths=both,light_share=0.5)", "prb", False
     )  # fmt: skip
-    assert (folder / "out/c.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out.splitlines()
-    assert printed[-2].startswith("Best for this scene: ")
+    assert printed[-1].startswith("Best for this scene: ")
     assert sum("16 rounds " in line for line in printed) == len(names)  # rows as they come
     assert any(line.startswith("ptracer: first step") for line in printed)  # and what was compiled, apart
+    # What is on file is not taken again.
+    monkeypatch.setattr(Process, "__init__", None)
+    assert call("tiny.yaml", *args) == 0
+    assert read(folder / "out/c.jsonl") == lines
+    again = capsys.readouterr().out.splitlines()
+    assert "samples in out/c.samples.npz count, and are not taken again" in again
+    assert again[-1] == printed[-1]
 
 
 @pytest.mark.long
@@ -90,7 +97,7 @@ def test_the_loss_catches_what_is_correlated(folder: Path, capsys: pytest.Captur
     assert methods[0]["slope"]["low"] > -0.4
     assert methods[1]["slope"]["low"] < -0.5 < methods[1]["slope"]["high"]
     assert methods[0]["bias"] > 0.1
-    sentence = capsys.readouterr().out.splitlines()[-2]
+    sentence = capsys.readouterr().out.splitlines()[-1]
     assert "Best for this scene: reslrb:stack(adjoint=independent); of all others a bias was found." in sentence
 
 
@@ -123,6 +130,12 @@ def test_a_budget_that_is_too_small_says_so(folder: Path, capsys: pytest.Capture
         (("--spp", "4,4"), "`4,4` names a number twice"),
         (("--spp", "3", "--set", "integrator.samples_per_pass=2"), "integrator.samples_per_pass: 2 does not divide"),
         (("--integrators", "prb(rr_depth=x)"), "integrator.rr_depth"),
+        (("--runs", "3"), "--runs was removed; compare whole runs by `reslrb sweep CONFIG --seeds N --set run.max_sec"),
+        (
+            ("--rates=1,3",),
+            "--rates was removed; try learning rates by `reslrb sweep CONFIG --vary 'optimizer.learning",
+        ),
+        (("--integrators", "reslrb:auto"), "`auto` is for whole runs; take `stack`"),
     ],
 )
 def test_bad_input_is_one_located_line(
@@ -135,16 +148,16 @@ def test_bad_input_is_one_located_line(
     assert len(printed.err.splitlines()) == 1
 
 
-@pytest.mark.parametrize("content", [None, b"", b"PK\x03\x04 cut off", "compressed"])
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut off", "compressed"])
 def test_steps_that_cannot_be_gone_on_from(
-    folder: Path, content: bytes | str | None, capsys: pytest.CaptureFixture[str]
+    folder: Path, content: bytes | str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / "c.jsonl").write_text("kept\n")
     if isinstance(content, bytes):
         (folder / "c.samples.npz").write_bytes(content)
-    elif content is not None:
+    else:
         np.savez_compressed(folder / "c.samples.npz", head=np.array("{}"))
-    assert call("tiny.yaml", "--resume", "c.jsonl") == 2
+    assert call("tiny.yaml", "--json", "c.jsonl") == 2
     assert "c.samples.npz: " in capsys.readouterr().err
     assert (folder / "c.jsonl").read_text() == "kept\n"
 
@@ -153,13 +166,12 @@ def test_steps_that_cannot_be_gone_on_from(
 def test_going_on(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     args = ["--integrators", "reslrb:stack", "--rounds", "4"]
     assert call("tiny.yaml", *args, "--json", "c.jsonl") == 0
-    assert call("tiny.yaml", *args[:-1], "8", "--resume", "c.jsonl") == 0
+    assert call("tiny.yaml", *args[:-1], "8", "--json", "c.jsonl") == 0
     assert {line["repeats"] for line in read(folder / "c.jsonl") if line["kind"] == "method"} == {16}
     capsys.readouterr()
-    assert call("tiny.yaml", *args[:-1], "9", "--resume", "c.jsonl", "--set", "run.spp=8") == 2
-    assert capsys.readouterr().err == ("--resume: c.jsonl is of another measurement: run.spp is 4 there, 8 here\n")
-    assert call("tiny.yaml", *args[:-1], "8", "--resume", "c.jsonl") == 2
-    assert "c.jsonl has 8 rounds already" in capsys.readouterr().err
+    assert call("tiny.yaml", *args[:-1], "9", "--json", "c.jsonl", "--set", "run.spp=8") == 2
+    reason = "run.spp is 4 there, 8 here; remove the file, or name another one"
+    assert capsys.readouterr().err == f"--json: c.jsonl is of another measurement: {reason}\n"
     assert len(read(folder / "c.jsonl")) > 2  # as it was
 
 
@@ -188,93 +200,3 @@ def test_an_interrupt_keeps_what_is_done(folder: Path) -> None:
     assert process.wait() == 130
     assert "the only one that was measured" in rest
     assert {line["kind"] for line in read(folder / "c.jsonl")} == {"point", "method", "reference", "summary"}
-
-
-# `reslrb convergence --runs` from the command line, on a poster of 8x8 pixels.
-
-
-@pytest.mark.parametrize(
-    ("args", "line"),
-    [
-        (("--runs", "2", "--objective", "fixed"), "--objective: does not go with --runs"),
-        (("--runs", "2", "--rounds", "3"), "--rounds: does not go with --runs: runs have a time"),
-        (("--runs", "2", "--resume", "c.jsonl"), "c.samples.npz: no such file"),
-        (("--runs", "0"), "0 is not in the range"),
-        (("--rates", "1,3"), "--rates: are those of whole optimisations; add --runs N"),
-        (("--runs", "2", "--rates", "1,0"), "0 is no factor above 0"),
-        (("--runs", "2", "--rates", "1,3,1.0"), "names a factor twice"),
-        (("--runs", "2", "--rates", "fast"), "'fast' is not a valid float"),
-        (("--runs", "2", "--integrators", "reslrb:stack,path"), "--integrators path: integrator.type: must be one of"),
-        (("--integrators", "reslrb:auto"), "`auto` is for whole runs; take `stack`"),
-    ],
-)
-def test_bad_input_of_runs_is_one_located_line(
-    folder: Path, args: tuple[str, ...], line: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert call("tiny.yaml", *args) == 2
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert line in printed.err
-    assert len(printed.err.splitlines()) == 1
-
-
-@pytest.mark.long
-def test_whole_runs_from_end_to_end(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Losses fall from what all begin with, the budget is kept, and all that is said is in the file."""
-    names = ["ptracer", "reslrb:stack", "reslrb:auto"]
-    args = ["--runs", "2", "--budget", "90", "--integrators", ",".join(names), "--json", "c.jsonl"]
-    began = time.monotonic()
-    assert call("tiny.yaml", *args, "--set", "run.iterations=100000", "--set", "target.render.spp=4096") == 0
-    assert time.monotonic() - began < 90
-    lines = read(folder / "c.jsonl")
-    points = [line for line in lines if line["kind"] == "run_point"]
-    methods = [line for line in lines if line["kind"] == "run_method"]
-    assert [line["label"] for line in methods] == names
-    assert {(line["label"], line["seed"]) for line in points} == {(name, seed) for name in names for seed in (0, 1)}
-    for method in methods:
-        own = [point for point in points if point["label"] == method["label"]]
-        assert len(own) == 2 * POINTS
-        assert (method["runs"], method["status"], method["message"]) == (2, "ok", "")
-        for what in ("loss", "parameter_error"):
-            ends = sorted(point[what] for point in own if point["elapsed_s"] == method["elapsed_s"])
-            assert [method[what]["low"], method[what]["high"]] == pytest.approx(ends)
-        assert method["loss"]["high"] < 0.5 * points[0]["loss"]
-        assert method["parameter_error"]["high"] < points[0]["parameter_error"]
-        assert 0 < method["first_s"]["low"] < method["elapsed_s"]
-        assert method["iterations"]["low"] > 5
-    assert {point["loss"] for point in points if point["iteration"] == 0} == {points[0]["loss"]}
-    assert lines[-1]["kind"] == "summary"
-    printed = capsys.readouterr().out
-    assert lines[-1]["line"] in printed
-    assert any(line.startswith("reslrb:auto: ") for line in printed.splitlines())  # what its pilot chose
-    assert (folder / "c.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.long
-def test_a_budget_that_is_too_small_for_runs_says_so(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert call("tiny.yaml", "--runs", "3", "--budget", "5", "--integrators", "reslrb:stack") == 1
-    printed = capsys.readouterr()
-    assert "the budget of 5 s" in printed.out
-    assert "Traceback" not in printed.err
-
-
-@pytest.mark.long
-def test_an_interrupt_keeps_the_runs_that_are_done(folder: Path) -> None:
-    script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
-    args = ["convergence", "tiny.yaml", "--runs", "50", "--budget", "2000", "--integrators", "reslrb:stack", "--json",
-            "c.jsonl"]  # fmt: skip
-    environment = {**os.environ, "PYTHONPATH": search_path(ROOT), "PYTHONUNBUFFERED": "1"}
-    process = subprocess.Popen(
-        [sys.executable, "-c", script, *args], cwd=folder, env=environment, stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    for line in process.stdout:
-        if line.split()[:2] == ["reslrb:stack", "1"]:  # the second seed is done
-            process.send_signal(signal.SIGINT)
-            break
-    rest = process.stdout.read()
-    assert process.wait() == 130
-    assert "the only one that was measured" in rest
-    lines = [json.loads(line) for line in (folder / "c.jsonl").read_text().splitlines()]
-    assert {point["seed"] for point in lines if point["kind"] == "run_point"} >= {0, 1}
-    assert lines[-2]["runs"] == 2

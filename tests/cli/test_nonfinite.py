@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 from turns import a_few
 
-from reslrb_cli.cli import main, nonfinite
+from reslrb_cli.cli import main
 from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators import reslrb
 from reslrb_cli.measure import nonfinite_trace
 from reslrb_cli.measure.nonfinite_trace import Witness
-from reslrb_cli.optimization import losses
+from reslrb_cli.optimization import losses, state
+from reslrb_cli.runs.resume import problem_before_nonfinite
 
 # Planted faults: what a run does about them, and whether the command that it prints finds them.
 
@@ -288,12 +289,45 @@ def test_each_shard_is_looked_at(spoilt_experiment, capsys):
 
 def test_there_must_be_something_to_show(spoilt_experiment, capsys):
     code, _, err = reslrb_nonfinite(capsys, "inspect", "config.yaml", "--nonfinite")
-    assert (code, len(err.splitlines())) == (2, 2)
+    assert (code, len(err.splitlines())) == (2, 1)
     assert "is not in a run folder" in err
     optimize(capsys, code=0)
     code, _, err = reslrb_nonfinite(capsys, "inspect", "runs/config/config.yaml", "--nonfinite")
     assert code == 2
     assert "met no value that was not finite" in err
+
+
+def test_the_run_s_own_step_is_traced_again(spoilt_experiment, capsys):
+    """Its files have to be those of the run, its state whole, and its settings are its own."""
+    optimize(capsys, STOP, "scene.options={wall: spoilt.exr}")
+    command = ("inspect", "runs/config/config.yaml", "--nonfinite")
+    code, _, err = reslrb_nonfinite(capsys, *command, "--set", "run.spp=4")
+    assert (code, err) == (2, "--set: does not go with --nonfinite, which traces the run's own step again\n")
+    wall = Path("spoilt.exr").read_bytes()
+    Path("spoilt.exr").write_bytes(Path("wall.exr").read_bytes())
+    code, _, err = reslrb_nonfinite(capsys, *command)
+    assert code == 2
+    assert "has changed since runs/config began; put it back" in err
+    Path("spoilt.exr").write_bytes(wall)
+    file = Path("runs/config/checkpoint/nonfinite.npz")
+    data = file.read_bytes()
+    file.write_bytes(data[: len(data) // 2])
+    code, _, err = reslrb_nonfinite(capsys, *command)
+    assert (code, len(err.splitlines())) == (2, 1)
+    assert err.startswith(f"{file}: is damaged, cut off, or not written by a run")
+
+
+@pytest.mark.parametrize("sequence", ["independent", "low_discrepancy", "auto"])
+def test_paths_are_of_the_run_s_sequence(spoilt_experiment, capsys, sequence):
+    """Where it was measured, of the sequence that was measured to pay."""
+    sets = ("scene.options={wall: spoilt.exr}", f"integrator.sequence={sequence}", "run.measuring=1000")
+    optimize(capsys, STOP, *sets)
+    problem, _ = problem_before_nonfinite(Path("runs/config"), print)
+    own = problem.integrator.plan(problem.scene, problem.scene.sensors()[0]).sequence
+    paid = manifest()["sequence"]["low_discrepancy"] if sequence == "auto" else sequence == "low_discrepancy"
+    assert (own is not None) == paid
+    parts = nonfinite_trace._parts(problem, problem.views[0], 1)
+    assert {samples.plan.sequence for samples, *_ in parts} == {own}
 
 
 def test_a_clamp_reports_its_bias(spoilt_experiment, capsys):
@@ -452,7 +486,7 @@ def test_it_is_the_step_of_the_run(spoilt_experiment, capsys, monkeypatch, way):
 def test_other_tables_are_seen(spoilt_experiment, capsys, fault, monkeypatch):
     """Tables that know nothing, that do not learn between the batches of a step, or that are those of another batch."""
     if fault == "untaught":
-        monkeypatch.setattr(nonfinite, "_teach", lambda problem, saved, archive: None)
+        monkeypatch.setattr(state, "restore_tables", lambda problem, calls, learned: None)
     elif fault == "not learned on":
         monkeypatch.setattr(Witness, "learn", lambda self, number, samples, adjoint: self.drawn.pop())
     else:

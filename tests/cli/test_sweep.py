@@ -23,12 +23,12 @@ from compilation import search_path
 from reslrb_cli.cli import main, progress, sweep
 from reslrb_cli.cli.terminal import Interrupts
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.optimization_benchmark.rank import find_best
 from reslrb_cli.records.lock import FolderLock
 from reslrb_cli.records.sweeps import Combination, Sweep, SweepRunRecord, in_words, read_sweep, run_name, short_keys
+from reslrb_cli.report import sweep as judged
 from reslrb_cli.report.page import sweep as curves
 from reslrb_cli.report.sources import Run, read_sweep_runs
-from reslrb_cli.report.sweep import best_records, lines, row_records, run_records
+from reslrb_cli.report.sweep import best_records, find_best, lines, notes, ratio, row_records, run_records
 from reslrb_cli.runs import recorder as recording
 from reslrb_cli.runs import sweep as plans
 from reslrb_cli.runs.sweep import make_plan
@@ -50,7 +50,7 @@ def folder(llvm, tmp_path, monkeypatch):
     return tmp_path
 
 
-def call(arguments, interrupts, verbose=False):
+def call(arguments, interrupts, verbose=False, fresh=False):
     """What `sweep.call` does, in this process."""
     result = CliRunner().invoke(main, list(arguments))
     return result.exit_code, result.output.strip().splitlines()[-1]
@@ -81,6 +81,21 @@ def test_all_combinations_with_all_seeds(folder):
     assert make_plan(Path("tiny.yaml"), ["run.spp=[4, 8]"], 3, ["run.seed=5"]).sweep.seeds == [5, 6, 7]
     found = {(type(each.optimizer).__name__, each.run.spp) for each in plan.configs.values()}
     assert found == {(kind, spp) for kind in ("Adam", "SGD") for spp in (4, 8, 12)}
+
+
+def test_integrators_are_varied_as_methods_that_keep_the_experiments_depth(folder):
+    values = "integrator=[prb, 'reslrb:stack(guiding=on,adjoint=independent)', {type: ptracer}]"
+    plan = make_plan(Path("tiny.yaml"), [values], 1, ["integrator.max_depth=3", "integrator.rr_depth=2"])
+    prb, stack, plain = plan.configs.values()
+    for config in (prb, stack):
+        assert (config.integrator.max_depth, config.integrator.rr_depth) == (3, 2)
+    assert (prb.integrator.type, stack.integrator.type, plain.integrator.type) == ("prb", "reslrb", "ptracer")
+    assert (stack.integrator.estimator, stack.integrator.guiding, stack.adjoint) == ("stack", "on", "independent")
+    assert plain.integrator.max_depth == 8  # a section stands for itself
+    names = ["integrator=prb", "integrator=reslrb-stack-guiding=on-adjoint=independent", "integrator=ptracer"]
+    assert list(plan.configs) == names
+    depths = make_plan(Path("tiny.yaml"), ["integrator=[prb]", "integrator.max_depth=[2, 3]"], 1, [])
+    assert [config.integrator.max_depth for config in depths.configs.values()] == [2, 3]
 
 
 def test_names_are_short_safe_and_different(folder):
@@ -124,6 +139,10 @@ def test_names_are_short_safe_and_different(folder):
         (["--vary", "run.spp=[4, 6]", "--vary", "run.adjoint=[independent, batched]"], "run.adjoint"),
         (["--set", "scene.file=gone.xml", "--vary", "run.spp=[4]"], "gone.xml: no such file"),
         (["--vary", "scene.file=[scene.xml, gone.xml]"], "gone.xml: no such file"),
+        (["--vary", "integrator=[prb, path]"], "--vary integrator path: integrator.type: must be one of"),
+        (["--vary", "integrator=[prb, 'ptracer,prb']"], "names several integrators in one value"),
+        (["--vary", "integrator=[prb, 'reslrb:']"], "--vary integrator: `reslrb:` is no integrator; write TYPE"),
+        (["--vary", "integrator=[own.py:Own]"], "would be run, with all your rights; --allow-code has it run"),
         (["--resume", "gone"], "gone: no such folder"),
         (["--resume", "."], ".: is no sweep's folder: it has no sweep.json"),
         (["-o", "tiny.yaml"], "-o: tiny.yaml is a file, not the folder of a sweep"),
@@ -203,7 +222,7 @@ def test_a_sweep_that_was_killed_ends_with_the_table_of_one_that_was_not(folder,
             copy("over-final-images")
         end(self)
 
-    def calling(arguments, interrupts, verbose=False):
+    def calling(arguments, interrupts, verbose=False, fresh=False):
         calls.append(arguments)
         if len(calls) == 4:
             copy("between-runs")
@@ -244,7 +263,7 @@ def test_a_run_that_fails_is_told_in_its_row(folder, monkeypatch):
     ends = {"learning_rate=0.02-seed=1": (5, "the loss is not finite"), "learning_rate=0.2-seed=0": (-9, "killed")}
     called = []
 
-    def failing(arguments, interrupts, verbose=False):
+    def failing(arguments, interrupts, verbose=False, fresh=False):
         called.append(arguments)
         name = next(word for word in ends if any(word in each for each in arguments)) if any(
             word in each for word in ends for each in arguments) else None  # fmt: skip
@@ -300,7 +319,7 @@ def test_ctrl_c_ends_it_after_the_iteration_with_folders_complete(folder, monkey
 def test_a_sweep_has_its_folder_to_itself(folder, monkeypatch):
     said = []
 
-    def another(arguments, interrupts, verbose=False):
+    def another(arguments, interrupts, verbose=False, fresh=False):
         said.append(reslrb("sweep", "--resume", "s").output)
         return 130, ""
 
@@ -346,6 +365,35 @@ def test_a_process_that_crashes_is_told_by_its_last_words(monkeypatch):
         interrupts = Interrupts()
         interrupts.requested = code == 130  # a run that does not heed signals yet
         assert sweep.call(["optimize"], interrupts) == (code, said)
+
+
+def test_runs_of_equal_time_find_nothing_of_earlier_runs(folder, monkeypatch):
+    monkeypatch.undo()  # `call` itself
+    monkeypatch.setattr(
+        sweep, "_PROGRAM", "import os; print(*map(os.environ.get, ('DRJIT_CACHE_DIR', 'RESLRB_CACHE')))"
+    )
+    plain = sweep.call([], Interrupts())[1]
+    kernels, decisions = sweep.call([], Interrupts(), fresh=True)[1].split()
+    assert kernels == decisions
+    assert kernels not in plain
+    assert not Path(kernels).exists()
+
+
+def test_only_runs_of_equal_time_are_fresh(folder, monkeypatch):
+    asked = []
+
+    def noting(arguments, interrupts, verbose=False, fresh=False):
+        asked.append(fresh)
+        return call(arguments, interrupts)
+
+    monkeypatch.setattr(sweep, "call", noting)
+    result = tiny.done("sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", "run.max_seconds=[null, 0.001]",
+                       "--vary", "integrator=[ptracer, reslrb:stack]", "--seeds", 2, "-o", "s")  # fmt: skip
+    assert asked == [False, False, True, True] * 2
+    runs, _ = table("s")
+    assert [run["iterations"] for run in runs if run["settings"]["run.max_seconds"]] == [1] * 4
+    assert "iterations" in result.output
+    assert "losses of different `integrator` are of images that each renders itself" in result.output
 
 
 def test_a_run_that_another_goes_on_with_is_waited_for(folder, monkeypatch):
@@ -470,12 +518,12 @@ def test_pairs_tell_what_the_spread_over_seeds_hides():
     noise = np.exp(rng.normal(0, 1, 10))
     values = {"a": 1.0 * noise, "b": 1.1 * noise * np.exp(rng.normal(0, 0.01, 10)), "c": 3.0 * noise}
     values = {name: list(each) for name, each in values.items()}
-    paired, unpaired = find_best(values, paired=True), find_best(values)
+    paired = find_best(values)
     assert (paired.best, paired.tied, paired.beats) == ("a", [], ["b", "c"])
-    assert unpaired.tied == ["b", "c"]
-    few = find_best({name: each[:5] for name, each in values.items()}, paired=True)
+    few = find_best({name: each[:5] for name, each in values.items()})
     assert (few.too_few, few.enough) == (True, 7)
-    assert find_best({"a": [1.0, 2.0], "b": [1.0, 2.0]}, paired=True).tied == ["b"]
+    assert find_best({"a": [1.0, 2.0], "b": [1.0, 2.0]}).tied == ["b"]
+    assert find_best({}) is None
 
 
 def pretended(losses, key="run.spp", **about):
@@ -507,8 +555,90 @@ def test_the_best_is_told_in_pairs_of_seeds_that_all_have():
     assert (row.loss.median, row.loss.low, row.loss.high) == (
         np.median(noise[:9]), noise[:9].min(), noise[:9].max())  # fmt: skip
     for key, compared in (("loss", ["error"]), ("loss.type", ["error"]), ("scene.size", []), ("target", ["error"]),
-                          ("parameters[0].bounds", []), ("lossy", ["loss", "error"])):  # fmt: skip
+                          ("parameters[0].bounds", []), ("lossy", ["loss", "error"]),
+                          ("parameters[0].learning_rate", ["loss", "error"])):  # fmt: skip
         assert [each.of for each in best_records(*pretended([noise, noise], key))] == compared, key
+
+
+RATE = "optimizer.learning_rate"
+
+
+def pretended_rates(errors, rates, seeds=8):
+    """A sweep of integrators by learning rates: the error of each, by name and rate, times the same noise by seed."""
+    settings = [{"integrator": name, RATE: rate} for name in errors for rate in rates]
+    if len(errors) == 1:
+        settings = [{RATE: rate} for rate in rates]
+    combinations = [Combination(str(number), each) for number, each in enumerate(settings)]
+    noise = np.exp(0.3 * np.random.default_rng(2).normal(size=seeds))
+    true = [error for name in errors for error in errors[name]]
+    runs = [
+        SweepRunRecord(run_name(each, seed), each.settings, seed, "finished", error=float(error * noise[seed]))
+        for seed in range(seeds)
+        for each, error in zip(combinations, true, strict=True)
+    ]
+    return Sweep("a.yaml", [], combinations, list(range(seeds))), runs
+
+
+def test_settings_are_compared_at_their_best_learning_rates():
+    """The second is better at its best rate alone, which is the greatest that was tried."""
+    sweep, runs = pretended_rates({"prb": [1.0, 0.6, 0.9], "reslrb:stack": [2.0, 1.0, 0.3]}, [0.01, 0.1, 1.0])
+    (best,) = best_records(sweep, runs)
+    assert (best.of, best.best, best.second, best.beats) == ("error", "5", "1", ["1"])
+    assert best.ratio.value == pytest.approx(0.5)
+    ratios = [row.error_ratio for row in row_records(sweep, runs)]
+    assert [found is None for found in ratios] == [True] * 5 + [False]
+    assert (ratios[5].value, ratios[5].low, ratios[5].high) == pytest.approx((0.5, 0.5, 0.5))
+    assert [line for line in notes(sweep, runs) if "learning_rate" in line] == [
+        f"integrator=reslrb:stack, learning_rate=1: this {RATE} is the best by error, and the outermost that was tried"
+    ]
+    told = lines(sweep, runs)
+    assert "error ratio" in told[0]
+    assert told[6].rstrip().endswith(" 0.5")
+
+
+def test_a_sweep_of_learning_rates_compares_them():
+    sweep, runs = pretended_rates({"": [1.0, 0.6, 0.9]}, [0.01, 0.1, 1.0])
+    assert [record.best for record in best_records(sweep, runs)] == ["1"]
+    assert [row.error_ratio.value for row in row_records(sweep, runs) if row.error_ratio] == pytest.approx([0.6, 0.9])
+    assert not any("outermost" in line for line in notes(sweep, runs))
+    assert any("outermost" in line for line in notes(*pretended_rates({"": [1.0, 0.6, 0.5]}, [0.01, 0.1, 1.0])))
+    few = row_records(*pretended_rates({"prb": [1.0], "ptracer": [0.5]}, [1.0], seeds=4))
+    assert few[1].error_ratio is None
+
+
+def coverage(count, seeds, spread, true, levels):
+    """How often the interval of a ratio contains the truth, where errors scatter by `spread`; `levels` are rates."""
+    random = np.random.default_rng(3)
+    hit = 0
+    for _ in range(count):
+        luck = random.normal(size=seeds) * spread / 2  # of the seed, which all have in common
+        own, base = (
+            [list(median * level * np.exp(luck + spread * random.normal(size=seeds))) for level in levels]
+            for median in (true, 1.0)
+        )
+        found = ratio(own, base)
+        hit += found.low <= true <= found.high
+    return hit / count
+
+
+@pytest.mark.parametrize("levels", [(1.0,), (1.6, 1.0, 1.9)])
+def test_intervals_hold_the_truth_as_often_as_they_say(levels, monkeypatch):
+    monkeypatch.setattr(judged, "RESAMPLES", 600)
+    assert coverage(300, 8, 0.2, 0.6, levels) > 0.92
+
+
+def test_an_interval_of_half_the_width_is_seen(monkeypatch):
+    monkeypatch.setattr(judged, "RESAMPLES", 600)
+    monkeypatch.setattr(judged, "CONFIDENCE", 0.6)
+    assert coverage(300, 8, 0.2, 0.6, (1.0,)) < 0.92
+
+
+def test_what_is_no_ratio():
+    for own, base in (([[1.0] * 4], [[1.0] * 4]), ([[1.0] * 5], [[0.0] * 5]), ([[float("inf")] * 5], [[1.0] * 5]),
+                      ([], [[1.0] * 5])):  # fmt: skip
+        assert ratio(own, base) is None
+    found = ratio([[1.0] * 5], [[4.0] * 5])
+    assert (found.value, found.low, found.high) == (0.25, 0.25, 0.25)
 
 
 def test_equal_settings_are_rarely_told_apart():
@@ -517,7 +647,7 @@ def test_equal_settings_are_rarely_told_apart():
     wrong = 0
     for _ in range(400):
         values = rng.normal(size=(4, 12))
-        wrong += bool(find_best({str(k): list(each) for k, each in enumerate(values)}, paired=True).beats)
+        wrong += bool(find_best({str(k): list(each) for k, each in enumerate(values)}).beats)
     # the best of four is chosen by the same values: more than 5 % would be 20 of 400, its standard deviation 4.4
     assert wrong <= 20 + 3 * 4.4
 

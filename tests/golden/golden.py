@@ -81,7 +81,6 @@ MEASUREMENTS = {
     "gradcheck": ("gradcheck", *_TINY, "--seeds", "4", "--estimators", "stack"),
     "bench": ("bench", *_TINY, "--max-depth", "2", "--rounds", "1", "--integrators", "reslrb:stack"),
     "convergence": ("convergence", *_FLOOR, "--integrators", "reslrb:stack,prb", "--rounds", "4"),
-    "runs": ("convergence", *_FLOOR, "--integrators", "reslrb:stack", "--runs", "1", "--set", "run.iterations=3"),
     "inspect": ("inspect", "configs/cornell_floor.yaml", "--json"),
 }
 _ALONE = """

@@ -19,7 +19,6 @@ from reslrb_cli.measure.methods import Sweep, depths, parse_cases, usual_values
 from reslrb_cli.measure.processes import MAX_ROUNDS, MIN_ROUNDS, Pace, Refused, Stopped
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurements import BenchStatus, Spread
-from reslrb_cli.report.plots import plot_bench
 from reslrb_cli.report.tables import bench_cells, bench_columns
 
 # The order of a sweep, and what becomes of cases that end: with processes that only pretend.
@@ -364,7 +363,7 @@ def test_one_thing_is_varied_and_all_else_is_as_it_was(swept: str, expected: lis
 
 
 @pytest.mark.usefixtures("_clean_values")
-def test_the_table_begins_with_what_is_swept_and_the_picture_is_drawn(tmp_path: Path) -> None:
+def test_the_table_begins_with_what_is_swept() -> None:
     Pretended.ends = {("walk_ad", 5): 2}
     rows, _ = run_swept("film", [16, 128])
     labels = LIST.split(",")
@@ -373,10 +372,7 @@ def test_the_table_begins_with_what_is_swept_and_the_picture_is_drawn(tmp_path: 
     lines = [table.line(bench_cells(row)) for row in rows]
     assert [line.split()[:2] for line in lines] == [[str(width), name] for width in (16, 128) for name in labels]
     assert lines[2].endswith("out_of_memory")
-    series = [(label, [(row.value, row.record) for row in rows if row.case.label == label]) for label in labels]
-    plot_bench(series, tmp_path / "x.png", "x", "film width")
     assert {row.record.status for row in rows} == {BenchStatus.OK, BenchStatus.OUT_OF_MEMORY}
-    assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.usefixtures("_clean_values")
@@ -509,10 +505,17 @@ def test_what_refused_stays_left_out() -> None:
 )
 def test_only_the_same_is_gone_on_from(change: dict[str, Any], line: str) -> None:
     first = measure(sweep())
-    with pytest.raises(ConfigError, match=re.escape(f"--resume: b.jsonl is of another measurement: {line}")):
+    with pytest.raises(ConfigError, match=re.escape(f"--json: b.jsonl is of another measurement: {line}")):
         session(sweep(**({"rounds": 5} | change)), again(first))
-    with pytest.raises(ConfigError, match=r"b\.jsonl has all of it, 3 rounds each; more are measured with a larger"):
-        session(sweep(), again(first))
+
+
+@pytest.mark.usefixtures("_clean")
+def test_rounds_on_file_are_not_taken_again() -> None:
+    first = measure(sweep())
+    Pretended.log.clear()
+    again_ = measure(sweep(), again(first))
+    assert Pretended.log == []
+    assert [result.record for result in again_.results()] == [result.record for result in first.results()]
 
 
 @pytest.mark.usefixtures("_clean")

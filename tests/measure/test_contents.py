@@ -246,7 +246,8 @@ def test_no_measurement_of_another_experiment_is_gone_on_from(folder: Path, comm
         if place == "loss.file":
             continue
         restore = change(folder / file)
-        result = reslrb(*words, "second.jsonl", "--resume", "first.jsonl")
-        said = f"--resume: first.jsonl is of another measurement: {place} has changed"
+        result = reslrb(*words, "first.jsonl")
+        advice = "remove the file, or name another one"
+        said = f"--json: first.jsonl is of another measurement: {place} has changed; {advice}"
         assert (result.exit_code, result.stderr.splitlines()[-1]) == (2, said), file
         restore()

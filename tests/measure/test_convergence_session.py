@@ -146,6 +146,17 @@ def test_going_on(tmp_path: Path) -> None:
         assert len({row.tobytes() for row in member.rows}) == len(member.rows)
 
 
+def test_rounds_on_file_are_not_taken_again(tmp_path: Path) -> None:
+    _, first, _ = play(tmp_path, Stage(), plan(rounds=4))
+    kept = play(tmp_path, Stage(), plan(rounds=4))[0].kept()
+    assert kept is not None
+    stage = Stage()
+    _, second, _ = play(tmp_path, stage, plan(rounds=4), earlier=Earlier("convergence", Path("c.jsonl"), *kept))
+    assert stage.asked == []
+    assert [record.efficiency for record in second.methods] == [record.efficiency for record in first.methods]
+    assert second.methods[0].efficiency is not None
+
+
 @pytest.mark.parametrize("after", [188, 212, 236])
 def test_a_round_that_was_broken_off_is_begun_anew(tmp_path: Path, after: int) -> None:
     """With new seeds, and none of its steps twice: the figures are those of whole rounds."""
@@ -204,11 +215,9 @@ def test_only_the_same_is_gone_on_from(tmp_path: Path, change: dict[str, Any], l
     kept = session.kept()
     assert kept is not None
     earlier = Earlier("convergence", Path("c.jsonl"), *kept)
-    with pytest.raises(ConfigError, match=re.escape(f"--resume: c.jsonl is of another measurement: {line}")):
+    with pytest.raises(ConfigError, match=re.escape(f"--json: c.jsonl is of another measurement: {line}")):
         begin(plan(**({"rounds": 8} | change)), earlier)
     begin(plan(rounds=8), earlier)
-    with pytest.raises(ConfigError, match=r"c\.jsonl has 4 rounds already; name more with --rounds"):
-        begin(plan(rounds=4), earlier)
     with pytest.raises(ConfigError, match="by another version"):
         Earlier("convergence", Path("c.jsonl"), kept[0] | {"version": 0}, kept[1])
     with pytest.raises(ConfigError, match="it is of `convergence`, this is `bench`"):

@@ -210,7 +210,7 @@ def test_the_command_and_more_seeds(
     monkeypatch.setattr(missing_check, "IMAGE_PATHS", 2**16)  # of noise in dL/dI, which is the same for all
     config = tmp_path / "lamp.yaml"
     config.write_text(LAMP.format(folder=Path(__file__).parent))
-    whole, part, more = (tmp_path / f"{name}.jsonl" for name in ("whole", "part", "more"))
+    whole, part = (tmp_path / f"{name}.jsonl" for name in ("whole", "part"))
     again = ["--missing", "--directions", "2", "--spp", "4"]
     assert call(str(config), *again, "--seeds", "6", "--json", str(whole)) == 0
     origin, row = map(json.loads, whole.read_text().splitlines())
@@ -220,15 +220,17 @@ def test_the_command_and_more_seeds(
     assert shown[-1].startswith("lamp.position: ")
     assert "dL/dI of the loss at the initial values" in shown[-2]
     assert call(str(config), *again, "--seeds", "3", "--json", str(part)) == 0
-    assert call(str(config), *again, "--seeds", "6", "--resume", str(part), "--json", str(more)) == 0
-    other = json.loads(more.read_text().splitlines()[-1])
+    assert call(str(config), *again, "--seeds", "6", "--json", str(part)) == 0
+    other = json.loads(part.read_text().splitlines()[-1])
     assert other["seeds"] == 6
     for name in ("share", "standard_error"):  # threads add up in any order
         assert other[name] == pytest.approx(row[name], rel=1e-3, abs=1e-5)
     capsys.readouterr()
-    assert call(str(config), *again, "--seeds", "6", "--resume", str(more)) == 2
-    assert "more.jsonl has 6 seeds already; name more with --seeds" in capsys.readouterr().err
-    assert call(str(config), "--missing", "--seeds", "9", "--spp", "4", "--resume", str(more)) == 2
+    with monkeypatch.context() as patch:
+        patch.setattr(Missing, "take", None)
+        assert call(str(config), *again, "--seeds", "6", "--json", str(part)) == 0
+    assert json.loads(part.read_text().splitlines()[-1]) == other
+    assert call(str(config), "--missing", "--seeds", "9", "--spp", "4", "--json", str(part)) == 2
     assert "is of another measurement: directions is 2 there, None here" in capsys.readouterr().err
 
 
@@ -238,7 +240,7 @@ def test_the_command_and_more_seeds(
     [
         (["--missing"], "--missing: needs a CONFIG"),
         (["CONFIG", "--missing", "--estimators", "stack"], "--estimators: does not go with --missing"),
-        (["CONFIG", "--missing", "--markdown", "a.md"], "--markdown: does not go with --missing"),
+        (["CONFIG", "--missing", "--markdown", "a.md"], "--markdown was removed; `reslrb report FILE"),
         (["CONFIG", "--directions", "2"], "--directions: goes with --missing alone"),
     ],
 )

@@ -125,7 +125,8 @@ def test_cases_of_the_suite_are_calls(tmp_path: Path, capsys: pytest.CaptureFixt
     )
     same = ("case", "parameter", "estimator", "reference", "seeds", "holds")
     assert [[row[name] for name in same] for row in first] == [[row[name] for name in same] for row in second]
-    assert call(*cases, "--resume", str(tmp_path / "two.jsonl")) == 2
+    assert call(*cases, "--json", str(tmp_path / "two.jsonl")) == 0
+    assert [json.loads(line) for line in (tmp_path / "two.jsonl").read_text().splitlines()[1:]] == second
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from reslrb_cli.errors import NonFinite
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.nonfinite import PATIENCE, count_nonfinite, finite_square_norm
 from reslrb_cli.optimization.optimizers import DECAY, clamp_gradients
+from reslrb_cli.optimization.stages import Stages
 from reslrb_cli.optimization.state import standing
 from reslrb_cli.records.clock import StepClock
 from reslrb_cli.records.metrics import ClampTally
@@ -40,6 +41,32 @@ def test_records_follow_gradient_descent(tmp_path, steps):
     assert all(record.step_ms > 0 and record.peak_mib > 0 for record in records)
     assert all(a.elapsed_s < b.elapsed_s for a, b in itertools.pairwise(records))
     assert (first.primal_ms, first.adjoint_ms) == (None, None)
+
+
+def test_the_time_ends_a_run_and_its_schedule(tmp_path, steps, monkeypatch):
+    """A clock that every look at it moves by a second: iterations after the first take equally long."""
+    seconds = itertools.count()
+    monkeypatch.setattr("time.perf_counter", lambda: float(next(seconds)))
+
+    def run(*sets):
+        problem = steps.problem = make_problem(tmp_path, sets=["run.iterations=50", *sets])
+        return list(loop.iterate(Stages(problem), standing(problem)))
+
+    ends = [state.elapsed_s for state, _ in run()]
+    length = ends[-1] - ends[-2]
+    assert np.diff(ends) == pytest.approx([length] * 49)
+    for done in (2, 7):
+        limit = ends[done - 1] + 0.5 * length
+        found = run(f"run.max_seconds={limit}")
+        assert len(found) == done
+        assert [bool(state.stopped) for state, _ in found] == [False] * (done - 1) + [True]
+        shares = [0.0, *((end - ends[0]) / (limit - ends[0]) for end in ends[: done - 1])]
+        rates = [2.0 * loop.learning_rate_factor("cosine", 0, 50, 0.01, share) for share in shares]
+        assert [record.lr for _, record in found] == pytest.approx(rates)
+    assert len(run("run.max_seconds=0.5")) == 1  # the first iteration is always completed
+    # iterations that are further than the time decide the schedule
+    last = run("run.max_seconds=1000000", "run.iterations=4")[-1]
+    assert (last[1].lr, last[0].stopped) == (pytest.approx(0.02), "")
 
 
 def test_a_step_is_split_where_it_has_an_image_in_between(tmp_path, steps):
@@ -82,7 +109,7 @@ def test_from_equal_states_equal_ones_follow(tmp_path, steps):
     assert {name: array.tobytes() for name, array in arrays[0].items()} == {
         name: array.tobytes() for name, array in arrays[1].items()
     }
-    assert {name for name in values[0] if values[0][name] != values[1][name]} <= {"elapsed_s", "peak_mib"}
+    assert {name for name in values[0] if values[0][name] != values[1][name]} <= {"elapsed_s", "first_s", "peak_mib"}
     assert values[0]["clamp"] == {"albedo": 3, "other": 3}
     np.testing.assert_array_equal(np.array(begun.values["albedo"]), 0.5)
 

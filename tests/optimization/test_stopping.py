@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from cli.tiny import KEY, read_metrics
-from optimization.toy import CONFIG
+from optimization.toy import CONFIG, make_problem
 from runs.going_on import begin_alone, differences, optimize, run_and_kill
 
 from reslrb_cli.config.loader import dump, load, loads
@@ -17,6 +18,7 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.state import State
 from reslrb_cli.optimization.stopping import Averaged, Watch, average_begins, lowered
+from reslrb_cli.records.decisions import GuidedRecord
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.records.run_folder import read_value
 
@@ -192,6 +194,39 @@ def test_a_run_that_stopped_goes_on_where_it_is_asked_to(experiment: Path, capsy
         np.load("runs/whole/parameters/parameters.npz") as other,
     ):
         assert one[KEY].tobytes() == other[KEY].tobytes()
+
+
+def test_a_run_whose_time_was_up_goes_on_with_more(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    more = ["--set", "run.iterations=1000000", "--set", "run.max_seconds=0.001"]
+    assert optimize("tiny.yaml", "--quiet", *SETS, *more) == 0
+    results = manifest("runs/tiny")["results"]
+    assert (results["iterations"], manifest("runs/tiny")["status"]) == (1, "finished")
+    assert results["stopped"].startswith("the time is up, after ")
+    assert optimize("--resume", "runs/tiny", "--quiet", "--set", "run.iterations=2000000") == 0
+    assert "after 1 of 2000000 iterations; --set run.max_seconds=NUMBER goes on" in capsys.readouterr().out
+    limit = results["elapsed_s"] + 0.5
+    assert optimize("--resume", "runs/tiny", "--quiet", "--set", f"run.max_seconds={limit}") == 0
+    results = manifest("runs/tiny")["results"]
+    assert results["iterations"] > 1
+    assert results["elapsed_s"] < limit + 0.5
+
+
+@pytest.mark.parametrize(
+    ("more", "line"),
+    [("run.stages=[{until: 0.5, film: 0.5}]", "run.max_seconds: does not go with run.stages"),
+     ("optimizer.average=3", "optimizer.average: does not go with run.max_seconds")],
+)  # fmt: skip
+def test_what_counts_iterations_does_not_go_with_a_time(tmp_path: Path, more: str, line: str) -> None:
+    with pytest.raises(ConfigError, match=line):
+        config(tmp_path, "run.max_seconds=5", more)
+
+
+def test_measuring_before_the_first_iteration_is_part_of_the_time(tmp_path: Path) -> None:
+    problem = make_problem(tmp_path, sets=["run.max_seconds=10"])
+    record = GuidedRecord(guided=True, measure_s=2.0, compile_s=1.5)
+    assert problem.limit_s == 10
+    assert replace(problem, guided=record).limit_s == 6.5
+    assert replace(problem, guided=replace(record, cached=True)).limit_s == 10
 
 
 def test_the_result_is_the_average_and_the_last_values_stand_beside_it(experiment: Path) -> None:

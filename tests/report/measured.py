@@ -79,28 +79,6 @@ def convergence_lines(parameter="all"):
     return [*lines, {"kind": "reference", **method, "reference_rmse": 0.01, "repeats": 8}]
 
 
-def runs_lines(label="reslrb:stack", finite=True):
-    """Three seeds of two methods, whose losses and errors are known: (1 + seed) times a factor over time."""
-    lines = []
-    for integrator, estimator, name, factor in (("ptracer", None, "ptracer", 5.0), ("reslrb", "stack", label, 1.0)):
-        method = {"label": name, "integrator": integrator, "estimator": estimator, "capacity": None}
-        method |= {"adjoint": "batched", "spp": 4}
-        for seed in range(3):
-            for elapsed in (1.0, 2.0, 4.0):
-                loss = factor * (1 + seed) / elapsed if finite else None
-                error = {"loss": loss, "parameter_error": 0.1 * factor * (1 + seed) / elapsed}
-                lines.append(
-                    {"kind": "run_point", **method, "seed": seed, "elapsed_s": elapsed, "iteration": 3, **error}
-                )
-        bands = {what: {"median": scale * factor / 2, "low": scale * factor / 4, "high": 3 * scale * factor / 4}
-                 for what, scale in (("loss", 1.0), ("parameter_error", 0.1))}  # fmt: skip
-        lines.append({
-            "kind": "run_method", **method, "status": "ok", "runs": 3, "elapsed_s": 4.0, "message": "",
-            "iterations": {"median": 30, "low": 28, "high": 33}, "first_s": {"median": 1.5, "low": 1.4, "high": 1.7},
-        } | bands)  # fmt: skip
-    return [*lines, {"kind": "summary", "line": "best by the loss is reslrb:stack"}]
-
-
 def write_convergence(path, parameter="all"):
     path.write_text("".join(json.dumps(line) + "\n" for line in convergence_lines(parameter)))
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import re
-from typing import Any
 
 import pytest
 
 from reslrb_cli.config.files import duration
 from reslrb_cli.errors import printable
-from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict
 from reslrb_cli.report.format import count, number, shorten, with_error
 from reslrb_cli.report.run_summary import last_line, parameter_lines, warnings
-from reslrb_cli.report.tables import suite_table
 
 # Numbers, times, keys and results in words.
 
@@ -206,23 +203,3 @@ def test_what_no_view_shows_is_told_beside_what_is_settled():
     found = judged({"verdict": "not seen", "shares": {"not seen": 1.0}, "spread": None})
     assert parameter_lines(found, 120)[1].endswith("not seen")
     assert warnings(found) == ["not seen: lamp.radiance.value"]
-
-
-# The table of a suite: one line a case, one column an estimator.
-
-
-def record(case: str, estimator: str, **figures: Any) -> GradcheckRecord:
-    return GradcheckRecord(
-        case, None, "reslrb", estimator, Reference.PTRACER, Kind.EXPECTATION, 8, Verdict.HOLDS, **figures
-    )
-
-
-def test_what_an_estimator_cannot_do_is_a_dash():
-    records = [
-        record("rest", "gather", z_max=2.0),
-        record("rest", "stack", z_max=1.0),
-        record("moved", "stack", z_max=3.0),
-    ]
-    lines = suite_table(records, {"rest": "a room", "moved": "a lens"}).splitlines()
-    assert lines[2] == "| `rest` | a room | ptracer | 8 | 2.0 | 1.0 |"
-    assert lines[3] == "| `moved` | a lens | ptracer | 8 | - | 3.0 |"

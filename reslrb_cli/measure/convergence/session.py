@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -39,8 +40,6 @@ class Session(Arena[Plan, Member]):
     def _set_up(self, earlier: Earlier | None) -> int:
         self.rounds = self._before = 0 if earlier is None else earlier.head["rounds"]
         self.judges: dict[str, Member] = {}
-        if earlier is not None and self.plan.rounds is not None and self.rounds >= self.plan.rounds:
-            raise earlier.complete(f"{self.rounds} rounds", "more with --rounds")
         return 1
 
     def slices(self) -> dict[str, slice]:
@@ -72,24 +71,25 @@ class Session(Arena[Plan, Member]):
         """
         if not self.rounds or not any(member.rows for member in self.members):
             return None
-        with np.load(self._arrays) as survey:
-            arrays = {f"survey/{name}": survey[name] for name in survey.files}
-        entries = []
-        for number, member in enumerate(self.members):
-            entry, arrays[f"rows/{number}"] = member.kept(self.rounds)
+        entries, samples = [], dict[resume_store.Name, Any]()
+        for member in self.members:
+            entry, samples[("rows", member.name)] = member.kept(self.rounds)
             entries.append(entry)
+        with np.load(self._arrays) as survey:
+            samples |= {("survey", name): survey[name] for name in survey.files}
         content = {"facts": self.facts, "rounds": self.rounds, "members": entries}
-        return resume_store.head(self.plan.KIND, self.settings, **content), arrays
+        return resume_store.kept(self.plan.KIND, self.settings, samples, **content)
 
     def _restore(self, earlier: Earlier) -> None:
         """Hand the members their steps. Raises ConfigError where they are others."""
         entries = earlier.head["members"]
         if [member.name for member in self.members] != [entry["name"] for entry in entries]:
             raise earlier.other("its methods are others: " + ", ".join(entry["name"] for entry in entries))
-        for number, (member, entry) in enumerate(zip(self.members, entries, strict=True)):
+        samples = earlier.samples
+        for member, entry in zip(self.members, entries, strict=True):
             if entry["config"] != dump(member.config):
                 raise earlier.other(f"its settings are not those of {member.label} here")
-            member.restore(entry, earlier.arrays[f"rows/{number}"])
+            member.restore(entry, samples.get(("rows", member.name), np.empty(0)))
 
     @property
     def _arrays(self) -> Path:
@@ -102,8 +102,7 @@ class Session(Arena[Plan, Member]):
         """Ask what stands as a reference, and have dL/dI made; False where time is up over it."""
         plan = self.plan
         if self._earlier is not None:
-            arrays = self._earlier.arrays.items()
-            found = {name.removeprefix("survey/"): a for name, a in arrays if name.startswith("survey/")}
+            found = {name: array for (what, name), array in self._earlier.samples.items() if what == "survey"}
             np.savez(self._arrays, **found)  # type: ignore[arg-type]
             self.facts = self._earlier.head["facts"]
             return True
@@ -155,8 +154,9 @@ class Session(Arena[Plan, Member]):
             "mode": {"fixed": "known"}.get(objective, objective),
             "purpose": f"convergence, {role.value} {method.label}",
         }
+        has_all = plan.rounds is not None and self._before >= plan.rounds
         member = Member(
-            process=self._start(first, "sampled_steps"),
+            process=None if has_all else self._start(first, "sampled_steps"),
             may_refuse=role is Role.INDEPENDENT or (role is Role.CASE and plan.default),
             role=role,
             method=method,

@@ -21,14 +21,13 @@ from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import gradient_step
 from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.comparison import Family, compare_equal_seeds, compare_expectations
-from reslrb_cli.measure.gradients import Case, integrator
+from reslrb_cli.measure.gradients import Case, extrapolated, integrator
 from reslrb_cli.measure.gradients import seeds as seeds_of
 from reslrb_cli.measure.methods import parse_estimators, records_of
 from reslrb_cli.measure.references import Situation, prb_image
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.scenes.analytic import KnownScene
 from reslrb_cli.measure.scenes.moving import Move, moving_case
-from reslrb_cli.records.manifest import versions
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
 
@@ -109,7 +108,7 @@ class Differences:
 class Extrapolated:
     """Finite differences of the image at the gradient's own random numbers, of each amplitude of what moves.
 
-    Those of `step` are corrected by those of twice the step, after Richardson. A tenth of the correction may be wrong,
+    Those of `step` are corrected by those of twice the step (`extrapolated`). A tenth of the correction may be wrong,
     and `left` of their root mean square, which the faces of a mesh and higher powers of the step leave.
     """
 
@@ -122,10 +121,9 @@ class Extrapolated:
         tracer = integrator("reslrb", **without_roulette(case))
         chosen, steps = seeds_of(case.seeds), (self.step, 2 * self.step)
         near, far = (setup.differences(tracer, along, chosen, case.spp, step) for step in steps)
-        correction = (near - far) / 3
-        values = near + correction
+        values = extrapolated(near, far)
         size = float(np.sqrt(np.mean(np.square(values.mean(0)))))
-        return Samples(values, True, along, bias=np.abs(correction.mean(0)) / 10 + self.left * size)
+        return Samples(values, True, along, bias=np.abs((values - near).mean(0)) / 10 + self.left * size)
 
 
 @dataclass(frozen=True)
@@ -248,7 +246,7 @@ def settings(estimators: Sequence[str] | None, seeds: int | None, variant: str, 
         "--seeds": "as the cases have it" if seeds is None else seeds,
         "variant": variant,
         "device": device,
-        "versions": versions(),
+        "versions": resume_store.program(),
     }
 
 

@@ -162,7 +162,8 @@ class Tuner:
         compile_ms = max(first.wall_ms + first.compile_ms - second.wall_ms, 0.0)
         iteration_ms = second.beside_ms + second.kernel_ms * run.spp / unit
         run_ms = compile_ms + run.iterations * iteration_ms
-        found = Allowance(run.measuring, run_ms / 1e3, compile_ms / 1e3, iteration_ms / 1e3)
+        run_s = min(run_ms / 1e3, run.max_seconds or math.inf)
+        found = Allowance(run.measuring, run_s, compile_ms / 1e3, iteration_ms / 1e3)
         self.take(allowance=found)
         return found
 

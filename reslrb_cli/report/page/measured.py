@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
-from operator import itemgetter
 from typing import Any
 
 from markupsafe import Markup
 
-from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Spread, Verdict, record_of
+from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verdict, record_of
 from reslrb_cli.report.format import count, number
 from reslrb_cli.report.page.images import gradient_maps, image_rows, seen_tables
 from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
@@ -41,7 +39,7 @@ def bench(objects: Sequence[Entry]) -> tuple[Markup, int]:
         others = [other for other in varied if other != name]
         chosen = [entry for entry in entries if all(entry.get(other) == usual[other] for other in others)]
         drawn = [
-            ("", diagram(_curves(chosen, labels, label, name, what), SWEPT[name], words, log_x=2))
+            ("", diagram(curves_of(chosen, labels, label, name, what), SWEPT[name], words, log_x=2))
             for what, words in (("step_ms", "time of a step (ms)"), ("peak_mib", "peak memory (MiB)"))
         ]
         at = ", ".join(f"{SWEPT[other]} {number(usual[other])}" for other in others)
@@ -65,7 +63,7 @@ def _with_sizes(entry: Entry) -> dict[str, Any]:
     return {"pixels": pixels, "texels": entry.get("texels")} | dict(entry)
 
 
-def _curves(entries: Sequence[Entry], labels: Sequence[str], naming: Naming, x: str, y: str) -> list[Curve]:
+def curves_of(entries: Sequence[Entry], labels: Sequence[str], naming: Naming, x: str, y: str) -> list[Curve]:
     """A curve for each label, of the figures `y` over `x`; of those that are spreads the medians, with a band."""
     curves = []
     for place, name in enumerate(labels):
@@ -85,9 +83,10 @@ MOST_DRAWN = 8
 
 
 def convergence(objects: Sequence[Entry]) -> tuple[Markup, int]:
-    """All that was measured of gradients, of whole runs, and in words; and how many lines are none of that."""
-    kinds = {kind: [entry for entry in objects if entry.get("kind") == kind]
-             for kind in ("point", "method", "reference", "run_point", "run_method")}  # fmt: skip
+    """All that was measured of gradients, and in words; and how many lines are none of that."""
+    kinds = {
+        kind: [entry for entry in objects if entry.get("kind") == kind] for kind in ("point", "method", "reference")
+    }
     said = [entry for entry in objects if entry.get("kind") not in kinds and isinstance(entry.get("line"), str)]
     known = [entry for entries in kinds.values() for entry in entries]
     spps = len({entry.get("spp") for entry in known if entry.get("status", "ok") == "ok"})
@@ -95,8 +94,6 @@ def convergence(objects: Sequence[Entry]) -> tuple[Markup, int]:
     markup = Markup().join(lay_out("paragraph", entry["line"]) for entry in said)
     if kinds["point"] or kinds["method"]:
         markup += _steps(kinds["point"], kinds["method"], name)
-    if kinds["run_point"] or kinds["run_method"]:
-        markup += whole_runs(kinds["run_point"], kinds["run_method"], name)
     return markup, len(objects) - len(known) - len(said)
 
 
@@ -132,25 +129,9 @@ def method_label(entry: Entry, with_spp: bool = False) -> str:
 
 def _error_diagram(points: Sequence[Entry], labels: Sequence[str], what: str, naming: Naming) -> tuple[str, Markup]:
     floors = sorted(value for entry in points if is_number(value := entry.get("reference_rmse")) and value > 0)
-    curves = _curves(points, labels, naming, "elapsed_s", "relative_rmse")
+    curves = curves_of(points, labels, naming, "elapsed_s", "relative_rmse")
     drawing = diagram(curves, "time (s)", "relative error", 10, floors[len(floors) // 2 :][:1])
     return {"all": "all parameters", "image": "the image"}.get(what, key(what)), drawing
-
-
-def whole_runs(points: Sequence[Entry], methods: Sequence[Entry], naming: Naming) -> Markup:
-    """A diagram of the loss, one of the parameters' error where that is known, and a table; `naming` names a method."""
-    labels = list(dict.fromkeys(map(naming, [*methods, *points])))
-    drawn = []
-    for of, words in (("loss", "loss"), ("parameter_error", "parameter error")):
-        found: dict[tuple[str, float], list[float]] = {}
-        for entry in points:
-            if is_number(entry.get(of)) and is_number(entry.get("elapsed_s")):
-                found.setdefault((naming(entry), float(entry["elapsed_s"])), []).append(float(entry[of]))
-        spreads = [{"name": name, "s": time, of: asdict(Spread.of(values))} for (name, time), values in found.items()]
-        curves = _curves(spreads, labels, itemgetter("name"), "s", of)
-        drawn.append((words, diagram(curves, "time of a run (s)", words)))
-    rows = [{"name": naming(entry), "entry": entry} for entry in methods]
-    return lay_out("legend", labels) + lay_out("diagrams", drawn) + lay_out("measured.runs", rows, bool(points))
 
 
 #: Names in the title of a page.

@@ -20,7 +20,16 @@ from reslrb_cli.report.perceptual import PLACES
 from reslrb_cli.report.plots import COLORS, MOST_POINTS, Curve
 from reslrb_cli.report.run_summary import units_differ
 from reslrb_cli.report.sources import Run, SweepRuns
-from reslrb_cli.report.sweep import best_records, figures_of, notes, row_records, run_records
+from reslrb_cli.report.sweep import (
+    RATIOS,
+    RATIOS_LINE,
+    best_records,
+    figures_of,
+    notes,
+    row_figures,
+    row_records,
+    run_records,
+)
 from reslrb_cli.report.tonemap import exposure_for, exposure_words, shown_exposures
 
 Array = np.ndarray[Any, Any]
@@ -39,17 +48,20 @@ def sweep_parts(source: SweepRuns) -> dict[str, Markup]:
     drawn = sweep.combinations[:MOST_CURVES]
 
     def settings() -> Markup:
+        records = row_records(sweep, runs)
         rows = [
             {"place": place if place < len(drawn) else None, "record": record,
              "values": [shorten(in_words(value), VALUE_WIDTH) for value in record.settings.values()]
              or [label(record.settings)]}
-            for place, record in enumerate(row_records(sweep, runs))
+            for place, record in enumerate(records)
         ]  # fmt: skip
         done = sum(run.is_done for run in runs)
         told = f"{count(len(sweep.combinations), 'combination')} with {count(len(sweep.seeds), 'seed')}: "
         told += f"{done} of {count(len(runs), 'run')} finished"
         lines = [f"{told}.", *(f"{best.line}." for best in best_records(sweep, runs))]
-        return lay_out("sweep.rows", rows, [short[name] for name in sweep.keys], figures, lines, notes(sweep, runs))
+        columns = row_figures(records, runs)
+        remarks = notes(sweep, runs) + ([f"{RATIOS_LINE}."] if RATIOS.keys() & columns.keys() else [])
+        return lay_out("sweep.rows", rows, [short[name] for name in sweep.keys], columns, lines, remarks)
 
     parts: dict[str, Callable[[], Markup]] = {
         "Settings": settings,
