@@ -84,7 +84,7 @@ class _Main(click.Group):
             try:
                 code = super().main(args, prog_name, complete_var, standalone_mode=False, **extra)
             except BaseException as error:
-                told = tell(_explained(error))
+                told = tell(error)
                 if told is None:
                     raise
                 if self.debug:
@@ -92,16 +92,6 @@ class _Main(click.Group):
                 line, code = told
                 click.echo(one_line(line, LINE_LENGTH), err=True)
         sys.exit(code if isinstance(code, int) else ExitCode.DONE)
-
-
-def _explained(error: BaseException) -> BaseException:
-    """Return an error that says what to do in place of a removed option; other errors as they are."""
-    if isinstance(error, click.NoSuchOption):
-        from reslrb_cli.cli.options import REMOVED
-
-        if error.option_name in REMOVED:
-            return click.UsageError(f"{error.option_name} {REMOVED[error.option_name]}", error.ctx)
-    return error
 
 
 def _set_debug(ctx: click.Context, _parameter: click.Parameter, value: bool) -> None:

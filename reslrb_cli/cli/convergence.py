@@ -11,6 +11,7 @@ import click
 
 from reslrb_cli.cli.options import (
     COUNT,
+    Command,
     Counts,
     Keeper,
     allow_code_option,
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from reslrb_cli.records.measurements import MethodRecord
 
 
-@click.command("convergence")
+@click.command("convergence", cls=Command)
 @experiment_arguments
 @click.option("--integrators", metavar="LIST",
               help="What to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)], separated by commas; OPTION is one of the "

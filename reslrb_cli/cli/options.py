@@ -49,6 +49,26 @@ def origin_of(variant: str) -> Origin:
     return Origin(device_name(variant), variant)
 
 
+#: What to do instead of options that are gone.
+REMOVED = {
+    "--rates": "try learning rates by `reslrb sweep CONFIG --vary 'optimizer.learning_rate=[0.03, 0.1]'`",
+    "--runs": "compare whole runs by `reslrb sweep CONFIG --seeds N --set run.max_seconds=SECONDS "
+    "--vary 'integrator=[prb, reslrb:stack]'`",
+}
+
+
+class Command(click.Command):
+    """A command that says what to do instead of an option that is gone."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        try:
+            return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            if error.option_name in REMOVED:
+                raise ConfigError(error.option_name, "", f"was removed; {REMOVED[error.option_name]}") from None
+            raise
+
+
 class Keeper:
     """Keeps a JSON file, and beside it what can be gone on from, so that a process that is killed loses seconds.
 
@@ -217,13 +237,6 @@ class Size(click.ParamType):
         except ValueError:
             self.fail(f"`{value}` is no size; write it as in 2GiB or 500MB", param, ctx)
 
-
-#: What to do in place of an option that was removed.
-REMOVED = {
-    "--runs": "was removed; compare whole runs by `reslrb sweep CONFIG --seeds N --set run.max_seconds=S "
-    "--vary 'integrator=[prb, reslrb:stack]'`",
-    "--rates": "was removed; try learning rates by `reslrb sweep CONFIG --vary 'optimizer.learning_rate=[0.03, 0.1]'`",
-}
 
 budget_option = click.option(
     "--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",

@@ -121,10 +121,13 @@ def test_a_budget_that_is_too_small_says_so(folder: Path, capsys: pytest.Capture
         (("--spp", "4,4"), "`4,4` names a number twice"),
         (("--spp", "3", "--set", "integrator.samples_per_pass=2"), "integrator.samples_per_pass: 2 does not divide"),
         (("--integrators", "prb(rr_depth=x)"), "integrator.rr_depth"),
-        (("--runs", "3"), "--runs was removed; compare whole runs by `reslrb sweep CONFIG --seeds N --set run.max_sec"),
+        (
+            ("--runs", "3"),
+            "--runs: was removed; compare whole runs by `reslrb sweep CONFIG --seeds N --set run.max_sec",
+        ),
         (
             ("--rates=1,3",),
-            "--rates was removed; try learning rates by `reslrb sweep CONFIG --vary 'optimizer.learning",
+            "--rates: was removed; try learning rates by `reslrb sweep CONFIG --vary 'optimizer.learning",
         ),
         (("--integrators", "reslrb:auto"), "`auto` is for whole runs; take `stack`"),
     ],
