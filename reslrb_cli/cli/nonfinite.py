@@ -92,7 +92,7 @@ def load_replay(config: Config) -> Replay:
         with _fitting(archive, config):
             problem = at_stage(problem, number, values)
     else:
-        problem = replace(problem, config=config.at_stage(number))
+        problem = replace(problem, config=config.without_stages())
     _teach(problem, saved, archive)
     return Replay(problem, iteration)
 

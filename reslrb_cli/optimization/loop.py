@@ -96,12 +96,8 @@ def step(
         loss, squares, counts, refused, costs = gradient(problem, iteration, split)
         dr.eval(loss, squares, counts)
     gradients = {key: optimizer.gradient(key) for key in optimizer.keys()}  # noqa: SIM118 (not a mapping)
-    factor = (
-        problem.pace
-        * lowered(config.optimizer, state.drops)
-        * learning_rate_factor(
-            config.optimizer.schedule, iteration, config.run.iterations, config.optimizer.final_fraction, progress()
-        )
+    factor = lowered(config.optimizer, state.drops) * learning_rate_factor(
+        config.optimizer.schedule, iteration, config.run.iterations, config.optimizer.final_fraction, progress()
     )
     with clock.counted():
         value = float(loss[0])
