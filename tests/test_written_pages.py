@@ -15,8 +15,8 @@ import pytest
 from benchmarks_measure import MEASUREMENTS, OTHERS, PAPER, RECORDS, ROOT, record_file
 from benchmarks_page import main, read
 
-from reslrb_cli.measure.extreme import CASES
 from paper import page as paper_page
+from reslrb_cli.measure.extreme import CASES
 
 TINY = ("bench", "--values", "2", "--integrators", "reslrb:stack", "--rounds", "1", "--set", "scene.options.size=8",
         "--set", "run.spp=1")  # fmt: skip

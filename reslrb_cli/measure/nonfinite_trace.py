@@ -112,7 +112,6 @@ def purposes(problem: Problem, view: View) -> list[tuple[int, str, Purpose]]:
         found = [(0, "", Purpose.IMAGE), (1, "", gradient)]
     else:
         found = [(0, "", Purpose.IMAGE), *((b, "", Purpose.BOTH) for b in range(1, options["batches"]))]
-        found += [(0, ", again", gradient)] if options["first_batch"] == "again" else []
     if options.get("halves"):
         return [(2 * place + half, word, purpose) for place, word, purpose in found for half in (0, 1)]
     return found

@@ -164,7 +164,6 @@ ADJOINTS = {
     "correlated": {"adjoint": "correlated"},
     "independent": {"adjoint": "independent"},
     "batched": {"adjoint": "batched", "batches": 2},
-    "again": {"adjoint": "batched", "batches": 2, "first_batch": "again"},
 }
 #: Each integrator once, each choice of samples for several.
 REFUSED = [(name, "independent") for name in INTEGRATORS]
