@@ -201,7 +201,9 @@ class SearchHooks(Hooks):
             first = first.otherwise(here, mi.Bool(True))
         return Search(first, Suspect.none(), mi.Point2f(0), mi.Bool(False), Suspect.none(), mi.Point2f(0))
 
-    def scattering(self, state: Search, vertex: Vertex, connection: Connection, scattering: Scattering) -> Search:
+    def vertex(
+        self, state: Search, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> Search:  # fmt: skip
         plan, seen, scattered = self.samples.plan, connection.active, scattering.active
         shape = dr.reinterpret_array(mi.UInt32, vertex.si.shape)
 
