@@ -34,6 +34,8 @@ from reslrb_cli.report.sources import Run, SweepRuns, is_number
 #: Settings by which losses become those of something else, so that they are not compared, and such for errors.
 OTHER_LOSS = ("loss", "views", "target", "scene", "parameters", "run.final_spp", "run.held_out")
 OTHER_ERROR = ("scene", "parameters")
+#: Settings by which images get other noise and lack other paths: errors are compared where they are known, not losses.
+OTHER_IMAGE = ("integrator",)
 OTHERS = {"loss": OTHER_LOSS, "error": OTHER_ERROR}
 
 #: Characters of a setting's value in the table, and of a combination in a line.
@@ -134,7 +136,8 @@ def incomparable(sweep: Sweep, others: Sequence[str]) -> str:
 def _paired(sweep: Sweep, runs: Sequence[SweepRunRecord], of: str) -> dict[str, list[float]]:
     """The values of each combination by its name, one a seed, over the seeds that all have; without those that failed,
     or that have none. Nothing where they cannot be compared."""
-    if incomparable(sweep, OTHERS[of]):
+    errors_known = any(run.error is not None for run in runs)
+    if incomparable(sweep, OTHERS[of]) or (of == "loss" and errors_known and incomparable(sweep, OTHER_IMAGE)):
         return {}
     found: dict[str, dict[int, float]] = {}
     for combination in sweep.combinations:
@@ -286,9 +289,10 @@ def notes(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
     lines = []
     if key := incomparable(sweep, OTHER_LOSS):
         lines.append(f"losses of different `{key}` are not of the same, and not compared")
-    elif key := incomparable(sweep, ("integrator",)):
-        lines.append(f"losses of different `{key}` are of images that each renders itself, with its own noise and what "
-                     "its paths lack: compare errors, or raise run.final_spp")  # fmt: skip
+    elif key := incomparable(sweep, OTHER_IMAGE):
+        known = any(run.error is not None for run in runs)
+        advice = "not compared" if known else "raise run.final_spp until that makes no difference"
+        lines.append(f"losses of different `{key}` have each one's own noise, and what its paths lack: {advice}")
     lines += _outermost(sweep, runs)
     failed = [run for run in runs if run.status == "failed"]
     lines += [f"{run.name} failed: {run.message}" for run in failed[:MOST_NAMED]]

@@ -393,7 +393,7 @@ def test_only_runs_of_equal_time_are_fresh(folder, monkeypatch):
     runs, _ = table("s")
     assert [run["iterations"] for run in runs if run["settings"]["run.max_seconds"]] == [1] * 4
     assert "iterations" in result.output
-    assert "losses of different `integrator` are of images that each renders itself" in result.output
+    assert "losses of different `integrator` have each one's own noise, and what its paths lack" in result.output
 
 
 def test_a_run_that_another_goes_on_with_is_waited_for(folder, monkeypatch):
@@ -556,8 +556,11 @@ def test_the_best_is_told_in_pairs_of_seeds_that_all_have():
         np.median(noise[:9]), noise[:9].min(), noise[:9].max())  # fmt: skip
     for key, compared in (("loss", ["error"]), ("loss.type", ["error"]), ("scene.size", []), ("target", ["error"]),
                           ("parameters[0].bounds", []), ("lossy", ["loss", "error"]),
-                          ("parameters[0].learning_rate", ["loss", "error"])):  # fmt: skip
+                          ("parameters[0].learning_rate", ["loss", "error"]),
+                          ("integrator.guiding", ["error"])):  # fmt: skip
         assert [each.of for each in best_records(*pretended([noise, noise], key))] == compared, key
+    unknown = pretended([noise, noise], "integrator.guiding", error=None)
+    assert [each.of for each in best_records(*unknown)] == ["loss"]
 
 
 RATE = "optimizer.learning_rate"
