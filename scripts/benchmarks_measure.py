@@ -16,7 +16,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,19 +28,24 @@ PAPER = ROOT / "docs" / "paper"
 EXTREME = ROOT / "docs" / "extreme.md"
 #: The code that every figure depends on, and the code that the figures of a command depend on besides.
 CODE = tuple(f"reslrb_cli/{name}" for name in ("backend", "scene", "transport", "estimators", "guiding", "integrators"))
-MEASURED_BY = {
-    "bench": ("reslrb_cli/measure",),
-    "gradcheck": ("reslrb_cli/measure",),
-    "optimize": ("reslrb_cli/optimization",),
-    "figure1": ("reslrb_cli/measure", "configs/paper/figure1.yaml"),
-    "figure5": ("reslrb_cli/measure",),
-    "figure6": ("reslrb_cli/measure",),
-}
+MEASURE = ("reslrb_cli/measure",)
+MEASURED_BY = {"optimize": ("reslrb_cli/optimization",), "figure1": (*MEASURE, "configs/paper/figure1.yaml")}
 #: Changes of these change no figure.
 WRITTEN = (":!docs", ":!README.md", ":!CHANGELOG.md")
-#: Of the experiments in configs/, in the order of the README's table.
-EXPERIMENTS = ("cornell_floor", "mixed_room", "caustic_slab", "grey_room", "furnace", "lens_pose", "caustic_heightmap",
-               "paper/figure1", "stiff/lamp", "stiff/plate", "stiff/wall")  # fmt: skip
+#: The experiments in configs/ in the order of the README's table, and its words for them.
+EXPERIMENTS = {
+    "cornell_floor": "a carpet of 64 x 64 texels",
+    "mixed_room": "the printed wall of a room with a caustic and a mirror, and a sofa",
+    "caustic_slab": "a print below rippled glass",
+    "grey_room": "a furnished room lit through windows",
+    "furnace": "the walls of a closed sphere",
+    "lens_pose": "a lens's place, and its tilt in degrees",
+    "caustic_heightmap": "the relief of a glass face",
+    "paper/figure1": "the relief of a glass face, finely",
+    "stiff/lamp": "albedo, and intensity",
+    "stiff/plate": "roughness, and radiance",
+    "stiff/wall": "73,728 texels, and one number",
+}
 #: Whole runs by other integrators: the record's name, what the README calls the run, and its command.
 OTHERS = {
     f"optimize_cornell_floor_{name}": (
@@ -57,49 +61,27 @@ _GLASS = (
 )
 
 
-@dataclass(frozen=True)
-class Measurement:
-    """One measurement: the words of `reslrb` that make it, without where it is written. Its record is NAME.jsonl."""
-
-    name: str
-    words: tuple[str, ...]
-
-    @property
-    def file(self) -> Path:
-        """Where its record lies."""
-        return RECORDS / f"{self.name}.jsonl"
-
-    @property
-    def command(self) -> list[str]:
-        """What a user types."""
-        return ["reslrb", *self.words]
-
-
 def experiment_record(experiment: str) -> str:
-    """The name of the measurement of a whole run of configs/EXPERIMENT.yaml."""
+    """Return the name of the measurement of a whole run of configs/EXPERIMENT.yaml."""
     return f"optimize_{experiment.replace('/', '_')}"
 
 
-def _all() -> list[Measurement]:
-    commands = {
-        "depth": "bench --max-depth 128",
+#: The words of `reslrb` that make each measurement, without the file of its record, which is NAME.jsonl.
+MEASUREMENTS = {
+    name: shlex.split(command)
+    for name, command in {
+        "depth": "bench --max-depth 128 --budget 480",
         "spp": "bench --sweep spp --values 1,4,16,64 --integrators ptracer,reslrb:reservoir,reslrb:stack --budget 120",
         "moving": _GLASS,
-    }
-    commands["extreme"] = "gradcheck --suite extreme"
-    commands |= {f"gradcheck_{name}": f"gradcheck configs/{name}.yaml --seeds 16" for name in CHECKED}
-    for name in EXPERIMENTS:
-        commands[experiment_record(name)] = f"optimize configs/{name}.yaml"
-    commands |= {name: command for name, (_, command) in OTHERS.items()}
-    return [Measurement(name, tuple(shlex.split(command))) for name, command in commands.items()]
-
-
-MEASUREMENTS = {measurement.name: measurement for measurement in _all()}
-
-#: What of a run's manifest is kept: figures, not what the page of the run is for.
+        "extreme": "gradcheck --suite extreme",
+        **{f"gradcheck_{name}": f"gradcheck configs/{name}.yaml --seeds 16" for name in CHECKED},
+        **{experiment_record(name): f"optimize configs/{name}.yaml" for name in EXPERIMENTS},
+        **{name: command for name, (_, command) in OTHERS.items()},
+    }.items()
+}
+#: The figures of a run's manifest that are kept.
 RESULTS = ("iterations", "loss", "elapsed_s", "rmse", "parameter_rmse", "relative_error", "worse")
-PILOT = ("label", "advantage", "next_label", "measure_s", "compile_s", "share")
-#: Iterations that the median step is taken without: they compile.
+#: The first iterations compile, and do not count for the median step.
 COLD = 5
 
 
@@ -132,7 +114,7 @@ def origins() -> dict[str, Mapping[str, Any]]:
 
 def measures(command: list[str]) -> list[str]:
     """Return the files and folders that the figures of a command depend on."""
-    found = [*CODE, *MEASURED_BY[command[1]]]
+    found = [*CODE, *MEASURED_BY.get(command[1], MEASURE)]
     for config in (word for word in found + command if word.endswith(".yaml")):
         scene = yaml.safe_load((ROOT / config).read_text(encoding="utf-8"))["scene"]["file"]
         found += [config, os.path.relpath((ROOT / config).parent / Path(scene).parent, ROOT)]
@@ -158,37 +140,37 @@ def stale() -> list[str]:
     return lines
 
 
-def measure(measurement: Measurement) -> None:
-    """Run the command and write its record; a record that there was stays where the command fails.
+def record_file(name: str) -> Path:
+    """Return the file of a measurement's record."""
+    return RECORDS / f"{name}.jsonl"
+
+
+def measure(name: str, words: Sequence[str]) -> None:
+    """Run `reslrb` with these words and write the record. If the command fails, an earlier record stays.
 
     Raises SystemExit.
     """
-    tree = code_state()
-    with tempfile.TemporaryDirectory(prefix="reslrb-benchmarks-") as name:
-        folder = Path(name)
-        record = folder / "record.jsonl"
-        kind = measurement.words[0]
-        files = ["--set", f"run.output={folder}", "--set", "run.name=run"] if kind == "optimize" else ["--json", record]
-        print(f"== {shlex.join(measurement.command)}", flush=True)
-        start = time.monotonic()
-        command = [sys.executable, "-m", "reslrb_cli", *measurement.words, *map(str, files)]
-        # As on a new machine: no kernels of Dr.Jit, which lie below HOME, and no pilots have been kept.
-        environment = os.environ | {"HOME": name, "RESLRB_CACHE": name}
+    tree, is_run = code_state(), words[0] == "optimize"
+    with tempfile.TemporaryDirectory(prefix="reslrb-benchmarks-") as temporary:
+        folder, record = Path(temporary), Path(temporary) / "record.jsonl"
+        files = ["--set", f"run.output={folder}", "--set", "run.name=run"] if is_run else ["--json", str(record)]
+        print(f"== {shlex.join(['reslrb', *words])}", flush=True)
+        # As on a new machine: Dr.Jit's kernels, which lie below HOME, and measured decisions are not there.
+        environment, start = os.environ | {"HOME": temporary, "RESLRB_CACHE": temporary}, time.monotonic()
+        command = [sys.executable, "-m", "reslrb_cli", *words, *files]
         code = subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
-        seconds = time.monotonic() - start
+        seconds = round(time.monotonic() - start, 1)
         if code:
-            raise SystemExit(f"benchmarks: {measurement.name}: exit code {code}; its record is left as it was")
-        lines = run_lines(folder / "run") if kind == "optimize" else _read(record)
-        lines[0] |= {"command": measurement.command, "seconds": round(seconds, 1)} | tree
-        if measurement.name == "extreme":
+            raise SystemExit(f"benchmarks: {name}: exit code {code}; its record is left as it was")
+        lines = run_lines(folder / "run") if is_run else read_lines(record)
+        lines[0] |= {"command": ["reslrb", *words], "seconds": seconds} | tree
+        if name == "extreme":  # the page has the thousands of comparisons
             EXTREME.write_text(extreme_page(lines), encoding="utf-8")
             holds = [line["holds"] for line in lines if "verdict" in line]
             counts = {"comparisons": len(holds), "hold": holds.count(True), "fail": holds.count(False)}
             lines = [lines[0], {"kind": "suite"} | counts]
-        RECORDS.mkdir(exist_ok=True)
-        text = "".join(json.dumps(line) + "\n" for line in lines)
-        measurement.file.write_text(text, encoding="utf-8")
-        if measurement.name == "depth":
+        record_file(name).write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+        if name == "depth":
             draw_bench(lines, ROOT / "docs" / "images" / "bench.png")
 
 
@@ -214,7 +196,7 @@ def draw_bench(lines: Sequence[Mapping[str, Any]], picture: Path) -> None:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table with a heading for each column."""
+    """Return a table with a heading for each column."""
     lines = ["|".join(f" {cell} " if cell else " " for cell in cells) for cells in [head, *rows]]
     lines.insert(1, "|".join("---" for _ in head))
     return "\n".join(f"|{line}|" for line in lines)
@@ -264,37 +246,34 @@ def _suite_cell(records: Sequence[Mapping[str, Any]]) -> str:
 
 
 def run_lines(folder: Path) -> list[dict[str, Any]]:
-    """What a run came to, as the lines of a record: where it comes from, then its figures."""
-    manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
-    steps = _read(folder / "metrics.jsonl")
+    """Return the lines of a run's record: where it comes from, then its figures."""
+    manifest, steps = json.loads((folder / "manifest.json").read_text("utf-8")), read_lines(folder / "metrics.jsonl")
     origin = {"kind": "origin"} | {name: manifest[name] for name in ("device", "variant", "versions", "platform")}
-    results = {name: manifest["results"].get(name) for name in RESULTS}
-    pilot = manifest.get("pilot")
-    warm = steps[COLD:] or steps
     figures = {
         "kind": "run",
-        **results,
+        **{name: manifest["results"].get(name) for name in RESULTS},
         "spp": steps[-1]["spp"],
-        "step_ms": statistics.median(step["step_ms"] for step in warm),
+        "step_ms": statistics.median(step["step_ms"] for step in steps[COLD:] or steps),
         "peak_mib": max(step["peak_mib"] for step in steps),
         "estimator": (manifest.get("plan") or {}).get("estimator"),
         **traced(manifest),
-        "pilot": pilot and {name: pilot.get(name) for name in PILOT},
     }
     return [origin | {"written": manifest["started"]}, figures]
 
 
 def traced(manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """Of a run by `reslrb`: its `paths`, which share of them are light paths, and whether these are guided."""
+    """Return the `paths` of a run by `reslrb`, the share of light paths, and whether these are guided."""
     rows = {row["feature"]: row for row in (manifest.get("plan") or {}).get("rows") or ()}
     camera = rows.get("camera paths")
     if camera is None:
         return {"paths": None, "light_share": None, "guided": None}
-    paths = re.match(r"paths: (\w+)", camera["reason"])[1] if camera["needed"] else "light"
+    found = re.match(r"paths: (\w+)", camera["reason"]) if camera["needed"] else None
+    paths = found[1] if found else "light"
     chosen = (manifest.get("paths") or {}).get("light_share")
     share = {"light": 1.0, "camera": 0.0}.get(paths, chosen)
     return {"paths": paths, "light_share": share, "guided": rows["guided emission"]["needed"]}
 
 
-def _read(file: Path) -> list[dict[str, Any]]:
+def read_lines(file: Path) -> list[dict[str, Any]]:
+    """Return the objects of a file of JSON lines."""
     return [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]

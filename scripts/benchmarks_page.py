@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""Writes docs/benchmarks.md and the README's results from the records in docs/benchmarks/.
+"""Measure what docs/benchmarks.md and the README's results say, and write them from the records in docs/benchmarks/.
 
-`scripts/benchmarks` runs it. Prose comes from docs/benchmarks/page.md, figures from the records: no figure in these
-tables is typed. The tables in Markdown that docs/paper.md is made of are here too.
+Prose comes from docs/benchmarks/page.md, figures from the records: no figure in these tables is typed. Measure on a
+machine that does nothing else. The tables in Markdown of docs/paper.md are made here too.
 """
 
 from __future__ import annotations
 
+import argparse
 import difflib
-import json
 import re
 import shlex
 import sys
@@ -28,31 +28,20 @@ from benchmarks_measure import (
     ROOT,
     experiment_record,
     measure,
+    read_lines,
     stale,
     table,
 )
 
 Row = Mapping[str, Any]
 PAGE, README, TEMPLATE = ROOT / "docs" / "benchmarks.md", ROOT / "README.md", "page.md"
-#: Where a table stands in the template, in a line of its own, and between what in the README.
+#: The place of a table, in a line of its own of the template, and between two comments of the README.
 PLACE = re.compile(r"^\{\{ (\w+) \}\}$", re.MULTILINE)
 BLOCK = re.compile(r"<!-- benchmarks: (\w+) -->\n.*?<!-- end -->", re.DOTALL)
 #: Columns of the README's text.
 WIDTH = 120
-#: What the README says of each experiment.
-ABOUT = {
-    "cornell_floor": "a carpet of 64 x 64 texels",
-    "caustic_slab": "a print below rippled glass",
-    "grey_room": "a furnished room lit through windows",
-    "furnace": "the walls of a closed sphere",
-    "lens_pose": "a lens's place, and its tilt in degrees",
-    "caustic_heightmap": "the relief of a glass face",
-    "mixed_room": "the printed wall of a room with a caustic and a mirror, and a sofa",
-    "paper/figure1": "the relief of a glass face, finely",
-    "stiff/lamp": "albedo, and intensity",
-    "stiff/plate": "roughness, and radiance",
-    "stiff/wall": "73,728 texels, and one number",
-}
+#: The setting that each `reslrb bench` varies: its name in the records, and its heading.
+SWEPT = {"depth": ("max_depth", "depth"), "spp": ("spp", "spp"), "moving": ("max_depth", "depth")}
 
 
 @dataclass(frozen=True)
@@ -69,11 +58,9 @@ class Record:
 
 
 def read(file: Path) -> Record:
-    """A record, whose first line says where it comes from. Raises OSError and ValueError."""
-    lines = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-    if not lines or lines[0].get("kind") != "origin":
-        raise ValueError(f"{file} does not begin with a line that says where it comes from")
-    return Record(lines[0], [line for line in lines if line.get("kind") != "origin"])
+    """Return a record, whose first line says where it comes from. Raises OSError."""
+    origin, *rows = read_lines(file)
+    return Record(origin, [row for row in rows if row.get("kind") != "origin"])
 
 
 def commit_of(origin: Row) -> str:
@@ -90,76 +77,86 @@ def measured_at(origins: Mapping[str, Row]) -> str:
     for name, origin in origins.items():
         names.setdefault(commit_of(origin), []).append(f"`{name}`")
     parts = [commit if len(names) == 1 else f"{commit}: {', '.join(of)}" for commit, of in names.items()]
-    return fill(f"Measured at {'; '.join(parts)}.", WIDTH, break_long_words=False, break_on_hyphens=False)
+    return _filled(f"Measured at {'; '.join(parts)}.")
+
+
+def _filled(text: str) -> str:
+    return fill(text, WIDTH, break_long_words=False, break_on_hyphens=False)
 
 
 def name_of(row: Row) -> str:
-    """What was measured, `reslrb`'s estimators without its name."""
+    """Return the name of an integrator, `reslrb`'s estimators without its name."""
     name = row["estimator"] or row["integrator"]
     return f"`{name}`" + (f" of {row['capacity']}" if row.get("capacity") not in (None, 1) else "")
 
 
 def figure(value: float | None, digits: int = 3) -> str:
-    """So many digits of a figure, without exponents where it is not far from 1; empty where there is none."""
+    """Return so many digits of a figure, without exponents where it is not far from 1; empty where there is none."""
     if value is None:
         return ""
     whole = f"{value:.{digits}g}"
     return f"{value:.0f}" if "e+" in whole and abs(value) < 1e6 else whole
 
 
-def bench_ratios(record: Record, swept: str, what: str = "kernel_ms") -> str:
-    """Medians over those of `ptracer`, a column for each value of what is swept, and the range of the peaks."""
-    values = sorted({row[swept] for row in record.rows})
-    base = {row[swept]: row for row in record.rows if row["integrator"] == "ptracer"}
+def bench_ratios(record: Record, swept: str) -> str:
+    """Return kernel times over those of `ptracer`, a column for each value of the sweep, and the range of the peaks."""
+    key, head = SWEPT[swept]
+    values = sorted({row[key] for row in record.rows})
+    found: dict[str, dict[int, Row]] = {}
+    for row in record.rows:
+        found.setdefault(name_of(row), {})[row[key]] = row
+    base = {row[key]: row for row in record.rows if row["integrator"] == "ptracer"}
     lines = []
-    for name, of in _by_name(record.rows, swept).items():
-        cells = [_over(of.get(value), base.get(value), what) for value in values]
-        lines.append([name, *cells, _peaks([row for row in of.values() if row["status"] == "ok"])])
-    words = {"max_depth": "depth", "spp": "spp"}[swept]
-    return table([words, *map(str, values), "peak memory, MiB"], lines)
+    for name, of in found.items():
+        peaks = sorted(row["peak_mib"] for row in of.values() if row["status"] == "ok")
+        ends = " to ".join(dict.fromkeys(f"{peak:.1f}" for peak in (*peaks[:1], *peaks[-1:])))
+        lines.append([name, *(ratio(of.get(value), base.get(value), "kernel_ms") for value in values), ends])
+    return table([head, *map(str, values), "peak memory, MiB"], lines)
 
 
-def bench_conditions(record: Record, swept: str) -> str:
-    """What all lines of a bench have in common, but for what is swept."""
-    row = next((row for row in record.rows if row["status"] == "ok"), record.rows[0])
-    parts = [f"film {row['width']}x{row['height']}"]
-    parts += [] if swept == "spp" else [f"{row['spp']} spp"]
-    parts += [] if swept == "max_depth" else [f"depth {row['max_depth']}"]
-    parts += [f"{row['texels']} texels"] if row.get("texels") else []
-    return ", ".join(parts)
+def ratio(row: Row | None, base: Row | None, times: str) -> str:
+    """Return the ratio of two medians, how a row ended without one, or nothing where there is nothing to divide."""
+    if row is None or row["status"] != "ok":
+        return "" if row is None else row["status"].replace("_", " ")
+    if base is None or base["status"] != "ok":
+        return ""
+    return f"{row[times]['median'] / base[times]['median']:.2f}"
 
 
 def bench_details(record: Record, swept: str) -> str:
-    """Every line of a bench: times with their least and greatest, and memory."""
-    head = ("depth" if swept == "max_depth" else swept, "", "step, ms", "kernels, ms", "first step, s", "peak, MiB",
-            "scratch of a path, B", "n")  # fmt: skip
+    """Return every line of a bench: times with their least and greatest, and memory."""
+    key, first = SWEPT[swept]
+    head = (first, "", "step, ms", "kernels, ms", "first step, s", "peak, MiB", "scratch of a path, B", "n")
+
+    def spread(times: Row) -> str:
+        return f"{times['median']:.1f} [{times['min']:.1f}, {times['max']:.1f}]"
+
     lines = []
     for row in record.rows:
-        cells = [str(row[swept]), name_of(row)]
-        if row["status"] != "ok":
-            lines.append([*cells, row["status"].replace("_", " "), "", "", "", "", ""])
-            continue
-        memory = [f"{row['peak_mib']:.1f}", str(row["scratch_bytes"]), str(row["repeats"])]
-        times = [_spread(row["step_ms"]), _spread(row["kernel_ms"]), f"{row['cold_ms'] / 1e3:.2f}"]
-        lines.append([*cells, *times, *memory])
+        if row["status"] == "ok":
+            cells = [spread(row["step_ms"]), spread(row["kernel_ms"]), f"{row['cold_ms'] / 1e3:.2f}",
+                     f"{row['peak_mib']:.1f}", str(row["scratch_bytes"]), str(row["repeats"])]  # fmt: skip
+        else:
+            cells = [row["status"].replace("_", " "), "", "", "", "", ""]
+        lines.append([str(row[key]), name_of(row), *cells])
     return table(head, lines)
 
 
 def gradcheck_line(record: Record) -> list[str]:
-    """What all comparisons of a gradcheck come to: verdicts, and the largest figures beside their limits."""
+    """Return the verdicts of a gradcheck, and its figures that are closest to their limits."""
     rows = [row for row in record.rows if "verdict" in row]
     of_means = [row for row in rows if row["kind"] == "expectation" and row["z_rms"] is not None]
     equal = [row["relative_l2"] for row in rows if row["kind"] == "equal_seeds" and row["relative_l2"] is not None]
     cells = [str(max(row["seeds"] for row in rows)), f"{sum(row['holds'] is True for row in rows)} of {len(rows)}"]
     cells.append(str(sum(row["holds"] is False for row in rows)))
-    for what in ("z_rms", "z_max"):  # closest to its limit
+    for what in ("z_rms", "z_max"):
         row = max(of_means, key=lambda row: row[what] / row[f"{what}_limit"], default=None)
         cells.append("" if row is None else f"{row[what]:.2f} ({row[f'{what}_limit']:.2f})")
     return [*cells, f"{max(equal):.1e}" if equal else ""]
 
 
 def run_errors(record: Record, moment: str) -> str:
-    """The parameters' errors at `initial` or `final`, each in its own unit; with its name where there are several."""
+    """Return the parameters' errors at `initial` or `final`, each in its own unit, with names if there are several."""
     errors = record.rows[0]["parameter_rmse"]
     if len(errors) == 1:
         return figure(next(iter(errors.values()))[moment])
@@ -170,42 +167,13 @@ def run_errors(record: Record, moment: str) -> str:
 
 
 def paths_of(record: Record) -> str:
-    """The paths of a run by `reslrb`; empty where that is not recorded, as before there were others."""
+    """Return the paths of a run by `reslrb` in words; nothing of other runs."""
     row = record.rows[0]
     name, share = row.get("paths"), row.get("light_share")
     if name is None:
         return ""
     words = name if share in (None, 0, 1) else f"{share:.0%} light"
     return words + ", guided" * bool(row["guided"])
-
-
-def took(record: Record) -> str:
-    """The seconds of a run's iterations, as a whole number of at least one."""
-    return f"{max(record.rows[0]['elapsed_s'], 1):.0f} s"
-
-
-def _by_name(rows: Sequence[Row], swept: str) -> dict[str, dict[int, Row]]:
-    found: dict[str, dict[int, Row]] = {}
-    for row in rows:
-        found.setdefault(name_of(row), {})[row[swept]] = row
-    return found
-
-
-def _over(row: Row | None, base: Row | None, what: str) -> str:
-    if row is None or row["status"] != "ok":
-        return "" if row is None else row["status"].replace("_", " ")
-    if base is None or base["status"] != "ok":
-        return ""
-    return f"{row[what]['median'] / base[what]['median']:.2f}"
-
-
-def _peaks(rows: Sequence[Row]) -> str:
-    peaks = [f"{row['peak_mib']:.1f}" for row in rows]
-    return " to ".join(dict.fromkeys(pick(peaks, key=float) for pick in (min, max))) if peaks else ""
-
-
-def _spread(times: Row) -> str:
-    return f"{times['median']:.1f} [{times['min']:.1f}, {times['max']:.1f}]"
 
 
 class Blocks:
@@ -215,12 +183,6 @@ class Blocks:
         self.folder = folder
         self.makers: dict[str, Callable[[], str]] = {
             "machine": self.machine,
-            "depth": lambda: self._bench("depth", "max_depth"),
-            "depth_ratios": lambda: self._ratios("depth", "max_depth"),
-            "spp": lambda: self._bench("spp", "spp"),
-            "spp_ratios": lambda: self._ratios("spp", "spp"),
-            "moving": lambda: self._bench("moving", "max_depth"),
-            "moving_ratios": lambda: self._ratios("moving", "max_depth"),
             "gradcheck": self.gradcheck,
             "extreme": self.extreme,
             "experiments": self.experiments,
@@ -228,129 +190,127 @@ class Blocks:
             "runs": self.runs,
             "gpu": self.gpu,
         }
+        for name in SWEPT:
+            self.makers |= {name: lambda of=name: self.bench(of), f"{name}_ratios": lambda of=name: self.ratios(of)}
 
     def make(self, name: str) -> str:
-        """A piece, in Markdown; where nothing of it is recorded, a line that says so. Raises KeyError, OSError."""
+        """Return a piece in Markdown, or a line that says that nothing of it is recorded. Raises KeyError, OSError."""
         try:
             return self.makers[name]()
         except FileNotFoundError as error:
             return f"Not recorded so far; `scripts/benchmarks measure {Path(error.filename).stem}` does that."
 
     def record(self, name: str) -> Record:
-        """The record of a measurement."""
-        return read(self.folder / MEASUREMENTS[name].file.name)
+        """Return the record of a measurement."""
+        return read(self.folder / f"{name}.jsonl")
 
-    def about(self, name: str, conditions: str = "") -> str:
-        """The command that was measured, how long it took, and under what conditions."""
-        record = self.record(name)
-        took = f"This took {record.origin['seconds']:.0f} s at {commit_of(record.origin)}"
-        return f"    {record.command}\n\n{took}{conditions and f'; {conditions}'}:"
+    def recorded(self, names: Mapping[str, str]) -> dict[str, tuple[str, Record]]:
+        """Return words and records, by the names of the records that there are: some may be measured later."""
+        return {name: (words, self.record(name)) for name, words in names.items()
+                if (self.folder / f"{name}.jsonl").exists()}  # fmt: skip
 
     def gpu(self) -> str:
-        """Return what `scripts/gpu_check` recorded on a GPU."""
+        """Return the summary that `scripts/gpu_check` wrote on a GPU."""
         file = self.folder / "gpu.md"
-        if not file.exists():
-            return "No figure on this page is from a GPU so far."
-        return file.read_text(encoding="utf-8").rstrip()
+        found = file.read_text(encoding="utf-8").rstrip() if file.exists() else ""
+        return found or "No figure on this page is from a GPU so far."
 
     def machine(self) -> str:
-        """What all records were measured on."""
+        """Return the machines of all records."""
         found = []
         for file in sorted(self.folder.glob("*.jsonl")):
             origin = read(file).origin
             versions = ", ".join(f"{package} {version}" for package, version in origin["versions"].items())
-            found.append(f"{origin['device']}, {origin['variant']}; {versions}; {origin['platform']}")
-        return "\n".join(f"- {words}" for words in dict.fromkeys(found))
+            found.append(f"- {origin['device']}, {origin['variant']}; {versions}; {origin['platform']}")
+        return "\n".join(dict.fromkeys(found))
+
+    def bench(self, name: str) -> str:
+        """Return every line of a bench below its command, how long that took, and the conditions of all lines."""
+        record = self.record(name)
+        row = next((row for row in record.rows if row["status"] == "ok"), record.rows[0])
+        parts = {"spp": f"{row['spp']} spp", "max_depth": f"depth {row['max_depth']}"}
+        conditions = [f"film {row['width']}x{row['height']}"]
+        conditions += [words for key, words in parts.items() if key != SWEPT[name][0]]
+        conditions += [f"{row['texels']} texels"] if row.get("texels") else []
+        took = f"This took {record.origin['seconds']:.0f} s at {commit_of(record.origin)}; {', '.join(conditions)}:"
+        return f"    {record.command}\n\n{took}\n\n{bench_details(record, name)}"
+
+    def ratios(self, name: str) -> str:
+        """Return the ratios of a bench."""
+        record = self.record(name)
+        return _with_commits(bench_ratios(record, name), {name: record})
 
     def gradcheck(self) -> str:
-        """A line for each scene whose gradients were compared."""
+        """Return a line for each scene whose gradients were compared."""
         head = ("command", "seeds", "hold", "fail", "z rms (limit)", "max abs z (limit)", "equal seeds, relative L2")
-        records = {
-            name: self.record(f"gradcheck_{name}")
-            for name in CHECKED if (self.folder / f"gradcheck_{name}.jsonl").exists()
-        }  # fmt: skip
-        rows = [[f"`{record.command}`", *gradcheck_line(record)] for record in records.values()]
-        return self._with_commits(table(head, rows), records)
+        found = dict(self.recorded({f"gradcheck_{name}": name for name in CHECKED}).values())
+        rows = [[f"`{record.command}`", *gradcheck_line(record)] for record in found.values()]
+        return _with_commits(table(head, rows), found)
 
     def extreme(self) -> str:
-        """Return what the extreme suite comes to, by its page, and by its record where there is one."""
+        """Return the result of the extreme suite, from its page and, if there is one, from its record."""
         rows = [line for line in EXTREME.read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
         notes = [" ".join(re.findall(r"\*\*(.*?)\*\*", row)) for row in rows]
         kinds = (": roughness", ": image", "no reference: expectation")
         roughness, image, left_out = (sum(kind in note for note in notes) for kind in kinds)
-        found, origin = f"{len(rows)} scenes: none fails", {}
-        if (self.folder / MEASUREMENTS["extreme"].file.name).exists():
+        found, origin = "none fails", {}
+        if (self.folder / "extreme.jsonl").exists():
             record = self.record("extreme")
             counts, origin = record.rows[0], record.origin
-            hold, compared, fail = (counts[name] for name in ("hold", "comparisons", "fail"))
-            found = f"{len(rows)} scenes: {hold} of {compared} comparisons hold, {fail} fail"
-        text = (
+            found = f"{counts['hold']} of {counts['comparisons']} comparisons hold, {counts['fail']} fail"
+        return _filled(
             "`reslrb gradcheck --suite extreme` ([docs/extreme.md](docs/extreme.md)) compares every estimator, and "
-            f"`stack` on both kinds of paths and on camera paths alone, in {found}. The roughness of `principled` "
-            f"stays open in {roughness} scenes, because its lobes are chosen. An image of camera paths stays open in "
-            f"{image}. "
-            f"Camera paths are left out of {left_out} scenes, whose light they do not find, or too rarely. "
-            f"Measured at {commit_of(origin)}."
+            f"`stack` on both kinds of paths and on camera paths alone, in {len(rows)} scenes: {found}. The roughness "
+            f"of `principled` stays open in {roughness} scenes, because its lobes are chosen. An image of camera paths "
+            f"stays open in {image}. Camera paths are left out of {left_out} scenes, whose light they do not find, or "
+            f"too rarely. Measured at {commit_of(origin)}."
         )
-        return fill(text, WIDTH, break_long_words=False, break_on_hyphens=False)
 
     def experiments(self) -> str:
-        """The README's table of whole runs."""
-        return self._ends({experiment_record(name): f"`{name}`: {ABOUT[name]}" for name in self.recorded()})
+        """Return the README's table of whole runs."""
+        return self._ends({experiment_record(name): f"`{name}`: {words}" for name, words in EXPERIMENTS.items()})
 
     def others(self) -> str:
-        """The README's table of whole runs by other integrators."""
+        """Return the README's table of whole runs by other integrators."""
         return self._ends({name: words for name, (words, _) in OTHERS.items()})
 
-    def _ends(self, runs: Mapping[str, str]) -> str:
-        """Errors at the start and at the end of runs, by the names of their records, and what they are called."""
+    def _ends(self, names: Mapping[str, str]) -> str:
+        """Return errors at the start and at the end of runs, by the names of their records and their words."""
         head = ("experiment", "parameter RMSE, start", "end", "time", "command that prints it")
-        rows, records = [], {name.removeprefix("optimize_"): self.record(name) for name in runs}
-        for words, record in zip(runs.values(), records.values(), strict=True):
+        rows, found = [], self.recorded(names)
+        for words, record in found.values():
             errors = [run_errors(record, moment) for moment in ("initial", "final")]
-            rows.append([words, *errors, took(record), f"`{record.command}`"])
-        return self._with_commits(table(head, rows), records)
-
-    def _with_commits(self, text: str, records: Mapping[str, Record]) -> str:
-        return f"{text}\n\n{measured_at({name: record.origin for name, record in records.items()})}"
+            took = f"{max(record.rows[0]['elapsed_s'], 1):.0f} s"
+            rows.append([words, *errors, took, f"`{record.command}`"])
+        return _with_commits(table(head, rows), {name.removeprefix("optimize_"): of for name, (_, of) in found.items()})
 
     def runs(self) -> str:
-        """Time and memory of whole runs, and what a pilot chose."""
+        """Return time, memory and paths of whole runs."""
         head = ("run", "iterations", "spp", "a step, ms", "iterations in all, s", "with everything, s", "peak, MiB",
-                "estimator", "chosen by a pilot, share of the run", "paths")  # fmt: skip
-        rows, records = [], {name: self.record(experiment_record(name)) for name in self.recorded()}
-        for name, record in records.items():
-            row, paths = record.rows[0], paths_of(record)
-            pilot = "" if row["pilot"] is None else f"{row['pilot']['label']}, {row['pilot']['share']:.1%}"
+                "estimator", "paths")  # fmt: skip
+        found = dict(self.recorded({experiment_record(name): name for name in EXPERIMENTS}).values())
+        rows = []
+        for name, record in found.items():
+            row = record.rows[0]
             rows.append([
-                f"`{name}`", str(row["iterations"]), str(row["spp"]),
-                figure(row["step_ms"]), figure(row["elapsed_s"]), f"{record.origin['seconds']:.0f}",
-                f"{row['peak_mib']:.1f}", f"`{row['estimator']}`" if row["estimator"] else "", pilot, paths,
+                f"`{name}`", str(row["iterations"]), str(row["spp"]), figure(row["step_ms"]), figure(row["elapsed_s"]),
+                f"{record.origin['seconds']:.0f}", f"{row['peak_mib']:.1f}",
+                f"`{row['estimator']}`" if row["estimator"] else "", paths_of(record),
             ])  # fmt: skip
-        return self._with_commits(table(head, rows), records)
+        return _with_commits(table(head, rows), found)
 
-    def recorded(self) -> list[str]:
-        """The experiments that have been recorded: those of many minutes may come later."""
-        return [name for name in EXPERIMENTS if (self.folder / f"{experiment_record(name)}.jsonl").exists()]
 
-    def _bench(self, name: str, swept: str) -> str:
-        record = self.record(name)
-        about = self.about(name, bench_conditions(record, swept))
-        return f"{about}\n\n{bench_details(record, swept)}"
-
-    def _ratios(self, name: str, swept: str) -> str:
-        record = self.record(name)
-        return self._with_commits(bench_ratios(record, swept), {name: record})
+def _with_commits(text: str, records: Mapping[str, Record]) -> str:
+    return f"{text}\n\n{measured_at({name: record.origin for name, record in records.items()})}"
 
 
 def page(blocks: Blocks) -> str:
-    """docs/benchmarks.md."""
-    text = (RECORDS / TEMPLATE).read_text(encoding="utf-8")
-    return PLACE.sub(lambda match: blocks.make(match[1]), text)
+    """Return docs/benchmarks.md."""
+    return PLACE.sub(lambda match: blocks.make(match[1]), (RECORDS / TEMPLATE).read_text(encoding="utf-8"))
 
 
 def readme(blocks: Blocks, text: str) -> str:
-    """The README with its tables made anew."""
+    """Return the README with its tables made anew."""
 
     def made(match: re.Match[str]) -> str:
         return f"<!-- benchmarks: {match[1]} -->\n{blocks.make(match[1])}\n<!-- end -->"
@@ -358,36 +318,33 @@ def readme(blocks: Blocks, text: str) -> str:
     return BLOCK.sub(made, text)
 
 
-def write() -> None:
-    """Write the page and the README's  Raises OSError."""
-    blocks = Blocks()
-    PAGE.write_text(page(blocks), encoding="utf-8")
-    README.write_text(readme(blocks, README.read_text(encoding="utf-8")), encoding="utf-8")
-
-
 def main(arguments: list[str]) -> int:
-    """Do what the first argument says; the exit code."""
-    what, *names = arguments
-    if what != "measure" and names:
-        print(f"benchmarks: {what} takes no names", file=sys.stderr)
-        return 2
-    for name in names:
-        if name not in MEASUREMENTS:
-            near = difflib.get_close_matches(name, MEASUREMENTS, n=1, cutoff=0)[0]
-            print(f"benchmarks: there is no measurement `{name}`; did you mean {near}?", file=sys.stderr)
-            return 2
-    if what == "list":
-        for measurement in MEASUREMENTS.values():
-            print(f"{measurement.name:28} {shlex.join(measurement.command)}")
+    """Do what the command line says; the exit code."""
+    parser = argparse.ArgumentParser(prog="scripts/benchmarks", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("list", help="the measurements, and the command of each")
+    commands.add_parser("stale", help="records that are older than the code that they measure; exit code 1 if any")
+    commands.add_parser("write", help="docs/benchmarks.md and the README's tables, from docs/benchmarks/")
+    measuring = commands.add_parser("measure", help="all, or these, into docs/benchmarks/; then write")
+    measuring.add_argument("names", nargs="*", metavar="NAME")
+    options = parser.parse_args(arguments)
+    if options.command == "list":
+        print("\n".join(f"{name:28} {shlex.join(['reslrb', *words])}" for name, words in MEASUREMENTS.items()))
         return 0
-    if what == "stale":
+    if options.command == "stale":
         lines = stale()
         print("\n".join(lines) or "no record is older than the code that it measures")
         return 1 if lines else 0
-    if what == "measure":
-        for name in names or MEASUREMENTS:
-            measure(MEASUREMENTS[name])
-    write()
+    if options.command == "measure":
+        for name in [name for name in options.names if name not in MEASUREMENTS]:
+            near = difflib.get_close_matches(name, MEASUREMENTS, n=1, cutoff=0)[0]
+            print(f"benchmarks: there is no measurement `{name}`; did you mean {near}?", file=sys.stderr)
+            return 2
+        for name in options.names or MEASUREMENTS:
+            measure(name, MEASUREMENTS[name])
+    blocks = Blocks()
+    PAGE.write_text(page(blocks), encoding="utf-8")
+    README.write_text(readme(blocks, README.read_text(encoding="utf-8")), encoding="utf-8")
     return 0
 
 

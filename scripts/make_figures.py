@@ -10,8 +10,8 @@ All need the environment that `scripts/setup` makes: run them with `.venv/bin/py
 
 from __future__ import annotations
 
-import argparse
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,41 +28,21 @@ ROOT = Path(__file__).resolve().parent.parent
 PANEL, MARGIN, TITLE = 1.9, 0.06, 0.24  # inches
 DPI = 100
 HEIGHT = 180  # pixels of a scene's picture
-#: Samples per pixel, the longest path, and the exposure of each scene's picture.
+#: The experiments whose target is shown: samples per pixel, and exposure.
 SCENES = {
-    "cornell_floor": (1024, 8, 1.0),
-    "grey_room": (4096, 16, 1.0),
-    "caustic_slab": (1024, 5, 1.0),
-    "furnace": (64, 8, 0.2),
+    "cornell_floor": (1024, 1.0),
+    "grey_room": (4096, 1.0),
+    "caustic_slab": (1024, 1.0),
+    "furnace": (64, 0.2),
+    "lens_pose": (4096, 1.0),
+    "caustic_heightmap": (4096, 0.6),
+    "mixed_room": (1, 1.5),  # its target is a file
 }
-
-#: Of the experiments that move light, or show it in a mirror, samples per pixel and exposure of the target's picture.
-EXPERIMENTS = {"lens_pose": (4096, 1.0), "caustic_heightmap": (4096, 0.6), "mixed_room": (4096, 1.5)}
 Image = np.ndarray[Any, Any]
+Panel = tuple[str, Image]
 
 
-def main() -> None:
-    """Parse the command line and write one picture."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    kinds = parser.add_subparsers(dest="kind", required=True)
-    run = kinds.add_parser("run", help="strip from a run folder")
-    run.add_argument("folder", type=Path)
-    run.add_argument("out", type=Path)
-    scenes = kinds.add_parser("scenes", help="strip of the shipped scenes")
-    scenes.add_argument("out", type=Path)
-    lens = kinds.add_parser("lens", help="strip from the run of a lens")
-    lens.add_argument("picture", type=Path)
-    lens.add_argument("folder", type=Path)
-    lens.add_argument("out", type=Path)
-    arguments = parser.parse_args()
-    if arguments.kind == "lens":
-        panels = lens_panels(arguments.picture, arguments.folder)
-    else:
-        panels = run_panels(arguments.folder) if arguments.kind == "run" else scene_panels()
-    write_strip(panels, arguments.out)
-
-
-def run_panels(folder: Path) -> list[tuple[str, Image]]:
+def run_panels(folder: Path) -> list[Panel]:
     """Target, initial image, and the first texture of the run: recovered, and true where it is known."""
     summary = json.loads((folder / "parameters" / "parameters.json").read_text())
     texture = next((entry["file"] for entry in summary.values() if "file" in entry), None)
@@ -77,7 +57,7 @@ def run_panels(folder: Path) -> list[tuple[str, Image]]:
     return [(title, imread(file.with_suffix(".png"))) for title, file in files.items() if file.exists()]
 
 
-def lens_panels(picture: Path, folder: Path) -> list[tuple[str, Image]]:
+def lens_panels(picture: Path, folder: Path) -> list[Panel]:
     """The picture, the face lit from its upper left (without its mean curvature), and the light it throws."""
     from reslrb_cli.backend.variant import set_variant
 
@@ -101,26 +81,18 @@ def lens_panels(picture: Path, folder: Path) -> list[tuple[str, Image]]:
     return [*panels, ("the light that it throws", encode(thrown * shown.mean()))]
 
 
-def scene_panels() -> list[tuple[str, Image]]:
-    """The scenes in `scenes/`, light-traced by `reslrb`; of `EXPERIMENTS` the target."""
+def scene_panels() -> list[Panel]:
+    """The targets of the experiments in `SCENES`."""
     from reslrb_cli.backend.variant import set_variant
     from reslrb_cli.config.loader import load
-    from reslrb_cli.integrators.step import make_integrator
     from reslrb_cli.optimization.assemble import assemble
-    from reslrb_cli.optimization.loading import render_in_passes
-    from reslrb_cli.scene.load import load_scene
 
     set_variant("auto")
     panels = []
-    for name, (spp, max_depth, exposure) in SCENES.items():
+    for name, (spp, exposure) in SCENES.items():
         width = HEIGHT * 4 // 3 if name == "grey_room" else HEIGHT
-        scene = load_scene(ROOT / "scenes" / name / "scene.xml", {"resx": width, "resy": HEIGHT})
-        integrator = make_integrator("reslrb", max_depth=max_depth)
-        image = render_in_passes(integrator, scene, 0, spp, 0, 0, "figure", None)
-        panels.append((name, encode(image * exposure)))
-    for name, (spp, exposure) in EXPERIMENTS.items():
-        size = [f"scene.options.{side}={HEIGHT}" for side in ("resx", "resy")]
-        problem = assemble(load(ROOT / "configs" / f"{name}.yaml", [*size, f"target.render.spp={spp}"]))
+        sets = [f"scene.options.resx={width}", f"scene.options.resy={HEIGHT}", f"target.render.spp={spp}"]
+        problem = assemble(load(ROOT / "configs" / f"{name}.yaml", sets))
         panels.append((name, encode(np.array(problem.views[0].target) * exposure)))
     return panels
 
@@ -132,19 +104,23 @@ def encode(image: Image) -> Image:
     return tonemap.encode(np.clip(image[:, :, :3], 0, 1))
 
 
-def write_strip(panels: Sequence[tuple[str, Image]], out: Path) -> None:
-    """Write panels of equal height beside each other, a title above each."""
-    widths = [PANEL * image.shape[1] / image.shape[0] for _, image in panels]
-    size = sum(widths) + MARGIN * (len(panels) - 1), PANEL + TITLE
-    figure = Figure(figsize=size, dpi=DPI, facecolor="white")
-    left = 0.0
-    for (title, image), width in zip(panels, widths, strict=True):
-        axes = figure.add_axes((left / size[0], 0, width / size[0], PANEL / size[1]))
-        fine = image.shape[0] >= PANEL * DPI  # shrink with a filter, enlarge texel by texel
-        axes.imshow(image, interpolation="antialiased" if fine else "nearest", aspect="auto")
-        axes.set_axis_off()
-        axes.set_title(title, fontsize=8, pad=3)
-        left += width + MARGIN
+def write_panels(rows: Sequence[Sequence[Panel]], out: Path) -> None:
+    """Write rows of panels, all rows of one width, the first of the height `PANEL`; a title above each panel."""
+    aspects = [[image.shape[1] / image.shape[0] for _, image in panels] for panels in rows]
+    gaps = [MARGIN * (len(panels) - 1) for panels in rows]
+    whole = PANEL * sum(aspects[0]) + gaps[0]
+    heights = [(whole - gap) / sum(of) for gap, of in zip(gaps, aspects, strict=True)]
+    size = whole, sum(heights) + TITLE * len(rows)
+    figure, bottom = Figure(figsize=size, dpi=DPI, facecolor="white"), size[1]
+    for panels, of, height in zip(rows, aspects, heights, strict=True):
+        bottom, left = bottom - TITLE - height, 0.0
+        for (title, image), aspect in zip(panels, of, strict=True):
+            axes = figure.add_axes((left / whole, bottom / size[1], aspect * height / whole, height / size[1]))
+            fine = image.shape[0] >= height * DPI  # shrink with a filter, enlarge texel by texel
+            axes.imshow(image, interpolation="antialiased" if fine else "nearest", aspect="auto")
+            axes.set_axis_off()
+            axes.set_title(title, fontsize=8, pad=3, parse_math=False)
+            left += aspect * height + MARGIN
     out.parent.mkdir(parents=True, exist_ok=True)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
@@ -154,4 +130,8 @@ def write_strip(panels: Sequence[tuple[str, Image]], out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    kinds = {"run": run_panels, "scenes": scene_panels, "lens": lens_panels}
+    if len(sys.argv) < 3 or sys.argv[1] not in kinds:
+        sys.exit(__doc__)
+    kind, *paths, out = sys.argv[1:]
+    write_panels([kinds[kind](*map(Path, paths))], Path(out))

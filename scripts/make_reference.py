@@ -19,34 +19,8 @@ from reslrb_cli.config.schema import Config
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 
-#: The example of the reference page, as a file in `configs/` would hold it.
-EXAMPLE = """\
-# Recover the floor texture of a Cornell box from a rendered target.
-scene:
-  file: ../scenes/cornell_floor/scene.xml
-  options: {resx: 128, resy: 128}
-target:
-  render:
-    spp: 1024                       # the scene as it stands, so its own texture is the truth
-parameters:
-  - key: floor.reflectance.data
-    initial: 0.5
-    bounds: [0, 1]
-integrator:
-  type: reslrb
-  max_depth: 6
-loss:
-  type: relative_l2
-  epsilon: 1e-2
-optimizer:
-  type: adam
-  learning_rate: 0.03
-  schedule: cosine
-run:
-  iterations: 100
-  spp: 16
-  adjoint: correlated
-"""
+#: The example of the reference page.
+EXAMPLE = (DOCS.parent / "configs" / "cornell_floor.yaml").read_text(encoding="utf-8")
 
 _HEAD = """\
 # Configuration
@@ -175,7 +149,6 @@ def _default(value: dict[str, Any]) -> str:
 _IN_A_LINE = {
     "ImageFile": "{file, color_space}",
     "RunValue": "{run}",
-    "TransportValue": "{transport: {receiver, floor, lamp}}",
     "CheckpointEvery": "{iterations} or {seconds}",
     **dict.fromkeys(
         ("MotionInitial", "MotionBounds", "MotionTransform", "MotionRates"), "{translation, x, y, z, rotation, scale}"

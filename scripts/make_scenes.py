@@ -30,9 +30,8 @@ def main(arguments: list[str]) -> None:
         write_exr(folder / name, image)
     Picture.fromarray(mottled_wall(192, 384)).save(folder / "stiff" / "wall.png", optimize=True)
     Picture.fromarray(np.uint8([[255, 13]])).save(folder / "stiff" / "filter.png")  # a torch's halves: 1 and 0.05
-    write_ply(folder / "caustic_slab" / "slab.ply", *slab())
-    for name, mesh in meshes().items():
-        write_ply(folder / name, *mesh)
+    for name, (*vertices, faces) in meshes().items():
+        (folder / name).write_bytes(ply_file(np.hstack(vertices), faces))
 
 
 def images() -> dict[str, Image]:
@@ -49,9 +48,10 @@ def images() -> dict[str, Image]:
     }
 
 
-def meshes() -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-    """Meshes with texture coordinates, by their paths below the scenes folder: what `height_field` returns."""
+def meshes() -> dict[str, tuple[np.ndarray, ...]]:
+    """Meshes by their paths below the scenes folder, as `height_field` returns them; the slab has no coordinates."""
     return {
+        "caustic_slab/slab.ply": height_field(96, 1.0, slab, texcoords=False),
         "caustic_heightmap/face.ply": height_field(128, 0.805, lambda x, z: 0 * x),
         "lens_pose/lens.ply": height_field(64, 0.6, lens),
         "mixed_room/pane.ply": height_field(64, 0.2, pane),
@@ -158,9 +158,8 @@ def wallpaper(size: int) -> Image:
 def heights(size: int) -> Image:
     """Smooth waves of glass, in scene units: two to four ripples across, so shallow that light does not fold."""
     y, x = (np.mgrid[0:size, 0:size] + 0.5) / size
-    # (ripples across the map, along x and y), phase, amplitude
-    waves = [((2, 2), 0.4, 1.4e-3), ((-3, 1), 1.9, 1.1e-3), ((1, -3), 4.1, 1.1e-3), ((3, 2), 2.7, 0.8e-3)]
-    value = sum(amplitude * np.sin(2 * np.pi * (kx * x + ky * y) + phase) for (kx, ky), phase, amplitude in waves)
+    ripples = [((2, 2), 0.4, 1.4e-3), ((-3, 1), 1.9, 1.1e-3), ((1, -3), 4.1, 1.1e-3), ((3, 2), 2.7, 0.8e-3)]
+    value = waves(2 * np.pi * x, 2 * np.pi * y, ripples)
     return quantise(np.repeat((value - value.mean())[:, :, None], 3, axis=2), 2.0**-20)
 
 
@@ -206,29 +205,17 @@ UP = (0.0, 0.9063, -0.4226)
 # ---- Mesh -----------------------------------------------------------------------------------------------------------
 
 
-def slab(cells: int = 96) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The rippled lower face of the glass slab: positions and normals (V, 3) float32, triangles (F, 3) int32.
-
-    A height field over [-1, 1]^2, normals downwards, out of the glass.
-    """
-    # Waves of 2 to 4 ripples across the slab in fixed directions: (wave vector, phase, amplitude).
-    waves = [
+def slab(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """The rippled lower face of the glass slab: waves of 2 to 4 ripples across the slab."""
+    return waves(x, z, [
         ((5.1, 2.3), 0.4, 0.0135), ((-3.7, 5.9), 1.9, 0.0120), ((7.9, -4.6), 4.1, 0.0062),
         ((2.2, -8.8), 2.7, 0.0055), ((-9.6, -7.1), 5.2, 0.0032), ((11.8, 3.9), 0.9, 0.0028),
-    ]  # fmt: skip
-    axis = np.linspace(-1, 1, cells + 1)
-    x, z = np.meshgrid(axis, axis, indexing="ij")
-    y, dx, dz = np.zeros_like(x), np.zeros_like(x), np.zeros_like(x)
-    for (kx, kz), phase, amplitude in waves:
-        argument = kx * x + kz * z + phase
-        y += amplitude * np.sin(argument)
-        dx += amplitude * kx * np.cos(argument)
-        dz += amplitude * kz * np.cos(argument)
-    normal = np.stack([dx, -np.ones_like(x), dz], -1)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    ])  # fmt: skip
 
-    positions = quantise(np.stack([x, y, z], -1).reshape(-1, 3), 2.0**-20)
-    return positions, quantise(normal.reshape(-1, 3), 2.0**-20), grid_faces(cells)
+
+def waves(x: np.ndarray, z: np.ndarray, parts: list[tuple[tuple[float, float], float, float]]) -> np.ndarray:
+    """A sum of waves, each with its wave vector, phase and amplitude."""
+    return sum(amplitude * np.sin(kx * x + kz * z + phase) for (kx, kz), phase, amplitude in parts)
 
 
 def grid_faces(cells: int) -> np.ndarray:
@@ -239,11 +226,11 @@ def grid_faces(cells: int) -> np.ndarray:
     return faces.astype(np.int32)
 
 
-def height_field(cells: int, half: float, height: Callable[[np.ndarray, np.ndarray], np.ndarray]
-                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+def height_field(cells: int, half: float, height: Callable[[np.ndarray, np.ndarray], np.ndarray], texcoords: bool = True
+                 ) -> tuple[np.ndarray, ...]:  # fmt: skip
     """A surface y = height(x, z) over [-half, half]^2, normals downwards, u along x, v along z.
 
-    Positions and normals (V, 3), texture coordinates (V, 2) float32, and triangles (F, 3) int32.
+    Positions and normals (V, 3), texture coordinates (V, 2) if there are any, float32, and triangles (F, 3) int32.
     """
     axis = np.linspace(-half, half, cells + 1)
     x, z = np.meshgrid(axis, axis, indexing="ij")
@@ -254,7 +241,8 @@ def height_field(cells: int, half: float, height: Callable[[np.ndarray, np.ndarr
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     positions = quantise(np.stack([x, y, z], -1).reshape(-1, 3), 2.0**-20)
     uv = np.stack([x + half, z + half], -1).reshape(-1, 2) / (2 * half)
-    return positions, quantise(normal.reshape(-1, 3), 2.0**-20), quantise(uv, 2.0**-20), grid_faces(cells)
+    vertices = [positions, *(quantise(each, 2.0**-20) for each in (normal.reshape(-1, 3), uv)[: 1 + texcoords])]
+    return (*vertices, grid_faces(cells))
 
 
 def lens(x: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -264,9 +252,8 @@ def lens(x: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 def pane(x: np.ndarray, z: np.ndarray) -> np.ndarray:
     """The lower face of a pane of cast glass: ripples in four directions, that gather light at arm's length."""
-    # Wave vector, phase, amplitude.
-    waves = [((26, 9), 0.4, 5.0e-3), ((-13, 24), 1.9, 4.2e-3), ((37, -20), 4.1, 1.6e-3), ((15, 33), 2.7, 1.4e-3)]
-    return sum(amplitude * np.sin(kx * x + kz * z + phase) for (kx, kz), phase, amplitude in waves)
+    vectors = [((26, 9), 0.4, 5.0e-3), ((-13, 24), 1.9, 4.2e-3), ((37, -20), 4.1, 1.6e-3), ((15, 33), 2.7, 1.4e-3)]
+    return waves(x, z, vectors)
 
 
 # ---- Tools ----------------------------------------------------------------------------------------------------------
@@ -299,13 +286,6 @@ def write_exr(path: Path, image: Image) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     OpenEXR.File(header, {"RGB": np.ascontiguousarray(image)}).write(str(path))
-
-
-def write_ply(path: Path, *arrays: np.ndarray) -> None:
-    """Write a triangle mesh as binary PLY: positions, normals, texture coordinates where it has any, and faces."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    *vertices, faces = arrays
-    path.write_bytes(ply_file(np.hstack(vertices), faces))
 
 
 if __name__ == "__main__":

@@ -211,6 +211,7 @@ def test_a_notebook_runs(
     assert any(output.get("text", "").startswith("finished ") for output in outputs)
 
 
+@pytest.mark.long
 def test_a_notebooks_stop_button_and_a_loss_of_nan_keep_the_result(
     python: Path, tmp_path: Path, llvm: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

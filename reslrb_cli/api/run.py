@@ -208,8 +208,7 @@ class Run:
     @property
     def parameters(self) -> dict[str, Array]:
         """The parameters' values after the last whole iteration, by key, float32 and in the parameters' own units:
-        a texture (height, width, channels), a colour (channels,), a number (), vertices (count, 3). At the end of a run
-        with `optimizer.average` they are the mean."""
+        a texture (height, width, channels), a colour (channels,), a number (), vertices (count, 3)."""
         return self._begun.course.values()
 
     @property

@@ -23,6 +23,7 @@ from reslrb_cli.cli.options import (
 )
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.schema import Config
+from reslrb_cli.config.views import ViewSpec
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.atomic import writing
 
@@ -159,9 +160,8 @@ def _of_sensor(config: Config, sensor: int) -> Config:
     """The experiment seen by one sensor alone, whether its view was trained on or held out."""
     return config.model_copy(
         update={
-            "scene": config.scene.model_copy(update={"sensors": [sensor]}),
-            "views": None,
-            # What is said of several views: an image has no use for it.
+            "views": [ViewSpec(sensor=sensor)],
+            # An image has no use for what is said of several views.
             "target": config.target.model_copy(update={"exposure": 1.0}),
             "run": config.run.model_copy(update={"held_out": [], "views_per_iteration": None}),
         }

@@ -36,6 +36,37 @@ _EXPECTED = {
 }
 
 
+#: What was removed, by the last two names of its key or by the value of a `type`, and what to do instead.
+REMOVED = {
+    "scene.sensors": "list them in `views`, such as views: [{sensor: 0}, {sensor: 1}]; all of scene.cameras are used",
+    "views.loss": "all views have the loss that `loss` says",
+    "render.seed": "the target always has the same samples; remove it",
+    "integrator.freeze": "steps are always recorded; remove it",
+    "integrator.jacobian_damping": "it is always 0.1; remove it",
+    "integrator.stack_size": "64 vertices are stored, and longer paths are traced a second time; remove it",
+    "integrator.type: direct_projective": "take prb_projective with max_depth: 2",
+    "loss.scales": "lower the film's resolution at first, by run.stages",
+    "loss.data_range": "it is always the target's largest value; remove it",
+    "loss.type: log_l2": "take relative_l2, or a loss of your own (type: custom)",
+    "loss.type: smape": "take relative_l2, or a loss of your own (type: custom)",
+    "optimizer.average": "let optimizer.schedule lower the rate; the last values then have as little noise",
+    "optimizer.type: adamw": "take adam; `bounds` and `regularizers` hold values back",
+    "optimizer.type: rmsprop": "take adam with beta_1: 0",
+    "run.first_batch": "the first batch always gives an image alone; remove it",
+    "run.reach_spp": "it is always 64; remove it",
+    "stages.spp": "all stages have run.spp; remove it",
+    "stages.learning_rate": "set optimizer.schedule",
+    "stages.regularizers": "all stages have the weights in `regularizers`; remove it",
+}
+
+
+def _removed(location: Location, value: Any = None) -> str | None:
+    """Return what to do in place of a removed key, or of a removed `value` of a key; None of others."""
+    names = ".".join([part for part in location if isinstance(part, str)][-2:])
+    advice = REMOVED.get(names if value is None else f"{names}: {value}")
+    return None if advice is None else f"was removed; {advice}"
+
+
 @dataclass(frozen=True)
 class Problem:
     """One error: where it is, in the notation of `--set`, and what is wrong; `explain` says what would be right.
@@ -69,6 +100,8 @@ def _problem(detail: ErrorDetails, data: Any) -> Problem:
     if kind.startswith("union_tag"):
         if not isinstance(value, dict):
             return Problem(key, _but_is("must be a mapping such as {type: NAME}", value))
+        if advice := _removed((*location, "type"), value.get("type")):
+            return Problem(_join(key, "type"), f"{value['type']} {advice}")
         given, known = value.get("type"), [str(_type_name(section)) for section in _candidates(detail["loc"])[0]]
         return Problem(_join(key, "type"), _but_is("must be " + _one_of(known, given), given))
     if kind == "missing" and isinstance(location[-1], str):
@@ -148,6 +181,8 @@ def _tag(section: type[Section]) -> str | None:
 
 def _unknown_key(loc: tuple[int | str, ...]) -> str:
     key = str(loc[-1])
+    if advice := _removed(tuple(part for part in loc if not _is_tag(part))):
+        return advice
     union, chosen = _candidates(loc[:-1])
     owners = list(dict.fromkeys(str(_type_name(each)) for each in union if key in each.model_fields))
     if owners:

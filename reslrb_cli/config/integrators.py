@@ -55,11 +55,6 @@ _CAPACITY = must(
     ),
 )
 
-_DIRECT = must(
-    lambda depth: depth == 2,
-    lambda depth: f"must be 2, not {depth}: direct_projective has direct light alone; prb_projective has longer paths",
-)
-
 #: Samples per pixel of one part of a derivative.
 Samples = Annotated[int, Field(ge=0, le=PASS_SAMPLES)]
 
@@ -102,10 +97,10 @@ class AttachingTracer(LightTracerOptions):
 #: The options of `reslrb` that belong to an estimator, by its name; the others have no use for them.
 ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
     "auto": (),
-    "reservoir": ("capacity", "weight", "jacobian_damping"),
+    "reservoir": ("capacity", "weight"),
     "gather": (),
     "event": ("capacity", "weight"),
-    "stack": ("stack_size",),
+    "stack": (),
 }
 
 #: Those that `auto` leaves to measurement beside any estimator, with what they are where nothing is measured.
@@ -138,17 +133,10 @@ class Reslrb(AttachingTracer):
     weight: Literal["luminance", "adjoint"] = "luminance"
     """What a connection is kept in proportion to: its `luminance`, or its share in the objective (`adjoint`: less
     variance; not with `run.adjoint: correlated`). Only with estimators `reservoir` and `event`."""
-    jacobian_damping: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.1
-    """Where light is followed: by how much the ray behind a surface that is not specular is taken to turn with the one
-    before it, to either side at random, so that its Jacobian has an inverse. It makes no bias; below 0.01 digits are
-    lost, above 0.5 noise grows. Only with estimator `reservoir`."""
     attached_sampling: Literal["auto", "follow", "stay"] = "auto"
     """Where light is followed: what becomes of it behind a surface that is not specular. `follow`: its direction turns
     with the surface, as `ptracer` has it, and sweeps over edges at rest, whose part is then missing; `stay`: it goes on
     to the same place; `auto`: `stay` behind diffuse surfaces, `follow` behind glossy ones, where `stay` is noisy."""
-    stack_size: Count = 64
-    """Vertices of a path that fit into thread-local memory; longer paths are traced a second time. Only with estimator
-    `stack`."""
     paths: Literal["auto", "light", "camera", "both"] = "auto"
     """Where paths begin. `light`: at the emitters, which finds caustics and light through glass, but shows mirrors and
     clear glass black; `camera`: at the sensor, which finds what mirrors and glass show, and most light of rooms, but no
@@ -185,9 +173,6 @@ class Reslrb(AttachingTracer):
     values. A texture that only a mirror shows gains most; a few colours may lose. `auto`: `measured` where
     there are camera paths, the loss is `l2`, and the measurement takes at most 2 % of the run's samples. The default is
     `auto` with estimator `auto`, and `even` with an estimator that you name."""
-    freeze: bool = True
-    """Record what a step launches and launch that again, so that its Python runs once, not in every iteration. Not with
-    passes, nor with more than 4 million paths, beside which Python does not show."""
 
     @model_validator(mode="after")
     def _leave_off(self) -> Self:
@@ -198,12 +183,6 @@ class Reslrb(AttachingTracer):
 
     @model_validator(mode="after")
     def _check_options(self) -> Self:
-        if self.estimator == "stack" and self.max_depth == -1 and self.stack_size >= LOCAL_ENTRIES:
-            raise located(
-                "stack_size",
-                f"{self.stack_size} vertices need as many places of thread-local memory, which has no more than "
-                f"{LOCAL_ENTRIES}; leave it at 64: longer paths are traced a second time, and nothing of them is lost",
-            )
         if self.paths == "camera" and self.estimator not in ("auto", "stack"):
             raise located(
                 "estimator",
@@ -245,10 +224,12 @@ class Prb(Integrator, json_schema_extra=NEEDS_TYPE):
     type: Literal["prb"] = Field(default="prb", description="Mitsuba's path replay backpropagation, from the sensor.")
 
 
-class ProjectiveOptions(Integrator):
-    """Options of Mitsuba's projective integrators. They trace from the sensor and differentiate outlines and shadow
-    edges of shapes that move. A derivative has three parts, each with its own samples."""
+class PrbProjective(Integrator, json_schema_extra=NEEDS_TYPE):
+    """Mitsuba's path replay backpropagation with the derivatives of outlines and shadow edges. A derivative has three
+    parts, each with its own samples."""
 
+    type: Literal["prb_projective"] = "prb_projective"
+    """Mitsuba's projective path replay, from the sensor."""
     sppc: Samples | None = None
     """Samples per pixel of what changes smoothly. 0 leaves that part out. null: those of the step."""
     sppp: Samples | None = None
@@ -256,22 +237,6 @@ class ProjectiveOptions(Integrator):
     sppi: Samples | None = None
     """Samples per pixel of shadow edges and of all else behind the first surface. 0 leaves them out. null: those of the
     step."""
-
-
-class PrbProjective(ProjectiveOptions, json_schema_extra=NEEDS_TYPE):
-    """Mitsuba's path replay backpropagation with the derivatives of outlines and shadow edges."""
-
-    type: Literal["prb_projective"] = "prb_projective"
-    """Mitsuba's projective path replay, from the sensor."""
-
-
-class DirectProjective(ProjectiveOptions, json_schema_extra=NEEDS_TYPE):
-    """Mitsuba's integrator of direct light with the derivatives of outlines and shadow edges."""
-
-    type: Literal["direct_projective"] = "direct_projective"
-    """Mitsuba's projective integrator of direct light, from the sensor."""
-    max_depth: Annotated[int, _DIRECT] = Field(default=2, json_schema_extra={"const": 2})
-    """Longest path in segments: direct light has two."""
 
 
 class WalkAd(AttachingTracer, json_schema_extra=NEEDS_TYPE):
@@ -318,9 +283,7 @@ class Own(Integrator, json_schema_extra=NEEDS_TYPE):
         return code_file(self.file)
 
 
-AnyIntegrator = Annotated[
-    Reslrb | Ptracer | Prb | PrbProjective | DirectProjective | WalkAd | Trajectory | Own, ByType("reslrb")
-]
+AnyIntegrator = Annotated[Reslrb | Ptracer | Prb | PrbProjective | WalkAd | Trajectory | Own, ByType("reslrb")]
 
 
 def _check_share(paths: str, light_share: float | str) -> None:

@@ -244,7 +244,7 @@ def with_integrator(config: Config, values: dict[str, Any], blame: str, adjoint:
     """
     data = config.model_dump(mode="json", exclude_none=True) | {"integrator": values}
     if "adjoint" in adjoint:
-        data["run"] = {key: value for key, value in data["run"].items() if key not in ("batches", "first_batch")}
+        data["run"] = {key: value for key, value in data["run"].items() if key != "batches"}
     data["run"] |= adjoint
     changed, found = _validate(data, config.source)
     if changed is None:

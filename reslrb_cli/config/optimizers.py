@@ -9,11 +9,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
-    BeforeValidator,
     Discriminator,
     Field,
     SerializerFunctionWrapHandler,
-    WithJsonSchema,
     model_serializer,
     model_validator,
 )
@@ -25,13 +23,11 @@ from reslrb_cli.config.base import (
     ByType,
     Choice,
     CodePlace,
-    Count,
     Positive,
     Section,
     code_file,
     located,
     mark,
-    wrong,
 )
 
 
@@ -43,9 +39,6 @@ class Loss(Choice):
     """`fitted`: in each step, and for each view by itself, the image is multiplied by s = <I, T> / <I, I> before it is
     compared, sums over the pixels inside the mask and all channels: how bright the image is does not matter, and the
     gradient goes through s. <I, I> is taken between two halves of the samples, since noise would make s too small."""
-    scales: Annotated[int, Field(ge=1, le=16)] = 1
-    """The loss is the mean over so many levels of a pyramid of image and target, each of half the resolution of the
-    level before (means of 2x2 pixels by their weights): 1 compares pixels alone, more also what is seen from afar."""
     weight: Positive = 1.0
     """What an entry of a list of losses (`loss: [{type: l2, weight: 1}, {type: ssim, weight: 0.1}]`) is multiplied by
     before they are added up; only there. In a list, `scale` is the same in all entries."""
@@ -53,7 +46,7 @@ class Loss(Choice):
     @model_serializer(mode="wrap")
     def _without_unasked(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         values: dict[str, Any] = handler(self)
-        for name, usual in (("scale", "none"), ("scales", 1), ("weight", 1.0)):
+        for name, usual in (("scale", "none"), ("weight", 1.0)):
             if values.get(name) == usual:
                 del values[name]
         return values
@@ -83,29 +76,13 @@ class RelativeL2(Loss, json_schema_extra=NEEDS_TYPE):
     """Added to the denominator, in squared units of radiance; keeps dark pixels from dominating."""
 
 
-class LogL2(Loss, json_schema_extra=NEEDS_TYPE):
-    """Mean of (log(I + epsilon) - log(T + epsilon))², negative values as 0."""
-
-    type: Literal["log_l2"] = Field(default="log_l2", description="Mean of (log(I + epsilon) - log(T + epsilon))².")
-    epsilon: Positive = Field(default=1e-2, description="Added inside both logarithms, in units of radiance.")
-
-
-class Smape(Loss, json_schema_extra=NEEDS_TYPE):
-    """Mean of |I - T| / (|I| + |T| + epsilon), the symmetric relative error."""
-
-    type: Literal["smape"] = Field(default="smape", description="Mean of |I - T| / (|I| + |T| + epsilon).")
-    epsilon: Positive = Field(default=1e-2, description="Added to the denominator, in units of radiance.")
-
-
 class SSIM(Loss, json_schema_extra=NEEDS_TYPE):
     """1 - mean SSIM (Wang et al. 2004) of windows of 11x11 pixels, Gaussian with a standard deviation of 1.5, each
-    channel by itself, of linear radiance; windows lie within the image, which has 11x11 pixels or more. Pixels that are
-    left out are in a window as if they were the target's, and windows about them do not count."""
+    channel by itself, of linear radiance. L, the data range of SSIM's constants, is the target's largest value. Windows
+    lie within the image, which has 11x11 pixels or more. Pixels that are left out are in a window as if they were the
+    target's, and windows about them do not count."""
 
     type: Literal["ssim"] = Field(default="ssim", description="1 - mean SSIM (Wang et al. 2004).")
-    data_range: Positive | None = None
-    """L of SSIM's constants (0.01 L)² and (0.03 L)², in units of radiance; null: the target's largest value, of each
-    view and level."""
 
 
 #: Bytes of a file of a user's own code.
@@ -134,7 +111,7 @@ class Custom(Loss, json_schema_extra=NEEDS_TYPE):
         return "" if self.file is None else self.file.rpartition(":")[2]
 
 
-AnyLoss = Annotated[L2 | L1 | RelativeL2 | LogL2 | Smape | SSIM | Custom, ByType("l2")]
+AnyLoss = Annotated[L2 | L1 | RelativeL2 | SSIM | Custom, ByType("l2")]
 
 
 def _loss_kind(value: Any) -> str:
@@ -162,16 +139,16 @@ Losses = Annotated[
 ]
 
 
-def losses_of(given: Loss | Sequence[Loss] | None) -> list[Loss]:
-    """The entries of `loss`, a single one as a list of it."""
-    return [] if given is None else [given] if isinstance(given, Loss) else list(given)
+def losses_of(given: Loss | Sequence[Loss]) -> list[Loss]:
+    """Return the entries of `loss`, a single one as a list of it."""
+    return [given] if isinstance(given, Loss) else list(given)
 
 
-def loss_keys(place: str, name: str, given: Loss | Sequence[Loss] | None) -> list[tuple[str, Loss]]:
-    """The entries of the loss that stands at `place`, each with the key of its option `name`."""
-    if given is None or isinstance(given, Loss):
-        return [(f"{place}.{name}", one) for one in losses_of(given)]
-    return [(f"{place}[{number}].{name}", one) for number, one in enumerate(given)]
+def loss_keys(name: str, given: Loss | Sequence[Loss]) -> list[tuple[str, Loss]]:
+    """Return the entries of `loss`, each with the key of its option `name`."""
+    if isinstance(given, Loss):
+        return [(f"loss.{name}", given)]
+    return [(f"loss[{number}].{name}", one) for number, one in enumerate(given)]
 
 
 def loss_words(given: Loss | Sequence[Loss]) -> str:
@@ -194,23 +171,6 @@ class Standing(Section):
     smaller this is, and the more noise losses have, the more windows the test needs."""
 
 
-def _average(value: Any) -> Any:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise wrong("must be a number of iterations, of 2 or more, or a share of them, above 0 and below 1")
-    if not (2 <= value < 2**31 if isinstance(value, int) else 0 < value < 1):
-        raise wrong("must be a number of iterations, of 2 or more, or a share of them, above 0 and below 1")
-    return value
-
-
-#: The last iterations: so many, or a share of all.
-Last = Annotated[
-    int | float,
-    BeforeValidator(_average),
-    WithJsonSchema({"anyOf": [{"type": "integer", "minimum": 2},
-                              {"type": "number", "exclusiveMinimum": 0, "exclusiveMaximum": 1}]}),
-]  # fmt: skip
-
-
 class Optimizer(Choice):
     """Options that all optimisers share: the learning rate and its schedule."""
 
@@ -230,11 +190,6 @@ class Optimizer(Choice):
     loss stands, as `run.stop` defines it."""
     final_fraction: float = Field(default=0.01, gt=0, le=1)
     """Last learning rate over the first; only with a schedule other than `constant`."""
-    average: Last | None = None
-    """The run's result is the mean of the values after the last iterations: of so many, or of a share of all. It has
-    less noise than the last values, which stand beside it in `parameters/last/`, and which the run goes on from. Where
-    values still move, it lags behind. Not with `run.stop`. null: the last values."""
-
     clamp_gradient: Annotated[float, Field(ge=1)] | None = None
     """Clamp each entry of a gradient at so many times its usual size: the larger of the running means of its own
     absolute value and of those of all entries of the parameter. Takes the noise of rare bright paths, and is biased by
@@ -264,8 +219,6 @@ class Optimizer(Choice):
         values: dict[str, Any] = handler(self)
         if self.schedule == "constant":
             values.pop("final_fraction", None)
-        if self.average is None:
-            values.pop("average", None)
         return values
 
     def own_options(self) -> dict[str, Any]:
@@ -273,7 +226,10 @@ class Optimizer(Choice):
         return {name: value for name, value in self.options().items() if name not in Optimizer.model_fields}
 
 
-class _AdamOptions(Optimizer):
+class Adam(Optimizer):
+    """Adam (Kingma and Ba 2015)."""
+
+    type: Literal["adam"] = Field(default="adam", description="Adam (Kingma and Ba 2015).")
     beta_1: _Decay = Field(default=0.9, description="Decay of the running mean of the gradient.")
     beta_2: _Decay = Field(
         default=0.9,
@@ -284,29 +240,6 @@ class _AdamOptions(Optimizer):
     epsilon: Positive = Field(default=1e-8, description="Added to the root of the mean squared gradient.")
 
 
-class Adam(_AdamOptions):
-    """Adam (Kingma and Ba 2015)."""
-
-    type: Literal["adam"] = Field(default="adam", description="Adam (Kingma and Ba 2015).")
-
-
-class AdamW(_AdamOptions, json_schema_extra=NEEDS_TYPE):
-    """Adam with decoupled weight decay (Loshchilov and Hutter 2019)."""
-
-    type: Literal["adamw"] = "adamw"
-    """Adam with decoupled weight decay (Loshchilov, Hutter 2019)."""
-    weight_decay: float = Field(default=0.01, ge=0)
-    """Share of the value that a step removes, per learning rate."""
-
-
-class RMSProp(Optimizer, json_schema_extra=NEEDS_TYPE):
-    """RMSProp (Hinton 2012)."""
-
-    type: Literal["rmsprop"] = Field(default="rmsprop", description="RMSProp (Hinton 2012).")
-    decay: _Decay = Field(default=0.99, description="Decay of the running mean of the squared gradient.")
-    epsilon: Positive = Field(default=1e-8, description="Added to the root of the mean squared gradient.")
-
-
 class SGD(Optimizer, json_schema_extra=NEEDS_TYPE):
     """Gradient descent with momentum."""
 
@@ -314,7 +247,7 @@ class SGD(Optimizer, json_schema_extra=NEEDS_TYPE):
     momentum: _Decay = Field(default=0.0, description="Decay of the running sum of gradients; 0: none.")
 
 
-AnyOptimizer = Annotated[Adam | AdamW | RMSProp | SGD, ByType("adam")]
+AnyOptimizer = Annotated[Adam | SGD, ByType("adam")]
 
 
 _Share = Annotated[float, Field(gt=0, le=1)]
@@ -332,11 +265,6 @@ class Stage(Section):
     film: _Share = 1.0
     """Width and height of the films: one over a whole number that divides them. The target's pixels are means of as
     many, by their weights."""
-    spp: Count | None = Field(default=None, description="Samples per pixel and step; null: `run.spp`.")
-    learning_rate: Positive = Field(default=1.0, description="What every learning rate is multiplied by.")
-    regularizers: Annotated[float, Field(ge=0)] = Field(
-        default=1.0, description="What the weight of every regularizer is multiplied by."
-    )
 
     @property
     def grain(self) -> tuple[float, float]:

@@ -137,7 +137,7 @@ class RunConfig(Section):
     """End the run before its last iteration, as finished, when these seconds are over. They count measuring what is
     `auto`, compiling, steps and updates; they do not count loading, targets and saved images. The last iteration is the
     one after which the mean iteration would take too long; the first one is always completed. `optimizer.schedule` ends
-    with the time or with the iterations, whichever comes first. Not with `stages` and `optimizer.average`. null: no
+    with the time or with the iterations, whichever comes first. Not with `stages`. null: no
     limit."""
     spp: Count = Field(default=16, description="Samples per pixel and step.")
     seed: Seed = Field(default=0, description="Seed of the run; every other seed is made from it.")
@@ -147,20 +147,18 @@ class RunConfig(Section):
     are in `shards`, the other shards (`others`, each path traced twice; as `auto` where shards are whole views).
     Gradients of `l2` and `relative_l2` are unbiased with all but `correlated`, with which the noise that both share
     pulls parameters, mostly towards darker: a run says by how much, where a measurement before its first iteration can
-    see it. `l1`, `log_l2`, `smape` and `ssim` are biased with any of them, since noise in the image does not average
-    out of their derivatives; more samples help. A list of losses is as its entries are, and one of one's own as its
+    see it. `l1` and `ssim` are biased with any of them, since noise in the image does not average out of their
+    derivatives; more samples help. A list of losses is as its entries are, and one of one's own as its
     formula is. `auto`: `others` where it can be; else `batched` where `batches` divides `spp`, else `independent`."""
     batches: Annotated[int, Field(ge=2)] = 4
     """Batches of a step's samples, or of a shard's; with `adjoint: batched` it must divide them. Not with `correlated`
     and `independent`."""
-    first_batch: Literal["image", "again"] = "image"
-    """What the first batch is for: an `image` alone, or to be traced `again` for its gradient, with the adjoint image
-    of all others. Not with `correlated` and `independent`."""
     shards: _Shards = 1
     """Parts that the samples of an iteration are split into, each with a seed of its own, whatever computes them: at
     most as many as it has views, each is some of these; a multiple of that, each is a share of one view's samples
     (`adjoint` and `batches` are then of a shard). Their gradients are added up in their order, in double precision.
-    `auto`: 16, or the most below that which these settings allow; where `scene.sensors` is `all`, whole views. 1: none.
+    `auto`: 16, or the most below that which these settings allow; whole views where only `scene.cameras` says how many
+    there are. 1: none.
     Not in what measures single steps (`bench`, `gradcheck`, `convergence`, `inspect`, what is `auto`, `certainty`)."""
     memory_budget: Memory | None = None
     """Memory that the iterations may take, with what stands before them: a number of MiB, or text such as 512 MiB or
@@ -201,11 +199,10 @@ class RunConfig(Section):
     checkpoint_every: CheckpointEvery = CheckpointEvery(seconds=30.0)
     """When the state of the run is kept, for `reslrb optimize --resume`: `iterations` or `seconds` between two
     checkpoints. Besides, before the first iteration and at the end, whatever ends it but a kill."""
-    reach_spp: Count = Field(default=64, description="Samples for the mask of the texels that light and sensor reach.")
     stages: list[Stage] = Field(default=[], max_length=16)
-    """How the run begins, in parts, from coarse to fine: resolution, film, samples, rates and weights until a share of
-    the iterations is done. After the last of them it is as configured. Where resolution or film change, the optimizer
-    begins anew, and so does what `optimizer.scale` measures."""
+    """How the run begins, in parts, from coarse to fine: resolution and film until a share of the iterations is done.
+    After the last of them it is as configured. Where resolution or film change, the optimizer begins anew, and so does
+    what `optimizer.scale` measures."""
 
     stop: Standing | None = None
     """End the run before its last iteration, as finished, once its loss stands: that of held-out views where there are
@@ -222,7 +219,7 @@ class RunConfig(Section):
         if self.stop is None:
             values.pop("stop", None)
         if self.adjoint not in ("auto", "batched", "others"):
-            del values["batches"], values["first_batch"]
+            del values["batches"]
         return values
 
     @property

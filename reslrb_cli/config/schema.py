@@ -16,7 +16,6 @@ from pydantic import (
     PrivateAttr,
     model_validator,
 )
-from pydantic_core import PydanticCustomError
 from typing_extensions import Self
 
 from reslrb_cli.config.base import (
@@ -24,11 +23,9 @@ from reslrb_cli.config.base import (
     Positive,
     Section,
     Size,
-    by_kind,
     each_once,
     few,
     located,
-    mark,
     must,
     wrong,
 )
@@ -58,9 +55,6 @@ def _scalar(value: Any) -> Any:
     return value
 
 
-_SENSORS = must(each_once, lambda _: "must name each sensor once")
-
-
 class SceneConfig(Section):
     """The scene and what it is seen through."""
 
@@ -72,14 +66,8 @@ class SceneConfig(Section):
     is seen stays the same where the ratio does."""
     cameras: ConfigPath | None = None
     """Cameras in place of the scene's own sensors: NeRF's `transforms.json`, or COLMAP's `images.txt` with
-    `cameras.txt` beside it; relative to the config file. Their images, relative to that file, are the targets of views
-    for which no other is named."""
-    sensors: Annotated[
-        Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1), _SENSORS, mark("list")]
-        | Annotated[Literal["all"], mark("text")],
-        by_kind("a list of sensor indices, or `all`", "all"),
-    ] = Field(default=[0])
-    """Indices of the scene's sensors that are used, or `all`."""
+    `cameras.txt` beside it; relative to the config file. Each is a view, unless `views` names some. Their images,
+    relative to that file, are the targets of views for which no other is named."""
 
 
 # --- solids -----------------------------------------------------------------------------------------------------------
@@ -123,8 +111,8 @@ class Config(Section):
     scene: SceneConfig = Field(description="The scene and its sensors.")
     target: TargetConfig = Field(description="What the image is compared with.")
     views: Annotated[list[ViewSpec], Field(min_length=1)] | None = None
-    """Sensors, each with its target, in place of `scene.sensors` and `target.file`; what a view does not say is as
-    `target` and `loss` have it."""
+    """Sensors, each with its target; what a view does not say is as `target` has it. null: the scene's first sensor,
+    with `scene.cameras` all of them."""
     parameters: Annotated[list[ParameterSpec], Field(min_length=1)] = Field(description="What is recovered.")
     integrator: AnyIntegrator = Field(default=ReslrbConfig(), description="How image and gradient are computed.")
     loss: Losses = Field(default=L2(), description="How image and target are compared.")
@@ -154,8 +142,10 @@ class Config(Section):
     @property
     def drawn_views(self) -> int | None:
         """How many views an iteration has; None where the scene alone says."""
-        named = self.views or self.scene.sensors
-        trained = None if named == "all" else max(len(named) - len(self.run.held_out), 1)
+        if self.views is None and self.scene.cameras is not None:
+            trained = None
+        else:
+            trained = max(len(self.views or [None]) - len(self.run.held_out), 1)
         asked = self.run.views_per_iteration or trained
         return asked if trained is None or asked is None else min(asked, trained)
 
@@ -192,8 +182,8 @@ class Config(Section):
 
     @property
     def losses(self) -> list[Loss]:
-        """The losses of all views, `loss` first, the entries of lists each by itself."""
-        return [one for given in (self.loss, *(view.loss for view in self.views or ())) for one in losses_of(given)]
+        """The entries of `loss`, a single one as a list of it."""
+        return losses_of(self.loss)
 
     @property
     def allows_code(self) -> bool:
@@ -218,7 +208,7 @@ class Config(Section):
         return config
 
     def with_loss(self, loss: Callable[..., Any]) -> Config:
-        """The same experiment with a function for the loss of all views that have none of their own.
+        """The same experiment with a function for its loss.
 
         It is called as `loss(image, target)` of two `mi.TensorXf` (H, W, C), with `weights` third where it has room for
         them, and returns a `mi.Float` of width 1 that Dr.Jit differentiates.
@@ -234,10 +224,7 @@ class Config(Section):
         if self.target.render is not None:
             integrators["target.render.integrator"] = self.target.render.integrator
         own: dict[str, Custom | Own] = {f"{key}.file": one for key, one in integrators.items() if isinstance(one, Own)}
-        places: dict[str, Any] = {"loss": self.loss}
-        places |= {f"views[{place}].loss": view.loss for place, view in enumerate(self.views or ())}
-        return own | {key: one for place, given in places.items() for key, one in loss_keys(place, "file", given)
-                      if isinstance(one, Custom)}  # fmt: skip
+        return own | {key: one for key, one in loss_keys("file", self.loss) if isinstance(one, Custom)}
 
     @property
     def halves(self) -> Literal[1, 2]:
@@ -247,9 +234,7 @@ class Config(Section):
     @property
     def by_pixel(self) -> bool:
         """Whether every loss looks at each pixel by itself."""
-        return all(
-            loss.scale == "none" and loss.scales == 1 and loss.type not in ("ssim", "custom") for loss in self.losses
-        )
+        return all(loss.scale == "none" and loss.type not in ("ssim", "custom") for loss in self.losses)
 
     @property
     def set_spp(self) -> int:
@@ -267,9 +252,9 @@ class Config(Section):
 
     def with_exposures_fixed(self) -> Config:
         """The experiment with exposures of 1 in place of recovered ones, for what looks at the scene alone."""
-        given = self.target.exposure
-        fixed = [1.0 if isinstance(each, str) else each for each in (given if isinstance(given, list) else [given])]
-        target = self.target.model_copy(update={"exposure": fixed if isinstance(given, list) else fixed[0]})
+        target = self.target
+        if isinstance(target.exposure, str):
+            target = target.model_copy(update={"exposure": 1.0})
         views = self.views and [
             view.model_copy(update={"exposure": 1.0}) if isinstance(view.exposure, str) else view for view in self.views
         ]
@@ -284,16 +269,15 @@ class Config(Section):
         over, or that has none, how many it has."""
         return sum(progress >= stage.until for stage in self.run.stages)
 
-    def at_stage(self, number: int) -> Config:
-        """The experiment with the samples of a stage, and as if that were all of its run."""
-        spp = self.stage(number).spp or self.run.spp
-        return self.model_copy(update={"run": self.run.model_copy(update={"spp": spp, "stages": []})})
+    def without_stages(self) -> Config:
+        """Return the experiment as if one stage were all of its run."""
+        return self.model_copy(update={"run": self.run.model_copy(update={"stages": []})})
 
     def step_options(self, shard: bool = False) -> dict[str, Any]:
         """What a gradient step is told of its samples, those of an iteration or of a `shard`."""
         options: dict[str, Any] = {"spp": self.share_spp if shard else self.run.spp, "adjoint": self.adjoint}
         if self.adjoint == "batched":
-            options |= {"batches": self.run.batches, "first_batch": self.run.first_batch}
+            options["batches"] = self.run.batches
         if self.halves == 2:
             options["halves"] = True
         return options
@@ -321,15 +305,10 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _check_together(self) -> Self:
-        sensors, files = self.scene.sensors, self.target.file
         if self.views is not None:
             check_views(self.views, self.scene, self.target)
-        elif files is None and self.target.render is None and self.scene.cameras is None:
+        elif self.target.file is None and self.target.render is None and self.scene.cameras is None:
             raise located("target", "must have exactly one of `file` and `render`, and has none")
-        if files is not None and sensors != "all" and len(files) != len(sensors):
-            raise located(
-                "target.file", f"must name one image for each sensor; images: {len(files)}, sensors: {len(sensors)}"
-            )
         places: dict[tuple[str, str], int] = {}
         for i, spec in enumerate(self.parameters):
             for option, j, name in spec.objects():
@@ -341,13 +320,6 @@ class Config(Section):
         self._check_samples()
         self._check_standing()
         check_stages(self.run.stages)
-        for number in range(len(self.run.stages)):
-            try:
-                self.at_stage(number)._check_samples()
-            except PydanticCustomError as error:
-                about = error.context or {}
-                reason = f"would not do as run.spp: {about.get('key')}: {about.get('message', error)}"
-                raise located(f"run.stages[{number}].spp", reason) from None
         if self.run.adjoint == "correlated" and self.integrator.options().get("weight") == "adjoint":
             raise located(
                 "integrator.weight",
@@ -368,19 +340,14 @@ class Config(Section):
         return self
 
     def _check_standing(self) -> None:
-        """Raise an error, located, where windows of losses hold too few, or an average's iterations are not known."""
-        stop, optimizer = self.run.stop, self.optimizer
+        """Raise an error, located, where windows of losses hold too few."""
+        stop = self.run.stop
         if stop is not None and self.run.held_out and stop.patience < 20:
             reason = f"must be at least 20, not {stop.patience}: held-out views are looked at every 10 iterations"
             raise located("run.stop.patience", reason)
         if self.run.max_seconds is not None and self.run.stages:
             reason = "does not go with run.stages, which are shares of run.iterations; remove one"
             raise located("run.max_seconds", reason)
-        ends = "run.stop" if stop is not None else "run.max_seconds" if self.run.max_seconds is not None else ""
-        if ends and optimizer.average is not None:
-            raise located(
-                "optimizer.average", f"does not go with {ends}, which ends a run nobody knows when; remove one"
-            )
 
     def _check_samples(self) -> None:
         """Raise an error, located, where a step's samples cannot be split as the run's settings have it."""
@@ -390,9 +357,8 @@ class Config(Section):
             obstacle = self.samples_obstacle(self.scene.size[0] * self.scene.size[1])
             if obstacle is not None:
                 raise located("run.spp", obstacle)
-        for option in sorted({"batches", "first_batch"} & self.run.model_fields_set):
-            if self.run.adjoint not in ("auto", "batched", "others"):
-                raise located(f"run.{option}", f"has no effect with run.adjoint: {self.run.adjoint}, but with batched")
+        if "batches" in self.run.model_fields_set and self.run.adjoint not in ("auto", "batched", "others"):
+            raise located("run.batches", f"has no effect with run.adjoint: {self.run.adjoint}, but with batched")
         if self.run.adjoint == "batched":
             spp, what = self.share_spp, "run.spp" if self.shares == 1 else "the samples of a shard"
             if spp % self.run.batches:
@@ -423,14 +389,10 @@ class Config(Section):
             reason = f"must be a multiple of {2 * sets}, not {self.run.spp}: loss.scale: fitted takes samples in halves"
             raise located("run.spp", reason)
         _check_passes(self.integrator, self.set_spp, "integrator", f"run.spp / {2 * sets}, by loss.scale: fitted")
-        shared = self.target.exposure if isinstance(self.target.exposure, list) else [self.target.exposure]
-        for number, view in enumerate(self.views or [None]):
-            given, place = (self.loss, "loss") if view is None or view.loss is None else \
-                (view.loss, f"views[{number}].loss")  # fmt: skip
-            key, own = loss_keys(place, "scale", given)[0]
-            exposures = shared if view is None or view.exposure is None else [view.exposure]
-            if own.scale == "fitted" and any(isinstance(each, str) for each in exposures):
-                by = "target.exposure" if view is None or view.exposure is None else f"views[{number}].exposure"
+        exposures = {f"views[{number}].exposure": view.exposure for number, view in enumerate(self.views or ())}
+        for by, exposure in {"target.exposure": self.target.exposure, **exposures}.items():
+            if isinstance(exposure, str):
+                key, _ = loss_keys("scale", self.loss)[0]
                 raise located(key, f"cannot be fitted beside {by}, which is recovered: both scale the image")
 
 

@@ -18,10 +18,9 @@ from pydantic import (
 from pydantic_core import CoreSchema
 from typing_extensions import Self
 
-from reslrb_cli.config.base import ConfigPath, Count, Positive, Section, Seed, list_of_one, located, must, wrong
+from reslrb_cli.config.base import ConfigPath, Count, Positive, Section, located, must, wrong
 from reslrb_cli.config.files import KEY_LENGTH
 from reslrb_cli.config.integrators import AnyIntegrator
-from reslrb_cli.config.optimizers import Losses
 from reslrb_cli.config.parameters import COLOR_SPACE, ColorSpace, Value
 
 _KINDS = ("specular", "border", "clipped", "alpha")
@@ -73,6 +72,18 @@ class _OrText:
 AnyMask = Annotated[Mask, BeforeValidator(_mask), _OrText()]
 
 
+def _view_mask(value: Any) -> Any:
+    if isinstance(value, dict) and {**value, "file": None} == {**dict.fromkeys(_KINDS, False), "file": None}:
+        return value  # as a run's own configuration has it
+    if not isinstance(value, (str, Path, Mask)) or value == "auto":
+        raise wrong("must be `none` or the path of an image of weights; which kinds are left out is in `target.mask`")
+    return _mask(value)
+
+
+#: `none`, or an image of weights.
+ViewMask = Annotated[Mask, BeforeValidator(_view_mask), WithJsonSchema({"type": "string"})]
+
+
 def _exposure(value: Any) -> Any:
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if (is_number and math.isfinite(value) and value > 0) or value in ("auto", "per_channel"):
@@ -82,23 +93,11 @@ def _exposure(value: Any) -> Any:
 
 _EXPOSURE = [{"type": "number", "exclusiveMinimum": 0}, {"enum": ["auto", "per_channel"]}]
 
-#: One view's exposure: a number, `auto` (recovered, one factor), or `per_channel` (recovered, one factor a channel).
+#: An exposure: a number, `auto` (recovered, one factor), or `per_channel` (recovered, one factor a channel).
 Exposure = Annotated[
     float | Literal["auto", "per_channel"],
     BeforeValidator(_exposure),
     WithJsonSchema({"anyOf": _EXPOSURE}),
-]
-
-
-def _exposures(value: Any) -> Any:
-    return [_exposure(item) for item in value] if isinstance(value, list) else _exposure(value)
-
-
-#: One exposure that all views share, or a list with one for each.
-Exposures = Annotated[
-    float | Literal["auto", "per_channel"] | list[Exposure],
-    BeforeValidator(_exposures),
-    WithJsonSchema({"anyOf": [*_EXPOSURE, {"type": "array", "items": {"anyOf": [{"type": "number"}, _EXPOSURE[1]]}}]}),
 ]
 
 
@@ -129,27 +128,16 @@ class Rendering(Section):
     """True values by key, as in `parameters`: a number, a list of numbers, or an image file. Empty: the scene as it
     stands."""
     spp: Count = Field(default=1024, description="Samples per pixel of the target.")
-    seed: Seed = Field(default=0, description="Seed of the target's samples.")
     integrator: AnyIntegrator | None = None
     """Integrator of the target; null: that of the run."""
-
-
-_PATH = {"type": "string", "format": "path"}
-
-_Files = Annotated[
-    list[ConfigPath],
-    Field(min_length=1),
-    BeforeValidator(list_of_one),
-    WithJsonSchema({"anyOf": [_PATH, {"type": "array", "items": _PATH, "minItems": 1}]}),
-]
 
 
 class TargetConfig(Section):
     """What the image is compared with: exactly one of `file` and `render`; views with own targets need none."""
 
-    file: _Files | None = None
-    """Target image (EXR, PNG, JPG, HDR), or a list with one for each sensor, in their order; relative to the config
-    file. It is turned as its EXIF orientation says, unless `scene.cameras` is given."""
+    file: ConfigPath | None = None
+    """Target image (EXR, PNG, JPG, HDR), relative to the config file. It is turned as its EXIF orientation says, unless
+    `scene.cameras` is given. Several views have theirs in `views`."""
     color_space: ColorSpace = Field(default="auto", description=f"{COLOR_SPACE} Only with `file`.")
     truth: bool = False
     """Whether files show the scene with its own values, as pictures of another renderer do: the error of each parameter
@@ -158,10 +146,18 @@ class TargetConfig(Section):
     mask: AnyMask = Mask()
     """Pixels that are left out of the loss, and what the others weigh: `auto` (all kinds are left out), `none`, the
     path of an image of weights, alone, or a section that switches kinds off and may add weights."""
-    exposure: Exposures = 1.0
+    exposure: Exposure = 1.0
     """What the image is multiplied by before it is compared, target = exposure * image: a number, `auto` (recovered
-    with the parameters, one factor), or `per_channel` (recovered, one for each channel, which is white balance), all
-    views having the same; or a list of these with one for each view, which are then recovered apart."""
+    with the parameters, one factor), or `per_channel` (recovered, one for each channel, which is white balance). All
+    views have the same; `views` may give each its own."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _check_lists(cls, values: Any) -> Any:
+        for name in ("file", "exposure") if isinstance(values, dict) else ():
+            if isinstance(values.get(name), list):
+                raise located(name, "is a list; give each view its own in `views`")
+        return values
 
     @model_validator(mode="after")
     def _check_one(self) -> Self:
@@ -188,26 +184,22 @@ class ViewSpec(Section):
     sensor: Annotated[int, Field(ge=0)] = Field(description="Index of the scene's sensor.")
     target: ConfigPath | None = None
     """Target image, relative to the config file; null: rendered, as `target.render` says."""
-    mask: AnyMask | None = Field(default=None, description="As `target.mask`, which it stands in place of.")
+    mask: ViewMask | None = None
+    """What stands in place of `target.mask`: `none`, or the path of an image of weights, alone."""
     weight: Positive = Field(default=1.0, description="The view's part of the loss, relative to the other views'.")
     exposure: Exposure | None = None
     """As `target.exposure`, but recovered for this view alone where it is not a number."""
-    loss: Losses | None = Field(default=None, description="How this view is compared; null: as `loss` says.")
 
 
 def check_views(views: list[ViewSpec], scene: Any, target: TargetConfig) -> None:
-    """Raise an error, located, where views and the short forms, `scene.sensors` and `target`, contradict each other."""
+    """Raise an error, located, where views contradict each other or `target`."""
     places: dict[int, int] = {}
     for number, view in enumerate(views):
         if places.setdefault(view.sensor, number) < number:
             raise located(f"views[{number}].sensor", f"{view.sensor} stands in views[{places[view.sensor]}] already")
         if view.target is None and target.render is None and scene.cameras is None:
             raise located(f"views[{number}].target", "missing; name an image, or have all rendered by target.render")
-    if scene.sensors != [0]:
-        raise located("scene.sensors", "stands beside `views`, which name their own sensors; remove it")
     if target.file is not None:
         raise located("target.file", "has no effect beside `views`; give each view its own target")
-    if isinstance(target.exposure, list):
-        raise located("target.exposure", "is a list, but there are `views`: give each view its own exposure")
     if target.render is not None and all(view.target is not None for view in views):
         raise located("target.render", "has no effect: every view has a target of its own")

@@ -102,7 +102,9 @@ class Pushing(VertexHooks):
     def goes_on(self, state: Pushed, vertex: Vertex) -> mi.Bool:
         return mi.Bool(True) if self.end is None else state.count < self.end
 
-    def scattering(self, state: Pushed, vertex: Vertex, connection: Connection, scattering: Scattering) -> Pushed:
+    def vertex(
+        self, state: Pushed, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> Pushed:  # fmt: skip
         p, plan, seen = self.p, self.p.plan, connection.active
         if p.block is not None:
             C = vertex.product.times(connection.c, vertex.depth).scaled(p.scale)

@@ -100,8 +100,8 @@ class Blocks:
 class ChainState:
     """What is kept of a path; what is in a list is there on the way alone.
 
-    `latest` is the latest vertex with anything to differentiate (0: none), `J` is J_{0->i}, `G` has a row for each
-    channel, and `numbers` are those to select the current connection by.
+    `latest` is the latest vertex with anything to differentiate (0: none), `J` is J_{0->i}, and `G` has a row for each
+    channel.
     """
 
     W: mi.Float
@@ -111,7 +111,6 @@ class ChainState:
     G: list[mi.Vector4d]
     blocks: list[Blocks]
     before: list[Before]
-    numbers: list[mi.Float]
 
     @staticmethod
     def empty(plan: Plan, capacity: int) -> ChainState:
@@ -127,11 +126,11 @@ class ChainState:
             for _ in range(capacity)
         ]  # fmt: skip
         latest, J, blocks = [mi.UInt32(0)], [mi.Matrix4d(1)], Blocks.of(plan)
-        return ChainState(mi.Float(0), slots, latest, J, rows(channels), blocks, Before.start(plan), [])
+        return ChainState(mi.Float(0), slots, latest, J, rows(channels), blocks, Before.start(plan))
 
     def stored(self) -> ChainState:
         """What is left of it at the end of a path."""
-        return ChainState(self.W, self.slots, [], [], [], [], [], [])
+        return ChainState(self.W, self.slots, [], [], [], [], [])
 
 
 def numbers_of(connection: Connection, scattering: Scattering) -> Numbers:
@@ -163,14 +162,9 @@ class ChainSelection(VertexHooks):
             return mi.Bool(True)
         return self.concerned(state) | begins(self.p.plan, vertex)
 
-    def connection(
-        self, state: ChainState, vertex: Vertex, connection: Connection, numbers: list[mi.Float]
-    ) -> ChainState:
-        return replace(state, numbers=numbers)
-
-    def scattering(
-        self, state: ChainState, vertex: Vertex, connection: Connection, scattering: Scattering
-    ) -> ChainState:
+    def vertex(
+        self, state: ChainState, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> ChainState:  # fmt: skip
         p, plan = self.p, self.p.plan
         C = contribution(p, vertex, connection)
         p.splat(connection.u, C.value(), connection.active)
@@ -178,10 +172,10 @@ class ChainSelection(VertexHooks):
         on = self.concerned(state) | here
         latest = dr.select(here & vertex.active, vertex.depth, state.latest[0])
         candidate = connection.active & on
-        numbers = numbers_of(connection, scattering)
         jacobian = segment_jacobian(
-            p.samples, vertex, state.before, numbers, candidate, scattering.active & on, self.damping
-        )
+            p.samples, vertex, state.before, numbers_of(connection, scattering), candidate, scattering.active & on,
+            self.damping,
+        )  # fmt: skip
         w = dr.select(candidate, self.weigh(connection, C, state.W), 0)
         W = state.W + w
         [J], G = state.J, state.G
@@ -196,19 +190,19 @@ class ChainSelection(VertexHooks):
             C_rows=[row_times(row, J) + before for row, before in zip(jacobian.log_c, G, strict=True)],
             block=[number for blocks in state.blocks for number in (blocks.chosen, blocks.number + 1)],
         )
-        slots = chosen_by(state.numbers[: self.capacity], w, W, this, state.slots)
+        slots = chosen_by(numbers[: self.capacity], w, W, this, state.slots)
         on &= scattering.active
         G = [dr.select(on, before + row_times(row, J), before) for row, before in zip(jacobian.log_s, G, strict=True)]
         after = replace(state, W=W, slots=slots, latest=[latest], J=[dr.select(on, jacobian.ray @ J, J)], G=G)
         before = Before.of(plan, vertex, scattering)
-        return replace(self._begun_anew(after, jacobian.damped), before=before, numbers=[])
+        return replace(self._begun_anew(after, jacobian.damped, numbers[-1]), before=before)
 
-    def _begun_anew(self, state: ChainState, damped: mi.Bool) -> ChainState:
+    def _begun_anew(self, state: ChainState, damped: mi.Bool, number: mi.Float) -> ChainState:
         """The chain begins anew with a block, instead of any before it, with one over their number as probability."""
         if not state.blocks:
             return state
         blocks, begins = state.blocks[0].past(damped)
-        anew = begins & (state.numbers[-1] * (blocks.number + 1) < 1)
+        anew = begins & (number * (blocks.number + 1) < 1)
         J = dr.select(anew, mi.Matrix4d(1), state.J[0])
         G = [dr.select(anew, mi.Vector4d(0), row) for row in state.G]
         chosen = dr.select(anew, blocks.number, blocks.chosen)
@@ -276,13 +270,14 @@ class ChainReplay(SlotReplay):
         rows, begun = [one.row for one in self.kept], mi.Bool(concerns_emission(plan))
         return ReplayState(rows, begun, Blocks.of(plan), Before.start(plan))
 
-    def scattering(
-        self, state: ReplayState, vertex: Vertex, connection: Connection, scattering: Scattering
-    ) -> ReplayState:
+    def vertex(
+        self, state: ReplayState, vertex: Vertex, connection: Connection, scattering: Scattering,
+        numbers: list[mi.Float],
+    ) -> ReplayState:  # fmt: skip
         plan, depth = self.p.plan, vertex.depth
         begun = state.begun | begins(plan, vertex)
-        numbers, on = numbers_of(connection, scattering), scattering.active & begun
-        jacobian = segment_jacobian(self.p.samples, vertex, state.before, numbers, None, on, self.damping)
+        drawn, on = numbers_of(connection, scattering), scattering.active & begun
+        jacobian = segment_jacobian(self.p.samples, vertex, state.before, drawn, None, on, self.damping)
         blocks, entered = state.blocks, mi.Bool(False)
         if blocks:
             passed, entered = blocks[0].past(jacobian.damped)
@@ -293,7 +288,7 @@ class ChainReplay(SlotReplay):
             inside, weight = kept.part(blocks)
             rows.append(dr.select(on & inside & ~entered & (depth < kept.slot.number), row_times(ahead, inverse), row))
             weighted.append(dr.select(inside, rows[-1] * weight, 0))
-        self._differentiate(vertex, state.before, numbers, scattering, weighted)
+        self._differentiate(vertex, state.before, drawn, scattering, weighted)
         return ReplayState(rows, begun, blocks, Before.of(plan, vertex, scattering))
 
     def _differentiate(

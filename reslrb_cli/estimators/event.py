@@ -64,7 +64,6 @@ class EventState:
     W: mi.Float
     prefix: list[Event]
     slots: list[Slot]
-    numbers: list[mi.Float]  # that chose between prefix and vertex in this one's connection
 
 
 @dataclass
@@ -87,14 +86,14 @@ class EventSelection(VertexHooks):
         slots = [Slot.empty(plan) for _ in range(self.capacity)]
         prefix = [Event.emission(plan) for _ in slots]
         Q = mi.Float(1 if plan.differentiate_emission else 0)
-        return EventState(Q, mi.Float(0), prefix, slots, [mi.Float(0) for _ in slots])
+        return EventState(Q, mi.Float(0), prefix, slots)
 
     def concerned(self, state: EventState) -> mi.Bool:
         return state.Q > 0
 
-    def connection(
-        self, state: EventState, vertex: Vertex, connection: Connection, numbers: list[mi.Float]
-    ) -> EventState:
+    def vertex(
+        self, state: EventState, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> EventState:  # fmt: skip
         p, plan = self.p, self.p.plan
         C = contribution(p, vertex, connection)
         p.splat(connection.u, C.value(), connection.active)
@@ -113,21 +112,15 @@ class EventSelection(VertexHooks):
                 event = dr.select(numbers[2 * k] * Q < q, this, event)
             pair = Slot(w, C.stored(), connection.u, event)
             slots.append(dr.select(is_taken(numbers[2 * k + 1], w * Q, W), pair, slot))
-        return replace(state, W=W, slots=slots, numbers=numbers[::2])
-
-    def scattering(
-        self, state: EventState, vertex: Vertex, connection: Connection, scattering: Scattering
-    ) -> EventState:
-        plan = self.p.plan
         if not plan.differentiate_bsdfs:
-            return state
+            return replace(state, W=W, slots=slots)
         q = dr.select(plan.differentiates(vertex.bsdf), mi.Float(1), 0)
         Q = state.Q + q
         this = Event.of_scattering(plan, vertex, scattering)
         prefix = [
-            dr.select(number * Q < q, this, event) for number, event in zip(state.numbers, state.prefix, strict=True)
+            dr.select(number * Q < q, this, event) for number, event in zip(numbers[::2], state.prefix, strict=True)
         ]
-        return EventState(Q, state.W, prefix, state.slots, state.numbers)
+        return EventState(Q, W, prefix, slots)
 
 
 class EventEstimator(Estimator):

@@ -90,9 +90,10 @@ class Gathering(VertexHooks):
             return GatherState(visibility, [], [])
         return GatherState(visibility, [AdjointSum.zero(p.plan.track_zeros)], [mi.UInt32(0)])
 
-    def connection(
-        self, state: GatherState, vertex: Vertex, connection: Connection, numbers: list[mi.Float]
-    ) -> GatherState:
+    def vertex(
+        self, state: GatherState, vertex: Vertex, connection: Connection, scattering: Scattering,
+        numbers: list[mi.Float],
+    ) -> GatherState:  # fmt: skip
         p, depth, last = self.p, vertex.depth, vertex.depth
         C = contribution(p, vertex, connection)
         p.splat(connection.u, C.value(), connection.active)
@@ -139,9 +140,9 @@ class Taking(Revisiting):
     def start(self, product: Product) -> AdjointSum:
         return self.S
 
-    def scattering(
-        self, state: AdjointSum, vertex: Vertex, connection: Connection, scattering: Scattering
-    ) -> AdjointSum:
+    def vertex(
+        self, state: AdjointSum, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> AdjointSum:  # fmt: skip
         p, plan, connected = self.p, self.p.plan, connection.active
         useful = plan.differentiates(vertex.bsdf)
         if self.first is not None:

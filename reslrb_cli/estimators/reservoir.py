@@ -97,9 +97,10 @@ class ReservoirSelection(VertexHooks):
     def concerned(self, state: ReservoirState) -> mi.Bool:
         return state.latest[0] > 0
 
-    def connection(
-        self, state: ReservoirState, vertex: Vertex, connection: Connection, numbers: list[mi.Float]
-    ) -> ReservoirState:
+    def vertex(
+        self, state: ReservoirState, vertex: Vertex, connection: Connection, scattering: Scattering,
+        numbers: list[mi.Float],
+    ) -> ReservoirState:  # fmt: skip
         C = contribution(self.p, vertex, connection)
         self.p.splat(connection.u, C.value(), connection.active)
         plan, candidate = self.p.plan, connection.active
@@ -109,13 +110,8 @@ class ReservoirSelection(VertexHooks):
         W = state.W + w
         event = [Event.of_connection(plan, vertex, connection)] if plan.differentiate_bsdfs else []
         this = Slot(w, state.latest[0], C.stored(), connection.u, event)
-        return ReservoirState(W, chosen_by(numbers, w, W, this, state.slots), state.latest)
-
-    def scattering(
-        self, state: ReservoirState, vertex: Vertex, connection: Connection, scattering: Scattering
-    ) -> ReservoirState:
-        latest = dr.select(self.p.plan.differentiates(vertex.bsdf), vertex.depth, state.latest[0])
-        return ReservoirState(state.W, state.slots, [latest])
+        latest = dr.select(plan.differentiates(vertex.bsdf), vertex.depth, state.latest[0])
+        return ReservoirState(W, chosen_by(numbers, w, W, this, state.slots), [latest])
 
 
 class ReservoirReplay(SlotReplay):
@@ -125,7 +121,9 @@ class ReservoirReplay(SlotReplay):
         super().__init__(p, [slot.last for slot in slots])
         self.kept = list(zip(slots, adjoints, strict=True))
 
-    def scattering(self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
+    def vertex(
+        self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> Any:  # fmt: skip
         plan, bsdf, depth = self.p.plan, vertex.bsdf, vertex.depth
         active = scattering.active & plan.differentiates(bsdf)
         rest, weight = mi.Spectrum(scattering.correction / scattering.pdf), mi.Spectrum(0)

@@ -118,7 +118,9 @@ class Pushing(VertexHooks):
     def goes_on(self, state: Pushed, vertex: Vertex) -> mi.Bool:
         return mi.Bool(True) if self.visibility is None else vertex.depth < self.visibility.last
 
-    def scattering(self, state: Pushed, vertex: Vertex, connection: Connection, scattering: Scattering) -> Pushed:
+    def vertex(
+        self, state: Pushed, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> Pushed:  # fmt: skip
         p, plan, connected = self.p, self.p.plan, connection.active
         C = contribution(p, vertex, connection)
         p.splat(connection.u, C.value(), connected)

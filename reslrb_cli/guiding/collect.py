@@ -296,13 +296,15 @@ class Hearing(Hooks):
         counts, sums = [mi.UInt32(0) for _ in self.groups], [mi.Spectrum(0) for _ in range(number)]
         return Heard(counts, sums, mi.Float(0), dr.max(dr.abs(product.weight())), Trail.begin(number), factor)
 
-    def connection(self, state: Heard, vertex: Vertex, connection: Connection, numbers: list[mi.Float]) -> Heard:
+    def vertex(
+        self, state: Heard, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> Heard:  # fmt: skip
         plan, active = self.samples.plan, connection.active
         C = vertex.product.times(connection.c, vertex.depth)
         said = self.adjoint.lookup(connection.u, active) * self.loudness * C.weight()
         said = dr.select(active, said, 0)
-        counts = [count + meets(group, vertex) for count, group in zip(state.counts, self.groups, strict=True)]
-        parts = [said * mi.Float(count) for count in counts]
+        met = [meets(group, vertex) for group in self.groups]
+        parts = [said * mi.Float(count + here) for count, here in zip(state.counts, met, strict=True)]
         if plan.differentiate_emission:
             parts.append(said)
         if plan.attached:
@@ -312,21 +314,17 @@ class Hearing(Hooks):
             assert self.film is not None
             block = self.film.block(connection.u)
             for voice, square in enumerate([*(dr.squared_norm(part) for part in parts), image]):
-                counts = active & dr.isfinite(square) & (square > 0) & (r > 0)
+                valid = active & dr.isfinite(square) & (square > 0) & (r > 0)
                 place = block + voice * self.film.count
-                dr.scatter_reduce(dr.ReduceOp.Add, self.places[0], square / r, place, counts)
+                dr.scatter_reduce(dr.ReduceOp.Add, self.places[0], square / r, place, valid)
         sums = [total + part for total, part in zip(state.sums, parts, strict=True)]
-        return replace(state, sums=sums, image=state.image + image, trail=state.trail.with_vertex([*parts, image]))
-
-    def scattering(self, state: Heard, vertex: Vertex, connection: Connection, scattering: Scattering) -> Heard:
-        counts = [
-            count + dr.select(scattering.active, meets(group, vertex), 0)
-            for count, group in zip(state.counts, self.groups, strict=True)
-        ]
+        trail = state.trail.with_vertex([*parts, image])
+        scattered = scattering.active
+        counts = [count + dr.select(scattered, here, 0) for count, here in zip(state.counts, met, strict=True)]
         throughput = dr.max(dr.abs(vertex.product.times(scattering.weight, vertex.depth).weight()))
-        inverse = dr.select(scattering.active & (throughput > 0), dr.rcp(throughput), 0)
-        state.trail.leaves(self.survival.cell(vertex.si.p, scattering.d), inverse)
-        return replace(state, counts=counts)
+        inverse = dr.select(scattered & (throughput > 0), dr.rcp(throughput), 0)
+        trail.leaves(self.survival.cell(vertex.si.p, scattering.d), inverse)
+        return replace(state, counts=counts, sums=sums, image=state.image + image, trail=trail)
 
     def aimed(self, state: Heard, factor: mi.Float) -> Heard:
         # Part of what paths say, other than the weight of a roulette that is being learned for.

@@ -104,9 +104,6 @@ class Projective(Replayed):
 
     def obstacle(self, scene: mi.Scene, sensors: Iterable[mi.Sensor], moved: Iterable[mi.Object]) -> str | None:
         """Return why Mitsuba 3.9 gets outlines or shadow edges of what is `moved` wrong, or None."""
-        spot = next((emitter for emitter in scene.emitters() if emitter.class_name() == "SpotLight"), None)
-        if spot is not None and self.plugin.max_depth == 2 and self.plugin.sppi != 0:
-            return f"misses the shadow edges of spot lamps, as {spot.id()} is; take prb_projective"
         advice = "or set integrator.sppp to 0, which leaves out outlines that the sensor sees"
         for sensor in sensors if self.plugin.sppp != 0 else ():
             if sensor.class_name() != "PerspectiveCamera":

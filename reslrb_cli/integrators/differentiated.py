@@ -196,10 +196,10 @@ class BouncedLight(Hooks):
             moved |= self.emitter == mi.EmitterPtr(moving)
         return Bounced(moved, mi.Bool(False), mi.Bool(False))
 
-    def connection(self, state: Bounced, vertex: Vertex, connection: Connection, numbers: list[mi.Float]) -> Bounced:
-        return Bounced(state.moved, state.bounced, state.seen | (connection.active & state.bounced))
-
-    def scattering(self, state: Bounced, vertex: Vertex, connection: Connection, scattering: Scattering) -> Bounced:
+    def vertex(
+        self, state: Bounced, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> Bounced:  # fmt: skip
+        seen = state.seen | (connection.active & state.bounced)
         moved = state.moved | self.plan.moves(vertex.si.shape) | self.plan.differentiates(vertex.bsdf)
         staying = scattering.active & stays_behind(self.plan, vertex.bsdf, scattering.is_delta)
-        return Bounced(moved, state.bounced | (moved & staying), state.seen)
+        return Bounced(moved, state.bounced | (moved & staying), seen)

@@ -59,7 +59,9 @@ class RecordedObjective(Hooks):
     def start(self, product: Product) -> mi.Float:
         return mi.Float(0)
 
-    def connection(self, state: mi.Float, vertex: Vertex, connection: Connection, numbers: list[mi.Float]) -> mi.Float:
+    def vertex(
+        self, state: mi.Float, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> mi.Float:  # fmt: skip
         C = vertex.product.times(connection.c, vertex.depth).scaled(self.samples.scale).value()
         delta = self.adjoint.lookup(connection.u, connection.active)
         return state + dr.select(connection.active, dr.dot(delta, C), 0)
@@ -94,7 +96,9 @@ class TangentSplat(Tangents):
     def start(self, product: Product) -> Tangent:
         return Tangent(mi.Spectrum(self.dE))
 
-    def scattering(self, state: Tangent, vertex: Vertex, connection: Connection, scattering: Scattering) -> Tangent:
+    def vertex(
+        self, state: Tangent, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> Tangent:  # fmt: skip
         s, P, scattered = self.samples, vertex.product.value(), scattering.active
         if s.plan.needs.has_null:
             limit = s.plan.max_depth - vertex.depth - 1
@@ -141,20 +145,21 @@ class AttachedTangentSplat(Tangents):
         before = Before.start(self.samples.plan)
         return AttachedTangent(mi.Spectrum(self.dE), mi.Vector3f(0), mi.Vector3f(0), before)
 
-    def scattering(
-        self, state: AttachedTangent, vertex: Vertex, connection: Connection, scattering: Scattering
-    ) -> AttachedTangent:
+    def vertex(
+        self, state: AttachedTangent, vertex: Vertex, connection: Connection, scattering: Scattering,
+        numbers: list[mi.Float],
+    ) -> AttachedTangent:  # fmt: skip
         s, P, scattered = self.samples, vertex.product.value(), scattering.active
         plan = s.plan
         seen, _ = passage(plan, s.scene, vertex.si, vertex.depth, connection)
-        numbers = Numbers(connection.sample, scattering.sample_2, scattering.sample_1)
+        drawn = Numbers(connection.sample, scattering.sample_2, scattering.sample_1)
         with dr.resume_grad():
             ray = mi.Ray3f(vertex.ray)
             ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
             dr.enable_grad(ray.o, ray.d)
             dr.set_grad(ray.o, mi.Point3f(state.d_origin))
             dr.set_grad(ray.d, state.d_direction)
-            this, reached = segment_again(s, state.before, ray, vertex.pi, numbers, seen, scattered)
+            this, reached = segment_again(s, state.before, ray, vertex.pi, drawn, seen, scattered)
             following, taps = this.next_ray(attached=True), s.film.taps(this.connection.u, plan.attached_normalization)
             # Selected: no other of these hangs on what that makes, which would be cleared on the way.
             connection, scattering = this.connection, this.scattering

@@ -84,7 +84,7 @@ class Recordings:
             reason = str(error.__cause__ or error).splitlines()[0]
             raise UnsupportedScene(
                 f"freeze: a recorded step no longer fits, as when another scene was loaded since ({reason}); "
-                "set integrator.freeze to false"
+                "switch recordings off by drjit.set_flag(drjit.JitFlag.KernelFreezing, False)"
             ) from error
 
     def counts(self) -> dict[str, int]:

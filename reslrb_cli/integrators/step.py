@@ -32,7 +32,6 @@ from reslrb_cli.integrators.plugin import TRACERS, make_tracer
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator, halves_of, whole_of
 
 Adjoint = Literal["correlated", "independent", "batched"]
-FirstBatch = Literal["image", "again"]
 Objective: TypeAlias = "Callable[[mi.TensorXf], mi.Float | mi.TensorXf]"
 
 #: Told of an image and of the dL/dI that its samples were differentiated with.
@@ -208,7 +207,6 @@ def gradient_step(
     params: mi.SceneParameters | None = None,
     on_image: Callable[[], None] | None = None,
     batches: int = 4,
-    first_batch: FirstBatch = "image",
     on_samples: OnSamples | None = None,
     halves: bool = False,
 ) -> StepResult:
@@ -216,10 +214,10 @@ def gradient_step(
 
     `objective` maps the image, a tensor (H, W, C) that tracks derivatives, to a scalar; `sensor` is one of the scene's
     or its index; `params` are the scene's parameters where the caller has them at hand (`mi.traverse` otherwise).
-    `on_image` is called once the image and the loss are evaluated, where a step has such a moment. `batches` and
-    `first_batch` belong to `adjoint="batched"`, whose loss is that of all samples' image. `on_samples` is called with
-    the image of each set of samples that is differentiated, and with the dL/dI that it is differentiated with: what
-    the image alone is multiplied by has its derivative from the same samples. With `halves`, what `objective` and
+    `on_image` is called once the image and the loss are evaluated, where a step has such a moment. `batches` belong to
+    `adjoint="batched"`, whose loss is that of all samples' image. `on_samples` is called with the image of each set of
+    samples that is differentiated, and with the dL/dI that it is differentiated with: what the image alone is
+    multiplied by has its derivative from the same samples. With `halves`, what `objective` and
     `on_samples` are given are the images (2, H, W, C) of two halves of the samples (`protocol.whole_of`), whose number
     has to be even in every set.
 
@@ -228,7 +226,6 @@ def gradient_step(
     """
     check_variant(mi.variant())
     one_of("adjoint", adjoint, get_args(Adjoint))
-    one_of("first_batch", first_batch, get_args(FirstBatch))
     _check_number("spp", spp, 0, PASSES * PASS_SAMPLES)
     _check_number("batches", batches, 2 if adjoint == "batched" else 1, PASSES)
     if isinstance(seed, Integral):
@@ -237,7 +234,7 @@ def gradient_step(
     if halves:
         work = Halves(work)
     if adjoint == "batched":
-        return _batched(work, job, objective, batches, first_batch, on_samples)
+        return _batched(work, job, objective, batches, on_samples)
     losses: list[mi.Float | mi.TensorXf] = []
     gradients: list[mi.TensorXf] = []
     refused = Refused()
@@ -308,20 +305,18 @@ def _job(scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int, params: 
 
 
 def _batched(
-    integrator: StepIntegrator, job: Job, objective: Objective, batches: int, first_batch: FirstBatch,
-    on_samples: OnSamples | None,
-) -> StepResult:  # fmt: skip
+    integrator: StepIntegrator, job: Job, objective: Objective, batches: int, on_samples: OnSamples | None
+) -> StepResult:
     """A step in batches (design of Deng et al. 2022's dual buffer): batch b takes delta from the image of those before.
 
     No path sees a delta that it helped to make, so that the gradient of an L2 loss is unbiased, as with `independent`,
-    from half the paths. The first batch gives an image alone, or is traced `again` with the delta of all others.
+    from half the paths. The first batch gives an image alone.
     """
     if job.spp < 1 or job.spp % batches:
         raise ValueError(f"the samples per pixel ({job.spp}) must be a multiple of the batches ({batches})")
     parts = [replace(job, seed=seed, spp=job.spp // batches) for seed in batch_seeds(job.seed, batches)]
-    share = 1 / (batches if first_batch == "again" else batches - 1)
-    first = integrator.image(parts[0])
-    image, refused = first, Refused()
+    share = 1 / (batches - 1)
+    image, refused = integrator.image(parts[0]), Refused()
     for b in range(1, batches):
         _, gradient = derivative_of(objective, image, refused)
         own = integrator.known(parts[b], gradient * share)
@@ -329,10 +324,6 @@ def _batched(
             on_samples(own, gradient * share)
         image = image + (own - image) / (b + 1)
         dr.eval(image)
-    if first_batch == "again":
-        others = (image * batches - first) / (batches - 1)
-        _, gradient = derivative_of(objective, others, refused)
-        _differentiate(integrator, parts[0], gradient * share, on_samples)
     return StepResult(whole_of(image), dr.detach(objective(image)), refused, image)
 
 

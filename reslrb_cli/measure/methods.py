@@ -53,7 +53,7 @@ BOTH_SHARE = float(UNDECIDED["light_share"])
 PLUGIN_ESTIMATOR = "reservoir"
 
 #: Options of a case that are those of `run`, for itself alone.
-ADJOINT = ("adjoint", "batches", "first_batch")
+ADJOINT = ("adjoint", "batches")
 _TYPES = {str(kind.model_fields["type"].default): kind for kind in get_args(get_args(AnyIntegrator)[0])}
 
 #: Options that make an estimator another one, in records.

@@ -178,7 +178,7 @@ class MissingCheck:
         self._weigh(problem, sensor, max(IMAGE_PATHS // (height * width), 1))
         options = problem.config.integrator.options()
         shared = {name: options[name] for name in ("max_depth", "hide_emitters")}
-        self._tracer = make_integrator("reslrb", **options)
+        self._tracer = make_integrator("reslrb", **options, freeze=True)
         self._differenced = make_integrator("walk_ad", **shared, rr_depth=NEVER if ends(depth) else options["rr_depth"])
         count_of_each = along or MOVING_DIRECTIONS
         self._directions = all_directions(self.case, problem.selection, count_of_each, count_of_each)

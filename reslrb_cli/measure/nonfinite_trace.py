@@ -112,7 +112,6 @@ def purposes(problem: Problem, view: View) -> list[tuple[int, str, Purpose]]:
         found = [(0, "", Purpose.IMAGE), (1, "", gradient)]
     else:
         found = [(0, "", Purpose.IMAGE), *((b, "", Purpose.BOTH) for b in range(1, options["batches"]))]
-        found += [(0, ", again", gradient)] if options["first_batch"] == "again" else []
     if options.get("halves"):
         return [(2 * place + half, word, purpose) for place, word, purpose in found for half in (0, 1)]
     return found
@@ -202,7 +201,9 @@ class SearchHooks(Hooks):
             first = first.otherwise(here, mi.Bool(True))
         return Search(first, Suspect.none(), mi.Point2f(0), mi.Bool(False), Suspect.none(), mi.Point2f(0))
 
-    def scattering(self, state: Search, vertex: Vertex, connection: Connection, scattering: Scattering) -> Search:
+    def vertex(
+        self, state: Search, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> Search:  # fmt: skip
         plan, seen, scattered = self.samples.plan, connection.active, scattering.active
         shape = dr.reinterpret_array(mi.UInt32, vertex.si.shape)
 

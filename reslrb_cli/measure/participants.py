@@ -284,6 +284,8 @@ class Participants:
                 continue
             if self._situation.moved:  # as the run
                 options |= {"paths": "light", "light_share": 0.5}
+            if kind == "reslrb":  # as in a run
+                options["freeze"] = True
             made[label] = make_integrator(kind, **options)
             if label in self.unguided:
                 made[_alike(label, Reference.UNGUIDED)] = make_integrator(kind, **options | {"guiding": "on"})

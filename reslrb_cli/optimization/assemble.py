@@ -214,7 +214,7 @@ def at_stage(problem: Problem, number: int, values: Mapping[str, Array] | None =
     `values` are those of its parameters, in its resolution; None: those that `problem` has now, resampled. Raises
     ValueError where they are not of its shapes.
     """
-    config, film = problem.config.at_stage(number), _film_at(problem, number)
+    config, film = problem.config.without_stages(), _film_at(problem, number)
     scene = config.scene if film is None else config.scene.model_copy(update={"size": film})
     config = config.model_copy(update={"parameters": _specs_at(problem, number), "scene": scene})
     # What is doubtful in the scene was told of the whole problem's.
@@ -234,12 +234,10 @@ def at_stage(problem: Problem, number: int, values: Mapping[str, Array] | None =
             size = math.gcd(integrator.samples_per_pass, config.set_spp)
             integrator = integrator.with_options(samples_per_pass=size, freeze=integrator.freeze)
         integrator.expect(pass_spp(config))
-    stage = problem.config.stage(number)
     return replace(
         made, integrator=integrator, samples_per_pass=size, paths=problem.paths, truth=problem.truth,
         masks=problem.masks, guided=problem.guided, sequence=problem.sequence, sides=problem.sides,
-        pixels=problem.pixels, pace=stage.learning_rate,
-        regularizers=make_regularizers(made.selection, stage.regularizers),
+        pixels=problem.pixels,
     )  # fmt: skip
 
 

@@ -39,6 +39,8 @@ logger = logging.getLogger(__name__)
 
 #: Paths in one pass of the gradient where naive AD keeps every vertex of each of them; light tracing keeps none.
 PATHS_PER_PASS = 2**18
+#: Samples per pixel that say which entries light and sensor reach.
+REACH_SPP = 64
 #: The relative step h.
 STEP = 0.02
 #: Eigenvalues below it are taken for 0: two directions at less than a degree to each other.
@@ -51,12 +53,12 @@ def find_reached(problem: Problem) -> Problem:
     """The problem with its `masks`, of the parameters whose true value is known.
 
     An entry counts as reached where light reaches it (the gradient of the image's sum with respect to it, over
-    `run.reach_spp` samples per pixel, is not 0 in some channel) and, for a texel, where some sensor also sees its
+    `REACH_SPP` samples per pixel, is not 0 in some channel) and, for a texel, where some sensor also sees its
     centre: a texel that only lights others is held by interreflection alone.
     """
     if not problem.truth:
         return problem
-    logger.debug(f"finding what light and sensor reach: {problem.config.run.reach_spp} spp")
+    logger.debug(f"finding what light and sensor reach: {REACH_SPP} spp")
     sensitive, masks = sensitivity(problem), dict[str, Array]()
     for key in problem.truth:
         mask: Array = sensitive[key] | (key in problem.selection.factors)  # every image shows its exposure
@@ -92,7 +94,7 @@ def sensitivity(problem: Problem) -> dict[str, Array]:
     run, integrator, multiple = problem.config.run, unrecorded(problem.integrator), samples_per_pass(problem.config)
     # A recording takes as long as some passes, of which there is mostly one.
     paths_per_pass = MOST_PATHS if isinstance(integrator, LightTracer) else PATHS_PER_PASS
-    spp = -(-run.reach_spp // multiple) * multiple if multiple else run.reach_spp
+    spp = -(-REACH_SPP // multiple) * multiple if multiple else REACH_SPP
     found: dict[str, Array] = {}
     for sensor in [view.sensor for view in problem.trained]:
         film = problem.scene.sensors()[sensor].film()

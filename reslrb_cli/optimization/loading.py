@@ -126,10 +126,8 @@ def choose_sensors(config: Config, scene: mi.Scene) -> list[int]:
     count = len(scene.sensors())
     if config.views is not None:
         named = {f"views[{place}].sensor": view.sensor for place, view in enumerate(config.views)}
-    elif config.scene.sensors == "all":
-        return list(range(count))
     else:
-        named = {f"scene.sensors[{place}]": sensor for place, sensor in enumerate(config.scene.sensors)}
+        return [0] if config.scene.cameras is None else list(range(count))
     for key, sensor in named.items():
         if sensor >= count:
             raise ConfigError(config.source, key, f"is {sensor}, but the scene has {sensors_in_words(count)}")
@@ -203,6 +201,8 @@ def make_configured(config: Config, integrator: Integrator, paths: str) -> StepI
     elif isinstance(integrator, WalkAd):
         integrator = integrator.model_copy(update={"paths": paths})
     options: dict[str, Any] = integrator.options()
+    if isinstance(integrator, ReslrbConfig):
+        options["freeze"] = True  # what a step launches is recorded, so that its Python runs once
     if isinstance(integrator, Own):
         options["allowed"] = config.allows_code
     return make_integrator(integrator.type, **options)

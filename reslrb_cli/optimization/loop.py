@@ -90,16 +90,12 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         loss, squares, counts, refused, costs = gradient(problem, iteration, split)
         dr.eval(loss, squares, counts)
     gradients = {key: optimizer.gradient(key) for key in optimizer.keys()}  # noqa: SIM118 (not a mapping)
-    factor = (
-        problem.pace
-        * lowered(config.optimizer, state.drops)
-        * learning_rate_factor(
-            config.optimizer.schedule,
-            iteration,
-            config.run.iterations,
-            config.optimizer.final_fraction,
-            time_share(problem.limit_s, state),
-        )
+    factor = lowered(config.optimizer, state.drops) * learning_rate_factor(
+        config.optimizer.schedule,
+        iteration,
+        config.run.iterations,
+        config.optimizer.final_fraction,
+        time_share(problem.limit_s, state),
     )
     with clock.counted():
         value = float(loss[0])

@@ -4,8 +4,8 @@ Each takes the image I, (H, W, C) and attached to the AD graph, the target T of 
 and what each entry weighs, of that shape too with a mean of 1 (None: all the same). It returns a width-1 array: a mean
 over pixels and channels, so that it depends neither on the resolution nor on how many pixels are left out.
 
-`weighted`, `pyramid` and `fitted` make others of them: a sum of several, the mean over several resolutions, and the
-loss of the image multiplied by what suits the target best.
+`weighted` and `fitted` make others of them: a sum of several, and the loss of the image multiplied by the factor that
+suits the target best.
 """
 
 from __future__ import annotations
@@ -48,51 +48,26 @@ def relative_l2(
     return _mean(dr.square(image - target) / (dr.square(target) + epsilon), weights)
 
 
-def log_l2(
-    image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /, epsilon: float = 1e-2
-) -> mi.Float:
-    """mean (log(I + ε) - log(T + ε))², ε in units of radiance.
-
-    Negative values, as filters with negative lobes make them, count as 0.
-    """
-    difference = dr.log(dr.maximum(image, 0.0) + epsilon) - dr.log(dr.maximum(target, 0.0) + epsilon)
-    return _mean(dr.square(difference), weights)
-
-
-def smape(
-    image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /, epsilon: float = 1e-2
-) -> mi.Float:
-    """mean |I - T| / (|I| + |T| + ε), the symmetric relative error (Vogels et al. 2018), ε in units of radiance.
-
-    Its derivative by I is bounded by 1 / (|T| + ε) whatever I is, and 0 where I = T.
-    """
-    return _mean(dr.abs(image - target) / (dr.abs(image) + dr.abs(target) + epsilon), weights)
-
-
 #: Of the Gaussian window of SSIM: standard deviation and side in pixels, and the constants K_1 and K_2 (Wang et al.).
 SSIM_SIGMA, SSIM_SIDE, SSIM_K = 1.5, 11, (0.01, 0.03)
 
 
-def ssim(
-    image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /, data_range: float | None = None
-) -> mi.Float:
+def ssim(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float:
     """1 - mean SSIM (Wang, Bovik, Sheikh and Simoncelli 2004, equation 13), of images of 11x11 pixels or more.
 
-        SSIM = (2 μ_I μ_T + C_1) (2 σ_IT + C_2) / ((μ_I² + μ_T² + C_1) (σ_I² + σ_T² + C_2)),  C_k = (K_k data_range)²
+        SSIM = (2 μ_I μ_T + C_1) (2 σ_IT + C_2) / ((μ_I² + μ_T² + C_1) (σ_I² + σ_T² + C_2)),  C_k = (K_k L)²
 
     in each channel and window, of a Gaussian with a standard deviation of 1.5 pixels, 11 pixels wide; the variances are
     those of the window itself. It is what scikit-image has with `gaussian_weights=True, use_sample_covariance=False`:
     the mean is over the windows that lie within the image. Each weighs as much as the pixel at its centre; a pixel that
-    is left out has to be the same in both images, as `View.judge` has it. A `data_range` of None is the target's
-    largest value. Raises ValueError for smaller images.
+    is left out has to be the same in both images, as `View.judge` has it. L is the target's largest value. Raises
+    ValueError for smaller images.
     """
     if min(image.shape[:2]) < SSIM_SIDE:
         raise ValueError(f"SSIM needs images of {SSIM_SIDE}x{SSIM_SIDE} pixels, not {image.shape[1]}x{image.shape[0]}")
     mean_i, mean_t = _windows(image), _windows(target)
-    extent: mi.Float | float = 0.0 if data_range is None else data_range
-    if data_range is None:
-        most = dr.max(target.array if weights is None else dr.select(weights.array > 0, target.array, 0))
-        extent = dr.select(most > 0, most, 1)
+    most = dr.max(target.array if weights is None else dr.select(weights.array > 0, target.array, 0))
+    extent = dr.select(most > 0, most, 1)
     first, second = (dr.square(factor * extent) for factor in SSIM_K)
     # About the means of the images, which the variances do not depend on: squares of bright pixels lose digits.
     level = dr.detach(dr.mean(target, axis=None).array)
@@ -130,19 +105,15 @@ def _windows(image: mi.TensorXf) -> mi.TensorXf:
     return image
 
 
-LOSSES: dict[str, Loss] = {
-    "l1": l1, "l2": l2, "relative_l2": relative_l2, "log_l2": log_l2, "smape": smape, "ssim": ssim,
-}  # fmt: skip
+LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2, "relative_l2": relative_l2, "ssim": ssim}
 
 #: Those whose derivative is linear in the image, so that its noise averages out.
 QUADRATIC = ("l2", "relative_l2")
 
 
-def make_loss(type: str, scales: int = 1, own: Loss | None = None, **options: float) -> Loss:
-    """Return the loss of that name with its options bound, or `own`, of so many `scales`. Raises KeyError for an
-    unknown name."""
-    loss = functools.partial(LOSSES[type], **options) if own is None else own
-    return loss if scales == 1 else functools.partial(pyramid, loss, scales)
+def make_loss(type: str, **options: float) -> Loss:
+    """Return the loss of that name with its options bound. Raises KeyError for an unknown name."""
+    return functools.partial(LOSSES[type], **options)
 
 
 def weighted(
@@ -155,40 +126,6 @@ def weighted(
     """The sum of losses, each multiplied by the number before it."""
     first, *others = (factor * loss(image, target, weights) for factor, loss in losses)
     return sum(others, first)
-
-
-def pyramid(
-    loss: Loss, scales: int, image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /
-) -> mi.Float:
-    """The mean of a loss over `scales` levels, the first of which are image and target themselves.
-
-    Each pixel of a level is the mean of 2x2 of the level before by their weights, and weighs as much as those together:
-    one along an odd border has fewer, and what is left out is no part of any.
-    """
-    total = loss(image, target, weights)
-    if weights is None:
-        weights = dr.full(mi.TensorXf, 1, image.shape)
-    for _ in range(1, scales):
-        coarse = _sums(weights)
-        image, target = (_sums(weights * each) / dr.maximum(coarse, 1e-30) for each in (image, target))
-        weights = coarse / dr.mean(coarse, axis=None)
-        total = total + loss(image, target, weights)
-    return total / scales
-
-
-def _sums(image: mi.TensorXf) -> mi.TensorXf:
-    """The sums over 2x2 pixels of an image (H, W, C), (ceil(H / 2), ceil(W / 2), C), attached."""
-    height, width, channels = image.shape
-    shape = ((height + 1) // 2, (width + 1) // 2, channels)
-    lane = dr.arange(mi.UInt32, math.prod(shape))
-    channel, column = lane % channels, 2 * (lane // channels % shape[1])
-    row, total = 2 * (lane // (channels * shape[1])), dr.zeros(mi.Float, math.prod(shape))
-    for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        inside = (row + down < height) & (column + right < width)
-        index = ((row + down) * width + column + right) * channels + channel
-        # Each entry has one place to go: the derivative needs no atomics, and is the same every time.
-        total += dr.gather(mi.Float, image.array, index, inside, dr.ReduceMode.Permute)
-    return mi.TensorXf(total, shape)
 
 
 def _product(first: mi.TensorXf, second: mi.TensorXf, weights: mi.TensorXf | None) -> mi.Float:

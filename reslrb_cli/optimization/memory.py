@@ -265,20 +265,11 @@ def free_for(needed: int) -> int:
 
 
 def check_memory(problem: Problem, integrator: Reslrb) -> None:
-    """Raise ConfigError where a step takes more memory than is free, or its paths more than a thread's stack has.
+    """Raise ConfigError where a step takes more memory than is free.
 
     With a `memory_budget` passes are chosen that keep it, and nothing is said of the first.
     """
     config = problem.config
-    if not mi.variant().startswith("cuda"):  # where the driver sees to stacks, and says so
-        most, size = local_bytes(), config.integrator.options().get("stack_size", 0)
-        for plan in plans(problem, integrator):
-            needed = integrator.scratch_bytes(plan)
-            if needed > most:
-                reason = f"{size} vertices take {in_words(needed)} of a thread's stack for each path, which has "
-                reason += f"{in_words(most)}; take at most {size * most // needed} (longer paths are traced a second "
-                reason += "time, and nothing of them is lost), or raise `ulimit -s`"
-                raise ConfigError(config.source, "integrator.stack_size", reason)
     if config.run.memory_budget is not None:
         return
     expected = estimate(problem, integrator, pass_spp(config), 0)  # what stands is taken already

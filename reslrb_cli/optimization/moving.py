@@ -8,7 +8,7 @@ outside is not traced. How much of the derivative is missing goes with how much 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -78,14 +78,13 @@ class BorderLight(Hooks):
                 moved |= emitter == mi.EmitterPtr(moving)
         return Sums(moved, mi.Float(0), mi.Float(0))
 
-    def connection(self, state: Sums, vertex: Vertex, connection: Connection, numbers: list[mi.Float]) -> Sums:
+    def vertex(
+        self, state: Sums, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> Sums:  # fmt: skip
         C = vertex.product.times(connection.c, vertex.depth).scaled(self.samples.scale).value()
         moved = state.moved | self.plan.moves(vertex.si.shape)
-        return state.plus(self.samples, connection.u, C, connection.active & moved)
-
-    def scattering(self, state: Sums, vertex: Vertex, connection: Connection, scattering: Scattering) -> Sums:
-        turned = self.plan.moves(vertex.si.shape) | self.plan.differentiates(vertex.bsdf)
-        return Sums(state.moved | turned, state.at_border, state.total)
+        state = state.plus(self.samples, connection.u, C, connection.active & moved)
+        return replace(state, moved=moved | self.plan.differentiates(vertex.bsdf))
 
 
 def is_at_border(samples: Samples, u: mi.Point2f) -> mi.Bool:

@@ -14,8 +14,6 @@ Updates (`Optimizer`): one optimiser for each parameter rather than one for all,
 not finite can sit an iteration out with its moments and its count of steps as they were.
 
     adam      m, v running means of g and g²; p -= lr · √(1-β₂ᵗ)/(1-β₁ᵗ) · m / (√v + ε)    Kingma and Ba 2015
-    adamw     as adam, and p -= lr · weight_decay · p besides                              Loshchilov and Hutter 2019
-    rmsprop   v the running mean of g²; p -= lr · g / (√v + ε)                             Hinton 2012
     sgd       v = momentum · v + g; p -= lr · v
 
 What a parameter must satisfy: finite values, within its bounds (`clamp`, `count_nonfinite`).
@@ -160,8 +158,6 @@ def _opaque(like: Any, number: float) -> Any:
 
 OPTIMIZERS: dict[str, Callable[..., Any]] = {
     "adam": dropt.Adam,
-    "adamw": dropt.AdamW,
-    "rmsprop": dropt.RMSProp,
     "sgd": dropt.SGD,
 }
 
@@ -286,12 +282,10 @@ class Optimizer:
         """
         own, extra = self._own[key], self._own[key].state[key][3]
         value = np.array(dr.detach(own[key]), dtype=np.float64).ravel()
-        if isinstance(own, dropt.Adam):  # AdamW is one
+        if isinstance(own, dropt.Adam):
             steps = int(np.array(extra[0]).ravel()[0])
             mean = np.array(extra[2], dtype=np.float64).ravel() / max(1 - own.beta_2**steps, 1e-300)
             steepness = (np.sqrt(mean) + own.epsilon) if steps else np.full_like(value, np.inf)
-        elif isinstance(own, dropt.RMSProp):
-            steepness = np.sqrt(np.array(extra, dtype=np.float64).ravel()) + own.epsilon
         else:
             steepness = np.full_like(value, 1 - own.momentum)
         if key not in self._variables:
@@ -304,9 +298,7 @@ class Optimizer:
         """The running mean of the squares of what the optimiser is handed, as it keeps it, and its decay; None of one
         that keeps none."""
         own, extra = self._own[key], self._own[key].state[key][3]
-        if isinstance(own, dropt.Adam):
-            return extra[2], own.beta_2
-        return (extra, own.alpha) if isinstance(own, dropt.RMSProp) else None
+        return (extra[2], own.beta_2) if isinstance(own, dropt.Adam) else None
 
     def slope(self, key: str) -> np.ndarray[Any, Any]:
         """What the optimiser is handed per unit of gradient of the scene's value, in a row."""

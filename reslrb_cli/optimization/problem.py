@@ -84,8 +84,6 @@ class Problem:
     regularizers: dict[str, dict[str, Cost | Plate]] = field(default_factory=dict)
     #: What computes the shards of a step (`shards.Engine`); None: this process, one after the other.
     engine: Callable[..., Any] | None = None
-    #: What learning rates are multiplied by, beside their schedule.
-    pace: float = 1.0
 
     def decisions(self) -> dict[str, dict[str, Any] | None]:
         """What was measured and planned before the first iteration, as manifests and checkpoints have it, by name."""
@@ -300,13 +298,11 @@ def _handed(value: Any, array: Array) -> Any:
     return type(value)(np.ascontiguousarray(array, dtype=np.float32)) + dr.opaque(mi.Float, 0)
 
 
-def make_regularizers(selection: Selection, times: float = 1.0) -> dict[str, dict[str, Cost | Plate]]:
-    """What the values of `selection` cost by themselves, by key and type, their weights multiplied by `times`; empty
-    where nothing does."""
+def make_regularizers(selection: Selection) -> dict[str, dict[str, Cost | Plate]]:
+    """Return what the values of `selection` cost by themselves, by key and type; empty where nothing does."""
     found: dict[str, dict[str, Cost | Plate]] = {}
     for key in selection.keys:
         for each in selection.spec(key).regularizers:
-            each = each.model_copy(update={"weight": times * each.weight})
             cost: Cost | Plate
             if isinstance(each, Thickness) and each.opposite is not None:
                 name = f"{each.opposite}.{HEIGHTMAP}"

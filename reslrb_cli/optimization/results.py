@@ -118,11 +118,11 @@ class Results:
             self._values[key]["true"] = summary(true, problem.masks.get(key))
 
     def add(self, record: Record) -> None:
-        """Take one iteration. The losses that are judged are those of whole films, with all samples."""
+        """Take one iteration. The losses that are judged are those of whole films."""
         self._iterations += 1
         config = self.problem.config
         stage = config.stage(config.stage_number(record.iteration / config.run.iterations))
-        if stage.film == 1 and stage.spp in (None, config.run.spp):
+        if stage.film == 1:
             self._losses.append(record.loss)
         for key, error in record.parameter_errors.items():
             self._errors.setdefault(key, []).append(error)

@@ -1,9 +1,9 @@
 """The stages of a run (`run.stages`): which problem its iterations work on, and what goes from one to the next.
 
 A stage that has a resolution or a film of its own works on a problem of its own, made of the run's (`at_stage`), in
-which the run's values stand resampled; one that differs in samples, rates or weights alone works on the one before it.
-The last one, the run as it is configured, works on the run's own problem. Where the problem changes, the optimiser
-begins anew: its moments are of other maps, and what a step may be depends on how fine they are.
+which the run's values stand resampled. The last one, the run as it is configured, works on the run's own problem.
+Where the problem changes, the optimiser begins anew: its moments are of other maps, and what a step may be depends on
+how fine they are.
 
 What a coarse stage does to the run's values x is the change of its own ones c, with R and P between the two maps:
 
@@ -22,7 +22,7 @@ import numpy as np
 
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.optimization.assemble import at_stage, bounded, resized
-from reslrb_cli.optimization.problem import Problem, make_regularizers
+from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.state import State, guiding_of, standing
 
 Array = np.ndarray[Any, Any]
@@ -67,28 +67,14 @@ class Stages:
         """The problem of a stage; one that was not at work just before has the values that `whole` has."""
         if number == self._number:
             return self._now
-        stage = self.whole.config.stage(number)
-        before, self._now = self._now, self.whole
-        if number == self.last:
-            pass
-        elif self.is_whole(number):
-            self._now = self._with_stage(self.whole, number)
-        elif self.whole.config.stage(self._number).grain == stage.grain:
-            self._now = self._with_stage(before, number)
-        else:
-            del before
+        if self.is_whole(number):
+            self._now = self.whole
+        elif self.whole.config.stage(self._number).grain != self.whole.config.stage(number).grain:
+            self._now = self.whole
             gc.collect()  # another scene takes part in all that is traced, until it is gone
             self._now = at_stage(self.whole, number)
         self._number = number
         return self._now
-
-    def _with_stage(self, problem: Problem, number: int) -> Problem:
-        """A problem of the same scene and optimiser, with the samples, rates and weights of a stage."""
-        stage = self.whole.config.stage(number)
-        run = problem.config.run.model_copy(update={"spp": self.whole.config.at_stage(number).run.spp, "stages": []})
-        weights = make_regularizers(problem.selection, stage.regularizers)
-        config = problem.config.model_copy(update={"run": run})
-        return replace(problem, config=config, regularizers=weights, pace=stage.learning_rate)
 
     def enter(self, state: State) -> tuple[Problem, State]:
         """The problem that the iteration after `state` works on, and the state as that begins with it."""

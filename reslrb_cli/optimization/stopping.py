@@ -1,31 +1,24 @@
-"""When a loss stands: what ends a run early (`run.stop`), and lowers its rate (`optimizer.schedule: plateau`); the time
-of a run (`run.max_seconds`); and the mean of its last values (`optimizer.average`).
+"""When a loss stands: what ends a run early (`run.stop`), and lowers its rate (`optimizer.schedule: plateau`); and the
+time of a run (`run.max_seconds`).
 
 A loss has windows of `patience` iterations, one after another, and is tested at the end of each: it stands where it is
 shown to fall by less than `relative` a window (`trend.stands`). Where views are held out, the test takes their loss,
 which has fewer values, always of the same samples. Windows begin once the run is as it is configured (`run.stages`),
 and anew where the rate is lowered. A run with a plateau ends only at its least rate.
-
-The mean of the values of the last iterations has less noise than the last of them (Polyak and Juditsky 1992).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
 from reslrb_cli.config.optimizers import AnyOptimizer, Standing
 from reslrb_cli.config.schema import Config
-from reslrb_cli.optimization.state import Count, State
+from reslrb_cli.optimization.state import State
 from reslrb_cli.optimization.trend import SPANS, levels_of, line, stands
 from reslrb_cli.records.metrics import Record
-from reslrb_cli.records.tree import Arrays, entry
-
-Array = np.ndarray[Any, Any]
-
 
 #: The factor by which a plateau lowers the learning rate.
 FACTOR = 0.5
@@ -106,31 +99,3 @@ class Watch:
         kind = "loss of held-out views" if self.held_out else "loss"
         share = f"{-100 * fall:.2g} +- {100 * error:.1g} %"
         return f"the {kind} stands: over the last {count * span} iterations it fell by {share} in {span}"
-
-
-@dataclass(frozen=True)
-class Averaged:
-    """The mean of values after the iterations from `average_first` on, of `average_count` of them (0: none yet)."""
-
-    average_first: Count = 0
-    average_count: Count = 0
-    average: Arrays = field(default_factory=dict, metadata=entry("average", "finite"))
-
-    def add(self, config: Config, done: int, values: dict[str, Array]) -> Averaged:
-        """The same with the values (shapes as they are shown) after `done` iterations, which are in the average."""
-        first, count = average_begins(config), self.average_count
-        if not count or self.average_first != first:
-            first_values = {key: value.astype(np.float64) for key, value in values.items()}
-            return Averaged(first, 1, first_values)
-        mean = {key: self.average[key] + (value - self.average[key]) / (count + 1) for key, value in values.items()}
-        return Averaged(first, count + 1, mean)
-
-
-def average_begins(config: Config) -> int:
-    """After how many iterations the values are in the average, those after the next as well; beyond the last without
-    one."""
-    asked, iterations = config.optimizer.average, config.run.iterations
-    if asked is None:
-        return iterations + 1
-    count = asked if isinstance(asked, int) else math.ceil(asked * iterations)
-    return max(iterations - count, 0) + 1

@@ -32,6 +32,8 @@ from reslrb_cli.scene.needs import scene_needs
 from reslrb_cli.scene.parameters import Selection, set_values
 from reslrb_cli.scene.visibility import interior, sees_specular, spread
 
+#: The seed of rendered targets.
+TARGET_SEED = 0
 #: What pixels of each kind are said to do.
 WORDS = {
     "specular": "see smooth glass or mirrors",
@@ -96,10 +98,7 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
 
     `say` is told what takes long, and what of the targets is left out. Raises ConfigError.
     """
-    config, files, upright = problem.config, problem.config.target.file, are_upright(problem.config)
-    if files is not None and len(files) != len(problem.views):
-        reason = f"must name one image for each sensor; images: {len(files)}, sensors: {len(problem.views)}"
-        raise ConfigError(config.source, "target.file", reason)
+    config, upright = problem.config, are_upright(problem.config)
     for view in problem.views:
         wanted, film = view.wanted, problem.scene.sensors()[view.sensor].film()
         if wanted.file is None:
@@ -184,7 +183,7 @@ def _render_targets(problem: Problem, say: Callable[[str], None]) -> dict[str, A
         if view.wanted.file is not None:
             continue
         say(f"rendering the target of sensor {view.sensor}: {render.spp} spp")
-        image = render_in_passes(integrator, true_scene, view.sensor, render.spp, render.seed, 0, "target", multiple)
+        image = render_in_passes(integrator, true_scene, view.sensor, render.spp, TARGET_SEED, 0, "target", multiple)
         _see(problem, view, image, None, say)
     return truth
 

@@ -5,7 +5,7 @@
   of a loss L(E I) with respect to E is the sum over pixels of dL/dI I / E: it takes the samples that the other
   parameters' derivatives are made of, and no more. Where dL/dI comes from other samples than I, it is as unbiased as
   those are.
-- `Wanted`: what an experiment says of its views, in `views` or in the short forms, `scene.sensors` and `target`.
+- `Wanted`: what an experiment says of its views, in `views` or, of one alone, in `target`.
 - `Masked`, the pixels of a view that are left out, and `View` itself.
 """
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.backend.memory import own_memory
-from reslrb_cli.config.optimizers import Custom, loss_keys, losses_of
+from reslrb_cli.config.optimizers import Custom, loss_keys
 from reslrb_cli.config.optimizers import Loss as LossConfig
 from reslrb_cli.config.parameters import Settings
 from reslrb_cli.config.schema import Config
@@ -90,7 +90,7 @@ class Wanted:
     """What an experiment says of the view through `sensor`: its target's file, None of a rendered one, and its mask.
 
     `file_key` and `mask_key` are where they stand in the configuration. `exposure` is a number, or how it is recovered,
-    by which key; `part` is the view's part of the loss, relative to the others', and `loss` its own, if it has one.
+    by which key; `part` is the view's part of the loss, relative to the others'.
     """
 
     sensor: int = 0
@@ -101,7 +101,6 @@ class Wanted:
     exposure: float | str = 1.0
     exposure_key: str = SHARED
     part: float = 1.0
-    loss: LossConfig | Sequence[LossConfig] | None = None
     held_out: bool = False
 
 
@@ -119,9 +118,8 @@ def wanted_views(config: Config, scene: mi.Scene) -> list[Wanted]:
         if spec.target is None:
             file_key = "scene.cameras"
         elif config.views is None:
-            file_key = "target.file" if len(target.file or ()) == 1 else f"target.file[{number}]"
+            file_key = "target.file"
         exposure = target.exposure if spec.exposure is None else spec.exposure
-        assert not isinstance(exposure, list), "checked with the configuration"
         wanted.append(
             Wanted(
                 spec.sensor,
@@ -132,7 +130,6 @@ def wanted_views(config: Config, scene: mi.Scene) -> list[Wanted]:
                 exposure=exposure,
                 exposure_key=SHARED if spec.exposure is None else f"{SHARED}.{spec.sensor}",
                 part=spec.weight,
-                loss=spec.loss,
                 held_out=spec.sensor in held_out,
             )
         )
@@ -146,8 +143,8 @@ def wanted_views(config: Config, scene: mi.Scene) -> list[Wanted]:
         reason = f"is {asked}; views that are trained on: {trained}"
         raise ConfigError(config.source, "run.views_per_iteration", reason)
     if config.drawn_views is None and config.run.shards != "auto" and config.shards > trained:
-        reason = f"is {config.shards}, with scene.sensors: all at most the {trained} views that are trained on; name "
-        raise ConfigError(config.source, "run.shards", f"{reason}the sensors, for shards of a view's samples")
+        reason = f"is {config.shards}, with scene.cameras at most the {trained} views that are trained on; list "
+        raise ConfigError(config.source, "run.shards", f"{reason}`views`, for shards of a view's samples")
     return wanted
 
 
@@ -163,21 +160,10 @@ def _held_out(config: Config, scene: mi.Scene, sensors: list[int]) -> set[int]:
 
 
 def _view_specs(config: Config, sensors: list[int]) -> list[ViewSpec]:
-    """What is said of each view: `views`, or the short forms, `scene.sensors` and `target`, as if they were that."""
+    """Return what is said of each view: `views`, or what `target` says of the scene's sensor or cameras."""
     if config.views is not None:
         return config.views
-    files, exposures = config.target.file or [], config.target.exposure
-    own: list[Any] = [None] * len(sensors)
-    if isinstance(exposures, list):
-        own = exposures
-        if len(own) != len(sensors):
-            reason = f"must have one entry for each sensor; entries: {len(own)}, sensors: {len(sensors)}"
-            raise ConfigError(config.source, "target.exposure", reason)
-    targets = [*files[: len(sensors)], *[None] * (len(sensors) - len(files))]
-    return [
-        ViewSpec.model_construct(sensor=sensor, target=target, exposure=exposure)
-        for sensor, target, exposure in zip(sensors, targets, own, strict=True)
-    ]
+    return [ViewSpec.model_construct(sensor=sensor, target=config.target.file) for sensor in sensors]
 
 
 @dataclass
@@ -337,41 +323,30 @@ def view_records(views: list[View]) -> list[dict[str, Any]]:
 
 
 def make_views(config: Config, scene: mi.Scene) -> list[View]:
-    """The views of an experiment, without their targets. Raises ConfigError as `wanted_views`, and for too many
-    scales."""
+    """Return the views of an experiment, without their targets. Raises ConfigError as `wanted_views`, and for images
+    that are too small for a loss."""
     wanted = wanted_views(config, scene)
     views: list[View] = []
     total = sum(one.part for one in wanted if not one.held_out)
     for one in wanted:
-        given: LossConfig | Sequence[LossConfig]
-        place, given = ("loss", config.loss) if one.loss is None else (f"views[{len(views)}].loss", one.loss)
         share = 1.0 if one.held_out else one.part / total
         width, height = (int(size) for size in scene.sensors()[one.sensor].film().crop_size())
         parts: list[tuple[float, Loss]] = []
         codes: list[OwnLoss] = []
-        for key, kind in loss_keys(place, "scales", given):
-            _check_size(config, key, kind, width, height)
+        for key, kind in loss_keys("type", config.loss):
+            if kind.type == "ssim" and min(width, height) < SSIM_SIDE:
+                reason = f"ssim needs {SSIM_SIDE}x{SSIM_SIDE} pixels, and there are {width}x{height}"
+                raise ConfigError(config.source, key, reason)
             if isinstance(kind, Custom):
-                codes.append(OwnLoss(config, f"{key.removesuffix('scales')}file", kind))
-            own = codes[-1] if isinstance(kind, Custom) else None
-            parts.append((kind.weight, make_loss(kind.type, kind.scales, own, **kind.own_options())))
-        loss = functools.partial(weighted, parts) if not isinstance(given, LossConfig) else parts[0][1]
-        fits, across = losses_of(given)[0].scale == "fitted", config.adjoint == "correlated"
+                codes.append(OwnLoss(config, f"{key.removesuffix('type')}file", kind))
+                parts.append((kind.weight, codes[-1]))
+            else:
+                parts.append((kind.weight, make_loss(kind.type, **kind.own_options())))
+        loss = parts[0][1] if isinstance(config.loss, LossConfig) else functools.partial(weighted, parts)
+        fits, across = config.losses[0].scale == "fitted", config.adjoint == "correlated"
         views.append(View(one.sensor, loss, share, fits=fits, across=across, held_out=one.held_out, wanted=one,
                           codes=codes))  # fmt: skip
     return views
-
-
-def _check_size(config: Config, key: str, kind: LossConfig, width: int, height: int) -> None:
-    """Raise ConfigError, located at `key`, where an image has too few pixels for a loss."""
-    coarsest, least = 2 ** (kind.scales - 1), SSIM_SIDE if kind.type == "ssim" else 1
-    if coarsest > max(width, height):
-        reason = f"{kind.scales} levels need an image of at least {coarsest} pixels, not {width}x{height}"
-        raise ConfigError(config.source, key, reason)
-    if least > 1 and min(-(-width // coarsest), -(-height // coarsest)) < least:
-        reason = f"ssim needs {least}x{least} pixels at each level, and there are {-(-width // coarsest)}x"
-        reason += f"{-(-height // coarsest)} at the {'last' if coarsest > 1 else 'only one'}"
-        raise ConfigError(config.source, key, reason)
 
 
 def expose(views: list[View], scene: mi.Scene, selection: Selection) -> None:

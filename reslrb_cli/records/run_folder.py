@@ -43,20 +43,15 @@ FABRICATION_FILE, SOLID_PICTURE = "fabrication.json", "solid"
 
 
 def read_value(run: Path, key: str) -> Array:
-    """The value of `key` in the newest checkpoint of the run folder `run`; where its result is an average, that.
+    """Return the value of `key` in the newest checkpoint of the run folder `run`.
 
     Shapes as in `parameters.npz`: a texture (H, W, C), a colour (C,), a buffer (N,), a number (). It may hold
     values that are not finite: who uses it says where. Raises ConfigError, located in the folder or a file of it, where
     it is no run's, damaged, or the run did not recover `key`.
     """
     path = checkpoint_of(run)
-    content = _manifest_of(run)
-    results = content.get("results")
-    averaged = content.get("status") == Status.FINISHED and isinstance(results, dict) and "average" in results
     with Archive(path, whole=False) as archive:
         known = archive.names("parameter/")
-        if averaged and key in archive.names("average/"):
-            return archive.array(f"average/{key}", kind="f", values="any").astype(np.float32)
         if key in known:
             return archive.array(f"parameter/{key}", kind="f", values="any")
     near = difflib.get_close_matches(key, known, n=_SHOWN, cutoff=0.5) or known[:_SHOWN]

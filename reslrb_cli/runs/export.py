@@ -259,13 +259,13 @@ def read_solid(config: Config, plan: Fabrication, params: mi.SceneParameters) ->
 
 
 def read_target(config: Config, sensor: mi.Sensor, needed: bool) -> Array | None:
-    """The image (H, W, C) that a sensor is to see; None where `target.file` is not one image of its film's size, unless
-    it is `needed` for tolerances. Raises ConfigError."""
-    files = config.target.file
-    if files is None or len(files) != 1:
-        reason = "what is thrown is compared with target.file, which has to be one image"
+    """Return the image (H, W, C) that a sensor is to see; None where `target.file` is no image of its film's size,
+    unless it is `needed` for tolerances. Raises ConfigError."""
+    file = config.target.file
+    if file is None:
+        reason = "what is thrown is compared with target.file, which is missing"
     else:
-        target = read_photo(files[0]).image[:, :, :3]
+        target = read_photo(file).image[:, :, :3]
         width, height = (int(n) for n in sensor.film().crop_size())
         if target.shape[:2] == (height, width):
             return target

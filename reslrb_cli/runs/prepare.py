@@ -33,7 +33,7 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import WINDOW, Best, Images, Least, Results
 from reslrb_cli.optimization.stages import Stages
 from reslrb_cli.optimization.state import Settled, State, check_bounds, load, noted_of, on_file, put, standing
-from reslrb_cli.optimization.stopping import Averaged, Watch, average_begins
+from reslrb_cli.optimization.stopping import Watch
 from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
 from reslrb_cli.optimization.views import view_records
 from reslrb_cli.records.cache import PilotCache
@@ -221,7 +221,7 @@ class Course:
         self.best = Best(any(view.held_out for view in problem.views))
         self.nonfinite, self.clamped, self.regularized = NonFiniteTally(), ClampTally(), RegularizedTally()
         self.last: Record | None = None
-        self.watch, self.average = Watch(problem.config), Averaged()
+        self.watch = Watch(problem.config)
         self._shared: SharedTime | None = None
         self._spent: Callable[[], SharedTime] | None = None
 
@@ -257,9 +257,6 @@ class Course:
         self._take(record)
         if self.stages.is_whole(state.stage):
             self.certainty.see(self.state, state)
-        if state.iteration >= average_begins(self.problem.config):
-            shown = {key: np.array(value) for key, value in self.stages.values(state).items()}
-            self.average = self.average.add(self.problem.config, state.iteration, shown)
         self.state = state
 
     def _counts(self, iteration: int) -> bool:
@@ -270,37 +267,13 @@ class Course:
         return all(self.stages.is_whole(config.stage_number(each / config.run.iterations)) for each in begun)
 
     def values(self) -> dict[str, Array]:
-        """The result as it is now, as `Problem.values` has it: the newest values, or at the end the average."""
-        if self.averages:
-            return {key: value.astype(np.float32) for key, value in self.average.average.items()}
+        """The newest values, as `Problem.values` has them."""
         return self.stages.values(self.state)
 
     def bring(self) -> Problem:
         """The run's own problem, at the newest values."""
         self.stages.bring(self.state)
         return self.problem
-
-    def bring_last(self) -> Problem:
-        """The run's own problem at its newest values, also where it was brought to an average."""
-        if self.averages:
-            put(self.problem, self.state)
-        return self.bring()
-
-    def bring_result(self) -> Problem:
-        """The run's own problem, at what is the result of a run at its end: the newest values, or the average."""
-        problem = self.bring()
-        if self.averages:
-            problem.selection.set_arrays({key: value.astype(np.float32) for key, value in self.average.average.items()})
-            for key in problem.selection.keys:
-                problem.optimizer.set_value(key, problem.selection.value(key))
-            problem.apply()
-            problem.optimizer.stands_at = None
-        return problem
-
-    @property
-    def averages(self) -> bool:
-        """Whether the run is at its end, and its result an average."""
-        return self.average.average_count > 0 and self.done == self.problem.config.run.iterations
 
     def go_on(self) -> None:
         """Take back that the run had stopped: other settings say when."""
@@ -354,7 +327,7 @@ class Course:
             self.results.images["initial"], self.certainty.noted, self.best.least, self.last, self.shared,
             self.best_values(), self.certainty.squares, self.certainty.last_steps(),
         )  # fmt: skip
-        return entries(self._settled, state, met, self.average)
+        return entries(self._settled, state, met)
 
     def restore(self, stored: Stored, records: Sequence[Record]) -> None:
         """Go on from what was stored, and from the records of all iterations until then.
@@ -368,10 +341,6 @@ class Course:
         kept = {key: each[0] for key, each in squares.items() if each is not None}
         last = self.certainty.expects(met.certainty)
         met = stored.fill(replace(met, best_values=wanted, squares=kept, last_steps=last))
-        average = stored.read(Averaged)
-        if average.average_count and average.average_first == average_begins(problem.config):
-            shapes = {key: expected(problem.selection.array(key).shape, np.float64) for key in problem.selection.keys}
-            self.average = stored.fill(replace(average, average=shapes))
         for record in records:
             self._take(record)
             self.watch.add(record)

@@ -352,9 +352,7 @@ class Recording:
 
     def _write_parameters(self) -> None:
         """Write the last values, and beside them the best so far, where there are any."""
-        if self.course.averages:
-            write_parameters(self.folder.parameters / "last", self.course.bring_last().values())
-        write_parameters(self.folder.parameters, self.course.bring_result().values())
+        write_parameters(self.folder.parameters, self.course.bring().values())
         best = self.course.best_values()
         if best:
             write_parameters(self.folder.parameters / "best", best)
@@ -389,9 +387,6 @@ class Recording:
         last = self.course.last
         config = self.problem.config
         if last is None or self.done < LEAST_ITERATIONS or not config.run.certainty:
-            return
-        if self.course.averages:
-            logger.info("how certain the values are is not measured of averages")
             return
         if not config.by_pixel:
             logger.info("how certain the values are is not measured: it takes a loss of each pixel by itself")
@@ -460,21 +455,12 @@ class Recording:
         }
 
     def _ended(self) -> dict[str, Any]:
-        """The results with the values of the end, and of an average beside them what the last values were."""
-        course, results, told = self.course, self.course.results, {}
-        if course.averages:
-            course.bring_last()
-            results.end()
-            last, average = results.to_json(), course.average
-            told = {"average": {
-                "first": average.average_first, "iterations": average.average_count,
-                "last": {key: each["final"] for key, each in last["parameters"].items()},
-                "last_rmse": {key: each["final"] for key, each in last["parameter_rmse"].items()},
-            }}  # fmt: skip
-        course.bring_result()
+        """Return the results with the values of the end."""
+        course, results = self.course, self.course.results
+        course.bring()
         results.end()
         stopped = {"stopped": course.state.stopped} if course.state.stopped else {}
-        return {**results.to_json(), **told, **stopped}
+        return {**results.to_json(), **stopped}
 
     def _kept(self) -> str:
         """What of the run a reader will find."""
@@ -491,7 +477,7 @@ class Recording:
 
     def _write_images(self, name: str) -> None:
         spp = saved_spp(self.problem, between=name.startswith("iteration"))
-        self.course.bring_result()
+        self.course.bring()
         if name == "final":
             logger.info(f"rendering the final image: {spp} spp")
         for view in self.problem.views:

@@ -145,25 +145,46 @@ def visible_texels(
     to_uv = key.removesuffix("data") + "to_uv"
     if not owners or to_uv not in params:
         return np.ones((height, width), dtype=bool)
-    transform = np.array(params[to_uv].matrix, dtype=np.float64)
-
+    texels = _Texels(owners, np.array(params[to_uv].matrix, dtype=np.float64).tolist(), (width, height))
     seen = dr.zeros(mi.UInt32, height * width)
     for sensor, kept in zip_longest(sensors, pixels[: len(sensors)]):
         count = int(np.prod(sensor.film().crop_size()))
         rays = min(_RAYS_PER_CELL * max(count, height * width), _MAX_RAYS)
         for number in range(-(-rays // _RAYS_PER_PASS)):
             random = mi.PCG32(size=min(rays, _RAYS_PER_PASS), initstate=dr.opaque(mi.UInt64, number))
-            _mark_seen(scene, sensor, owners, transform, random, seen, (width, height), kept, mirrored)
+            _mark_seen(scene, sensor, texels, random, seen, kept, mirrored)
             dr.eval(seen)
     return np.array(seen).reshape(height, width) > 0
 
 
+@dataclass(frozen=True)
+class _Texels:
+    """The texels of a texture of `size` (width, height), on surfaces of the BSDFs `owners`; `transform` is its
+    `to_uv`."""
+
+    owners: Sequence[Any]
+    transform: list[list[float]]
+    size: tuple[int, int]
+
+    def met(self, si: Any) -> tuple[Any, Any]:
+        """Return the texel at each surface point, and whether the point is in the inner quarter of its cell."""
+        is_owner = mi.Mask(False)
+        for owner in self.owners:
+            is_owner |= si.bsdf() == mi.BSDFPtr(owner)
+        u, v = (row[0] * si.uv.x + row[1] * si.uv.y + row[2] for row in self.transform[:2])
+        cell = mi.Point2f(u, v) * mi.Vector2f(self.size)
+        inside = mi.Vector2f(cell - dr.floor(cell))
+        inner = (dr.abs(inside.x - 0.5) < 0.25) & (dr.abs(inside.y - 0.5) < 0.25)
+        # Twice, since the remainder of what is below 0 is not above it.
+        x, y = ((mi.Int32(dr.floor(c)) % n + n) % n for c, n in zip((cell.x, cell.y), self.size, strict=True))
+        return mi.UInt32(y * self.size[0] + x), si.is_valid() & is_owner & inner
+
+
 def _mark_seen(
-    scene: Any, sensor: Any, owners: Sequence[Any], transform: Any, random: Any, seen: Any, size: tuple[int, int],
-    kept: np.ndarray[Any, Any] | None, mirrored: bool,
+    scene: Any, sensor: Any, texels: _Texels, random: Any, seen: Any, kept: np.ndarray[Any, Any] | None, mirrored: bool,
 ) -> None:  # fmt: skip
-    """Cast one primary ray per lane, through pixels (H, W) that are `kept`, and mark in `seen` the texels, of `size`
-    (width, height), whose inner quarter it hits, where `mirrored` by way of mirrors and clear glass, too."""
+    """Cast one primary ray per lane, through pixels (H, W) that are `kept`, and mark in `seen` the texels that it
+    meets, where `mirrored` by way of mirrors and clear glass, too."""
     time = sensor.shutter_open() + random.next_float32() * sensor.shutter_open_time()
     film = mi.Point2f(random.next_float32(), random.next_float32())
     aperture = mi.Point2f(random.next_float32(), random.next_float32())
@@ -174,16 +195,8 @@ def _mark_seen(
         x, y = (mi.UInt32(dr.minimum(c * size, size - 1)) for c, size in ((film.x, columns), (film.y, rows)))
         active = dr.gather(mi.UInt32, mi.UInt32(kept.ravel().astype(np.uint32)), y * columns + x) > 0
     for si, reached in surfaces_met(scene, ray, active, random if mirrored else None):
-        is_owner = mi.Mask(False)
-        for owner in owners:
-            is_owner |= si.bsdf() == mi.BSDFPtr(owner)
-        u, v = (row[0] * si.uv.x + row[1] * si.uv.y + row[2] for row in transform.tolist()[:2])
-        cell = mi.Point2f(u, v) * mi.Vector2f(size)
-        inside = mi.Vector2f(cell - dr.floor(cell))
-        inner = (dr.abs(inside.x - 0.5) < 0.25) & (dr.abs(inside.y - 0.5) < 0.25)
-        # Twice, since the remainder of what is below 0 is not above it.
-        x, y = ((mi.Int32(dr.floor(c)) % n + n) % n for c, n in zip((cell.x, cell.y), size, strict=True))
-        dr.scatter(seen, mi.UInt32(1), mi.UInt32(y * size[0] + x), reached & si.is_valid() & is_owner & inner)
+        texel, inner = texels.met(si)
+        dr.scatter(seen, mi.UInt32(1), texel, reached & inner)
         dr.schedule(seen, random)
 
 

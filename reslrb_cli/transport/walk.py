@@ -43,9 +43,9 @@ class Vertex(Hit):
 class Hooks:
     """What an estimator does along a walk. All are pure: state in, state out; none draws a random number.
 
-    `numbers` says how many random numbers `connection` wants at each vertex; without `connects` no connection is
-    evaluated, and `connection` is not called. A walk whose hooks are `replaying` follows a path that is known to get as
-    far as `goes_on` asks, so that neither its throughput nor its roulette is computed.
+    `numbers` is how many random numbers `vertex` gets at each vertex. Without `connects` no connection is evaluated:
+    `vertex` gets its geometry alone. A walk whose hooks are `replaying` follows a path that is known to get as far as
+    `goes_on` asks, so that neither its throughput nor its roulette is computed.
     Hooks that are `tracked` keep derivatives of the factors in the loop state, which is then evaluated vertex by vertex
     (naive AD); with `max_iterations` the loop stays symbolic, and Dr.Jit itself reverses it, from a record of the loop
     state in thread-local memory. Where they are `attached` too, so are the rays.
@@ -70,10 +70,6 @@ class Hooks:
         """Lanes whose connection from this vertex is of use; others trace no shadow ray."""
         return mi.Bool(True)
 
-    def connection(self, state: Any, vertex: Vertex, connection: Connection, numbers: list[mi.Float]) -> Any:
-        """Called at each vertex with its connection to the sensor."""
-        return state
-
     def goes_on(self, state: Any, vertex: Vertex) -> mi.Bool:
         """Lanes that scatter on from this vertex, as far as the hooks care."""
         return mi.Bool(True)
@@ -82,8 +78,11 @@ class Hooks:
         """In a replay: lanes that `goes_on` let scatter, and whose next vertex is wanted as well."""
         return mi.Bool(True)
 
-    def scattering(self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
-        """Called at each vertex with the sampled scattering event, also in lanes that `goes_on` ended."""
+    def vertex(
+        self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> Any:  # fmt: skip
+        """Called at each vertex with its connection to the sensor, and with the sampled scattering event, also in lanes
+        that `goes_on` ended."""
         return state
 
     def survived(self, state: Any, weight: mi.Float) -> Any:
@@ -101,7 +100,9 @@ class Splat(Hooks):
     def __init__(self, samples: Samples, block: mi.ImageBlock) -> None:
         self.samples, self.block = samples, block
 
-    def connection(self, state: Any, vertex: Vertex, connection: Connection, numbers: list[mi.Float]) -> Any:
+    def vertex(
+        self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> Any:  # fmt: skip
         s = self.samples
         C = vertex.product.times(connection.c, vertex.depth).scaled(s.scale)
         normalization = self.attached and s.plan.attached_normalization
@@ -254,6 +255,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
             connection.weight *= weight_of_connection(arrived, connection.p_cam, N, ways.ahead_back)
             behind = arrived.after(mi.Float(0), arrived.M + arrived.V * ways.back, scattering, cos)
             rivals = [dr.select(scattering.is_null, before_here.after_null(arrived), behind)]
+        chosen_by: list[mi.Float] = []
         if hooks.connects:
             if not (hooks.tracked or plan.track_zeros):
                 # No shadow ray where neither light nor its derivative would arrive.
@@ -267,8 +269,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
                 connection.f = dr.select(connection.active, connection.f, 0)
             connection.c = connection.f * transmittance * connection.weight
             chosen_by = [] if selection is None else [selection.next_float32() for _ in range(hooks.numbers)]
-            state = hooks.connection(state, vertex, connection, chosen_by)
-        state = hooks.scattering(state, vertex, connection, scattering)
+        state = hooks.vertex(state, vertex, connection, scattering, chosen_by)
         if hooks.replaying:
             sampler.next_1d(active)  # roulette's
             active &= hooks.is_followed(state, vertex)

@@ -48,12 +48,13 @@ def run(script: str, folder: Path) -> list[str]:
 
 @pytest.fixture
 def quick_checkout(llvm: str, tmp_path: Path) -> Path:
-    """The same, with the one experiment of the page, which measures nothing, and whose target has few samples."""
+    """The same, with the one experiment of the page, small: it measures nothing, and its target has few samples."""
     (tmp_path / "scenes").symlink_to(ROOT / "scenes")
     (tmp_path / "configs").mkdir()
     text = (ROOT / "configs/cornell_floor.yaml").read_text(encoding="utf-8")
     assert text.count("\nrun:\n") == text.count("{spp: 1024}") == 1
     text = text.replace("\nrun:\n", "\nrun:\n  measuring: 0\n").replace("{spp: 1024}", "{spp: 64}")
+    text = text.replace("{resx: 256, resy: 256}", "{resx: 32, resy: 32}")
     (tmp_path / "configs/cornell_floor.yaml").write_text(text, encoding="utf-8")
     return tmp_path
 

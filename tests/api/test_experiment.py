@@ -54,7 +54,7 @@ def experiment(**run: Any) -> dict[str, Any]:
             {"key": LAMP, "initial": np.array([3, 4, 5]), "bounds": np.float32([0, 20])},
         ],
         "integrator": {"type": "reslrb", "max_depth": 3, "estimator": "stack"},
-        "run": {"iterations": 5, "spp": 4, "reach_spp": 8, "name": "tiny", **run},
+        "run": {"iterations": 5, "spp": 4, "name": "tiny", **run},
     }
 
 
@@ -141,7 +141,7 @@ def test_every_way_of_change_keeps_the_own_loss_and_the_permission(folder: Path)
         "with_code": load("tiny.yaml").with_loss(np.mean).with_code(),
         "with_loss": load("tiny.yaml").with_code().with_loss(np.mean),
         "with_integrator": with_integrator(given, alone, "here", {}),
-        "a stage": given.at_stage(0),
+        "a stage": given.without_stages(),
         "exposures": given.with_exposures_fixed(),
         "model_copy": given.model_copy(update={"variant": "auto"}),
         "copy": copy.copy(given),
@@ -193,7 +193,7 @@ def test_an_image_is_that_of_the_command(folder: Path) -> None:
     assert np.array_equal(images[0], np.array(mi.Bitmap("command.exr")))
     assert images[0].dtype == np.float32
     assert np.array_equal(rl.render(experiment(), initial=False)[0], np.array(mi.Bitmap("scene.exr")))
-    views = rl.load("tiny.yaml", {"scene.sensors": "all"})
+    views = rl.load("tiny.yaml", {"views": [{"sensor": n} for n in range(3)]})
     assert [(sensor, image.shape) for sensor, image in rl.render(views).items()] == [(n, (8, 8, 3)) for n in range(3)]
 
 

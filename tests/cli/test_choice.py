@@ -161,7 +161,7 @@ def test_measuring_has_seeds_of_its_own(experiment, monkeypatch):
 
 @pytest.mark.long
 def test_auto_works_with_batches_and_several_views(experiment, capsys):
-    settings = ["run.adjoint=batched", "scene.sensors=all", "run.spp=8", "run.iterations=1"]
+    settings = ["run.adjoint=batched", "views=[{sensor: 0}, {sensor: 1}]", "run.spp=8", "run.iterations=1"]
     code, err = optimize(capsys, "integrator.guiding=auto", *settings)
     assert code == 0, err
     assert read_manifest(Path("runs/box"))["guided"]["spp"] in (4, 8)

@@ -13,7 +13,6 @@ import pytest
 from cli import tiny
 from cli.elsewhere import WALLS, write_photograph, write_studio, write_terrace
 from cli.tiny import done, reslrb, settings
-from click.testing import CliRunner
 from turns import a_few, real_room
 
 from reslrb_cli.cli import main
@@ -156,13 +155,6 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def run_reslrb(*arguments: str) -> str:
-    """What a command prints; it must succeed."""
-    result = CliRunner().invoke(main, list(arguments))
-    assert result.exit_code == 0, result.output
-    return result.stdout
-
-
 def keys_of_run(folder: Path) -> dict[str, list[str]]:
     """The keys in each of a run's records, in their order."""
     with (
@@ -182,7 +174,7 @@ def keys_of_run(folder: Path) -> dict[str, list[str]]:
 @pytest.mark.parametrize("name", a_few(UNNAMED, ["corner"]))
 def test_keys_are_the_same_from_inspect_to_the_page(folder, name):
     listed, parameters, chosen = UNNAMED[name]
-    report = json.loads(run_reslrb("inspect", f"{name}.xml", "--json"))
+    report = json.loads(tiny.done("inspect", f"{name}.xml", "--json").stdout)
     assert [entry["key"] for entry in report["parameters"] if entry["obstacle"] is None] != []
     assert {entry["key"] for entry in report["parameters"]} >= set(listed)
     assert not [entry["key"] for entry in report["parameters"] if entry["key"].startswith("object_")]
@@ -190,10 +182,10 @@ def test_keys_are_the_same_from_inspect_to_the_page(folder, name):
     for target in ("{render: {spp: 8}}", f"{{file: {name}.exr}}"):
         (folder / f"{name}.yaml").write_text(
             f"scene: {{file: {name}.xml}}\ntarget: {target}\nparameters: {parameters}\n"
-            "integrator: {type: ptracer, max_depth: 2}\nrun: {iterations: 1, spp: 2, reach_spp: 1}\n"
+            "integrator: {type: ptracer, max_depth: 2}\nrun: {iterations: 1, spp: 2}\n"
         )
         for _ in range(2 if "render" in target else 1):
-            run_reslrb("optimize", f"{name}.yaml", "--quiet")
+            tiny.done("optimize", f"{name}.yaml", "--quiet")
     for number in range(1, 4):
         run = folder / "runs" / (name if number == 1 else f"{name}-{number}")
         for record, found in keys_of_run(run).items():
@@ -225,13 +217,13 @@ def test_the_other_commands_know_the_names(folder):
     (folder / "lamps.yaml").write_text(
         f"scene: {{file: lamps.xml}}\ntarget: {{render: {{spp: 8, parameters: {{{key}: [2, 3, 4]}}}}}}\n"
         f"parameters: [{{key: {key}}}]\nintegrator: {{max_depth: 2, estimator: stack}}\n"
-        "run: {iterations: 1, spp: 2, reach_spp: 2}\n"
+        "run: {iterations: 1, spp: 2}\n"
     )
-    run_reslrb("render", "lamps.yaml", "-o", "image.exr")
-    assert f"* {key}" in run_reslrb("inspect", "lamps.yaml")
-    assert key in run_reslrb("gradcheck", "lamps.yaml", "--seeds", "3")
-    run_reslrb("bench", "lamps.yaml", "--max-depth", "2", "--rounds", "1", "--integrators", "reslrb:stack")
-    run_reslrb("optimize", "lamps.yaml", "--quiet")
+    tiny.done("render", "lamps.yaml", "-o", "image.exr")
+    assert f"* {key}" in tiny.done("inspect", "lamps.yaml").stdout
+    assert key in tiny.done("gradcheck", "lamps.yaml", "--seeds", "3").stdout
+    tiny.done("bench", "lamps.yaml", "--max-depth", "2", "--rounds", "1", "--integrators", "reslrb:stack")
+    tiny.done("optimize", "lamps.yaml", "--quiet")
     truth = json.loads((folder / "runs" / "lamps" / "parameters" / "true" / "parameters.json").read_text())
     assert truth[key]["value"] == [2, 3, 4]
 

@@ -18,7 +18,7 @@ from reslrb_cli.backend.installation import package_folder, shipped_plugins
 pytestmark = pytest.mark.usefixtures("llvm")
 
 #: Three iterations, as short as they may be.
-SHORT = settings("target={render: {spp: 64}}", "run.iterations=3", "run.spp=4", "run.reach_spp=1",
+SHORT = settings("target={render: {spp: 64}}", "run.iterations=3", "run.spp=4",
                  "run.certainty=false", "integrator.max_depth=4")  # fmt: skip
 #: What a run would find out first.
 DECIDED = settings("integrator.estimator=stack", "integrator.guiding=off", "integrator.sequence=independent")
@@ -30,7 +30,7 @@ scene: {file: scene.xml}
 target: {render: {spp: 4}}
 parameters: [{key: floor.bsdf.reflectance.value, initial: 0.3}]
 integrator: {max_depth: 3}
-run: {iterations: 1, spp: 4, reach_spp: 1}
+run: {iterations: 1, spp: 4}
 """
 
 

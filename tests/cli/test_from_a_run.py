@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from agreement import compare
 from cli import tiny
-from click.testing import CliRunner, Result
+from cli.tiny import reslrb
 
-from reslrb_cli.cli import main
 from reslrb_cli.cli.options import read_recovered
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.parameters import ParameterSpec, RunValue
@@ -35,10 +34,6 @@ LAMP = "lamp.emitter.radiance.value"
 #: A texture, a colour and a motion, which is what a value can be shaped like.
 PARAMETERS = f"""[{{key: {tiny.KEY}, initial: 0.5, bounds: [0, 1]}}, {{key: {LAMP}, initial: [3, 4, 5]}},
   {{motion: {{of: wall, free: [translation, scale]}}, learning_rate: 0.01}}]"""
-
-
-def reslrb(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module")
@@ -241,13 +236,13 @@ SCENE = """<scene version="3.0.0">
 """
 CONFIG = """
 variant: llvm_ad_rgb
-scene: {file: scene.xml, cameras: transforms.json, sensors: all}
+scene: {file: scene.xml, cameras: transforms.json}
 parameters:
   - {heightmap: {mesh: sheet, resolution: [4, 4]}, bounds: [-0.3, 0.3], learning_rate: 0.03}
   - {key: sheet.bsdf.brdf_0.reflectance.value, initial: 0.5, bounds: [0, 1], learning_rate: 0.05}
 integrator: {type: reslrb, max_depth: 3, estimator: stack}
-target: {exposure: [1, 0.9]}
-run: {iterations: 6, spp: 16, reach_spp: 8, final_spp: 4, held_out: [right]}
+views: [{sensor: 0}, {sensor: 1, exposure: 0.9}]
+run: {iterations: 6, spp: 16, final_spp: 4, held_out: [right]}
 """
 EYES = ((-0.8, 0.0, 3.5), (0.9, 0.5, 3.2))
 

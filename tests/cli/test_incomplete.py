@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cli.tiny import done, reslrb, settings
+from kit import area, diffuse, scene, sensor, shape
 from optimization import glass
 
 from reslrb_cli.config.loader import load
@@ -18,24 +19,13 @@ from reslrb_cli.records.measurements import MissingRecord
 from reslrb_cli.report.run_summary import find_remedy, warnings
 
 #: A box on a floor under an area lamp, seen from above; its place is read from a picture by `path`.
-SCENE = """<scene version="3.0.0">
-  <sensor type="perspective">
-    <float name="fov" value="45"/>
-    <transform name="to_world"><lookat origin="0, 3.2, 4.2" target="0, 0.2, 0" up="0, 1, 0"/></transform>
-    <film type="hdrfilm"><integer name="width" value="20"/><integer name="height" value="20"/>
-      <string name="pixel_format" value="rgb"/><rfilter type="gaussian"/></film>
-  </sensor>
-  <shape type="rectangle" id="floor">
-    <transform name="to_world"><rotate x="1" angle="-90"/><scale value="3"/></transform>
-    <bsdf type="diffuse"><rgb name="reflectance" value="0.5, 0.5, 0.5"/></bsdf></shape>
-  <shape type="cube" id="box"><transform name="to_world"><scale value="0.4"/><translate value="0, 0.4, 0"/></transform>
-    <bsdf type="diffuse"><rgb name="reflectance" value="0.7, 0.3, 0.2"/></bsdf></shape>
-  <shape type="rectangle" id="lamp">
-    <transform name="to_world"><rotate x="1" angle="90"/><scale value="0.7"/><translate value="0.8, 3.5, 0.5"/>
-    </transform>
-    <emitter type="area"><rgb name="radiance" value="12, 12, 12"/></emitter></shape>
-</scene>
-"""
+SCENE = scene(
+    sensor("0, 3.2, 4.2", "0, 0.2, 0", size=20, fov=45, rfilter="gaussian"),
+    shape("rectangle", "floor", diffuse("0.5, 0.5, 0.5"), place='<rotate x="1" angle="-90"/><scale value="3"/>'),
+    shape("cube", "box", diffuse("0.7, 0.3, 0.2"), place='<scale value="0.4"/><translate value="0, 0.4, 0"/>'),
+    shape("rectangle", "lamp", area("12, 12, 12"),
+          place='<rotate x="1" angle="90"/><scale value="0.7"/><translate value="0.8, 3.5, 0.5"/>'),
+)  # fmt: skip
 CONFIG = """
 variant: llvm_ad_rgb
 scene: {file: box.xml}
@@ -44,7 +34,7 @@ parameters:
   - {motion: {of: box, free: [x, z]}, learning_rate: 0.01}
 integrator: {max_depth: 2, estimator: stack, guiding: off, sequence: independent}
 loss: {type: l2}
-run: {iterations: 20, spp: 16, final_spp: 16, reach_spp: 4, measuring: 0.5}
+run: {iterations: 20, spp: 16, final_spp: 16, measuring: 0.5}
 """
 ACCEPT = "run.accept_incomplete=true"
 

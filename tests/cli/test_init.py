@@ -105,7 +105,7 @@ def test_nothing_is_replaced_unless_that_is_asked_for(folder: Path) -> None:
 def test_a_photograph_says_how_large_the_film_is(folder: Path) -> None:
     config, _ = of_photograph(folder, 12, 12)
     assert config.scene.size == (12, 12)
-    assert config.target.file == [folder / "photo.png"]
+    assert config.target.file == folder / "photo.png"
     problem = assemble_scene(config)
     assert tuple(problem.scene.sensors()[0].film().size()) == (12, 12)
 
@@ -115,8 +115,8 @@ def test_a_large_photograph_is_copied_at_a_size_that_runs_in_minutes(folder: Pat
     width, height = config.scene.size or (0, 0)
     assert 0.9 * PIXELS < width * height <= 1.02 * PIXELS
     assert f"photo-{width}x{height}.png" in result.output
-    assert config.target.file == [folder / f"photo-{width}x{height}.png"]
-    assert tuple(mi.Bitmap(str(config.target.file[0])).size()) == (width, height)
+    assert config.target.file == folder / f"photo-{width}x{height}.png"
+    assert tuple(mi.Bitmap(str(config.target.file)).size()) == (width, height)
 
 
 def test_exposure_is_recovered_where_the_photograph_clips(folder: Path) -> None:
@@ -327,11 +327,13 @@ def test_of_several_sensors_one_is_named(choices: Path) -> None:
     first = reslrb("init", "hall.xml")
     assert "sensor 0 (floor); --sensor takes another: 1 (ball)" in first.output
     config = load(choices / "hall.yaml")
-    assert (config.scene.sensors, config.parameters[0].keys) == ([0], ["Rectangle_1.bsdf.reflectance.value"])
+    assert [view.sensor for view in config.views] == [0]
+    assert config.parameters[0].keys == ["Rectangle_1.bsdf.reflectance.value"]
     other = reslrb("init", "hall.xml", "--sensor", 1, "--target", write_noise(choices / "photo.png", 12, 8), "--force")
     assert "sensor 1 (ball); --sensor takes another: 0 (floor)" in other.output
     config = load(choices / "hall.yaml")
-    assert (config.scene.sensors, config.scene.size) == ([1], None)  # that one's film is as large as the photograph
+    assert [view.sensor for view in config.views] == [1]
+    assert config.scene.size is None  # that one's film is as large as the photograph
     assert [spec.keys for spec in config.parameters] == [["Sphere_1.bsdf.reflectance.value"]]
     # A ball of one colour under a light of one colour: its exposure cannot be told from it.
     few = settings("run.iterations=2", "integrator.estimator=stack", "target.exposure=1")
@@ -362,7 +364,7 @@ def test_a_photograph_is_taken_as_a_person_sees_it(choices: Path) -> None:
     assert made.exit_code == 0, made.output
     assert told in made.output
     config = load(choices / "hall.yaml")
-    assert (config.scene.size, config.target.file) == (None, [choices / "photo.jpg"])
+    assert (config.scene.size, config.views[0].target) == (None, choices / "photo.jpg")
     few = settings("run.iterations=1", "integrator.estimator=stack", "target.exposure=1", "target.mask=none")
     done = reslrb("optimize", "hall.yaml", *few)
     assert done.exit_code == 0, done.output
@@ -372,7 +374,7 @@ def test_a_photograph_is_taken_as_a_person_sees_it(choices: Path) -> None:
     assert np.allclose(target, decode_srgb(seen), atol=1e-5)
     photograph(600, 900, 8)  # copied, upright and smaller
     assert init().exit_code == 0
-    [copy] = load(choices / "hall.yaml").target.file or []
+    copy = load(choices / "hall.yaml").views[0].target
     assert (orientation_of(copy), image_size(copy)[0] > image_size(copy)[1]) == (1, True)
     photograph(12, 8, 5)
     refused = init()

@@ -209,7 +209,7 @@ def test_what_is_given_wrong(scene, capsys, arguments, said):
 def test_a_run_folder_says_how_far_it_came(scene):
     Path("c.yaml").write_text(
         "scene: {file: scene.xml}\ntarget: {render: {spp: 4}}\nparameters: [{key: Sphere_1.emitter.radiance.value}]\n"
-        "integrator: {type: ptracer, max_depth: 2}\nrun: {iterations: 2, spp: 1, reach_spp: 1}\n"
+        "integrator: {type: ptracer, max_depth: 2}\nrun: {iterations: 2, spp: 1}\n"
     )
     done = CliRunner().invoke(main, ["optimize", "c.yaml", "--quiet"])
     assert done.exit_code == 0, done.output

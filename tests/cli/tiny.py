@@ -13,6 +13,7 @@ from typing import Any
 
 from click.testing import CliRunner, Result
 from compilation import search_path
+from kit import POSTER_BSDF, ref, scene, sensor, shape
 
 from reslrb_cli.cli import main
 from reslrb_cli.records.manifest import read_content, read_manifest
@@ -42,6 +43,12 @@ def settings(*given: str) -> list[str]:
 def read_metrics(folder: Path | str) -> list[dict[str, Any]]:
     """The lines of a run's metrics, oldest first."""
     return [json.loads(line) for line in (Path(folder) / "metrics.jsonl").read_text().splitlines()]
+
+
+def manifest(folder: Path | str = "runs/tiny") -> dict[str, Any]:
+    """The manifest of a run."""
+    content: dict[str, Any] = json.loads((Path(folder) / "manifest.json").read_text())
+    return content
 
 
 # What goes wrong while a tiny run is at work, and what it then says.
@@ -76,28 +83,22 @@ def failing_last(monkeypatch, name, failure=full, calls=1):
 
 ROOT = Path(__file__).resolve().parents[2]
 KEY = "poster.reflectance.data"
-SCENE = """<scene version="3.0.0">
-    <sensor type="perspective">
-        <float name="fov" value="50"/>
-        <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
-        <film type="hdrfilm">
-            <integer name="width" value="8"/> <integer name="height" value="8"/>
-            <string name="pixel_format" value="rgb"/> <rfilter type="box"/>
-        </film>
-    </sensor>
-    <bsdf type="diffuse" id="poster">
-        <texture type="bitmap" name="reflectance">
-            <string name="filename" value="poster.exr"/> <boolean name="raw" value="true"/>
-            <string name="format" value="variant"/> <string name="filter_type" value="nearest"/>
-        </texture>
-    </bsdf>
-    <shape type="rectangle" id="wall"><ref id="poster"/></shape>
-    <shape type="rectangle" id="lamp">
+#: Three places of the camera.
+EYES = ("0, 0, 4", "1, 0.5, 4", "-1, 1, 3")
+
+
+def scene_seen(*eyes: str, rfilter: str = "box") -> str:
+    """Return the scene with a sensor at each of these places."""
+    return scene(
+        *(sensor(eye, rfilter=rfilter) for eye in eyes), POSTER_BSDF, shape("rectangle", "wall", ref("poster")),
+        """<shape type="rectangle" id="lamp">
         <transform name="to_world"><rotate x="1" angle="180"/><translate z="5"/></transform>
         <emitter type="area"><rgb name="radiance" value="8, 8, 8"/></emitter>
-    </shape>
-</scene>
-"""
+    </shape>""",
+    )  # fmt: skip
+
+
+SCENE = scene_seen("0, 0, 4")
 CONFIG = f"""
 variant: llvm_ad_rgb
 scene: {{file: scene.xml}}
@@ -105,7 +106,7 @@ target: {{render: {{spp: 16}}}}
 parameters:
   - {{key: {KEY}, initial: 0.5, bounds: [0, 1]}}
 integrator: {{type: reslrb, max_depth: 3, estimator: stack}}
-run: {{iterations: 5, spp: 4, reach_spp: 8}}
+run: {{iterations: 5, spp: 4}}
 """
 #: What a run folder holds when all went well.
 COMPLETE = {
@@ -116,14 +117,14 @@ COMPLETE = {
 }  # fmt: skip
 
 
-def write_experiment(folder: Path) -> None:
+def write_experiment(folder: Path, text: str = SCENE) -> None:
     """Put scene, texture and `tiny.yaml` into `folder`; a variant must be set."""
     import mitsuba as mi
     import numpy as np
 
     texture = np.random.default_rng(2).uniform(0.1, 0.9, (4, 4, 3)).astype(np.float32)
     mi.Bitmap(texture).write(str(folder / "poster.exr"))
-    (folder / "scene.xml").write_text(SCENE)
+    (folder / "scene.xml").write_text(text)
     (folder / "tiny.yaml").write_text(CONFIG)
 
 

@@ -210,7 +210,7 @@ FAULTS = [
                   "concerns_emission(plan)", "plan.moving_emission"),
     AttachedFault("pushed_from_the_second_vertex", "mirror", "estimators.attached:begins",
                   "plan.moves(vertex.si.shape) | ", ""),
-    AttachedFault("another_point_of_the_lens", "thin_lens", "estimators.attached:Pushing.scattering",
+    AttachedFault("another_point_of_the_lens", "thin_lens", "estimators.attached:Pushing.vertex",
                   "aperture=[connection.sample]", "aperture=[mi.Point2f(0.5)]"),
     # ---- The segment: naive AD shares the fault, `ptracer` does not ----
     AttachedFault("next_ray_detached", "slab", "transport.walk:Segment.next_ray",

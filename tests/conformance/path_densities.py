@@ -125,15 +125,12 @@ class LightNotes(Hooks, Notes):
     def start(self, product: Any) -> Any:
         return dr.arange(mi.UInt32, self.lanes)
 
-    def connection(self, lane: Any, vertex: Any, connection: Any, numbers: list[Any]) -> Any:
+    def vertex(self, lane: Any, vertex: Any, connection: Any, scattering: Any, numbers: list[Any]) -> Any:
         s, si = self.samples, vertex.si
         alone = connect(replace(s.plan, paths="light"), s.sensor, si, vertex.ray, connection.sample, connection.active)
         f, b, ok = self.event(vertex, connection.wo, False)
         self.note(lane, vertex.depth, connection.active, L=connection.weight[0] / alone.weight[0],
                   to=si.to_world(connection.wo), to_f=f, to_b=b, to_ok=ok)  # fmt: skip
-        return lane
-
-    def scattering(self, lane: Any, vertex: Any, connection: Any, scattering: Any) -> Any:
         self.scattered(lane, vertex, scattering, False)
         return lane
 

@@ -214,7 +214,7 @@ class Fault:
 
     right: str
     wrong: str
-    where: str = "integrators.forward:AttachedTangentSplat.scattering"
+    where: str = "integrators.forward:AttachedTangentSplat.vertex"
 
 
 FORWARD_FAULTS = {

@@ -211,11 +211,11 @@ class Fault:
 
 SELECTION, REPLAY = "estimators.chain:ChainSelection", "estimators.chain:ChainReplay"
 FAULTS = {
-    "no_G": Fault(f"{SELECTION}.scattering",
+    "no_G": Fault(f"{SELECTION}.vertex",
                   "row_times(row, J) + before for row, before in zip(jacobian.log_c",
                   "row_times(row, J) for row, before in zip(jacobian.log_c"),
-    "factors_passed_stay": Fault(f"{REPLAY}.scattering", "ahead = row - sum", "ahead = row + 0 * sum"),
-    "no_inverse": Fault(f"{REPLAY}.scattering", "row_times(ahead, inverse)", "ahead"),
+    "factors_passed_stay": Fault(f"{REPLAY}.vertex", "ahead = row - sum", "ahead = row + 0 * sum"),
+    "no_inverse": Fault(f"{REPLAY}.vertex", "row_times(ahead, inverse)", "ahead"),
     "film_position_stays": Fault("estimators.chain:Kept.of", "[*by_u, *A]", "[*(0 * by_u), *A]"),
     "own_vertex_left_out": Fault(f"{REPLAY}._differentiate", "own_part + later", "later"),
     "rays_left_out": Fault(f"{REPLAY}._differentiate", "moved + dr.dot(by_s", "0 * moved + dr.dot(by_s"),

@@ -424,7 +424,6 @@ ADJOINTS = {
     "independent": {"adjoint": "independent"},
     "two batches": {"adjoint": "batched", "batches": 2},
     "four batches": {"adjoint": "batched", "batches": 4},
-    "first batch again": {"adjoint": "batched", "batches": 2, "first_batch": "again"},
 }
 
 

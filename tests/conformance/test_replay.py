@@ -59,18 +59,15 @@ class Recording(ReservoirSelection):
 
         return mi.Bool(True)
 
-    def connection(self, state: Kept, vertex: Any, connection: Any, numbers: list[Any]) -> Kept:
+    def vertex(self, state: Kept, vertex: Any, connection: Any, scattering: Any, numbers: list[Any]) -> Kept:
         import drjit as dr
         import mitsuba as mi
 
         [slot] = state.state.slots
         before = replace(state.state, slots=[replace(slot, last=mi.UInt32(NONE))])
-        after = super().connection(before, vertex, connection, numbers)
+        after = super().vertex(before, vertex, connection, scattering, numbers)
         taken = after.slots[0].last != NONE
         return Kept(after, dr.select(taken, vertex.depth, state.I), dr.select(taken, vertex.si.p, state.p))
-
-    def scattering(self, state: Kept, vertex: Any, connection: Any, scattering: Any) -> Kept:
-        return replace(state, state=super().scattering(state.state, vertex, connection, scattering))
 
 
 class Rewalk(Hooks):
@@ -90,15 +87,13 @@ class Rewalk(Hooks):
     def goes_on(self, state: Any, vertex: Any) -> Any:
         return vertex.depth < self.kept.I
 
-    def connection(self, state: Any, vertex: Any, connection: Any, numbers: list[Any]) -> Any:
+    def vertex(self, state: Any, vertex: Any, connection: Any, scattering: Any, numbers: list[Any]) -> Any:
         import drjit as dr
 
         here = vertex.active & (vertex.depth == self.kept.I)
         found = [state[0] * connection.c * self.samples.scale, vertex.si.p, connection.u, vertex.depth]
-        return [state[0], *(dr.select(here, new, old) for new, old in zip(found, state[1:], strict=True))]
-
-    def scattering(self, state: Any, vertex: Any, connection: Any, scattering: Any) -> Any:
-        return [state[0] * scattering.weight, *state[1:]]
+        latest = [dr.select(here, new, old) for new, old in zip(found, state[1:], strict=True)]
+        return [state[0] * scattering.weight, *latest]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -164,7 +159,6 @@ ADJOINTS = {
     "correlated": {"adjoint": "correlated"},
     "independent": {"adjoint": "independent"},
     "batched": {"adjoint": "batched", "batches": 2},
-    "again": {"adjoint": "batched", "batches": 2, "first_batch": "again"},
 }
 #: Each integrator once, each choice of samples for several.
 REFUSED = [(name, "independent") for name in INTEGRATORS]

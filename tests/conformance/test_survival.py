@@ -351,12 +351,9 @@ def test_what_follows_a_bounce_is_heard_where_its_ray_left() -> None:
             for k, value in enumerate(values):
                 dr.scatter(self.kept, mi.Float(value), self.lane + (first + k), active)
 
-        def connection(self, state: Any, vertex: Any, connection: Any, numbers: Any) -> Any:
+        def vertex(self, state: Any, vertex: Any, connection: Any, scattering: Any, numbers: Any) -> Any:
             C = vertex.product.times(connection.c, vertex.depth).value()
             self.keep(8, vertex.depth == 2, dr.select(connection.active, dr.squared_norm(C), 0), 1)
-            return state
-
-        def scattering(self, state: Any, vertex: Any, connection: Any, scattering: Any) -> Any:
             weight = dr.max(vertex.product.times(scattering.weight, vertex.depth).value())
             self.keep(0, (vertex.depth == 1) & scattering.active, 1, weight, *vertex.si.p, *scattering.d)
             return state

@@ -26,7 +26,7 @@ VALUES = Path(__file__).with_name("values.json")
 SCHEMA = ROOT / "docs" / "config.schema.json"
 #: As little as still goes through all that a run does: gradients by a descent that hides none of their bits.
 SMALL = (
-    "run.iterations=3", "run.spp=8", "run.final_spp=8", "run.reach_spp=8", "run.certainty=false",
+    "run.iterations=3", "run.spp=8", "run.final_spp=8", "run.certainty=false",
     "target.render.spp=8", "loss={type: l2}", "optimizer={type: sgd, learning_rate: 10}",
 )  # fmt: skip
 #: Configuration, seed, and settings of each run, by name.
@@ -49,7 +49,14 @@ for _number, (_estimator, _adjoint) in enumerate(
     _run(f"room_{_estimator}", "grey_room", _ours(_estimator, _adjoint, guiding="on"), seed=_number)
     _run(f"slab_{_estimator}", "caustic_slab", _ours(_estimator, _adjoint, sequence="low_discrepancy"), seed=_number)
 _run("floor_guided", "cornell_floor", _ours("stack", "batched", "on", "low_discrepancy"))
-_run("floor_not_frozen", "cornell_floor", _ours("stack", "batched", more=", freeze: false"))
+_run(
+    "floor_not_frozen",
+    "cornell_floor",
+    _ours(
+        "stack",
+        "batched",
+    ),
+)
 _run("floor_adjoint", "cornell_floor", _ours("reservoir", "batched", more=", weight: adjoint, capacity: 2"))
 _run("heights_stack", "caustic_heightmap", _ours("stack", "independent"))
 _run("heights_reservoir", "caustic_heightmap", _ours("reservoir", "independent"))
@@ -91,6 +98,8 @@ from reslrb_cli.backend.variant import set_variant
 set_variant("llvm_ad_rgb")
 from compilation import compute_alone
 compute_alone()
+import drjit
+drjit.set_flag(drjit.JitFlag.KernelFreezing, {recorded})
 from reslrb_cli.cli import main
 main.main(sys.argv[1:], prog_name="reslrb")
 """
@@ -109,9 +118,10 @@ def machine() -> str:
     return f"{name}, family {family}, model {model}, libLLVM {version[1] if version else 'unknown'}"
 
 
-def reslrb(*words: str, alone: bool = False) -> subprocess.CompletedProcess[str]:
-    """What the command line says, in a process of its own; with `alone` kernels are computed by one thread."""
-    program = ["-c", _ALONE.format(tests=str(ROOT / "tests"))] if alone else ["-m", "reslrb_cli"]
+def reslrb(*words: str, alone: bool = False, recorded: bool = True) -> subprocess.CompletedProcess[str]:
+    """What the command line says, in a process of its own; with `alone` kernels are computed by one thread, and what
+    steps launch is recorded or not."""
+    program = ["-c", _ALONE.format(tests=str(ROOT / "tests"), recorded=recorded)] if alone else ["-m", "reslrb_cli"]
     environment = os.environ | {"COLUMNS": "100", "NO_COLOR": "1"}
     return subprocess.run(
         [sys.executable, *program, *words], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
@@ -139,7 +149,8 @@ def values_of(name: str, other_seed: bool = False) -> dict[str, Any]:
         if config == "stiff/lamp":  # its target has an integrator of its own
             words.append("target.render={spp: 8}")
         sets = [part for word in words for part in ("--set", word)]
-        done = reslrb("optimize", f"configs/{config}.yaml", "--quiet", *sets, "--set", "run.name=run", alone=True)
+        words, recorded = ["--quiet", *sets, "--set", "run.name=run"], name != "floor_not_frozen"
+        done = reslrb("optimize", f"configs/{config}.yaml", *words, alone=True, recorded=recorded)
         if done.returncode:
             return {"error": done.stderr.splitlines()[-1:]}
         run = Path(folder) / "run"

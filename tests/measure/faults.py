@@ -6,9 +6,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from unittest.mock import patch
 
 from reslrb_cli.config.loader import loads
 from reslrb_cli.config.schema import Config
+from reslrb_cli.estimators.stack import Stack
 from reslrb_cli.measure.extreme import run_suite
 from reslrb_cli.measure.gradcheck import Gradcheck
 from reslrb_cli.measure.methods import parse_estimators
@@ -45,6 +47,12 @@ def cornell(*overrides: str, estimators: str, seeds: int = 8) -> Check:
     return lambda: checked(loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, *overrides]), estimators, seeds)
 
 
+def stack_of_2() -> list[GradcheckRecord]:
+    """The same with `stack` where a stack holds two vertices."""
+    with patch.object(Stack.__init__, "__defaults__", (2,)):
+        return list(cornell(estimators="stack")())
+
+
 def moving(name: str, key: str) -> Check:
     """The same of a parameter that moves light in a scene that stands beside this file."""
 
@@ -65,7 +73,7 @@ CHECKS: dict[str, Check] = {
     "cornell_event": cornell(estimators="event,stack"),
     "cornell_roulette": cornell("integrator.rr_depth=1", estimators="stack"),
     "cornell_capacity_2": cornell(estimators="reservoir(capacity=2),stack", seeds=16),
-    "cornell_stack_of_2": cornell(estimators="stack(stack_size=2)"),
+    "cornell_stack_of_2": stack_of_2,
     "veil": lambda: checked(
         room("veiled_room.xml", "veil.opacity.value", "floor.reflectance.value"), "gather,stack", 8
     ),
@@ -187,7 +195,7 @@ FAULTS = [
     # ---- Estimators: the others are right ----
     Fault("another_point_of_the_lens", "behind_lens", "estimators.kept:differentiate_event",
           "kept.point.ray(), sample,", "kept.point.ray(), mi.Point2f(0),", by("event", "walk_ad")),
-    Fault("w_of_previous_step", "cornell_reservoir", "estimators.reservoir:ReservoirSelection.connection",
+    Fault("w_of_previous_step", "cornell_reservoir", "estimators.reservoir:ReservoirSelection.vertex",
           "chosen_by(numbers, w, W,", "chosen_by(numbers, w, state.W,", by("reservoir", *GRADIENT, "ptracer")),
     Fault("replay_one_number_too_many", "delta_lobes", WALK,
           "sampler.next_1d(active)  # roulette's", "sampler.next_1d(active), sampler.next_1d(active)",
@@ -196,8 +204,8 @@ FAULTS = [
           "vertex.depth < self.last", "vertex.depth + 1 < self.last", by("reservoir", *GRADIENT, "ptracer")),
     Fault("slots_counted_twice", "cornell_capacity_2", "estimators.selection:inverse_probability",
           "W / (capacity * slot.w)", "W / slot.w", by("reservoir(capacity=2)", *GRADIENT, "ptracer")),
-    Fault("weight_of_prefix", "cornell_event", "estimators.event:EventSelection.scattering",
-          "return EventState(Q, state.W", "return EventState(state.Q, state.W", by("event", *GRADIENT, "ptracer")),
+    Fault("weight_of_prefix", "cornell_event", "estimators.event:EventSelection.vertex",
+          "return EventState(Q, W", "return EventState(state.Q, W", by("event", *GRADIENT, "ptracer")),
     Fault("one_visibility_bit_late", "cornell", "estimators.gather:Visibility.seen",
           "index = depth - 1", "index = depth", by("gather stack", *GRADIENT)),
     Fault("beyond_visibility_bits_all_seen", "deep", "transport.connection:passage",
@@ -210,12 +218,12 @@ FAULTS = [
           by("stack", *GRADIENT)),
     Fault("stack_without_its_tail", "cornell_stack_of_2", "estimators.stack:walk_back",
           "tail.value + tail.rest + since.value", "since.value",
-          by("stack(stack_size=2)", *GRADIENT)),
+          by("stack", *GRADIENT)),
     Fault("stack_forgets_what_it_does_not_push", "cornell", "estimators.stack:push",
           "dr.select(fits, PlainSum.zero(plan.track_zeros), since)", "PlainSum.zero(plan.track_zeros)",
           by("stack", *GRADIENT)),
     Fault("candidates_by_their_own_factor_alone", "cornell_reservoir",
-          "estimators.reservoir:ReservoirSelection.connection",
+          "estimators.reservoir:ReservoirSelection.vertex",
           "self.concerned(state) | plan.concerns(vertex.bsdf)", "plan.concerns(vertex.bsdf)",
           by("reservoir", *GRADIENT, "ptracer")),
     Fault("sum_ends_a_vertex_early", "cornell", "estimators.gather:needed",
@@ -237,7 +245,7 @@ FAULTS = [
     Fault("adjoints_of_origin_and_direction_exchanged", "wavy_glass", BACK,
           "dr.grad(ray.o), dr.grad(ray.d), dr.detach", "dr.grad(ray.d), mi.Vector3f(dr.grad(ray.o)), dr.detach",
           by("stack", *MOVED)),
-    Fault("last_vertex_of_the_attached_stack", "wavy_glass", "estimators.attached:Pushing.scattering",
+    Fault("last_vertex_of_the_attached_stack", "wavy_glass", "estimators.attached:Pushing.vertex",
           "dr.select(seen & pushed, count, state.needed)", "dr.select(seen & pushed, state.count, state.needed)",
           by("stack", *MOVED)),
     Fault("next_ray_detached", "wavy_glass", "transport.walk:Segment.next_ray",
@@ -254,9 +262,9 @@ FAULTS = [
     # ---- Forward mode: all estimators share it ----
     Fault("forward_without_emission", "glow", "integrators.forward:TangentSplat.start",
           "mi.Spectrum(self.dE)", "mi.Spectrum(0)", by("event stack", "forward_mode")),
-    Fault("forward_without_prefix", "cornell", "integrators.forward:TangentSplat.scattering",
+    Fault("forward_without_prefix", "cornell", "integrators.forward:TangentSplat.vertex",
           "state.d_product * c + P * dc", "P * dc", by("gather stack", "forward_mode")),
-    Fault("forward_without_veil", "veil", "integrators.forward:TangentSplat.scattering",
+    Fault("forward_without_veil", "veil", "integrators.forward:TangentSplat.vertex",
           "(df_c * passed + f_c * d_passed)", "df_c * passed",
           by("gather stack", "forward_mode")),
 ]  # fmt: skip

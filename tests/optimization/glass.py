@@ -6,39 +6,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from kit import diffuse, ref, scene, sensor, shape
 
 CELLS = 16
-SCENE = """<scene version="3.0.0">
-    <default name="filter" value="gaussian"/>
-    <sensor type="perspective" id="camera">
-        <float name="fov" value="90"/>
-        <transform name="to_world"><lookat origin="0, 1, 0" target="0, 0, 0" up="0, 0, -1"/></transform>
-        <film type="hdrfilm">
-            <integer name="width" value="24"/> <integer name="height" value="24"/>
-            <string name="pixel_format" value="rgb"/> <rfilter type="$filter"/>
-        </film>
-    </sensor>
-    <bsdf type="dielectric" id="glass"/>
-    <shape type="rectangle" id="floor">
-        <transform name="to_world"><rotate x="1" angle="-90"/></transform>
-        <bsdf type="diffuse"><rgb name="reflectance" value="0.8, 0.7, 0.6"/></bsdf>
-    </shape>
-    <shape type="rectangle" id="top">
-        <transform name="to_world"><rotate x="1" angle="-90"/><translate y="2.2"/></transform> <ref id="glass"/>
-    </shape>
-    <shape type="ply" id="slab"><string name="filename" value="slab.ply"/> <ref id="glass"/></shape>
-    <shape type="cube" id="bare">
-        <boolean name="face_normals" value="true"/>
-        <transform name="to_world"><scale value="0.05"/><translate x="30"/></transform>
-        <bsdf type="diffuse"><rgb name="reflectance" value="0.1, 0.2, 0.3"/></bsdf>
-    </shape>
-    <emitter type="spot" id="lamp">
+SCENE = scene(
+    '<default name="filter" value="gaussian"/>',
+    sensor("0, 1, 0", up="0, 0, -1", size=24, fov=90, id="camera", rfilter="$filter"),
+    '<bsdf type="dielectric" id="glass"/>',
+    shape("rectangle", "floor", diffuse("0.8, 0.7, 0.6"), place='<rotate x="1" angle="-90"/>'),
+    shape("rectangle", "top", ref("glass"), place='<rotate x="1" angle="-90"/><translate y="2.2"/>'),
+    shape("ply", "slab", '<string name="filename" value="slab.ply"/>', ref("glass")),
+    shape("cube", "bare", '<boolean name="face_normals" value="true"/>', diffuse("0.1, 0.2, 0.3"),
+          place='<scale value="0.05"/><translate x="30"/>'),
+    """<emitter type="spot" id="lamp">
         <rgb name="intensity" value="10, 9, 8"/>
         <float name="cutoff_angle" value="12"/> <float name="beam_width" value="4"/>
         <transform name="to_world"><lookat origin="0, 5, 0" target="0, 0, 0" up="0, 0, -1"/></transform>
-    </emitter>
-</scene>
-"""
+    </emitter>""",
+)  # fmt: skip
 CONFIG = """
 variant: llvm_ad_rgb
 scene: {file: scene.xml}
@@ -47,7 +32,7 @@ parameters:
   - motion: {of: lamp, free: [translation]}
     learning_rate: 0.02
 integrator: {max_depth: 4, rr_depth: 100, estimator: stack}
-run: {iterations: 3, spp: 16, reach_spp: 4, final_spp: 16}
+run: {iterations: 3, spp: 16, final_spp: 16}
 """
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from kit import POSTER_BSDF, area, diffuse, ref, scene, sensor, shape
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization.assemble import assemble
@@ -24,44 +25,19 @@ WALL, ALPHA, POSTER = "wall.reflectance.value", "metal.alpha.value", "poster.ref
 
 
 def lamp(name: str, x: float, radiance: str, size: float = 0.6, facing: float = 180) -> str:
-    return f"""<shape type="rectangle" id="{name}">
-        <transform name="to_world"><scale value="{size}"/><rotate x="1" angle="{facing}"/>
-            <translate x="{x}" y="0.8" z="3"/></transform>
-        <bsdf type="diffuse"><rgb name="reflectance" value="0, 0, 0"/></bsdf>
-        <emitter type="area"><rgb name="radiance" value="{radiance}"/></emitter>
-    </shape>"""
+    place = f'<scale value="{size}"/><rotate x="1" angle="{facing}"/><translate x="{x}" y="0.8" z="3"/>'
+    return shape("rectangle", name, diffuse("0, 0, 0"), area(radiance), place=place)
 
 
-SCENE = f"""<scene version="3.0.0">
-    <sensor type="perspective">
-        <float name="fov" value="42"/>
-        <transform name="to_world"><lookat origin="0, -0.5, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
-        <film type="hdrfilm">
-            <integer name="width" value="16"/> <integer name="height" value="16"/>
-            <string name="pixel_format" value="rgb"/> <rfilter type="box"/>
-        </film>
-    </sensor>
-    <bsdf type="diffuse" id="wall"><rgb name="reflectance" value="0.6, 0.4, 0.25"/></bsdf>
-    <bsdf type="roughconductor" id="metal"><float name="alpha" value="0.25"/></bsdf>
-    <bsdf type="diffuse" id="poster">
-        <texture type="bitmap" name="reflectance">
-            <string name="filename" value="poster.exr"/> <boolean name="raw" value="true"/>
-            <string name="format" value="variant"/> <string name="filter_type" value="nearest"/>
-        </texture>
-    </bsdf>
-    <shape type="rectangle" id="back">
-        <transform name="to_world"><scale value="3"/><translate z="-0.5"/></transform><ref id="wall"/>
-    </shape>
-    <shape type="rectangle" id="plate">
-        <transform name="to_world"><scale value="0.5"/><translate x="0.9" y="0.3"/></transform><ref id="metal"/>
-    </shape>
-    <shape type="rectangle" id="print">
-        <transform name="to_world"><scale value="0.9"/><translate x="-0.6"/></transform><ref id="poster"/>
-    </shape>
-    {lamp("left", -2, "9, 6, 4")} {lamp("right", 2, "3, 5, 8")} {lamp("hidden", 0, "2, 2, 2", facing=0)}
-    {lamp("twin", 0.5, "4, 4, 4", 0.3)} {lamp("other_twin", 0.5001, "4, 4, 4", 0.3)}
-</scene>
-"""
+SCENE = scene(
+    sensor("0, -0.5, 4", size=16, fov=42), diffuse("0.6, 0.4, 0.25", "wall"),
+    '<bsdf type="roughconductor" id="metal"><float name="alpha" value="0.25"/></bsdf>', POSTER_BSDF,
+    shape("rectangle", "back", ref("wall"), place='<scale value="3"/><translate z="-0.5"/>'),
+    shape("rectangle", "plate", ref("metal"), place='<scale value="0.5"/><translate x="0.9" y="0.3"/>'),
+    shape("rectangle", "print", ref("poster"), place='<scale value="0.9"/><translate x="-0.6"/>'),
+    lamp("left", -2, "9, 6, 4"), lamp("right", 2, "3, 5, 8"), lamp("hidden", 0, "2, 2, 2", facing=0),
+    lamp("twin", 0.5, "4, 4, 4", 0.3), lamp("other_twin", 0.5001, "4, 4, 4", 0.3),
+)  # fmt: skip
 CONFIG = """
 variant: llvm_ad_rgb
 scene: {file: scene.xml}

@@ -511,9 +511,7 @@ def test_walks_that_are_learned_from_come_before_all_steps_that_are_guided() -> 
 
 
 @pytest.mark.parametrize("iterations", [1, 3, 23])
-@pytest.mark.parametrize(
-    "how", [["run.adjoint=correlated"], ["run.spp=8"], ["run.spp=8", "run.first_batch=again"]], ids=str
-)
+@pytest.mark.parametrize("how", [["run.adjoint=correlated"], ["run.spp=8"]], ids=str)
 def test_a_run_learns_as_often_as_is_said_of_it(
     how: list[str], iterations: int, llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -61,7 +61,9 @@ def test_the_time_ends_a_run_and_its_schedule(tmp_path, steps, monkeypatch):
         assert len(found) == done
         assert [bool(state.stopped) for state, _ in found] == [False] * (done - 1) + [True]
         shares = [0.0, *((end - ends[0]) / (limit - ends[0]) for end in ends[: done - 1])]
-        rates = [2.0 * loop.learning_rate_factor("cosine", 0, 50, 0.01, share) for share in shares]
+        rates = [
+            2.0 * loop.learning_rate_factor("cosine", number, 50, 0.01, share) for number, share in enumerate(shares)
+        ]
         assert [record.lr for _, record in found] == pytest.approx(rates)
     assert len(run("run.max_seconds=0.5")) == 1  # the first iteration is always completed
     # iterations that are further than the time decide the schedule

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -91,7 +92,8 @@ def glass_at(problem: Any, values: dict[str, np.ndarray]) -> Any:
 
 def test_a_recorded_step_follows_what_moves(tmp_path):
     frozen = glass.assemble(tmp_path, MOTIONS, NO_TRUTH)
-    plain = glass.assemble(tmp_path, MOTIONS, NO_TRUTH, "integrator.freeze=false")
+    plain = glass.assemble(tmp_path, MOTIONS, NO_TRUTH)
+    plain = replace(plain, integrator=plain.integrator.with_options(samples_per_pass=None, freeze=False))
     assert frozen.integrator.freeze
     before = gradients(frozen, 16)
     moved = {"slab.translation": np.array([0.2, -0.3, 0.1], np.float32), "slab.scale": np.array(0.8, np.float32),
@@ -108,7 +110,7 @@ def test_a_recorded_step_follows_what_moves(tmp_path):
 def norm_of_all_samples(llvm, tmp_path_factory) -> float:
     """The gradient's norm in a step of more samples, in one pass."""
     path = glass.write_experiment(tmp_path_factory.mktemp("all"))
-    one = assemble(load(path, ["run.adjoint=independent", "run.iterations=1", "integrator.freeze=false", "run.spp=64"]))
+    one = assemble(load(path, ["run.adjoint=independent", "run.iterations=1", "run.spp=64"]))
     one = find_reached(one)
     [reference] = list(optimize(one))
     return float(reference.grad_norm)
@@ -124,7 +126,7 @@ def norm_of_all_samples(llvm, tmp_path_factory) -> float:
 def test_steps_of_several_backward_passes_add_up(tmp_path, options, norm_of_all_samples):
     """Batches and passes propagate more than once through what moves, from one set of values."""
     path = glass.write_experiment(tmp_path)
-    problem = assemble(load(path, [options, "run.iterations=1", "integrator.freeze=false"]))
+    problem = assemble(load(path, [options, "run.iterations=1"]))
     problem = find_reached(problem)
     [record] = list(optimize(problem))
     assert record.grad_norm > 0

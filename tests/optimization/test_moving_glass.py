@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kit import area, diffuse, scene, sensor, shape
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization.assemble import assemble, at_stage
@@ -15,32 +16,15 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import set_targets, target_arrays
 from reslrb_cli.scene.visibility import interior, sees_specular
 
-SCENE = """<scene version="3.0.0">
-    <default name="size" value="32"/>
-    <sensor type="perspective" id="camera">
-        <float name="fov" value="45"/>
-        <transform name="to_world"><lookat origin="0, -4.5, 4.5" target="0, 0, 0.3" up="0, 0, 1"/></transform>
-        <film type="hdrfilm">
-            <integer name="width" value="$size"/> <integer name="height" value="$size"/>
-            <string name="pixel_format" value="rgb"/> <rfilter type="gaussian"/>
-        </film>
-    </sensor>
-    <shape type="rectangle" id="floor">
-        <transform name="to_world"><scale value="4"/></transform>
-        <bsdf type="diffuse"><rgb name="reflectance" value="0.8, 0.7, 0.5"/></bsdf>
-    </shape>
-    <shape type="sphere" id="ball">
-        <float name="radius" value="0.5"/> <point name="center" x="0" y="0" z="1.2"/>
-        <bsdf type="dielectric"/>
-    </shape>
-    <shape type="rectangle" id="lamp">
-        <transform name="to_world">
-            <scale value="0.4"/> <rotate x="1" angle="180"/> <translate x="-1" y="0.5" z="4"/>
-        </transform>
-        <emitter type="area"><rgb name="radiance" value="20, 18, 16"/></emitter>
-    </shape>
-</scene>
-"""
+SCENE = scene(
+    '<default name="size" value="32"/>',
+    sensor("0, -4.5, 4.5", "0, 0, 0.3", up="0, 0, 1", size="$size", fov=45, id="camera", rfilter="gaussian"),
+    shape("rectangle", "floor", diffuse("0.8, 0.7, 0.5"), place='<scale value="4"/>'),
+    shape("sphere", "ball", '<float name="radius" value="0.5"/> <point name="center" x="0" y="0" z="1.2"/>',
+          '<bsdf type="dielectric"/>'),
+    shape("rectangle", "lamp", area("20, 18, 16"),
+          place='<scale value="0.4"/> <rotate x="1" angle="180"/> <translate x="-1" y="0.5" z="4"/>'),
+)  # fmt: skip
 CONFIG = """
 variant: llvm_ad_rgb
 scene: {file: scene.xml}

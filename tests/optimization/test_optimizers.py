@@ -22,16 +22,11 @@ START = np.array([0.9, -0.4, 0.2, 1.5])
 TARGET = np.array([0.1, 0.3, 0.8, -0.7])
 
 
-def adam(p, g, s, t, beta_1=0.9, beta_2=0.999, epsilon=1e-8, rate=RATE, weight_decay=0.0):
+def adam(p, g, s, t, beta_1=0.9, beta_2=0.999, epsilon=1e-8, rate=RATE):
     s["m"] = beta_1 * s.get("m", 0) + (1 - beta_1) * g
     s["v"] = beta_2 * s.get("v", 0) + (1 - beta_2) * g**2
     step = rate * np.sqrt(1 - beta_2**t) / (1 - beta_1**t)  # Section 2 of the paper: epsilon is not corrected for bias
-    return p - step * s["m"] / (np.sqrt(s["v"]) + epsilon) - rate * weight_decay * p
-
-
-def rmsprop(p, g, s, t, decay=0.99, epsilon=1e-8, rate=RATE):
-    s["v"] = decay * s.get("v", 0) + (1 - decay) * g**2
-    return p - rate * g / (np.sqrt(s["v"]) + epsilon)
+    return p - step * s["m"] / (np.sqrt(s["v"]) + epsilon)
 
 
 def sgd(p, g, s, t, momentum=0.0, rate=RATE):
@@ -42,9 +37,6 @@ def sgd(p, g, s, t, momentum=0.0, rate=RATE):
 CASES = [
     ("adam", {}, adam),
     ("adam", {"beta_1": 0.5, "beta_2": 0.9, "epsilon": 1e-2}, adam),
-    ("adamw", {"weight_decay": 0.1}, adam),
-    ("rmsprop", {}, rmsprop),
-    ("rmsprop", {"decay": 0.8, "epsilon": 1e-2}, rmsprop),
     ("sgd", {}, sgd),
     ("sgd", {"momentum": 0.9}, sgd),
 ]
@@ -179,7 +171,7 @@ def test_how_far_a_step_goes_where_a_value_is():
     """In the scene's unit, by way of what is moved; with plain gradient descent that depends on the gradient."""
     start = mi.Float(2.0)
     for kind, transform, bounds, step in (
-        ("adam", "none", None, RATE), ("rmsprop", "none", None, RATE), ("sgd", "none", None, None),
+        ("adam", "none", None, RATE), ("sgd", "none", None, None),
         ("adam", "log", (0, np.inf), 2 * (np.exp(RATE) - 1)), ("sgd", "log", (0, np.inf), None),
     ):  # fmt: skip
         made = {"a": make_transform(transform, bounds)}

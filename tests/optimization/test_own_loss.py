@@ -349,7 +349,7 @@ def test_what_is_handed_over_and_allowed_stays_with_other_integrators(experiment
     handed = load("tiny.yaml").with_loss(np.mean).with_code()
     other = with_integrator(handed, {"type": "prb"}, "--integrators", {})
     assert (other.own_loss, other.allows_code) == (np.mean, True)
-    assert handed.with_exposures_fixed().at_stage(0).own_loss is np.mean
+    assert handed.with_exposures_fixed().without_stages().own_loss is np.mean
 
 
 @pytest.mark.long

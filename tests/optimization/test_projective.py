@@ -9,6 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+from kit import area, diffuse, scene, sensor, shape
 
 from reslrb_cli.cli import main
 from reslrb_cli.config.loader import load
@@ -21,38 +22,20 @@ from reslrb_cli.optimization.identifiability import find_reached
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.problem import Problem
 
-SCENE = """<scene version="3.0.0">
-    <default name="sensor" value="perspective"/>
-    <sensor type="$sensor" id="camera">
-        <float name="fov" value="45"/>
-        <transform name="to_world"><lookat origin="0, -2.6, 2.6" target="0, 0, 0.1" up="0, 0, 1"/></transform>
-        <film type="hdrfilm">
-            <integer name="width" value="16"/> <integer name="height" value="16"/>
-            <string name="pixel_format" value="rgb"/> <rfilter type="gaussian"/>
-        </film>
-    </sensor>
-    <shape type="rectangle" id="floor">
-        <transform name="to_world"><scale value="3"/></transform>
-        <bsdf type="diffuse"><rgb name="reflectance" value="0.8, 0.7, 0.5"/></bsdf>
-    </shape>
-    <shape type="obj" id="box">
-        <string name="filename" value="box.obj"/> <boolean name="face_normals" value="true"/>
-        <transform name="to_world"><scale value="0.3"/> <translate z="0.3"/></transform>
-        <bsdf type="diffuse"><rgb name="reflectance" value="0.2, 0.3, 0.6"/></bsdf>
-    </shape>
-    <shape type="rectangle" id="lamp">
-        <transform name="to_world">
-            <scale value="0.3"/> <rotate x="1" angle="180"/> <translate x="-1" y="0.5" z="3"/>
-        </transform>
-        <emitter type="area"><rgb name="radiance" value="20, 18, 16"/></emitter>
-    </shape>
-    <emitter type="spot" id="spot">
+SPOT = """<emitter type="spot" id="spot">
         <rgb name="intensity" value="0.001"/>
         <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="1, 0, 0"/></transform>
-    </emitter>
-</scene>
-"""
-SPOT = SCENE[SCENE.index('    <emitter type="spot"') : SCENE.index("</scene>")]
+    </emitter>"""
+CAMERA = sensor("0, -2.6, 2.6", "0, 0, 0.1", up="0, 0, 1", size=16, fov=45, id="camera", rfilter="gaussian")
+SCENE = scene(
+    '<default name="sensor" value="perspective"/>', CAMERA.replace('"perspective"', '"$sensor"'),
+    shape("rectangle", "floor", diffuse("0.8, 0.7, 0.5"), place='<scale value="3"/>'),
+    shape("obj", "box", '<string name="filename" value="box.obj"/> <boolean name="face_normals" value="true"/>',
+          diffuse("0.2, 0.3, 0.6"), place='<scale value="0.3"/> <translate z="0.3"/>'),
+    shape("rectangle", "lamp", area("20, 18, 16"),
+          place='<scale value="0.3"/> <rotate x="1" angle="180"/> <translate x="-1" y="0.5" z="3"/>'),
+    SPOT,
+)  # fmt: skip
 FACES = ("1 3 2", "1 4 3", "5 6 7", "5 7 8", "1 2 6", "1 6 5", "2 3 7", "2 7 6", "3 4 8", "3 8 7", "4 1 5", "4 5 8")
 CORNERS = [f"v {x} {y} {z}" for z in (-1, 1) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
 CONFIG = """
@@ -122,8 +105,6 @@ def test_parts_have_their_own_samples_and_steps_no_memory(tmp_path: Path) -> Non
 #: Settings, whether there is a spot lamp, and where the error is and what it holds.
 REFUSED = {
     "prb": (["integrator.type=prb"], False, "integrator.type", "prb_projective"),
-    "depth": (["integrator={type: direct_projective, max_depth: 3}"], False, "integrator.max_depth", "must be 2"),
-    "spot": (["integrator={type: direct_projective}"], True, "integrator.type", "shadow edges of spot lamps, as spot"),
     "lens": (["scene.options.sensor=orthographic"], False, "integrator.type", "perspective sensors alone, and camera"),
     "rectangle": (
         ["parameters=[{motion: {of: lamp}}]", "target.render.parameters={}"], False, "integrator.type",
@@ -142,22 +123,15 @@ def test_what_mitsuba_gets_wrong_is_refused(case: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "spot", "sets"),
-    [
-        ("direct_projective", False, []),
-        ("prb_projective", True, []),
-        ("direct_projective", True, ["integrator.sppi=0"]),
-        ("prb_projective", False, ["scene.options.sensor=orthographic", "integrator.sppp=0"]),
-    ],
+    ("spot", "sets"), [(True, []), (False, ["scene.options.sensor=orthographic", "integrator.sppp=0"])]
 )
-def test_what_mitsuba_gets_right_is_not_refused(kind: str, spot: bool, sets: list[str], tmp_path: Path) -> None:
-    config = load(write_experiment(tmp_path, spot), [f"integrator={{type: {kind}}}", *sets])
+def test_what_mitsuba_gets_right_is_not_refused(spot: bool, sets: list[str], tmp_path: Path) -> None:
+    config = load(write_experiment(tmp_path, spot), sets)
     assert type(assemble_scene(config).integrator) is Projective
 
 
-@pytest.mark.parametrize("kind", ["prb_projective", "direct_projective"])
-def test_measurements_take_them_as_they_take_prb(kind: str, tmp_path: Path) -> None:
-    config = load(write_experiment(tmp_path), ["integrator.sppp=3"])
+def test_measurements_take_it_as_they_take_prb(tmp_path: Path) -> None:
+    config, kind = load(write_experiment(tmp_path), ["integrator.sppp=3"]), "prb_projective"
     [case] = parse_cases(f"{kind}(sppi=2)")
     made = case.at(config, 2, known=False)
     assert (made.integrator.type, *(made.integrator.options()[name] for name in ("sppp", "sppi"))) == (kind, 3, 2)
@@ -165,9 +139,9 @@ def test_measurements_take_them_as_they_take_prb(kind: str, tmp_path: Path) -> N
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("kind", ["prb_projective", "direct_projective"])
-def test_commands_take_them_as_they_take_prb(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_take_it_as_they_take_prb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a colour, which has no silhouettes. The few samples may fail a check."""
+    kind = "prb_projective"
     write_experiment(tmp_path)
     monkeypatch.chdir(tmp_path)
     sets = ["parameters=[{key: floor.bsdf.reflectance.value}]", "target.render.parameters={}", "integrator.max_depth=2"]

@@ -268,7 +268,7 @@ def test_it_goes_on_from_what_it_was(at):
 # Images that are saved: which of them are recorded.
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
-TINY = ["scene.options={resx: 12, resy: 12}", "integrator.max_depth=2", "integrator.freeze=true"]
+TINY = ["scene.options={resx: 12, resy: 12}", "integrator.max_depth=2"]
 
 
 @pytest.mark.parametrize(("most", "recorded"), [(12 * 12 * 8, True), (12 * 12 * 8 - 1, False)])

@@ -31,7 +31,7 @@ from reslrb_cli.optimization.state import standing
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
 TINY = ["scene.options={resx: 12, resy: 12}", "integrator.max_depth=2", "integrator.paths=light", "run.spp=32",
-        "run.reach_spp=16", "target.render.integrator.max_depth=2", "target.render.spp=256"]  # fmt: skip
+        "target.render.integrator.max_depth=2", "target.render.spp=256"]  # fmt: skip
 FLOOR, LAMP = "floor.reflectance.value", "lamp.intensity.value"
 
 
@@ -112,9 +112,9 @@ def test_own_lengths():
         assert own_length(sigmoid, (0.0, 1.0), mi.Float(x), length) == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize("type", ["adam", "adamw", "rmsprop", "sgd"])
+@pytest.mark.parametrize("type", ["adam", "sgd"])
 def test_in_units_of_its_own_no_scale_is_left(type):
-    """The same problem in units of 1e6 and 1, and its loss times 1e-12: equal steps, weight decay and epsilon too."""
+    """The same problem in units of 1e6 and 1, and its loss times 1e-12: equal steps, epsilon too."""
 
     def descend(unit, loss):
         optimizer = Optimizer(type, 0.02, {}, {"p": mi.TensorXf(np.array([0.3, 0.7], np.float32) * unit)},

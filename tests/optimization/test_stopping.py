@@ -1,15 +1,13 @@
-"""When a loss stands: runs that end early, plateaus, and averages of the last values."""
+"""When a loss stands: runs that end early, and plateaus."""
 
 from __future__ import annotations
 
-import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.tiny import KEY, read_metrics
+from cli.tiny import KEY, manifest, read_metrics
 from optimization.toy import CONFIG, make_problem
 from runs.going_on import begin_alone, differences, optimize, run_and_kill
 
@@ -17,10 +15,9 @@ from reslrb_cli.config.loader import dump, load, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.state import State
-from reslrb_cli.optimization.stopping import Averaged, Watch, average_begins, lowered
+from reslrb_cli.optimization.stopping import Watch, lowered
 from reslrb_cli.records.decisions import GuidedRecord
 from reslrb_cli.records.metrics import Record
-from reslrb_cli.records.run_folder import read_value
 
 # What is decided, of losses that are made up.
 
@@ -87,7 +84,7 @@ def test_held_out_views_decide_where_there_are_any(tmp_path: Path) -> None:
 
 
 def test_a_run_in_stages_is_looked_at_once_it_is_as_configured(tmp_path: Path) -> None:
-    given = config(tmp_path, STOP, "run.stages=[{until: 0.25, spp: 2}]")
+    given = config(tmp_path, STOP, "run.stages=[{until: 0.25, film: 0.5}]")
     assert len(follow(given, np.ones(400))) == 161
 
 
@@ -104,29 +101,11 @@ def test_a_plateau_lowers_the_rate_and_only_then_a_run_stops(tmp_path: Path) -> 
     assert lowered(config(tmp_path).optimizer, 3) == 1
 
 
-def test_an_average_is_that_of_the_last_values(tmp_path: Path) -> None:
-    given = config(tmp_path, "run.iterations=10", "optimizer.average=4")
-    assert average_begins(given) == 7
-    assert average_begins(config(tmp_path, "run.iterations=10", "optimizer.average=0.25")) == 8
-    assert average_begins(config(tmp_path, "run.iterations=10")) == 11
-    values = np.random.default_rng(1).uniform(size=(11, 2, 3))
-    found = Averaged()
-    for done in range(7, 11):
-        found = found.add(given, done, {"a": values[done]})
-    assert (found.average_first, found.average_count) == (7, 4)
-    np.testing.assert_allclose(found.average["a"], values[7:].mean(axis=0), rtol=1e-12)
-    longer = found.add(config(tmp_path, "run.iterations=20", "optimizer.average=4"), 17, {"a": values[0]})
-    assert (longer.average_first, longer.average_count) == (17, 1), "begun anew"
-
-
 @pytest.mark.parametrize(
     ("setting", "key", "words"),
     [
         ("run.stop={patience: 4}", "run.stop.patience", "at least 5"),
         ("run.stop={relative: 1}", "run.stop.relative", "below 1"),
-        ("optimizer.average=1", "optimizer.average", "or a share of them"),
-        ("optimizer.average=1.5", "optimizer.average", "or a share of them"),
-        ("optimizer.average=true", "optimizer.average", "or a share of them"),
     ],
 )
 def test_settings_that_are_none(tmp_path: Path, setting: str, key: str, words: str) -> None:
@@ -137,15 +116,12 @@ def test_settings_that_are_none(tmp_path: Path, setting: str, key: str, words: s
 
 
 def test_settings_that_do_not_go_together(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="does not go with run"):
-        config(tmp_path, "run.stop={}", "optimizer.average=0.5")
     with pytest.raises(ConfigError, match=r"run\.stop\.patience: must be at least 20, not 10"):
         config(tmp_path, "run.stop={patience: 10}", "run.held_out=[0]")
 
 
 def test_what_is_not_asked_for_is_not_written(tmp_path: Path) -> None:
     written = config(tmp_path).model_dump()
-    assert "average" not in written["optimizer"]
     assert "stop" not in written["run"]
     asked = config(tmp_path, STOP, "optimizer={schedule: plateau}")
     assert loads(dump(asked), tmp_path / "config.yaml") == asked
@@ -160,10 +136,6 @@ SETS = ["--set", "run.checkpoint_every={iterations: 3}", "--set", "run.certainty
 def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     begin_alone(tmp_path, monkeypatch)
     return tmp_path
-
-
-def manifest(run: str | Path) -> dict:
-    return json.loads((Path(run) / "manifest.json").read_text())
 
 
 @pytest.mark.parametrize("at", [18, 19, 20])
@@ -213,8 +185,7 @@ def test_a_run_whose_time_was_up_goes_on_with_more(experiment: Path, capsys: pyt
 
 @pytest.mark.parametrize(
     ("more", "line"),
-    [("run.stages=[{until: 0.5, film: 0.5}]", "run.max_seconds: does not go with run.stages"),
-     ("optimizer.average=3", "optimizer.average: does not go with run.max_seconds")],
+    [("run.stages=[{until: 0.5, film: 0.5}]", "run.max_seconds: does not go with run.stages")],
 )  # fmt: skip
 def test_what_counts_iterations_does_not_go_with_a_time(tmp_path: Path, more: str, line: str) -> None:
     with pytest.raises(ConfigError, match=line):
@@ -227,33 +198,3 @@ def test_measuring_before_the_first_iteration_is_part_of_the_time(tmp_path: Path
     assert problem.limit_s == 10
     assert replace(problem, guided=record).limit_s == 6.5
     assert replace(problem, guided=replace(record, cached=True)).limit_s == 10
-
-
-def test_the_result_is_the_average_and_the_last_values_stand_beside_it(experiment: Path) -> None:
-    average = ["--set", "run.iterations=8"]
-    assert optimize("tiny.yaml", "--quiet", *SETS, *average, "--set", "run.name=plain") == 0
-    values = []
-    for iterations in (6, 7, 8):
-        more = ["--set", f"run.iterations={iterations}", "--set", f"run.name=n{iterations}"]
-        assert optimize("tiny.yaml", "--quiet", *SETS, *more) == 0
-        with np.load(f"runs/n{iterations}/parameters/parameters.npz") as found:
-            values.append(found[KEY].astype(np.float64))
-    assert optimize("tiny.yaml", "--quiet", *SETS, *average, "--set", "optimizer.average=3") == 0
-    run = Path("runs/tiny")
-    with np.load(run / "parameters/parameters.npz") as found, np.load(run / "parameters/last/parameters.npz") as last:
-        np.testing.assert_allclose(found[KEY], np.mean(values, axis=0), rtol=1e-6)
-        np.testing.assert_array_equal(last[KEY], values[-1].astype(np.float32))
-        np.testing.assert_array_equal(read_value(run, KEY), found[KEY])
-    results = manifest(run)["results"]
-    assert (results["average"]["first"], results["average"]["iterations"]) == (6, 3)
-    plain = manifest("runs/plain")["results"]
-    assert results["average"]["last_rmse"][KEY] == plain["parameter_rmse"][KEY]["final"]
-    assert results["parameter_rmse"][KEY]["final"] != plain["parameter_rmse"][KEY]["final"]
-    # It goes on from its last values, as one without an average does.
-    shutil.copytree(run, "runs/more")
-    assert optimize("--resume", "runs/more", "--quiet", "--set", "run.iterations=11") == 0
-    assert manifest("runs/more")["results"]["average"]["first"] == 9
-    assert optimize("--resume", "runs/plain", "--quiet", "--set", "run.iterations=11") == 0
-    with np.load("runs/more/parameters/last/parameters.npz") as one, np.load(
-        "runs/plain/parameters/parameters.npz") as other:  # fmt: skip
-        np.testing.assert_array_equal(one[KEY], other[KEY])

@@ -31,15 +31,12 @@ PARAMETERS = (
     f"[{{key: {tiny.KEY}, initial: 0.5, bounds: [0, 1]}}, {{key: {LAMP}, initial: [3, 4, 5], bounds: [0, 20]}}]"
 )
 MOTION = "{motion: {of: wall, free: [translation, scale]}, learning_rate: 0.01}"
-SENSOR = tiny.SCENE[tiny.SCENE.index("<sensor") : tiny.SCENE.index("</sensor>") + len("</sensor>")]
 
 
 def write_experiment(folder: Path) -> None:
     """As `tiny` has it, with three sensors, a smooth filter, and parameters of two shapes."""
-    tiny.write_experiment(folder)
-    sensors = "\n".join(SENSOR.replace('origin="0, 0, 4"', f'origin="{x}, 0, 4"') for x in (0, 1, -1))
-    scene = tiny.SCENE.replace(SENSOR, sensors).replace('<rfilter type="box"/>', '<rfilter type="gaussian"/>')
-    (folder / "scene.xml").write_text(scene)
+    eyes = [f"{x}, 0, 4" for x in (0, 1, -1)]
+    tiny.write_experiment(folder, tiny.scene_seen(*eyes, rfilter="gaussian"))
     config = tiny.CONFIG.replace(f"\n  - {{key: {tiny.KEY}, initial: 0.5, bounds: [0, 1]}}", f" {PARAMETERS}")
     (folder / "tiny.yaml").write_text(config)
 

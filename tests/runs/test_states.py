@@ -204,7 +204,7 @@ def test_the_state_before_is_taken_and_that_is_said(run: Path, capsys: pytest.Ca
 
 def test_what_differs_is_shown(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert told(capsys, run, "--set", "run.spp=8").startswith("--set: run.spp: is 8, 4 in the run; ")
-    line = told(capsys, run, *(word for each in ("run.seed=1", "run.spp=8", "loss.type=l1", "run.reach_spp=9")
+    line = told(capsys, run, *(word for each in ("run.seed=1", "run.spp=8", "loss.type=l1", "run.final_spp=9")
                                for word in ("--set", each)))  # fmt: skip
     assert all(part in line for part in ("is l1, l2 in the run", "run.spp is 8", "1 more"))
     text = (run / "config.yaml").read_text()

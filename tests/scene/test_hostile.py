@@ -32,9 +32,9 @@ _RED = re.compile(r"\x1b\[31m([^\x1b]*)\x1b\[0m")
 #: Seconds that a case may take; a hang takes longer on any machine.
 SECONDS = 100
 PHOTO = CONFIG.replace("{render: {spp: 16}}", "{file: x.exr}").replace("iterations: 5", "iterations: 1")
-PHOTO = PHOTO.replace("spp: 4, reach_spp: 8", "spp: 4, certainty: false, final_spp: 1")
+PHOTO = PHOTO.replace("spp: 4", "spp: 4, certainty: false, final_spp: 1")
 RUN = CONFIG.replace("{render: {spp: 16}}", "{render: {spp: 1}}").replace("file: scene.xml", "file: mutated.xml")
-RUN = RUN.replace("iterations: 5, spp: 4, reach_spp: 8", "iterations: 1, spp: 1, reach_spp: 1, final_spp: 1")
+RUN = RUN.replace("iterations: 5, spp: 4", "iterations: 1, spp: 1, final_spp: 1")
 
 
 class Hostile:

@@ -30,7 +30,7 @@ scene: {file: scene/scene.xml}
 target: {render: {spp: 4}}
 parameters: [{key: Sphere_1.bsdf.reflectance.value, initial: 0.3}]
 integrator: {max_depth: 2}
-run: {iterations: 1, spp: 4, reach_spp: 1}
+run: {iterations: 1, spp: 4}
 """
 SMALL = '<film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/></film>'
 

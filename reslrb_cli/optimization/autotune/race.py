@@ -306,7 +306,7 @@ LEARNING_SHARE, LEARNINGS = 0.4, 2
 def lessons(problem: Problem) -> float:
     """How often tables of guided emission learn in an iteration of the run, in the mean over all of it."""
     run, sensors = problem.config.run, len(problem.trained)
-    each = run.batches - (run.first_batch == "image") if problem.config.adjoint == "batched" else 1
+    each = run.batches - 1 if problem.config.adjoint == "batched" else 1
     each = each * problem.config.halves if problem.config.shards == 1 else 1  # of shards, once a step
     gradients = run.iterations * each * len(problem.drawn(0)) / sensors
     return learnings(max(round(gradients), 1)) * sensors / run.iterations

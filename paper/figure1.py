@@ -1,0 +1,107 @@
+"""Figure 1: a caustic, its target, and the gradient of their distance with respect to the heights of the glass.
+
+Gradients by naive AD (Mitsuba's `ptracer`) and by ours, with few samples and with many, each kind under the same limit
+of memory. The means have to agree, the noise of ours has to fall with the root of the samples, and naive AD with many
+samples has to run out of memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from make_figures import encode
+
+from paper.gradients import MIB, OWN, Kind, colored, compare, fall, own_label, sample, take_pictures
+from reslrb_cli.config.loader import load
+from reslrb_cli.config.schema import Config
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.records.measurements import BenchStatus, Verdict
+from reslrb_cli.report.tonemap import signed_end
+
+CONFIG = Path(__file__).resolve().parent.parent / "configs" / "paper" / "figure1.yaml"
+#: Seeds with few samples for each seed with many.
+MANY = 4
+#: The grey of a gradient that does not fit.
+GREY = 0.93
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Samples per pixel, seeds, and the limit of each process in bytes."""
+
+    few_spp: int = 32
+    many_spp: int = 1024
+    reference_spp: int = 4096
+    seeds: int = 32
+    many_seeds: int = 8
+    limit: int = 2 << 30
+
+
+def plan(sets: list[str], seeds: int, _room: Path | None) -> tuple[Config, Plan]:
+    """Return the experiment and its plan."""
+    return load(CONFIG, sets), Plan(seeds=seeds, many_seeds=seeds // MANY)
+
+
+def measure(config: Config, plan: Plan, say: Callable[[str], None]) -> tuple[dict[str, Any], Any]:
+    """Sample and check everything; returns the record, and the rows of panels of the picture.
+
+    Raises ConfigError, `processes.Refused`, and Ended where a gradient that has to be there is missing.
+    """
+    label = own_label(config)
+    if config.parameters[0].heightmap is None:
+        raise ConfigError(config.source, "parameters[0]", "must be a heightmap, whose gradient is shown")
+    say(f"target and initial image, {plan.reference_spp} spp")
+    pictures = take_pictures(config, plan.reference_spp)
+    # Memory grows in proportion to the samples, so two sample counts predict that of many.
+    half = Kind("naive AD", max(plan.few_spp // 2, 1), "ptracer")
+    naive, failing = (Kind("naive AD", spp, "ptracer") for spp in (plan.few_spp, plan.many_spp))
+    ours, many = (Kind(label, spp, OWN) for spp in (plan.few_spp, plan.many_spp))
+    for kind, count in ((half, 1), (naive, plan.seeds), (ours, plan.seeds), (many, plan.many_seeds), (failing, 1)):
+        say(f"{kind.label}: {count} seed{'s' if count > 1 else ''}")
+        series = f"figure1, {'ours' if kind.by == OWN else 'naive'}, {kind.spp} spp"
+        sample(kind, count, config, pictures["adjoint"], series, plan.limit)
+        if kind.end is not None and kind is not failing:
+            raise kind.end
+    growth = ((naive.arrays_mib or 0) - (half.arrays_mib or 0)) / (naive.spp - half.spp)
+    asked_mib = (naive.arrays_mib or 0) + growth * (plan.many_spp - naive.spp)
+    kinds = [naive, ours, many, failing]
+    return judge(plan, kinds, asked_mib), panels(pictures, kinds, plan.limit)
+
+
+def judge(plan: Plan, kinds: list[Kind], asked_mib: float) -> dict[str, Any]:
+    """Return the record: the comparisons of the means, the fall of the noise, and whether all `holds`."""
+    naive, ours, many, failing = kinds
+    comparisons = compare([(ours, naive), (many, naive), (many, ours)])
+    noise = fall(ours.rows, many.rows, float(np.sqrt(many.spp / ours.spp)))
+    verdicts = [row["verdict"] for row in (*comparisons, noise)]
+    does_not_fit = failing.end is not None and failing.end.status is BenchStatus.OUT_OF_MEMORY
+    return {
+        "plan": asdict(plan),
+        "gradients": [kind.record(many.rows.mean(0)) for kind in kinds],
+        "naive_at_many_spp_mib": asked_mib,
+        "comparisons": comparisons,
+        "noise": noise,
+        "holds": does_not_fit and all(verdict is Verdict.HOLDS for verdict in verdicts),
+    }
+
+
+def panels(pictures: dict[str, np.ndarray], kinds: list[Kind], limit: int) -> list[list[tuple[str, np.ndarray]]]:
+    """Return the panels of the picture: target and caustic, and a gradient of each kind, of one seed."""
+    naive, ours, many, failing = kinds
+    shape, white = np.shape(many.samples)[1:], float(np.quantile(pictures["target"], 0.999)) or 1.0
+    end = signed_end(many.rows[0].reshape(shape).sum(-1))
+    target, caustic = (encode(pictures[name] / white) for name in ("target", "initial"))
+
+    def shown(kind: Kind) -> tuple[str, np.ndarray]:
+        if kind.samples is None:
+            return f"{kind.label}: more than {limit / MIB:.0f} MiB", np.full((*shape[:2], 3), GREY)
+        return f"dL/dh by {kind.label}: {kind.arrays_mib:.0f} MiB", colored(kind.samples[0].sum(-1), end)
+
+    return [
+        [("target", target), shown(naive), shown(failing)],
+        [("caustic at the start", caustic), shown(ours), shown(many)],
+    ]

@@ -1,0 +1,116 @@
+"""Figure 5: the gradient of an image's loss with respect to the floor of the Grey & White Room, paths of length 32.
+
+Gradients by naive AD and by ours at 32 spp, and the z map of their means. dL/dI is 0 where light paths find less light
+than camera paths: where the sensor sees glass, mirrors or coats, and at the film's border. Naive AD is that of our own
+walk, as stock `ptracer` emits wrongly from the room's environment map, which is turned. The experiment's own estimator
+is compared at other seeds with naive AD and with `prb`, which shares no code with ours; the exact estimators with naive
+AD at equal seeds.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from make_figures import encode
+
+from paper.gradients import OWN, Kind, colored, compare, compared, own_label, sample, take_pictures
+from reslrb_cli.config.loader import load
+from reslrb_cli.config.schema import Config
+from reslrb_cli.measure.comparison import compare_equal_seeds, parts, z_scores
+from reslrb_cli.records.measurements import Verdict
+from reslrb_cli.report.tonemap import signed_end
+
+CONFIG = Path(__file__).resolve().parent / "room.yaml"
+#: Estimators that equal naive AD of the same paths but for rounding, and the limit of their relative L2 distance.
+EXACT, CLOSE = ("stack", "gather"), 1e-4
+#: Tiles of the z map along each side, and the standard errors at the end of its colour scale.
+TILES, FAR = 32, 5.0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Samples per pixel of a gradient and of the image of dL/dI, and seeds."""
+
+    spp: int = 32
+    reference_spp: int = 1024
+    seeds: int = 24
+
+
+def room_settings(room: Path) -> list[str]:
+    """Return the settings of `room.yaml` for the room in this folder."""
+    file = room if room.suffix == ".xml" else room / "scene.xml"
+    return [f"scene.file={json.dumps(str(file.resolve()))}"]
+
+
+def plan(sets: list[str], seeds: int, room: Path) -> tuple[Config, Plan]:
+    """Return the experiment and its plan."""
+    config = load(CONFIG, [*room_settings(room), *sets])
+    return config, Plan(spp=config.run.spp, seeds=seeds)
+
+
+def measure(config: Config, plan: Plan, say: Callable[[str], None]) -> tuple[dict[str, Any], Any]:
+    """Sample and check everything; returns the record, and the rows of panels of the picture.
+
+    Raises ConfigError, `processes.Refused`, and Ended where a gradient is missing.
+    """
+    label = own_label(config)
+    say(f"image and dL/dI, {plan.reference_spp} spp")
+    pictures = take_pictures(config, plan.reference_spp, masked=True)
+
+    def taken(name: str, by: str, count: int, series: str) -> Kind:
+        kind = Kind(name, plan.spp, by)
+        say(f"{kind.label}: {count} seed{'s' if count > 1 else ''}")
+        sample(kind, count, config, pictures["adjoint"], f"figure5, {series}")
+        if kind.end is not None:
+            raise kind.end
+        return kind
+
+    sampled = {"naive AD": "walk_ad", label: OWN, "prb": "prb"}
+    kinds = [taken(name, by, plan.seeds, by) for name, by in sampled.items()]
+    exact = [taken(f"reslrb:{name}", name, 1, "walk_ad") for name in EXACT]
+    height, width = pictures["adjoint"].shape[:2]
+    found = {
+        "plan": asdict(plan),
+        "film": [width, height],
+        "max_depth": config.integrator.max_depth,
+        "left_out": float(np.mean(~pictures["adjoint"].any(-1))),
+    }
+    return found | judge(kinds, exact), panels(pictures["initial"], kinds)
+
+
+def judge(kinds: list[Kind], exact: list[Kind]) -> dict[str, Any]:
+    """Return the gradients and comparisons of the record, and whether all `holds`."""
+    naive, ours, prb = kinds
+    comparisons = compare([(ours, naive), (ours, prb)])
+    comparisons += [compared(kind, naive, compare_equal_seeds(kind.rows, naive.rows[:1], CLOSE)) for kind in exact]
+    mean = (naive.rows.mean(0) + ours.rows.mean(0)) / 2
+    return {
+        "gradients": [kind.record(mean) for kind in kinds],
+        "comparisons": comparisons,
+        "holds": all(row["verdict"] is Verdict.HOLDS for row in comparisons),
+    }
+
+
+def z_map(naive: Kind, ours: Kind) -> np.ndarray:
+    """Return the z scores of the means of tiles, channels added up, with the size of the gradient: (H, W)."""
+    height, width, channels = shape = np.shape(ours.samples)[1:]
+    down, across = min(TILES, height), min(TILES, width)
+    sums = [parts(kind.rows, shape, TILES).reshape(-1, down, across, channels).sum(-1) for kind in (ours, naive)]
+    rows, columns = np.arange(height) * down // height, np.arange(width) * across // width
+    return np.asarray(z_scores(*sums)[np.ix_(rows, columns)])
+
+
+def panels(image: np.ndarray, kinds: list[Kind]) -> list[list[tuple[str, np.ndarray]]]:
+    """Return the panels of the picture: the room, the z map, and a gradient by naive AD and by ours, of one seed."""
+    naive, ours, _ = kinds
+    shape, white = np.shape(naive.samples)[1:], float(np.quantile(image, 0.9)) or 1.0
+    first = {kind.label: kind.rows[0].reshape(shape).sum(-1) for kind in (naive, ours)}
+    end, z = signed_end(first[naive.label]), z_map(naive, ours)
+    gradients = [(f"dL/d floor by {name}", colored(gradient, end)) for name, gradient in first.items()]
+    means = f"z of their means, {len(ours.rows)} seeds each: rms {np.sqrt(np.mean(z**2)):.2f}"
+    return [[("the room", encode(image / white)), (means, colored(z, FAR))], gradients]

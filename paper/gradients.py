@@ -1,0 +1,240 @@
+"""Gradients of an experiment with the same dL/dI for all, and comparisons of their means and of their noise.
+
+From their own images, gradients of different noise have different expectations, since the noise of an image biases the
+gradient. So dL/dI is that of one reference image. Each kind of gradient is sampled in a process of its own, which may
+have a limit of memory; gradients are those at the parameters' initial values, of the first parameter, through the first
+sensor.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import stats
+
+from reslrb_cli.backend.installation import python_command
+from reslrb_cli.backend.variant import set_variant
+from reslrb_cli.config.integrators import Prb, Ptracer, WalkAd
+from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.loader import dump, loads
+from reslrb_cli.config.schema import Config
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure.comparison import ALPHA, Family, compare_expectations, entry_count
+from reslrb_cli.measure.gradients import Case
+from reslrb_cli.measure.participants import ALIKE, NEVER
+from reslrb_cli.measure.processes import Ended, Process
+from reslrb_cli.measure.workers import Begun
+from reslrb_cli.optimization.assemble import assemble, assemble_scene
+from reslrb_cli.records.clock import peak_mib, reset_peak
+from reslrb_cli.records.measurements import Comparison, Reference, Verdict
+from reslrb_cli.records.metrics import finite
+from reslrb_cli.report.tonemap import color_map
+from reslrb_cli.scene.visibility import interior, sees_specular
+from reslrb_cli.seeds import seed
+from reslrb_cli.statistics import jackknife_variance
+
+MIB = 2**20
+#: On a GPU the address space of a process says nothing about the memory of its arrays.
+VARIANT = "llvm_ad_rgb"
+#: The integrator of the experiment itself.
+OWN = "own"
+#: Confidence of the interval of `fall`, and the relative half width of its test above which the ratio is not known.
+CONFIDENCE, WIDEST = 0.95, 0.2
+
+
+@dataclass
+class Kind:
+    """One kind of gradient: `samples` (N, H, W, C) by the integrator `by` (see `comparable`), and the peak of arrays.
+
+    `end` says how its process ended if it did not take all samples.
+    """
+
+    name: str
+    spp: int
+    by: str
+    samples: np.ndarray | None = None
+    arrays_mib: float | None = None
+    end: Ended | None = None
+
+    @property
+    def label(self) -> str:
+        """The name and the samples per pixel."""
+        return f"{self.name}, {self.spp} spp"
+
+    @property
+    def rows(self) -> np.ndarray:
+        """The samples in rows, (N, P), in double precision."""
+        assert self.samples is not None, "has been sampled"
+        return self.samples.reshape(len(self.samples), -1).astype(np.float64)
+
+    def record(self, mean: np.ndarray) -> dict[str, Any]:
+        """Return the figures of this kind; its noise is relative to the gradient `mean` (P,)."""
+        count = 0 if self.samples is None else len(self.samples)
+        return {
+            "gradient": self.name,
+            "spp": self.spp,
+            "seeds": count,
+            "relative_noise": relative_noise(self.rows, mean) if count > 1 else None,
+            "arrays_mib": self.arrays_mib,
+            "status": "ok" if self.end is None else self.end.status.value,
+            "reason": None if self.end is None else self.end.reason,
+        }
+
+
+def own_label(config: Config) -> str:
+    """Return the label of the experiment's own estimator. Raises ConfigError where gradients cannot be compared."""
+    integrator = config.integrator
+    if config.variant not in ("auto", VARIANT):
+        raise ConfigError(config.source, "variant", f"must be auto or {VARIANT}: the limit bounds address space alone")
+    if not isinstance(integrator, ReslrbConfig) or integrator.estimator == "auto":
+        raise ConfigError(config.source, "integrator.estimator", "must name an estimator of `reslrb`")
+    if integrator.max_depth < 0:
+        raise ConfigError(config.source, "integrator.max_depth", "must be a limit: paths are traced without roulette")
+    return f"reslrb:{integrator.estimator}"
+
+
+def comparable(config: Config, by: str) -> Config:
+    """Return the experiment with another integrator; the gradients of all of them have the same expectation.
+
+    `by` is `own` for the experiment's `reslrb`, `ptracer` or `walk_ad` for naive AD of the stock walk or of ours,
+    `prb`, or the name of an estimator. None has roulette, whose decision naive AD does not differentiate.
+    """
+    assert isinstance(config.integrator, ReslrbConfig), "checked by `own_label`"
+    own = config.integrator.undecided_off()
+    alike: dict[str, Any] = {**ALIKE[Reference.PTRACER], "rr_depth": NEVER}
+    shared: dict[str, Any] = {"max_depth": own.max_depth, "rr_depth": NEVER, "hide_emitters": own.hide_emitters}
+    if by == "ptracer":
+        return config.model_copy(update={"integrator": Ptracer(type="ptracer", **shared)})
+    if by == "prb":
+        return config.model_copy(update={"integrator": Prb(type="prb", **shared)})
+    if by == "walk_ad":
+        options: Any = shared | {"filter_normalization": "detached", "attached": own.attached}
+        return config.model_copy(update={"integrator": WalkAd(type="walk_ad", **options)})
+    other = {} if by == OWN else {"estimator": by}
+    return config.model_copy(update={"integrator": own.model_copy(update=alike | other)})
+
+
+def take_pictures(config: Config, spp: int, masked: bool = False) -> dict[str, np.ndarray]:
+    """Return the target and the initial image (H, W, C), the latter with `spp` samples, and dL/dI at it (`adjoint`).
+
+    If `masked`, dL/dI is 0 where light paths find less light than camera paths: in pixels that see smooth specular
+    lobes, and at the film's border.
+    """
+    set_variant(VARIANT)
+    problem = assemble(config.with_exposures_fixed())
+    view = problem.views[0]
+    initial = problem.render(view.sensor, spp, 0, "reference")
+    image = mi.TensorXf(initial)
+    dr.enable_grad(image)
+    dr.backward(view.compare(image))
+    adjoint = np.array(dr.grad(image))
+    if masked:
+        sensor = problem.scene.sensors()[view.sensor]
+        seen = sees_specular(problem.scene, sensor)
+        adjoint *= (interior(adjoint.shape, sensor) & ~(seen.alone | seen.mixed))[:, :, None]
+    return {"target": np.array(view.target), "initial": initial, "adjoint": adjoint}
+
+
+def begin(first: dict[str, Any]) -> Begun:
+    """Begin a process of `sample`; each question names `seed`, `spp`, and the file `out` for the gradient."""
+    problem = assemble_scene(comparable(loads(first["config"], first["source"]), first["by"]).with_exposures_fixed())
+    selection = problem.selection
+    case = Case(problem.scene, selection.keys, problem.sensors[0], selection)
+    case.weigh(np.load(first["adjoint"])[:, :, : case.weights.shape[2]])
+    key = selection.keys[0]
+
+    def gradient(question: dict[str, Any]) -> dict[str, Any]:
+        reset_peak()
+        found = case.gradient(problem.integrator, question["seed"], question["spp"], step=case.known_step)
+        shape = selection.array(key).shape
+        np.save(question["out"], found[case.places[key]].reshape(shape).astype(np.float32))
+        return {"peak_mib": peak_mib(dr.backend_v(mi.Float))}
+
+    return {}, gradient
+
+
+def sample(kind: Kind, count: int, config: Config, adjoint: np.ndarray, series: str, limit: int | None = None) -> None:
+    """Take `count` gradients with this dL/dI (H, W, C), in a process whose address space has a limit in bytes.
+
+    Kinds of the same `series` have the same seeds.
+    """
+    with tempfile.TemporaryDirectory(prefix="reslrb-paper-") as name:
+        held, out, taken = Path(name) / "adjoint.npy", Path(name) / "gradient.npy", []
+        np.save(held, adjoint)
+        first = {"config": dump(config), "source": str(config.source), "variant": VARIANT, "memory_limit": limit,
+                 "by": kind.by, "adjoint": str(held)}  # fmt: skip
+        code = "from paper.gradients import begin\nfrom reslrb_cli.measure.workers import run\nrun(lambda: begin)"
+        process = Process(first, python_command(code))
+        try:
+            process.answer(lambda: False)
+            for number in range(count):
+                process.ask({"seed": seed(config.run.seed, number, 0, series), "spp": kind.spp, "out": str(out)})
+                answer = process.answer(lambda: False)
+                kind.arrays_mib = max(kind.arrays_mib or 0.0, float(answer["peak_mib"]))
+                taken.append(np.load(out))
+            kind.samples = np.stack(taken)
+        except Ended as end:
+            kind.end = end
+        finally:
+            process.close()
+
+
+# --- what is said of the samples --------------------------------------------------------------------------------------
+
+
+def compare(pairs: Sequence[tuple[Kind, Kind]]) -> list[dict[str, Any]]:
+    """Return a record for each pair of kinds, whose means are compared in standard errors, all pairs as one family."""
+    shape = np.shape(pairs[0][0].samples)[1:]
+    family = Family(len(pairs), len(pairs) * entry_count(shape))
+    found = [compare_expectations(one.rows, other.rows, family, shape=shape, paired=False) for one, other in pairs]
+    return [compared(*pair, figures) for pair, figures in zip(pairs, found, strict=True)]
+
+
+def compared(one: Kind, other: Kind, figures: Comparison) -> dict[str, Any]:
+    """Return the record of one comparison."""
+    return {"gradient": one.label, "reference": other.label, **finite(vars(figures))}
+
+
+def relative_noise(samples: np.ndarray, mean: np.ndarray) -> float:
+    """Return the standard deviation of (N, P) samples over the norm of the mean (P,), in L2."""
+    return float(np.sqrt(samples.var(0, ddof=1).sum()) / np.linalg.norm(mean))
+
+
+def fall(coarse: np.ndarray, fine: np.ndarray, expected: float) -> dict[str, Any]:
+    """Return the ratio of the noise of (N, P) samples to that of (M, P) others, its interval, and a verdict.
+
+    The logarithm of the ratio has the jackknife's standard error and the degrees of freedom of Welch and Satterthwaite.
+    The verdict is `holds` if the expected ratio lies in the interval that a right ratio leaves with probability
+    `ALPHA`, and `unresolved` if that interval is wider than `WIDEST`.
+    """
+    (a, var_a), (b, var_b) = (_log_deviation(samples) for samples in (coarse, fine))
+    error = np.sqrt(var_a + var_b)
+    freedom = error**4 / (var_a**2 / (len(coarse) - 1) + var_b**2 / (len(fine) - 1))
+    half, most = (stats.t.isf(level / 2, freedom) * error for level in (1 - CONFIDENCE, ALPHA))
+    verdict = Verdict.HOLDS if abs(a - b - np.log(expected)) <= most else Verdict.FAILS
+    if verdict is Verdict.HOLDS and most > np.log1p(WIDEST):
+        verdict = Verdict.UNRESOLVED
+    low, ratio, high = np.exp([a - b - half, a - b, a - b + half]).tolist()
+    return {"ratio": ratio, "low": low, "high": high, "expected": expected, "verdict": verdict}
+
+
+def _log_deviation(samples: np.ndarray) -> tuple[float, float]:
+    """Return the logarithm of the standard deviation of (N, P) samples, and its variance by the jackknife."""
+    count = len(samples)
+    deviations = np.square(samples - samples.mean(0)).sum(1)
+    total = deviations.sum()
+    # Leave-one-out: dropping row k lowers the sum of squares by n / (n - 1) times its squared distance.
+    left = 0.5 * np.log((total - deviations * count / (count - 1)) / (count - 2))
+    return float(0.5 * np.log(total / (count - 1))), float(jackknife_variance(left))
+
+
+def colored(values: np.ndarray, end: float) -> np.ndarray:
+    """Return values (H, W) as colours (H, W, 3): blue at -`end` and below, grey at 0, red at `end` and above."""
+    return np.asarray(color_map(signed=True)(np.clip(values / end / 2 + 0.5, 0, 1))[:, :, :3])

@@ -1,0 +1,141 @@
+"""docs/paper.md: the paper's figures beside ours, prose from docs/paper/page.md, figures from the records there.
+
+No figure of ours is typed.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import benchmarks_page as tables
+from benchmarks_measure import PAPER, ROOT
+
+from reslrb_cli.errors import ConfigError
+
+Row = Mapping[str, Any]
+IMAGES, PAGE, TEMPLATE = ROOT / "docs" / "images", ROOT / "docs" / "paper.md", PAPER / "page.md"
+#: Published for Figure 6, on an RTX 5080: milliseconds of a step by naive AD and by ResLRB, by depth.
+PUBLISHED_MS: dict[int, tuple[int | None, int | None]] = {4: (63, 93), 16: (260, 132), 128: (None, 197)}
+#: The depth at which both take the same time in the paper.
+PARITY = 8
+MEANS = "Means of the gradients, compared in standard errors"
+
+
+def write(folder: Path | None = None) -> int:
+    """Write the page, after records and pictures were taken over from `folder`; the exit code. Raises ConfigError."""
+    names = [f"figure{number}.{ending}" for number in (1, 5, 6) for ending in ("json", "jsonl", "png")]
+    found = [] if folder is None else [folder / name for name in names if (folder / name).exists()]
+    if folder is not None and not found:
+        raise ConfigError(folder, "", "holds no figure1.json, figure5.json or figure6.jsonl")
+    for file in found:
+        shutil.copy(file, IMAGES if file.suffix == ".png" else PAPER)
+    PAGE.write_text(page(), encoding="utf-8")
+    return 0
+
+
+def page() -> str:
+    """Return the page."""
+
+    def made(match: re.Match[str]) -> str:
+        [file] = PAPER.glob(f"{match[1]}.json*")
+        text = file.read_text(encoding="utf-8")
+        record = json.loads(text) if file.suffix == ".json" else [json.loads(line) for line in text.splitlines()]
+        return FIGURES[match[1]](record)
+
+    return tables.PLACE.sub(made, TEMPLATE.read_text(encoding="utf-8"))
+
+
+def _figure1(record: Row) -> str:
+    fall, plan = record["noise"], record["plan"]
+    few, many, lack = plan["few_spp"], plan["many_spp"], record["naive_at_many_spp_mib"] / 1024
+    ratio, low, high, expected = (f"{fall[name]:.2f}" for name in ("ratio", "low", "high", "expected"))
+    about = f"Each process under {plan['limit'] / 2**30:g} GiB of address space:"
+    noise = (
+        f"From {few} to {many} spp noise falls by {ratio} ({low} to {high}), expected {expected}.\n"
+        f"By its growth naive AD would take about {lack:.1f} GiB at {many} spp."
+    )
+    return "\n\n".join([_gradients(record, about), f"{MEANS}:", _comparisons(record["comparisons"]), noise])
+
+
+def _figure5(record: Row) -> str:
+    film, left_out = "{}x{}".format(*record["film"]), f"dL/dI is 0 in {record['left_out']:.1%} of the pixels"
+    about = f"Film {film}, paths of length {record['max_depth']}; {left_out}:"
+    means = f"{MEANS}; the exact estimators at equal seeds, in relative L2:"
+    return "\n\n".join([_gradients(record, about), means, _comparisons(record["comparisons"])])
+
+
+def _figure6(lines: Sequence[Row]) -> str:
+    rows = [line for line in lines if line.get("kind") != "origin"]
+    depths = sorted({row["max_depth"] for row in rows})
+    found = {(tables.name_of(row), row["max_depth"]): row for row in rows}
+    names = list(dict.fromkeys(name for name, _ in found))
+
+    def published(depth: int, number: int) -> str:
+        value = PUBLISHED_MS.get(depth, (None, None))[number]
+        return "" if value is None else f"{value} ms"
+
+    def ratio(depth: int) -> str:
+        naive, ours = PUBLISHED_MS.get(depth, (None, None))
+        return "about 1" if depth == PARITY else "" if naive is None or ours is None else f"{ours / naive:.2f}"
+
+    def measured(name: str, depth: int) -> str:
+        row = found.get((name, depth))
+        if row is None or row["status"] != "ok":
+            return "" if row is None else str(row["status"]).replace("_", " ")
+        return f"{row['step_ms']['median']:.0f} ms, {row['peak_mib']:.0f}"
+
+    def over(name: str, depth: int) -> str:
+        row, base = found.get((name, depth)), found.get((names[0], depth))
+        return tables.ratio(row, base, "step_ms") if row and row["status"] == "ok" else ""
+
+    cells = [[f"published, {name}", *(published(depth, number) for depth in depths)]
+             for number, name in enumerate(("naive AD", "ResLRB"))]  # fmt: skip
+    cells += [[name, *(measured(name, depth) for depth in depths)] for name in names]
+    ratios = [["published", *map(ratio, depths)]]
+    ratios += [[name, *(over(name, depth) for depth in depths)] for name in names[1:]]
+    head, film = ["depth", *map(str, depths)], "{width}x{height}, {spp} spp".format_map(rows[0])
+    origins = dict.fromkeys(_origin(line) for line in lines if line.get("kind") == "origin")
+    about = f"Film {film}, no roulette; milliseconds of a step, and MiB of arrays at their most:"
+    parts = [about, tables.table(head, cells), f"A step over one of naive AD ({names[0]}):", tables.table(head, ratios)]
+    return "\n\n".join([*origins, *parts])
+
+
+#: What a figure says, by its record.
+FIGURES: dict[str, Callable[[Any], str]] = {"figure1": _figure1, "figure5": _figure5, "figure6": _figure6}
+
+
+def _origin(origin: Row) -> str:
+    where = f"{origin['device']}, {origin['variant']}, at {tables.commit_of(origin)}"
+    return f"    {shlex.join(origin['command'])}\n\n{where}."
+
+
+def _gradients(record: Row, about: str) -> str:
+    """Return where a record comes from, and its table of gradients."""
+    rows = []
+    for row in record["gradients"]:
+        spp = row.get("spp", record["plan"].get("spp"))
+        memory, ended = row["arrays_mib"], str(row.get("status")).replace("_", " ")
+        cells = [row["gradient"], str(spp), str(row["seeds"] or ""), tables.figure(row["relative_noise"])]
+        rows.append([*cells, ended if memory is None else f"{memory:.1f}"])
+    table = tables.table(["gradient", "spp", "seeds", "relative noise", "arrays, MiB"], rows)
+    return "\n\n".join([_origin(record["origin"]), about, table])
+
+
+def _comparisons(rows: Sequence[Row]) -> str:
+    def cell(row: Row, name: str, form: str) -> str:
+        value, limit = row[name], row[f"{name}_limit"]
+        return "" if value is None else format(value, form) + ("" if limit is None else f" ({limit:{form}})")
+
+    lines = []
+    for row in rows:
+        cells = [cell(row, name, form) for name, form in (("relative_l2", ".1e"), ("z_rms", ".2f"), ("z_max", ".2f"))]
+        seen, verdict = tables.figure(row["detectable"], 2), str(row["verdict"]).replace("_", " ")
+        lines.append([f"{row['gradient']} - {row['reference']}", *cells, seen, verdict])
+    head = ["compared", "relative L2 (limit)", "z rms (limit)", "max abs z (limit)", "a fault seen", "verdict"]
+    return tables.table(head, lines)

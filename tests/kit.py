@@ -1,0 +1,57 @@
+"""Parts of scene files, which the small scenes of many tests are put together from."""
+
+from __future__ import annotations
+
+#: The reflectance of a surface that shows `poster.exr`, texel by texel.
+TEXTURE = """<texture type="bitmap" name="reflectance">
+            <string name="filename" value="{}"/> <boolean name="raw" value="true"/>
+            <string name="format" value="variant"/> <string name="filter_type" value="nearest"/>
+        </texture>"""
+POSTER_BSDF = f'<bsdf type="diffuse" id="poster">\n        {TEXTURE.format("poster.exr")}\n    </bsdf>'
+
+
+def named(id: str) -> str:
+    """Return the attribute that names an object; "" names none."""
+    return f' id="{id}"' if id else ""
+
+
+def scene(*parts: str) -> str:
+    """Return the text of a scene file."""
+    return "\n".join(['<scene version="3.0.0">', *(f"    {part}" for part in parts), "</scene>", ""])
+
+
+def sensor(
+    origin: str = "0, 0, 4", target: str = "0, 0, 0", up: str = "0, 1, 0", size: object = 8, fov: float = 50,
+    id: str = "", rfilter: str = "box", pixels: str = "rgb",
+) -> str:  # fmt: skip
+    """Return a perspective sensor; its film has `size` pixels, a number (or a variable) or (width, height)."""
+    width, height = size if isinstance(size, tuple) else (size, size)
+    return f"""<sensor type="perspective"{named(id)}>
+        <float name="fov" value="{fov:g}"/>
+        <transform name="to_world"><lookat origin="{origin}" target="{target}" up="{up}"/></transform>
+        <film type="hdrfilm"{named(id and f"{id}_film")}>
+            <integer name="width" value="{width}"/> <integer name="height" value="{height}"/>
+            <string name="pixel_format" value="{pixels}"/> <rfilter type="{rfilter}"/>
+        </film>
+    </sensor>"""
+
+
+def diffuse(color: str, id: str = "") -> str:
+    """Return a diffuse surface of one colour."""
+    return f'<bsdf type="diffuse"{named(id)}><rgb name="reflectance" value="{color}"/></bsdf>'
+
+
+def ref(id: str) -> str:
+    """Return a reference to an object that stands elsewhere in the file."""
+    return f'<ref id="{id}"/>'
+
+
+def area(radiance: str, id: str = "") -> str:
+    """Return what makes a shape a lamp."""
+    return f'<emitter type="area"{named(id)}><rgb name="radiance" value="{radiance}"/></emitter>'
+
+
+def shape(kind: str, id: str, *parts: str, place: str = "") -> str:
+    """Return a shape; `place` are the steps of its `to_world`, the first that is done first."""
+    moved = f'<transform name="to_world">{place}</transform>' if place else ""
+    return f'<shape type="{kind}"{named(id)}>{moved}{"".join(parts)}</shape>'
