@@ -20,7 +20,7 @@ from turns import a_few
 from reslrb_cli.config.loader import load, loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators import forward
-from reslrb_cli.measure import sampling
+from reslrb_cli.measure import resume_store, sampling
 from reslrb_cli.measure.gradcheck import Gradcheck, Result
 from reslrb_cli.measure.gradients import (
     Case,
@@ -590,6 +590,20 @@ def test_only_the_same_is_gone_on_from(change: dict[str, Any], line: str) -> Non
     with pytest.raises(ConfigError) as caught:
         Earlier(KIND, Path("g.jsonl"), head, {}).check(settings(replace(what, **change), "llvm_ad_rgb", ""))
     assert f"--json: g.jsonl is of another measurement: {line}" in str(caught.value)
+
+
+def test_samples_of_other_code_are_not_gone_on_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    what = Settings(loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE), parse_estimators("stack"), 0, 4)
+    now = settings(what, "llvm_ad_rgb", "")
+    earlier = Earlier(KIND, Path("g.jsonl"), {"version": VERSION, "kind": KIND, "settings": now}, {})
+    earlier.check(settings(what, "llvm_ad_rgb", ""))
+    read_bytes = Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read_bytes(path) + b" " * (path.name == "stack.py"))
+    changed = {"versions": resume_store.program.__wrapped__()}
+    with pytest.raises(
+        ConfigError, match=r"another measurement: versions\.code is \w+ there, \w+ here; remove the file"
+    ):
+        earlier.check(now | changed)
 
 
 class Directed(Pretended):
