@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from make_figures import encode
 
-from paper.gradients import MIB, OWN, Kind, colored, compare, fall, own_label, sample, take_pictures
+from paper.gradients import OWN, Kind, colored, compare, fall, own_label, sample, take_pictures
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
@@ -98,8 +98,8 @@ def panels(pictures: dict[str, np.ndarray], kinds: list[Kind], limit: int) -> li
 
     def shown(kind: Kind) -> tuple[str, np.ndarray]:
         if kind.samples is None:
-            return f"{kind.label}: more than {limit / MIB:.0f} MiB", np.full((*shape[:2], 3), GREY)
-        return f"dL/dh by {kind.label}: {kind.arrays_mib:.0f} MiB", colored(kind.samples[0].sum(-1), end)
+            return f"{kind.label}: over {limit / 2**30:g} GiB", np.full((*shape[:2], 3), GREY)
+        return f"{kind.label}: {kind.arrays_mib:.0f} MiB", colored(kind.samples[0].sum(-1), end)
 
     return [
         [("target", target), shown(naive), shown(failing)],

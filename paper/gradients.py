@@ -40,7 +40,6 @@ from reslrb_cli.scene.visibility import interior, sees_specular
 from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import jackknife_variance
 
-MIB = 2**20
 #: On a GPU the address space of a process says nothing about the memory of its arrays.
 VARIANT = "llvm_ad_rgb"
 #: The integrator of the experiment itself.

@@ -105,7 +105,7 @@ def test_relative_noise_of_known_noise() -> None:
 def test_what_is_written(tmp_path: Path) -> None:
     kinds, image = pretended(), np.random.default_rng(2).uniform(size=(16, 16, 3)).astype(np.float32)
     panels = figure1.panels({"target": image, "initial": image}, kinds, figure1.Plan.limit)
-    assert [title for title, _ in panels[0]][2] == "naive AD, 1024 spp: more than 2048 MiB"
+    assert [title for title, _ in panels[0]][2] == "naive AD, 1024 spp: over 2 GiB"
     write_panels(panels, tmp_path / "figure1.png")
     assert (tmp_path / "figure1.png").read_bytes().startswith(b"\x89PNG")
     said = FIGURES["figure1"](judged(kinds))

@@ -58,7 +58,6 @@ def test_all_runs_are_in_one_picture(tmp_path):
     assert [row[0] for row in page.cells["Runs"][1:]] == ["a", "b", "c"]
     assert page.row("Runs", "b")[3] == "20"
     assert page.row("Runs", "b")[7] == "90 ms"
-    assert re.findall(r"(\w) [\d.]+ ms", page.sections["Time of an iteration"]) == ["a", "b", "c"]
     for name in ("a", "b", "c"):
         assert "started" in page.sections[f"Run {name}"]
     assert len([alt for alt, _ in page.pictures if alt == "target"]) == 3

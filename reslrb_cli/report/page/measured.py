@@ -12,7 +12,7 @@ from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verd
 from reslrb_cli.report.format import count, number
 from reslrb_cli.report.page.images import gradient_maps, image_rows, seen_tables
 from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
-from reslrb_cli.report.page.run import StepParts, bars, guarded, problems, record_parts
+from reslrb_cli.report.page.run import guarded, problems, record_parts, step_ms
 from reslrb_cli.report.page.sweep import sweep_parts
 from reslrb_cli.report.page.values import convergence_of_all, parameter_table, texture_pictures
 from reslrb_cli.report.plots import Curve
@@ -165,7 +165,6 @@ def run_comparison(runs: Sequence[Run]) -> Parts:
     made: dict[str, Callable[[], Markup]] = {
         "Runs": lambda: overview(runs),
         "Convergence": lambda: convergence_of_all(runs),
-        "Time of an iteration": lambda: bars(runs),
         "Images": lambda: _each(runs, image_rows),
         "Errors as people see them": lambda: seen_tables(runs),
         "Parameters": lambda: _each(runs, lambda run: parameter_table(run.results)),
@@ -179,7 +178,7 @@ def overview(runs: Sequence[Run]) -> Markup:
     rows = [
         {"run": run, "place": place, "estimator": _estimator(run), "error": _final_error(run),
          "loss": run.last("loss") if (loss := run.results.get("loss")) is None else loss,
-         "step": StepParts.of(run.records)}
+         "step": step_ms(run.records)}
         for place, run in enumerate(runs)
     ]  # fmt: skip
     return lay_out("run.overview", rows)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -36,63 +35,20 @@ from reslrb_cli.report.sources import Run
 WARM_UP = 5
 
 
-@dataclass(frozen=True)
-class StepParts:
-    """Milliseconds of an iteration: medians without the first ones. Where image and gradient are one kernel, or cannot
-    be told apart, `image` and `gradient` are None.
-
-    `update` is what an iteration takes beside its step, on the average.
-    """
-
-    step: float
-    image: float | None
-    gradient: float | None
-    update: float
-
-    @classmethod
-    def of(cls, records: Sequence[Mapping[str, Any]]) -> StepParts | None:
-        """Of a run's records; None where there is none."""
-        if not records:
-            return None
-        steady = records[WARM_UP:] or records
-        outside = 1e3 * records[-1]["elapsed_s"] - sum(record["step_ms"] for record in records)
-        return cls(
-            _median(steady, "step_ms") or 0.0, _median(steady, "primal_ms"), _median(steady, "adjoint_ms"),
-            max(outside / len(records), 0.0),
-        )  # fmt: skip
-
-    def words(self) -> str:
-        """In a line."""
-        named = ((self.image, "up to image and loss"), (self.gradient, "for the gradient"))
-        parts = [f"{duration(part / 1e3)} {what}" for part, what in named if part is not None]
-        return f"{duration(self.step / 1e3)} (median){': ' if parts else ''}{', '.join(parts)}"
-
-    def by_place(self) -> dict[int, float]:
-        """Milliseconds by the place of the part's name in `PARTS`."""
-        if self.image is None or self.gradient is None:
-            return {2: self.step, 3: self.update}
-        return {0: self.image, 1: self.gradient, 3: self.update}
-
-
-def _median(records: Sequence[Mapping[str, Any]], name: str) -> float | None:
-    known = [record[name] for record in records if record.get(name) is not None]
+def step_ms(records: Sequence[Mapping[str, Any]], name: str = "step_ms") -> float | None:
+    """Return the median milliseconds of a step, or of the part `name`, without the first steps; None if unknown."""
+    known = [record[name] for record in records[WARM_UP:] or records if record.get(name) is not None]
     return statistics.median(known) if known else None
 
 
-#: The parts of an iteration, by place.
-PARTS = ("image and loss", "gradient", "whole step, not told apart", "update")
-
-
-def bars(runs: Sequence[Run]) -> Markup:
-    """An iteration of each run as a bar of its parts, all on one scale; nothing where none has an iteration."""
-    known = [(run.name, step.by_place()) for run in runs if (step := StepParts.of(run.records)) is not None]
-    longest = max((sum(parts.values()) for _, parts in known), default=0) or 1.0
-    rows = [
-        (name, sum(parts.values()) / 1e3, [(k, f"{100 * ms / longest:.3g}", ms / 1e3) for k, ms in parts.items()])
-        for name, parts in known
-    ]
-    used = {place for _, parts in known for place, value in parts.items() if value > 0}
-    return lay_out("run.bars", rows, PARTS, [name if place in used else "" for place, name in enumerate(PARTS)])
+def step_words(records: Sequence[Mapping[str, Any]]) -> str:
+    """Return the time of a step in words, and the times of its image and gradient where they are measured apart."""
+    step = step_ms(records)
+    if step is None:
+        return ""
+    named = (("primal_ms", "up to image and loss"), ("adjoint_ms", "for the gradient"))
+    parts = [f"{duration(ms / 1e3)} {what}" for name, what in named if (ms := step_ms(records, name)) is not None]
+    return f"{duration(step / 1e3)} (median){': ' if parts else ''}{', '.join(parts)}"
 
 
 def _wall(manifest: Mapping[str, Any]) -> str:
@@ -189,7 +145,7 @@ def record_parts(run: Run) -> dict[str, Markup]:
         "Not finite": lambda: lay_out("run.not_finite", results.get("nonfinite") or {}),
         "Clamped gradients": lambda: lay_out("run.clamped", results.get("clamped") or {}),
         "Regularizers": lambda: lay_out("run.regularized", results.get("regularized") or {}),
-        "Run": lambda: lay_out("run.run", run, StepParts.of(run.records), _wall(manifest)),
+        "Run": lambda: lay_out("run.run", run, step_words(run.records), _wall(manifest)),
         "Plan": lambda: lay_out("run.plan", plan["rows"]) if (plan := manifest.get("plan")) else Markup(),
         "Choice of the samples": lambda: (
             soft(measured_line(PathsRecord, manifest.get("paths")))
