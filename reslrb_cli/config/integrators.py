@@ -147,7 +147,7 @@ class Reslrb(AttachingTracer):
     with the surface, as `ptracer` has it, and sweeps over edges at rest, whose part is then missing; `stay`: it goes on
     to the same place; `auto`: `stay` behind diffuse surfaces, `follow` behind glossy ones, where `stay` is noisy."""
     stack_size: Count = 64
-    """Vertices of a path that fit into thread-local memory; longer paths are traced a second time. Only with estimator
+    """Vertices of a path that fit into thread-local memory; longer paths are traced again. Only with estimator
     `stack`."""
     paths: Literal["auto", "light", "camera", "both"] = "auto"
     """Where paths begin. `light`: at the emitters, which finds caustics and light through glass, but shows mirrors and

@@ -19,7 +19,7 @@ from reslrb_cli.config.optimizers import Adam, RMSProp
 from reslrb_cli.config.parameters import ImageFile, ParameterSpec
 from reslrb_cli.config.run import memory_bytes
 from reslrb_cli.config.schema import Config
-from reslrb_cli.estimators import ESTIMATORS
+from reslrb_cli.estimators import ESTIMATORS, options_of
 
 # Values that a configuration may hold, its defaults, its paths, and the way back to YAML.
 
@@ -387,7 +387,7 @@ def test_options_and_defaults_are_the_estimators_own(name: str) -> None:
     shared = {"max_depth", "rr_depth", "hide_emitters", "estimator", "freeze"}
     shared |= {"attached", "filter_normalization", "attached_sampling", "guiding", "sequence", "paths", "light_share"}
     shared |= {"pixels"}
-    assert {key: value for key, value in options.items() if key not in shared} == ESTIMATORS[name].OPTIONS
+    assert {key: value for key, value in options.items() if key not in shared} == options_of(name)
 
 
 def test_paths_that_an_estimator_named_leaves_to_nobody() -> None:
