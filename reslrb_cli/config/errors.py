@@ -43,7 +43,7 @@ REMOVED = {
     "render.seed": "the target always has the same samples; remove it",
     "integrator.freeze": "steps are always recorded; remove it",
     "integrator.jacobian_damping": "it is always 0.1; remove it",
-    "integrator.stack_size": "64 vertices are stored, and longer paths are traced a second time; remove it",
+    "integrator.stack_size": "64 vertices are stored, and longer paths are traced again; remove it",
     "integrator.type: direct_projective": "take prb_projective with max_depth: 2",
     "loss.scales": "lower the film's resolution at first, by run.stages",
     "loss.data_range": "it is always the target's largest value; remove it",

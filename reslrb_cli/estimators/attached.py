@@ -12,130 +12,125 @@ vertex to the first,
 and at the emitter dS += <a_1, dv_1/dtheta> + <B_0, dE/dtheta>. Nothing is divided and nothing is inverted: factors that
 are zero, and chains of any conditioning, need no care.
 
-Vertices are pushed from the first on that a parameter moves, or gives its BSDF; what comes before depends on no
-parameter but those of the emitter. The stack holds `stack_size` vertices, the last ones: where a path has more, it is
-traced again for those before, block by block, the last block first.
+Where vertices stay where they are on their surfaces, instead of going where a turned direction meets them, `Before` is
+what is kept of the vertex before the current one. Behind a vertex i-1 that is not specular, light goes to all places.
+`follow` has the sampled direction turn with surface i-1, so that x_i slides over whatever it meets. `stay` integrates
+over places instead: x_i moves with its own surface alone, and the factor of the scattering carries what that changes,
+
+    s_{i-1} = f_{i-1}(x_{i-2}, x_{i-1}, x_i) |cos_i| / |x_i - x_{i-1}|^2 dA_i / (the same density, detached)
+
+with dA_i the area that a piece of surface i takes. All of it but what f_{i-1} changes with x_{i-1} is differentiated at
+vertex i, whose adjoint then hands to i-1 a derivative by its place and none by its direction.
+
+Source: Worchel et al. 2025, "Radiative Backpropagation with Non-Static Geometry", whose surface-integral form this
+is. Edges at rest are not swept over, so that their part in the derivative is not lost; visibility's part is, in
+either form.
+
+All vertices are pushed from the first on that a parameter moves, or gives its BSDF. What comes before depends on no
+parameter but those of the emitter. The stack is that of `stack.py`: behind the vertex that was pushed last its T is
+r_i.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators.base import Pass, VertexHooks, allocate, entry_bytes, places, read, vertices, write
-from reslrb_cli.estimators.kept import Before, SurfacePoint, segment_again
-from reslrb_cli.transport.bsdf import Scattering
+from reslrb_cli.estimators.base import (
+    STACK_SIZE,
+    Estimator,
+    Pass,
+    VertexHooks,
+    at_least_one,
+    entry_bytes,
+    places,
+)
+from reslrb_cli.estimators.kept import SurfacePoint
+from reslrb_cli.estimators.stack import Ring, StackState, walk_back
+from reslrb_cli.transport.bsdf import Hit, Scattering, evaluate, stays_behind
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.samples import Numbers
-from reslrb_cli.transport.walk import Vertex
+from reslrb_cli.transport.samples import Numbers, Samples
+from reslrb_cli.transport.walk import (
+    Segment,
+    Splat,
+    Vertex,
+    find_following_vertex,
+    find_vertex,
+    segment,
+)
+
+# ---- A segment is done again ----
 
 
 @dataclass
-class Frame:
-    """One vertex on the stack: all that its segment is done again from, and P_i.
-
-    `connected` is 1 where the sensor was seen. `aperture` holds the sample of the aperture where the sensor has one,
-    `before` the vertex before where vertices stay on their surfaces.
-    """
+class Before:
+    """The vertex before the current one; `stays` is 1 where it is not specular, so that the current one stays."""
 
     point: SurfacePoint
-    sample_1: mi.Float
-    sample_2: mi.Point2f
-    prefix: mi.Spectrum
-    connected: mi.UInt32
-    aperture: list[mi.Point2f]
-    before: list[Before]
+    stays: mi.UInt32
 
     @staticmethod
-    def blank(plan: Plan) -> Frame:
-        """A frame of zeros with the members that the plan needs."""
-        aperture = [mi.Point2f(0)] if plan.needs.thin_lens else []
-        zeros = mi.Float(0), mi.Point2f(0), mi.Spectrum(0), mi.UInt32(0)
-        return Frame(SurfacePoint.blank(plan), *zeros, aperture, Before.start(plan))
+    def start(plan: Plan) -> list[Before]:
+        """At the beginning of a path; nothing where no vertex stays."""
+        return [Before(SurfacePoint.blank(plan), mi.UInt32(0))] if plan.stays else []
+
+    @staticmethod
+    def of(plan: Plan, vertex: Vertex, scattering: Scattering) -> list[Before]:
+        """What the vertex is to the next one."""
+        if not plan.stays:
+            return []
+        stays = stays_behind(plan, vertex.bsdf, scattering.is_delta)
+        return [Before(SurfacePoint.of(plan, vertex), dr.select(stays, mi.UInt32(1), 0))]
 
 
-def blank_roulette(plan: Plan) -> list[mi.Float]:
-    """Return a blank weight of a vertex's roulette; nothing where light paths play none."""
-    return [mi.Float(0)] if plan.plays_roulette else []
+def is_staying(before: list[Before]) -> mi.Bool:
+    """Lanes in which the vertex behind `before` stays where it is."""
+    return before[0].stays != 0 if before else mi.Bool(False)
 
 
-@dataclass
-class Pushed:
-    """Loop state of the way out.
+def reach(
+    plan: Plan, before: list[Before], ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool,
+    parameters: bool = True,
+) -> tuple[Hit, mi.Spectrum]:  # fmt: skip
+    """The vertex where `ray` hits what `pi` says, and a factor (C,) of value 1 that carries the derivatives of s_{i-1}
+    which belong to it.
 
-    `count` is the number of vertices that were to be pushed so far, `needed` what it was after the last visible
-    connection. `stack` are thread-local arrays, one for each member of a frame, `roulette` is one more of r_i, where
-    roulette is played; `place` is where in them the current vertex stands, `before` is what the next one asks for.
+    Call under `dr.resume_grad()`, the ray being differentiable; without `parameters`, where it is resumed for the ray
+    alone.
     """
+    if not before:
+        return find_vertex(ray, pi, active), mi.Spectrum(1)
+    stays = active & is_staying(before)
+    slid = find_vertex(ray, pi, active & ~stays).si
+    stayed, reaching, factor = find_following_vertex(ray, pi, stays)
+    with dr.suspend_grad():
+        other, other_bsdf = before[0].point.interaction(plan, stays)
+    # What f changes by its own parameters belongs to the vertex before: where they are resumed, the direction alone
+    # is. (A variable that is made under one selective scope counts as suspended under another.)
+    with dr.suspend_grad(when=parameters), dr.resume_grad(reaching.d, when=parameters):
+        f = evaluate(plan, other, other_bsdf, other.to_local(reaching.d), stays)
+    changed = dr.select(stays & (f != 0), dr.replace_grad(mi.Spectrum(1), f / dr.detach(f)), 1) * factor
+    si = dr.select(stays, stayed, slid)
+    there = mi.Ray3f(ray)
+    there.d = dr.select(stays, reaching.d, ray.d)
+    return Hit(si, si.bsdf(), there), dr.select(stays, changed, 1)
 
-    count: mi.UInt32
-    needed: mi.UInt32
-    place: mi.UInt32
-    stack: list[dr.Local]
-    roulette: list[dr.Local]
-    before: list[Before]
+
+def segment_again(
+    samples: Samples, before: list[Before], ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, numbers: Numbers,
+    connected: mi.Bool, scattered: mi.Bool, evaluates: bool = True, parameters: bool = True,
+) -> tuple[Segment, mi.Spectrum]:  # fmt: skip
+    """The segment from there, with attached derivatives, and that factor."""
+    hit, factor = reach(samples.plan, before, ray, pi, connected | scattered, parameters)
+    return segment(samples, hit, numbers, connected, scattered, evaluates, attached=True), factor
 
 
-class Pushing(VertexHooks):
-    """The way out: splat, and push vertices into a ring, so that it holds the last ones.
-
-    Of vertices from number `end` on (from 0) none is pushed, and the path is not followed farther. None: no such end.
-    """
-
-    def __init__(self, p: Pass, size: int, end: mi.UInt32 | None = None) -> None:
-        super().__init__(p)
-        self.size, self.end = size, end
-
-    def start(self, product: Product) -> Pushed:
-        plan = self.p.plan
-        stack, roulette = allocate(Frame.blank(plan), self.size), allocate(blank_roulette(plan), self.size)
-        return Pushed(mi.UInt32(0), mi.UInt32(0), mi.UInt32(0), stack, roulette, Before.start(plan))
-
-    def wants(self, state: Pushed, vertex: Vertex) -> mi.Bool:
-        """Where there is no image to splat into, connections behind something that is differentiated."""
-        return mi.Bool(True) if self.p.block is not None else self._useful(state, vertex)
-
-    def goes_on(self, state: Pushed, vertex: Vertex) -> mi.Bool:
-        return mi.Bool(True) if self.end is None else state.count < self.end
-
-    def vertex(
-        self, state: Pushed, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
-    ) -> Pushed:  # fmt: skip
-        p, plan, seen = self.p, self.p.plan, connection.active
-        if p.block is not None:
-            C = vertex.product.times(connection.c, vertex.depth).scaled(p.scale)
-            p.splat(connection.u, C.value(), seen)
-        pushed = vertex.active & self._useful(state, vertex)
-        if self.end is not None:
-            pushed = pushed & (state.count < self.end)
-        frame = Frame(
-            point=SurfacePoint.of(plan, vertex),
-            sample_1=scattering.sample_1,
-            sample_2=scattering.sample_2,
-            prefix=vertex.product.value(),
-            connected=dr.select(seen, mi.UInt32(1), 0),
-            aperture=[connection.sample] if plan.needs.thin_lens else [],
-            before=state.before,
-        )
-        place = dr.select(pushed, state.count % self.size, self.size)  # what is not pushed goes where nobody reads
-        write(state.stack, frame, place, pushed)
-        count = state.count + dr.select(pushed, mi.UInt32(1), 0)
-        needed, before = dr.select(seen & pushed, count, state.needed), Before.of(plan, vertex, scattering)
-        return Pushed(count, needed, place, state.stack, state.roulette, before)
-
-    def survived(self, state: Pushed, weight: mi.Float) -> Pushed:
-        for array in state.roulette:
-            array.write(weight, state.place, state.place < self.size)
-        return state
-
-    def _useful(self, state: Pushed, vertex: Vertex) -> mi.Bool:
-        """Lanes in which the vertex, or one before it, depends on a parameter."""
-        plan = self.p.plan  # where B_0 is asked for, all of them
-        return (state.count > 0) | (mi.Bool(True) if concerns_emission(plan) else begins(plan, vertex))
+# ---- The stack of segments ----
 
 
 @dataclass
@@ -158,76 +153,153 @@ class Adjoint:
         return Adjoint(mi.Vector3f(0), mi.Vector3f(0), mi.Spectrum(0))
 
 
-def sweep(p: Pass, stack_size: int) -> Adjoint:
-    """Trace the paths, splat them where there is an image, and walk back: the adjoint at the emitter.
+@dataclass
+class AttachedFrame:
+    """One vertex on the stack: all that its segment is done again from, P_i, and r_{i-1}.
 
-    dL/dI is known.
+    `connected` is 1 where the sensor was seen. `aperture` holds the sample of the aperture where the sensor has one,
+    `before` the vertex before where vertices stay on their surfaces.
     """
-    size, longest = places(p.plan, stack_size), vertices(p.plan)
-    pushed: Pushed = p.walk(Pushing(p, size))
-    bottom = dr.select(pushed.count > size, pushed.count - size, 0)  # the first vertex that the ring still holds
-    adjoint = walk_back(p, size, pushed, pushed.needed, bottom, Adjoint.zero())
-    if longest <= size:
-        return adjoint
 
-    again = Pass(p.samples, None, p.adjoint)
+    point: SurfacePoint
+    sample_1: mi.Float
+    sample_2: mi.Point2f
+    prefix: mi.Spectrum
+    roulette: mi.Float
+    connected: mi.UInt32
+    aperture: list[mi.Point2f]
+    before: list[Before]
 
-    def block(left: mi.UInt32, adjoint: Adjoint) -> tuple[mi.UInt32, Adjoint]:
-        pushed = again.walk(Pushing(again, size, left), left > 0)
-        bottom = dr.select(left > size, left - size, 0)
-        return bottom, walk_back(again, size, pushed, left, bottom, adjoint)
+    @staticmethod
+    def blank(plan: Plan) -> AttachedFrame:
+        """A frame of zeros with the members that the plan needs."""
+        aperture = [mi.Point2f(0)] if plan.needs.thin_lens else []
+        zeros = mi.Float(0), mi.Point2f(0), mi.Spectrum(0), mi.Float(0), mi.UInt32(0)
+        return AttachedFrame(SurfacePoint.blank(plan), *zeros, aperture, Before.start(plan))
 
-    _, adjoint = dr.while_loop(
-        state=(dr.minimum(bottom, pushed.needed), adjoint),
-        cond=lambda left, adjoint: left > 0,
-        body=block,
-        labels=("left", "adjoint"),
-        label="blocks of the stack",
-    )
-    return adjoint
-
-
-def walk_back(p: Pass, size: int, pushed: Pushed, top: mi.UInt32, bottom: mi.UInt32, adjoint: Adjoint) -> Adjoint:
-    """Differentiate the segments of the vertices number top - 1 to bottom, in this order. Traces no ray."""
-    plan, form = p.plan, Frame.blank(p.plan)
-    assert p.adjoint is not None
-    image = p.adjoint
-
-    def body(
-        number: mi.UInt32, adjoint: Adjoint, stack: list[dr.Local], roulette: list[dr.Local]
-    ) -> tuple[mi.UInt32, Adjoint, list[dr.Local], list[dr.Local]]:
-        place = (number - 1) % size
-        frame = read(stack, form, place)
-        r = roulette[0].read(place) if roulette else mi.Float(1)
-        connected = frame.connected != 0
-        scattered = dr.any(adjoint.B != 0) | dr.any(adjoint.origin != 0) | dr.any(adjoint.direction != 0)
-        aperture = frame.aperture[0] if frame.aperture else mi.Point2f(0.5)
-        numbers = Numbers(aperture, frame.sample_2, frame.sample_1)
-        pi, ray = frame.point.hit()
-        P, B = frame.prefix, adjoint.B
+    def differentiate(self, p: Pass, adjoint: Adjoint) -> Adjoint:
+        """Add the derivatives of the vertex's segment, given the adjoint of the ray that it ends in; return that of the
+        ray that reaches the vertex."""
+        assert p.adjoint is not None
+        plan, P, B = p.plan, self.prefix, adjoint.B
+        connected = self.connected != 0
+        scattered = dr.any(B != 0) | dr.any(adjoint.origin != 0) | dr.any(adjoint.direction != 0)
+        numbers = Numbers(self.aperture[0] if self.aperture else mi.Point2f(0.5), self.sample_2, self.sample_1)
+        pi, ray = self.point.hit()
         with dr.resume_grad():
             ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
             dr.enable_grad(ray.o, ray.d)
-            this, reached = segment_again(p.samples, frame.before, ray, pi, numbers, connected, scattered)
+            this, reached = segment_again(p.samples, self.before, ray, pi, numbers, connected, scattered)
             there, following = this.connection, this.next_ray(attached=True)
             seen = connected & there.active
-            delta = image.lookup(there.u, seen, plan.attached_normalization) * p.scale
+            delta = p.adjoint.lookup(there.u, seen, plan.attached_normalization) * p.scale
             own = dr.select(seen, delta * there.f * there.weight, 0)
-            later = dr.select(scattered, this.scattering.weight * (r * B), 0)
+            later = dr.select(scattered, this.scattering.weight * B, 0)
             moved = dr.dot(following.o, adjoint.origin) + dr.dot(following.d, adjoint.direction)
             dr.backward_from(dr.dot(P, reached * (own + later)) + dr.select(scattered, moved, 0))
             # What a lane without light computes may be no number: none of it goes on to the vertices before.
-            before = Adjoint.where(connected | scattered, dr.grad(ray.o), dr.grad(ray.d), dr.detach(own + later))
-        return number - 1, before, stack, roulette
+            B = dr.detach(own + later) * self.roulette
+            return Adjoint.where(connected | scattered, dr.grad(ray.o), dr.grad(ray.d), B)
 
-    _, adjoint, _, _ = dr.while_loop(
-        state=(mi.UInt32(top), adjoint, pushed.stack, pushed.roulette),
-        cond=lambda number, *_: number > bottom,
-        body=body,
-        labels=("number", "adjoint", "stack", "roulette"),
-        label="attached walk back",
-    )
-    return adjoint
+
+@dataclass
+class AttachedState:
+    """Loop state of the way out: the stack, and what the next vertex asks for of the current one."""
+
+    stack: StackState
+    before: list[Before]
+
+
+class AttachedSweep(VertexHooks):
+    """The way out: splat, and push the vertices before number `end`, beyond which no path is followed.
+
+    Where `end` is None all vertices are pushed.
+    """
+
+    def __init__(self, p: Pass, ring: Ring, end: mi.UInt32 | None = None) -> None:
+        super().__init__(p)
+        self.ring, self.end = ring, end
+
+    def start(self, product: Product) -> AttachedState:
+        plan = self.p.plan
+        stack = StackState.begin(AttachedFrame.blank(plan), self.ring, mi.Float(1))
+        return AttachedState(stack, Before.start(plan))
+
+    def wants(self, state: AttachedState, vertex: Vertex) -> mi.Bool:
+        """Where there is no image to splat into, connections behind something that is differentiated."""
+        return mi.Bool(True) if self.p.block is not None else self._useful(state, vertex)
+
+    def goes_on(self, state: AttachedState, vertex: Vertex) -> mi.Bool:
+        return mi.Bool(True) if self.end is None else state.stack.count < self.end
+
+    def vertex(
+        self, state: AttachedState, vertex: Vertex, connection: Connection, scattering: Scattering,
+        numbers: list[mi.Float],
+    ) -> AttachedState:  # fmt: skip
+        p, plan, seen = self.p, self.p.plan, connection.active
+        if p.block is not None:
+            C = vertex.product.times(connection.c, vertex.depth).scaled(p.scale)
+            p.splat(connection.u, C.value(), seen)
+        here = vertex.active & self._useful(state, vertex)
+        if self.end is not None:
+            here = here & (state.stack.count < self.end)
+        frame = AttachedFrame(
+            point=SurfacePoint.of(plan, vertex),
+            sample_1=scattering.sample_1,
+            sample_2=scattering.sample_2,
+            prefix=vertex.product.value(),
+            roulette=state.stack.throughput,
+            connected=dr.select(seen, mi.UInt32(1), 0),
+            aperture=[connection.sample] if plan.needs.thin_lens else [],
+            before=state.before,
+        )
+        stack = state.stack.pushed(frame, self.ring, here, seen)
+        return AttachedState(stack, Before.of(plan, vertex, scattering))
+
+    def survived(self, state: AttachedState, weight: mi.Float) -> AttachedState:
+        return AttachedState(state.stack.scaled(weight), state.before)
+
+    def _useful(self, state: AttachedState, vertex: Vertex) -> mi.Bool:
+        """Lanes in which the vertex, or one before it, depends on a parameter."""
+        plan = self.p.plan  # where B_0 is asked for, all of them
+        return (state.stack.count > 0) | (mi.Bool(True) if concerns_emission(plan) else begins(plan, vertex))
+
+
+class AttachedStack(Estimator):
+    """`stack` where light moves."""
+
+    exact = True
+
+    OPTIONS: ClassVar[dict[str, Any]] = {"stack_size": STACK_SIZE}
+
+    def __init__(self, stack_size: int = STACK_SIZE) -> None:
+        at_least_one("stack_size", stack_size)
+        self.stack_size = stack_size
+
+    def forward(self, p: Pass) -> Any:
+        if p.adjoint is not None:
+            return self._sweep(p)
+        assert p.block is not None
+        return p.walk(Splat(p.samples, p.block))  # nothing is kept of a path: it is traced again
+
+    def backward(self, p: Pass, state: Any) -> None:
+        differentiate_start(p, state if isinstance(state, Adjoint) else self._sweep(p))
+
+    def kept(self, plan: Plan) -> Any:
+        return []
+
+    def scratch_bytes(self, plan: Plan) -> int:
+        return sum(entry_bytes(AttachedFrame.blank(plan))) * (places(plan, self.stack_size) + 1)
+
+    def _sweep(self, p: Pass) -> Adjoint:
+        """Trace the paths, splat them where there is an image, and walk back: the adjoint at the emitter."""
+        ring, again = Ring.of(p.plan, self.stack_size), Pass(p.samples, None, p.adjoint)
+        state: AttachedState = p.walk(AttachedSweep(p, ring))
+
+        def before(end: mi.UInt32) -> StackState:
+            return again.walk(AttachedSweep(again, ring, end), end > 0).stack
+
+        return walk_back(p, AttachedFrame.blank(p.plan), ring, state.stack, Adjoint.zero(), before)
 
 
 def begins(plan: Plan, vertex: Vertex) -> mi.Bool:
@@ -251,8 +323,3 @@ def differentiate_start(p: Pass, adjoint: Adjoint) -> None:
         if plan.moving_emission:
             objective += dr.dot(adjoint.origin, emission.ray.o) + dr.dot(adjoint.direction, emission.ray.d)
         dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
-
-
-def scratch_bytes(plan: Plan, stack_size: int) -> int:
-    """Thread-local bytes of each path that is being traced."""
-    return sum(entry_bytes([Frame.blank(plan), blank_roulette(plan)])) * (places(plan, stack_size) + 1)

@@ -74,8 +74,12 @@ class Estimator(ABC):
 
     OPTIONS: ClassVar[dict[str, Any]] = {}
     exact: ClassVar[bool] = False  # every connection of a path counts, as under naive AD of the same paths
-    attaches: ClassVar[bool] = False  # it has derivatives of what moves light
     stack_size: int = STACK_SIZE  # that of stacks of vertices, where there are any
+    attached: Estimator | None = None  # the estimator of the same name where light moves; None: there is none
+
+    def of(self, plan: Plan) -> Estimator:
+        """Return this estimator, or `attached` where the plan asks for attached derivatives."""
+        return self.attached if plan.attached and self.attached is not None else self
 
     @abstractmethod
     def forward(self, p: Pass) -> Any:
@@ -201,15 +205,6 @@ def differentiate_passage(
         return transmittance(
             p.samples.scene, si, connection.target, limit, active, on_crossing, past_lamps=past_lamps
         ).value
-
-
-def adjoint_of_connection(
-    p: Pass, vertex: Vertex, connection: Connection, active: mi.Bool, adjoint: PathAdjoint
-) -> mi.Spectrum:
-    """d(objective)/df (C,) of a connection's BSDF; adds the derivative of the masks on its way."""
-    rest = mi.Spectrum(dr.rcp(stand_in(connection)[0]))
-    rest *= differentiate_passage(p, vertex.si, vertex.depth, connection, active, adjoint)
-    return adjoint_of_factor(adjoint, vertex.depth, connection.f, rest)
 
 
 def contribution(p: Pass, vertex: Vertex, connection: Connection) -> Product:

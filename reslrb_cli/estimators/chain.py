@@ -31,16 +31,30 @@ the inverse is regularised. With a random sign in the regularisation there is no
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators.attached import Adjoint, begins, concerns_emission, differentiate_start
-from reslrb_cli.estimators.base import Pass, PathAdjoint, VertexHooks, adjoint_of_factor, contribution
-from reslrb_cli.estimators.kept import Before, is_staying, segment_again
-from reslrb_cli.estimators.selection import SlotReplay, chosen_by
+from reslrb_cli.estimators.attached import (
+    Adjoint,
+    Before,
+    begins,
+    concerns_emission,
+    differentiate_start,
+    is_staying,
+    segment_again,
+)
+from reslrb_cli.estimators.base import Estimator, Pass, PathAdjoint, VertexHooks, adjoint_of_factor, contribution
+from reslrb_cli.estimators.reservoir import Reservoir
+from reslrb_cli.estimators.selection import (
+    SlotReplay,
+    at_least_share,
+    chosen_by,
+    inverse_probability,
+    selection_weight,
+)
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
@@ -51,9 +65,12 @@ from reslrb_cli.transport.walk import Vertex
 #: Vertices that are not specular in one block of a chain.
 BLOCK = 10
 
+#: By how much a ray turns with the one before it, where its Jacobian would have no inverse (`segment_jacobian`).
+JACOBIAN_DAMPING = 0.1
+
 
 @dataclass
-class Slot:
+class ChainSlot:
     """One kept connection. `last` is the last vertex up to its own, `number`, with anything to differentiate; 0: none.
 
     `prefix` (C,) is the path's throughput before its vertex. `u_rows` and `C_rows` are du_I/dp_I J_{0->I} and
@@ -73,7 +90,7 @@ class Slot:
 
 
 @dataclass
-class Blocks:
+class ChainBlocks:
     """Where a path stands in its blocks: vertices passed that are not specular, and which block the chain begins
     with."""
 
@@ -81,19 +98,19 @@ class Blocks:
     chosen: mi.UInt32
 
     @staticmethod
-    def of(plan: Plan) -> list[Blocks]:
+    def of(plan: Plan) -> list[ChainBlocks]:
         """At the beginning; nothing where a path cannot have more than one."""
-        return [Blocks(mi.UInt32(0), mi.UInt32(0))] if plan.max_depth - 2 > BLOCK else []
+        return [ChainBlocks(mi.UInt32(0), mi.UInt32(0))] if plan.max_depth - 2 > BLOCK else []
 
     @property
     def number(self) -> mi.UInt32:
         """Of the block that the ray from here on belongs to, from 0."""
         return self.passed // BLOCK
 
-    def past(self, damped: mi.Bool) -> tuple[Blocks, mi.Bool]:
+    def past(self, damped: mi.Bool) -> tuple[ChainBlocks, mi.Bool]:
         """Behind a vertex, and where a block begins with it."""
         passed = self.passed + dr.select(damped, mi.UInt32(1), 0)
-        return Blocks(passed, self.chosen), damped & (passed % BLOCK == 0)
+        return ChainBlocks(passed, self.chosen), damped & (passed % BLOCK == 0)
 
 
 @dataclass
@@ -105,11 +122,11 @@ class ChainState:
     """
 
     W: mi.Float
-    slots: list[Slot]
+    slots: list[ChainSlot]
     latest: list[mi.UInt32]
     J: list[mi.Matrix4d]
     G: list[mi.Vector4d]
-    blocks: list[Blocks]
+    blocks: list[ChainBlocks]
     before: list[Before]
 
     @staticmethod
@@ -121,11 +138,11 @@ class ChainState:
 
         channels = len(mi.Spectrum(0))
         slots = [
-            Slot(mi.Float(0), mi.UInt32(0), mi.UInt32(0), Product.none(plan.track_zeros), mi.Point2f(0),
-                 mi.Spectrum(0), rows(2), rows(channels), [mi.UInt32(0) for _ in 2 * Blocks.of(plan)])
+            ChainSlot(mi.Float(0), mi.UInt32(0), mi.UInt32(0), Product.none(plan.track_zeros), mi.Point2f(0),
+                 mi.Spectrum(0), rows(2), rows(channels), [mi.UInt32(0) for _ in 2 * ChainBlocks.of(plan)])
             for _ in range(capacity)
         ]  # fmt: skip
-        latest, J, blocks = [mi.UInt32(0)], [mi.Matrix4d(1)], Blocks.of(plan)
+        latest, J, blocks = [mi.UInt32(0)], [mi.Matrix4d(1)], ChainBlocks.of(plan)
         return ChainState(mi.Float(0), slots, latest, J, rows(channels), blocks, Before.start(plan))
 
     def stored(self) -> ChainState:
@@ -139,17 +156,12 @@ def numbers_of(connection: Connection, scattering: Scattering) -> Numbers:
 
 
 class ChainSelection(VertexHooks):
-    """Image pass: splat, chain Jacobians, and keep connections as `choose` says."""
+    """Image pass: splat, chain Jacobians, and keep connections by a reservoir."""
 
-    def __init__(
-        self, p: Pass, capacity: int, damping: float,
-        weigh: Callable[[Connection, Product, mi.Float], mi.Float],
-    ) -> None:  # fmt: skip
-        """`weigh(connection, C, W)` is the selection weight w of a connection, W the sum before it."""
+    def __init__(self, p: Pass, capacity: int, weight: str, damping: float) -> None:
         super().__init__(p)
-        self.capacity, self.damping = capacity, damping
-        self.numbers = capacity + len(Blocks.of(p.plan))
-        self.weigh = weigh
+        self.capacity, self.weight, self.damping = capacity, weight, damping
+        self.numbers = capacity + len(ChainBlocks.of(p.plan))
 
     def start(self, product: Product) -> ChainState:
         return ChainState.empty(self.p.plan, self.capacity)
@@ -176,10 +188,11 @@ class ChainSelection(VertexHooks):
             p.samples, vertex, state.before, numbers_of(connection, scattering), candidate, scattering.active & on,
             self.damping,
         )  # fmt: skip
-        w = dr.select(candidate, self.weigh(connection, C, state.W), 0)
+        w = at_least_share(selection_weight(p, self.weight, connection, C), state.W)
+        w = dr.select(candidate, w, 0)
         W = state.W + w
         [J], G = state.J, state.G
-        this = Slot(
+        this = ChainSlot(
             w=w,
             number=vertex.depth,
             last=latest,
@@ -206,25 +219,25 @@ class ChainSelection(VertexHooks):
         J = dr.select(anew, mi.Matrix4d(1), state.J[0])
         G = [dr.select(anew, mi.Vector4d(0), row) for row in state.G]
         chosen = dr.select(anew, blocks.number, blocks.chosen)
-        return replace(state, J=[J], G=G, blocks=[Blocks(blocks.passed, chosen)])
+        return replace(state, J=[J], G=G, blocks=[ChainBlocks(blocks.passed, chosen)])
 
 
 @dataclass
-class Kept:
+class KeptConnection:
     """A slot in a replay.
 
     `share` is W / (m w_I), `adjoint` the sensitivity of the objective to its connection, `A` = delta C_I (C,) what of
     it is left where factors are zero, `row` a_0; each with `share` in it.
     """
 
-    slot: Slot
+    slot: ChainSlot
     share: mi.Float
     adjoint: PathAdjoint
     A: mi.Spectrum
     row: mi.Vector4d
 
     @staticmethod
-    def of(p: Pass, slot: Slot, share: mi.Float) -> Kept:
+    def of(p: Pass, slot: ChainSlot, share: mi.Float) -> KeptConnection:
         """That of a slot, dL/dI being known."""
         assert p.adjoint is not None
         C = slot.C.value() * share
@@ -238,9 +251,9 @@ class Kept:
         A, row = delta * C, mi.Vector4d(0)
         for weight, one in zip([*by_u, *A], [*slot.u_rows, *slot.C_rows], strict=True):
             row += mi.Float64(weight) * one
-        return Kept(slot, share, PathAdjoint(delta * slot.C.nonzero * share, slot.C), A, row)
+        return KeptConnection(slot, share, PathAdjoint(delta * slot.C.nonzero * share, slot.C), A, row)
 
-    def part(self, blocks: list[Blocks]) -> tuple[mi.Bool, mi.Float64]:
+    def part(self, blocks: list[ChainBlocks]) -> tuple[mi.Bool, mi.Float64]:
         """Where a ray belongs to the block that the chain begins with, and what stands for all other blocks."""
         if not blocks:
             return mi.Bool(True), mi.Float64(1)
@@ -254,21 +267,21 @@ class ReplayState:
 
     rows: list[mi.Vector4d]
     begun: mi.Bool
-    blocks: list[Blocks]
+    blocks: list[ChainBlocks]
     before: list[Before]
 
 
 class ChainReplay(SlotReplay):
     """Replay up to the last vertex with anything to differentiate, and differentiate each segment's ray and factors."""
 
-    def __init__(self, p: Pass, kept: list[Kept], damping: float) -> None:
+    def __init__(self, p: Pass, kept: list[KeptConnection], damping: float) -> None:
         super().__init__(p, [one.slot.last for one in kept])
         self.kept, self.damping = kept, damping
 
     def start(self, product: Product) -> ReplayState:
         plan = self.p.plan
         rows, begun = [one.row for one in self.kept], mi.Bool(concerns_emission(plan))
-        return ReplayState(rows, begun, Blocks.of(plan), Before.start(plan))
+        return ReplayState(rows, begun, ChainBlocks.of(plan), Before.start(plan))
 
     def vertex(
         self, state: ReplayState, vertex: Vertex, connection: Connection, scattering: Scattering,
@@ -318,13 +331,37 @@ class ChainReplay(SlotReplay):
             dr.backward_from(own_part + later)
 
 
-def differentiate(p: Pass, kept: list[Kept], damping: float) -> None:
+class AttachedReservoir(Estimator):
+    """`reservoir` where light moves."""
+
+    OPTIONS: ClassVar[dict[str, Any]] = Reservoir.OPTIONS | {"jacobian_damping": JACOBIAN_DAMPING}
+
+    def __init__(self, jacobian_damping: float = JACOBIAN_DAMPING, **options: Any) -> None:
+        """`options` are those of `Reservoir`."""
+        if not jacobian_damping > 0:
+            raise ValueError(f'"jacobian_damping" must be positive, not {jacobian_damping}')
+        checked = Reservoir(**options)
+        self.capacity, self.weight, self.damping = checked.capacity, checked.weight, jacobian_damping
+
+    def forward(self, p: Pass) -> ChainState:
+        return p.walk(ChainSelection(p, self.capacity, self.weight, self.damping)).stored()
+
+    def backward(self, p: Pass, state: ChainState) -> None:
+        shares = [inverse_probability(state.W, slot, self.capacity) for slot in state.slots]
+        kept = [KeptConnection.of(p, slot, share) for slot, share in zip(state.slots, shares, strict=True)]
+        differentiate(p, kept, self.damping)
+
+    def kept(self, plan: Plan) -> ChainState:
+        return ChainState.empty(plan, self.capacity).stored()
+
+
+def differentiate(p: Pass, kept: list[KeptConnection], damping: float) -> None:
     """Add the derivatives of the kept connections."""
     if concerns_emission(p.plan):
         emission = p.emission()
         B, origin, direction = mi.Spectrum(0), mi.Vector3f(0), mi.Vector3f(0)
         for one in kept:
-            inside, weight = one.part(Blocks.of(p.plan))
+            inside, weight = one.part(ChainBlocks.of(p.plan))
             by_o, by_d = spread(emission.ray.d, dr.select(inside, one.row * weight, 0), mi.Bool(False))
             B += adjoint_of_factor(one.adjoint, mi.Int32(0), dr.detach(emission.weight), 1)
             origin, direction = origin + by_o, direction + by_d

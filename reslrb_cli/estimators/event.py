@@ -32,8 +32,14 @@ from reslrb_cli.estimators.base import (
     differentiate_emission,
     one_of,
 )
-from reslrb_cli.estimators.kept import Event, differentiate_event
-from reslrb_cli.estimators.selection import at_least_share, is_taken, selection_weight, slot_adjoint
+from reslrb_cli.estimators.selection import (
+    Event,
+    at_least_share,
+    differentiate_event,
+    is_taken,
+    selection_weight,
+    slot_adjoint,
+)
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
@@ -42,7 +48,7 @@ from reslrb_cli.transport.walk import Vertex
 
 
 @dataclass
-class Slot:
+class EventSlot:
     """One kept pair of a connection and an event."""
 
     w: mi.Float  # selection weight of the connection; 0: nothing kept
@@ -51,9 +57,9 @@ class Slot:
     event: Event
 
     @staticmethod
-    def empty(plan: Plan) -> Slot:
+    def empty(plan: Plan) -> EventSlot:
         """Nothing kept yet."""
-        return Slot(mi.Float(0), Product.none(plan.track_zeros), mi.Point2f(0), Event.emission(plan))
+        return EventSlot(mi.Float(0), Product.none(plan.track_zeros), mi.Point2f(0), Event.emission(plan))
 
 
 @dataclass
@@ -63,15 +69,15 @@ class EventState:
     Q: mi.Float
     W: mi.Float
     prefix: list[Event]
-    slots: list[Slot]
+    slots: list[EventSlot]
 
 
 @dataclass
-class Kept:
+class KeptEvents:
     """What is kept of a path."""
 
     W: mi.Float
-    slots: list[Slot]
+    slots: list[EventSlot]
 
 
 class EventSelection(VertexHooks):
@@ -83,7 +89,7 @@ class EventSelection(VertexHooks):
 
     def start(self, product: Product) -> EventState:
         plan = self.p.plan
-        slots = [Slot.empty(plan) for _ in range(self.capacity)]
+        slots = [EventSlot.empty(plan) for _ in range(self.capacity)]
         prefix = [Event.emission(plan) for _ in slots]
         Q = mi.Float(1 if plan.differentiate_emission else 0)
         return EventState(Q, mi.Float(0), prefix, slots)
@@ -110,7 +116,7 @@ class EventSelection(VertexHooks):
             event = state.prefix[k]
             if plan.differentiate_bsdfs:  # else emission is the one event
                 event = dr.select(numbers[2 * k] * Q < q, this, event)
-            pair = Slot(w, C.stored(), connection.u, event)
+            pair = EventSlot(w, C.stored(), connection.u, event)
             slots.append(dr.select(is_taken(numbers[2 * k + 1], w * Q, W), pair, slot))
         if not plan.differentiate_bsdfs:
             return replace(state, W=W, slots=slots)
@@ -133,14 +139,14 @@ class EventEstimator(Estimator):
         one_of("weight", weight, ("luminance", "adjoint"))
         self.capacity, self.weight = capacity, weight
 
-    def forward(self, p: Pass) -> Kept:
+    def forward(self, p: Pass) -> KeptEvents:
         state: EventState = p.walk(EventSelection(p, self.capacity, self.weight))
-        return Kept(state.W, state.slots)
+        return KeptEvents(state.W, state.slots)
 
-    def kept(self, plan: Plan) -> Kept:
-        return Kept(mi.Float(0), [Slot.empty(plan) for _ in range(self.capacity)])
+    def kept(self, plan: Plan) -> KeptEvents:
+        return KeptEvents(mi.Float(0), [EventSlot.empty(plan) for _ in range(self.capacity)])
 
-    def backward(self, p: Pass, state: Kept) -> None:
+    def backward(self, p: Pass, state: KeptEvents) -> None:
         adjoints = [slot_adjoint(p, state.W, slot, self.capacity) for slot in state.slots]
 
         def emission_weight(E: mi.Spectrum) -> mi.Spectrum:

@@ -21,15 +21,15 @@ from reslrb_cli.estimators.base import (
     Pass,
     PathAdjoint,
     VertexHooks,
-    adjoint_of_connection,
+    adjoint_of_factor,
     contribution,
     differentiate_emission,
+    differentiate_passage,
     vertices,
 )
-from reslrb_cli.estimators.kept import AdjointSum
 from reslrb_cli.transport.bsdf import Scattering, tracked_factors
-from reslrb_cli.transport.connection import Connection, Seen
-from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.connection import Connection, Seen, stand_in
+from reslrb_cli.transport.factors import NO_ZERO, Product, showing
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
 
@@ -64,6 +64,63 @@ class Visibility:
             visible |= ((index >> 5) == k) & (((word >> (index & 31)) & 1) != 0)
         enough = vertices <= 32 * len(self.words)
         return Seen(visible, None if enough else index < 32 * len(self.words))
+
+
+@dataclass
+class AdjointSum:
+    """sum_i delta_i C_i over connections of a path, (C,), as `value` + `rest`.
+
+    `rest` is what rounding lost (Knuth's two-sum), so that taking off what was added leaves zero also after a thousand
+    vertices. `behind_zero` is the same pair for contributions whose prefix holds exactly one zero factor, without it:
+    their value is nothing, and their derivative by that factor is the sum. It is empty where zeros are not tracked.
+    """
+
+    value: mi.Spectrum
+    rest: mi.Spectrum
+    behind_zero: list[mi.Spectrum]
+
+    @staticmethod
+    def zero(track_zeros: bool) -> AdjointSum:
+        """The empty sum."""
+        behind_zero = [mi.Spectrum(0), mi.Spectrum(0)] if track_zeros else []
+        return AdjointSum(mi.Spectrum(0), mi.Spectrum(0), behind_zero)
+
+    def plus(self, delta: mi.Spectrum, C: Product, index: mi.UInt32, active: mi.Bool) -> AdjointSum:
+        """The sum with delta C of one more connection, that of vertex `index`."""
+        delta = dr.select(active, delta, 0)
+        value, rest = self._add(self.value, self.rest, delta * C.value())
+        if not self.behind_zero:
+            return AdjointSum(value, rest, [])
+        term = delta * C.nonzero
+        for c, zero in enumerate(C.zero):
+            # A connection whose own factor is the zero one has a derivative there, and none in the prefix.
+            term[c] = dr.select((zero >= 0) & (zero != mi.Int32(index)), term[c], 0)
+        return AdjointSum(value, rest, list(self._add(self.behind_zero[0], self.behind_zero[1], term)))
+
+    def minus(self, delta: mi.Spectrum, C: Product, index: mi.UInt32, active: mi.Bool) -> AdjointSum:
+        """The sum without delta C of a connection that is in it."""
+        return self.plus(-delta, C, index, active)
+
+    def adjoint_of_factor(self, f: mi.Spectrum, prefix: Product, rest: mi.Float | float) -> mi.Spectrum:
+        """d(sum)/df (C,), for a factor `f * rest` of the path with this prefix, before all connections in the sum."""
+        f, total = dr.detach(f), self.value + self.rest
+        result = dr.select(f != 0, total / f, 0)
+        if self.behind_zero:
+            behind = (self.behind_zero[0] + self.behind_zero[1]) * rest
+            for c, zero in enumerate(prefix.zero):
+                result[c] = dr.select((f[c] == 0) & (zero == NO_ZERO), behind[c], result[c])
+        return showing(result)
+
+    def adjoint_of_emission(self, E: mi.Spectrum) -> mi.Spectrum:
+        """d(sum)/dE (C,)."""
+        return self.adjoint_of_factor(E, Product.one(bool(self.behind_zero)), 1)
+
+    @staticmethod
+    def _add(value: mi.Spectrum, rest: mi.Spectrum, term: mi.Spectrum) -> tuple[mi.Spectrum, mi.Spectrum]:
+        """value + rest + term, as the rounded sum and what it lost (Knuth 1969, 4.2.2, theorem B)."""
+        total = value + term
+        part = total - value
+        return total, rest + ((value - (total - part)) + (term - part))
 
 
 @dataclass
@@ -128,14 +185,11 @@ class Summing(Revisiting, Gathering):
 
 
 class Taking(Revisiting):
-    """Replay: take each contribution off the sum again, and differentiate both factors of each vertex.
+    """Replay: take each contribution off the sum again, and differentiate both factors of each vertex."""
 
-    `S` sums the connections of the vertices from `first` on; what comes before them is left alone. None: of all.
-    """
-
-    def __init__(self, p: Pass, visibility: Visibility, S: AdjointSum, first: mi.UInt32 | None = None) -> None:
+    def __init__(self, p: Pass, visibility: Visibility, S: AdjointSum) -> None:
         super().__init__(p, visibility)
-        self.S, self.first = S, first
+        self.S = S
 
     def start(self, product: Product) -> AdjointSum:
         return self.S
@@ -145,10 +199,6 @@ class Taking(Revisiting):
     ) -> AdjointSum:  # fmt: skip
         p, plan, connected = self.p, self.p.plan, connection.active
         useful = plan.differentiates(vertex.bsdf)
-        if self.first is not None:
-            # Not in place: the walk goes on with the same masks.
-            connected = connected & (vertex.depth >= self.first)
-            useful = useful & (vertex.depth >= self.first)
         C = contribution(p, vertex, connection)
         delta = p.delta(connection.u, connected)
         S = state.minus(delta, C, vertex.depth, connected)
@@ -160,6 +210,15 @@ class Taking(Revisiting):
             f_c, f_s = tracked_factors(plan, vertex.si, vertex.bsdf, connection.wo, connected, scattering, scattered)
             dr.backward_from(dr.select(connected, weight_c * f_c, 0) + dr.select(scattered, weight_s * f_s, 0))
         return S
+
+
+def adjoint_of_connection(
+    p: Pass, vertex: Vertex, connection: Connection, active: mi.Bool, adjoint: PathAdjoint
+) -> mi.Spectrum:
+    """d(objective)/df (C,) of a connection's BSDF; adds the derivative of the masks on its way."""
+    rest = mi.Spectrum(dr.rcp(stand_in(connection)[0]))
+    rest *= differentiate_passage(p, vertex.si, vertex.depth, connection, active, adjoint)
+    return adjoint_of_factor(adjoint, vertex.depth, connection.f, rest)
 
 
 def needed(latest: mi.UInt32, depth: mi.UInt32) -> mi.UInt32:

@@ -21,7 +21,6 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.config.files import CAPACITY
-from reslrb_cli.estimators import chain
 from reslrb_cli.estimators.base import (
     Estimator,
     Pass,
@@ -33,12 +32,12 @@ from reslrb_cli.estimators.base import (
     differentiate_emission,
     one_of,
 )
-from reslrb_cli.estimators.kept import Event, differentiate_event
 from reslrb_cli.estimators.selection import (
+    Event,
     SlotReplay,
     at_least_share,
     chosen_by,
-    inverse_probability,
+    differentiate_event,
     selection_weight,
     slot_adjoint,
 )
@@ -47,8 +46,6 @@ from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
-
-JACOBIAN_DAMPING = 0.1  # of attached derivatives: `estimators.jacobian`
 
 
 @dataclass
@@ -138,38 +135,17 @@ class ReservoirReplay(SlotReplay):
 class Reservoir(Estimator):
     """Reservoir of `capacity` slots with selection weight `luminance` or `adjoint`."""
 
-    attaches = True
+    OPTIONS: ClassVar[dict[str, Any]] = {"capacity": 1, "weight": "luminance"}
 
-    OPTIONS: ClassVar[dict[str, Any]] = {
-        "capacity": 1,
-        "weight": "luminance",
-        "jacobian_damping": JACOBIAN_DAMPING,
-    }
-
-    def __init__(
-        self, capacity: int = 1, weight: str = "luminance", jacobian_damping: float = JACOBIAN_DAMPING
-    ) -> None:
+    def __init__(self, capacity: int = 1, weight: str = "luminance") -> None:
         one_of("weight", weight, ("luminance", "adjoint"))
         at_least_one("capacity", capacity, CAPACITY)
-        if not jacobian_damping > 0:
-            raise ValueError(f'"jacobian_damping" must be positive, not {jacobian_damping}')
-        self.capacity, self.weight, self.damping = capacity, weight, jacobian_damping
+        self.capacity, self.weight = capacity, weight
 
-    def forward(self, p: Pass) -> ReservoirState | chain.ChainState:
-        if p.plan.attached:
-
-            def weigh(connection: Connection, C: Product, W: mi.Float) -> mi.Float:
-                return at_least_share(selection_weight(p, self.weight, connection, C), W)
-
-            return p.walk(chain.ChainSelection(p, self.capacity, self.damping, weigh)).stored()
+    def forward(self, p: Pass) -> ReservoirState:
         return replace(p.walk(ReservoirSelection(p, self.capacity, self.weight)), latest=[])
 
-    def backward(self, p: Pass, state: ReservoirState | chain.ChainState) -> None:
-        if isinstance(state, chain.ChainState):
-            shares = [inverse_probability(state.W, slot, self.capacity) for slot in state.slots]
-            kept = [chain.Kept.of(p, slot, share) for slot, share in zip(state.slots, shares, strict=True)]
-            chain.differentiate(p, kept, self.damping)
-            return
+    def backward(self, p: Pass, state: ReservoirState) -> None:
         adjoints = [slot_adjoint(p, state.W, slot, self.capacity) for slot in state.slots]
 
         def emission_weight(E: mi.Spectrum) -> mi.Spectrum:
@@ -183,7 +159,5 @@ class Reservoir(Estimator):
             replay = ReservoirReplay(p, state.slots, adjoints)
             p.walk(replay, replay.last > 0)
 
-    def kept(self, plan: Plan) -> ReservoirState | chain.ChainState:
-        if plan.attached:
-            return chain.ChainState.empty(plan, self.capacity).stored()
+    def kept(self, plan: Plan) -> ReservoirState:
         return replace(ReservoirState.empty(plan, self.capacity), latest=[])

@@ -1,18 +1,24 @@
 """Weighted reservoir sampling of a path's connections (Chao 1982), and replays towards those that were chosen.
 
 slot k keeps candidate i with probability w_i / W,   W = sum_i w_i
+
+Of the choice an `Event` is kept, a single factor of a path, so that its derivative needs no replay.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators.base import Pass, PathAdjoint, VertexHooks
-from reslrb_cli.transport.connection import Connection
+from reslrb_cli.estimators.base import Pass, PathAdjoint, VertexHooks, adjoint_of_factor, differentiate_passage
+from reslrb_cli.estimators.kept import SurfacePoint, event, lobe
+from reslrb_cli.transport.bsdf import Scattering, tracked_factor
+from reslrb_cli.transport.connection import Connection, connect, stand_in
 from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
 
 S = TypeVar("S")
@@ -92,3 +98,66 @@ class SlotReplay(VertexHooks):
 
     def is_followed(self, state: Any, vertex: Vertex) -> mi.Bool:
         return vertex.depth < self.last
+
+
+@dataclass
+class Event:
+    """One factor of a path: f towards local direction `wo`; `index` is its vertex, 0 for emission.
+
+    `rest` times f is the factor as a whole, but for the transmittance of masks; it is kept where zero factors are
+    tracked, beside which alone it is of use. `own` holds whether the event is a connection's own, and the sample of the
+    aperture, where masks may stand between it and the sensor.
+    """
+
+    index: mi.UInt32
+    point: SurfacePoint
+    wo: mi.Vector3f
+    f: mi.Spectrum
+    rest: list[mi.Float]
+    lobe: list[mi.UInt32 | mi.Float | mi.Point2f]
+    own: list[mi.Bool | mi.Point2f]
+
+    @staticmethod
+    def emission(plan: Plan) -> Event:
+        """The event before the first vertex."""
+        rest, wo, f = [mi.Float(0)] if plan.track_zeros else [], mi.Vector3f(0), mi.Spectrum(0)
+        return Event(mi.UInt32(0), SurfacePoint.blank(plan), wo, f, rest, lobe(plan, None), _own(plan, None))
+
+    @staticmethod
+    def of_connection(plan: Plan, vertex: Vertex, connection: Connection) -> Event:
+        """The BSDF of the vertex towards the sensor; index 0 where there is nothing to differentiate."""
+        useful = mi.Bool(True) if plan.passage_in_gradient else plan.differentiates(vertex.bsdf)
+        index, point = dr.select(useful, mi.UInt32(vertex.depth), 0), SurfacePoint.of(plan, vertex)
+        rest = [dr.rcp(stand_in(connection)[0])] if plan.track_zeros else []
+        return Event(index, point, connection.wo, connection.f, rest, lobe(plan, None), _own(plan, connection))
+
+    @staticmethod
+    def of_scattering(plan: Plan, vertex: Vertex, scattering: Scattering) -> Event:
+        """The BSDF of the vertex along the path."""
+        rest = [scattering.correction / scattering.pdf] if plan.track_zeros else []
+        index, point, wo = mi.UInt32(vertex.depth), SurfacePoint.of(plan, vertex), scattering.wo
+        return Event(index, point, wo, scattering.f, rest, lobe(plan, scattering), _own(plan, None))
+
+
+def _own(plan: Plan, connection: Connection | None) -> list[mi.Bool | mi.Point2f]:
+    """`Event.own` of an event that is a connection's, or of another."""
+    if not plan.passage_in_gradient:
+        return []
+    return [mi.Bool(False), mi.Point2f(0)] if connection is None else [mi.Bool(True), connection.sample]
+
+
+def differentiate_event(p: Pass, kept: Event, adjoint: PathAdjoint, active: mi.Bool) -> None:
+    """Add the derivative of an event, of a connection with this adjoint, in `active` lanes that hold one."""
+    plan, active = p.plan, active & (kept.index > 0)
+    si, bsdf = kept.point.interaction(plan, active)
+    rest = mi.Spectrum(kept.rest[0] if kept.rest else 0)
+    if plan.passage_in_gradient:
+        own, sample = kept.own
+        connection = connect(plan, p.samples.sensor, si, kept.point.ray(), sample, active & own)
+        passed = differentiate_passage(p, si, kept.index, connection, active & own, adjoint)
+        rest = dr.select(own, rest * passed, rest)
+    weight = adjoint_of_factor(adjoint, kept.index, kept.f, rest)
+    active &= plan.differentiates(bsdf)
+    with dr.resume_grad():
+        f = tracked_factor(plan, si, bsdf, event(kept.wo, kept.lobe), active)
+        dr.backward_from(dr.select(active, dr.dot(weight, f), 0))

@@ -1,262 +1,356 @@
 """Every connection of a path, at no extra variance and in one traversal: push vertices, then walk back over them.
 
-Walking back, the sum over all later connections is at hand when a vertex is reached:
+Let P_j be the throughput before vertex j, s_j its scattering, and c_j its connection, both f = bsdf * cos times numbers
+without a derivative. Let B_j be what all later contributions add to the objective per unit of throughput behind s_j,
+and delta_j = dL/dI where c_j lands. Then, from the last vertex to the first,
 
-    A_k = 0,   A_{j-1} = A_j + delta_j C_j
-    dS  = A_0 dE/E + sum_j [ A_j ds_j/s_j + delta_j C_j dc_j/c_j ]
+    dS     += P_j [ delta_j dc_j + B_j ds_j ]
+    B_{j-1} = delta_j c_j + s_j B_j                      B = 0 behind the last vertex
 
-Only vertices with something to differentiate are pushed, each with the contributions since the last one. The stack is
-thread-local memory, about 90 bytes a vertex, of at most `stack_size` vertices. What lies beyond is summed on the way,
-and a second walk takes that sum apart as `gather` does: no vertex is left out. With delta known before the paths are
-traced, image and gradient are one kernel; otherwise they are traced again for it, without shadow rays.
+and at the emitter dS += B_0 dE. Nothing is divided, so factors that are zero need no care.
+
+Only vertices with something to differentiate are pushed. What lies between two of them is folded on the way out:
+behind the vertex that was pushed last, T is the throughput so far, roulette included, and D what the vertices since
+contribute. When vertex k is pushed, it takes both with it, and the recursion becomes
+
+    B = (D + T delta_k c_k) + (T s_k) B_k                of the vertex that was pushed before k
+
+The stack is a ring of `stack_size` places in thread-local memory, some 95 bytes each, so it holds the last vertices.
+Longer paths are traced again for the vertices before those, block by block, the last block first. If delta is known
+before the paths are traced, image and gradient are one kernel. Otherwise paths are traced again for the gradient,
+without shadow rays.
+
+`attached.py` has the same recursion for what moves light, and `camera.py` that of camera paths.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators import attached
 from reslrb_cli.estimators.base import (
     STACK_SIZE,
     Estimator,
     Pass,
     PathAdjoint,
     VertexHooks,
-    adjoint_of_connection,
     allocate,
     at_least_one,
     contribution,
     differentiate_emission,
+    differentiate_passage,
     entry_bytes,
     places,
     read,
     vertices,
     write,
 )
-from reslrb_cli.estimators.gather import Gather, GatherState, Taking, Visibility
-from reslrb_cli.estimators.kept import AdjointSum, PlainSum, SurfacePoint, event
+from reslrb_cli.estimators.gather import Gathering, Visibility
+from reslrb_cli.estimators.kept import SurfacePoint, event
 from reslrb_cli.estimators.kept import lobe as kept_lobe
 from reslrb_cli.transport.bsdf import Scattering, tracked_factors
 from reslrb_cli.transport.connection import Connection, Seen
-from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.factors import Product, showing
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.walk import Splat, Vertex
+from reslrb_cli.transport.walk import Vertex
+
+A = TypeVar("A")
+
+# ---- The stack ----
+
+
+class Differentiable(Protocol[A]):
+    """A vertex on the stack: a PyTree of arrays."""
+
+    def differentiate(self, p: Pass, adjoint: A) -> A:
+        """Add the derivatives of the vertex, given the adjoint behind it; return the adjoint before it."""
+
+
+@dataclass(frozen=True)
+class Ring:
+    """Which place a vertex has on the stack, by its number; the place number `size` is one that nobody reads."""
+
+    size: int
+    wraps: bool
+
+    @staticmethod
+    def of(plan: Plan, stack_size: int) -> Ring:
+        """That of at most so many places, for the paths of a plan."""
+        size = places(plan, stack_size)
+        return Ring(size, vertices(plan) > size)
+
+    def place(self, number: mi.UInt32) -> mi.UInt32:
+        """The place of a vertex."""
+        return number % self.size if self.wraps else number
+
+    def bottom(self, count: mi.UInt32) -> mi.UInt32:
+        """The first vertex that is still on the stack after so many."""
+        return dr.select(count > self.size, count - self.size, 0) if self.wraps else mi.UInt32(0)
+
+
+@dataclass
+class StackState:
+    """Loop state of the way out.
+
+    `count` vertices have been pushed so far, `needed` of them up to the last contribution. `throughput` is T at the
+    current vertex: roulette alone where no vertex is left out. `since` is D behind vertex number `needed`. `stack` has
+    an array for each member of a frame.
+    """
+
+    stack: list[dr.Local]
+    count: mi.UInt32
+    needed: mi.UInt32
+    throughput: mi.Float | mi.Spectrum
+    since: mi.Spectrum
+
+    @staticmethod
+    def begin(form: Any, ring: Ring, throughput: mi.Float | mi.Spectrum) -> StackState:
+        """An empty stack of frames of this form; None: nothing is ever pushed. `throughput` is 1."""
+        stack = [] if form is None else allocate(form, ring.size)
+        return StackState(stack, mi.UInt32(0), mi.UInt32(0), throughput, mi.Spectrum(0))
+
+    def gap(self) -> mi.Spectrum:
+        """D behind the vertex that was pushed last."""
+        return dr.select(self.needed == self.count, self.since, 0)
+
+    def plus(self, value: mi.Spectrum, active: mi.Bool) -> StackState:
+        """The state with a contribution, delta times `value` per unit of throughput, in active lanes."""
+        since = dr.select(active, self.gap() + self.throughput * value, self.since)
+        return replace(self, needed=dr.select(active, self.count, self.needed), since=since)
+
+    def scaled(self, weight: mi.Float | mi.Spectrum) -> StackState:
+        """The state behind a factor of the path."""
+        return replace(self, throughput=self.throughput * weight)
+
+    def pushed(self, frame: Any, ring: Ring, here: mi.Bool, contributes: mi.Bool) -> StackState:
+        """The state with a vertex on the stack, in lanes `here`; `contributes`: lanes in which it does so itself."""
+        place = dr.select(here, ring.place(self.count), ring.size)
+        write(self.stack, frame, place, here)
+        count, contributes = self.count + dr.select(here, mi.UInt32(1), 0), here & contributes
+        return StackState(
+            self.stack,
+            count,
+            needed=dr.select(contributes, count, self.needed),
+            throughput=dr.select(here, 1, self.throughput),
+            since=dr.select(contributes, 0, self.since),
+        )
+
+
+def walk_back(
+    p: Pass, form: Any, ring: Ring, state: StackState, adjoint: A, again: Callable[[mi.UInt32], StackState]
+) -> A:
+    """Differentiate all vertices, the last one first; return the adjoint before the first.
+
+    `adjoint` is that behind the last contribution. `again(end)` traces the paths anew and pushes the vertices before
+    number `end`; it is called only where paths may be longer than the stack.
+    """
+    if not state.stack:
+        return adjoint
+    bottom = ring.bottom(state.count)
+    adjoint = pop(p, form, ring, state, state.needed, bottom, adjoint)
+    if not ring.wraps:
+        return adjoint
+
+    def block(left: mi.UInt32, adjoint: A) -> tuple[mi.UInt32, A]:
+        bottom = ring.bottom(left)
+        return bottom, pop(p, form, ring, again(left), left, bottom, adjoint)
+
+    _, adjoint = dr.while_loop(
+        state=(dr.minimum(bottom, state.needed), adjoint),
+        cond=lambda left, adjoint: left > 0,
+        body=block,
+        labels=("left", "adjoint"),
+        label="blocks of the stack",
+    )
+    return adjoint
+
+
+def pop(p: Pass, form: Any, ring: Ring, state: StackState, top: mi.UInt32, bottom: mi.UInt32, adjoint: A) -> A:
+    """Differentiate the vertices number top - 1 to bottom, in this order. Traces no ray."""
+
+    def body(number: mi.UInt32, adjoint: A, stack: list[dr.Local]) -> tuple[mi.UInt32, A, list[dr.Local]]:
+        frame: Differentiable[A] = read(stack, form, ring.place(number - 1))
+        return number - 1, frame.differentiate(p, adjoint), stack
+
+    _, adjoint, _ = dr.while_loop(
+        state=(mi.UInt32(top), adjoint, state.stack),
+        cond=lambda number, *_: number > bottom,
+        body=body,
+        labels=("number", "adjoint", "stack"),
+        label="walk back",
+    )
+    return adjoint
+
+
+# ---- A vertex whose directions do not move ----
 
 
 @dataclass
 class Frame:
-    """One vertex on the stack.
+    """One vertex on the stack: its BSDF is evaluated again, towards the sensor and along the path.
 
-    `weight_c` is d(objective)/df of its connection, (C,), 0 where the sensor is not seen; `f_s` is f of its scattering;
-    `own` is what the vertex adds to A: its delta C, and those of the vertices since the one below it on the stack.
+    `weight_c` is P_k delta_k c_k / f_c and `weight_s` is P_k s_k / f_s, (C,): what the derivatives of both f count for,
+    the latter times B_k. `own` + `onward` B_k is B of the vertex that was pushed before.
     """
 
     point: SurfacePoint
     wo_c: mi.Vector3f
     wo_s: mi.Vector3f
     weight_c: mi.Spectrum
-    f_s: mi.Spectrum
+    weight_s: mi.Spectrum
     own: mi.Spectrum
-    # Where zeros are tracked: correction / pdf of the scattering, and `own` behind a zero factor.
-    zeros: list[mi.Float | mi.Spectrum]
+    onward: mi.Spectrum
     lobe: list[mi.UInt32 | mi.Float | mi.Point2f]
 
     @staticmethod
     def blank(plan: Plan) -> Frame:
         """A frame of zeros with the members that the plan needs."""
-        zeros = [mi.Float(0), mi.Spectrum(0)] if plan.track_zeros else []
-        wo = mi.Vector3f(0)
-        point, lobe = SurfacePoint.blank(plan), kept_lobe(plan, None)
-        return Frame(point, wo, wo, mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0), zeros, lobe)
+        wo, zero = mi.Vector3f(0), mi.Spectrum(0)
+        return Frame(SurfacePoint.blank(plan), wo, wo, zero, zero, zero, zero, kept_lobe(plan, None))
+
+    @staticmethod
+    def empty_stack(plan: Plan, ring: Ring) -> StackState:
+        """The state before the first vertex."""
+        throughput = mi.Float(1) if is_gapless(plan) else mi.Spectrum(1)
+        return StackState.begin(Frame.blank(plan) if plan.differentiate_bsdfs else None, ring, throughput)
+
+    def differentiate(self, p: Pass, adjoint: mi.Spectrum) -> mi.Spectrum:
+        """Add the derivatives of both factors, given B (C,) behind the vertex; return B of the one pushed before."""
+        si, bsdf = self.point.interaction(p.plan)
+        weight_c, weight_s = self.weight_c, showing(self.weight_s * adjoint)
+        connected, scattered = dr.any(weight_c != 0), dr.any(weight_s != 0)
+        with dr.resume_grad():
+            sampled = event(self.wo_s, self.lobe)
+            f_c, f_s = tracked_factors(p.plan, si, bsdf, self.wo_c, connected, sampled, scattered)
+            dr.backward_from(dr.select(connected, weight_c * f_c, 0) + dr.select(scattered, weight_s * f_s, 0))
+        return self.own + self.onward * adjoint
 
 
-@dataclass
-class Pushed:
-    """Loop state of the way out."""
+def push(
+    plan: Plan, state: StackState, ring: Ring, here: mi.Bool, vertex: Vertex, scattering: Scattering,
+    connection: Connection | None, weight: mi.Spectrum,
+) -> StackState:  # fmt: skip
+    """The state behind a vertex, which is on the stack in lanes `here`.
 
-    stack: list[dr.Local]  # thread-local arrays, one for each member of a frame
-    height: mi.UInt32
-    since: AdjointSum  # contributions since the last vertex that was pushed
-    tail: AdjointSum  # contributions from vertex `first` on
-    first: mi.UInt32  # the first vertex that found the stack full; 0: none
-    last: mi.UInt32  # last vertex with a visible connection; 0: none
+    `weight` (C,) is delta times all of the connection but its BSDF; 0 where the connection does not count.
+    """
+    T, P, on = state.throughput, vertex.product.value(), scattering.active
+    wo, own, seen = mi.Vector3f(0), mi.Spectrum(0), mi.Bool(False)
+    if connection is not None:
+        wo, own, seen = connection.wo, weight * connection.f, connection.active
+    if not state.stack:
+        return state.plus(own, seen).scaled(scattering.weight)
+    frame = Frame(
+        point=SurfacePoint.of(plan, vertex),
+        wo_c=wo,
+        wo_s=scattering.wo,
+        weight_c=showing(P * weight),
+        weight_s=dr.select(on, P * (scattering.correction / scattering.pdf), 0),
+        own=state.gap() + T * own,
+        onward=dr.select(on, T * scattering.weight, 0),
+        lobe=kept_lobe(plan, scattering),
+    )
+    if not is_gapless(plan):
+        state = state.plus(own, seen & ~here).scaled(scattering.weight)
+    return state.pushed(frame, ring, here, seen)
 
 
-@dataclass
-class StackState:
-    """What is left to do after the sweep: emission, and the vertices that found the stack full."""
-
-    S: AdjointSum
-    tail: AdjointSum
-    first: mi.UInt32
-    last: mi.UInt32
+def is_gapless(plan: Plan) -> bool:
+    """Whether all vertices have something to differentiate."""
+    return plan.differentiate_bsdfs and not plan.only_bsdfs
 
 
-class Pushing(VertexHooks):
-    """The way out: splat, and push vertices; what is not pushed goes where nobody reads."""
+# ---- Light paths ----
 
-    def __init__(self, p: Pass, visibility: Visibility | None, stack_size: int) -> None:
+
+class LightSweep(VertexHooks):
+    """The way out of light paths: splat, and push the vertices before number `end`. None: all of them.
+
+    `visibility` is what an earlier walk saw, if there was one.
+    """
+
+    def __init__(self, p: Pass, ring: Ring, visibility: Visibility | None = None, end: mi.UInt32 | None = None) -> None:
         super().__init__(p)
-        self.visibility, self.size = visibility, places(p.plan, stack_size)
+        self.ring, self.visibility, self.end = ring, visibility, end
 
-    def start(self, product: Product) -> Pushed:
-        plan = self.p.plan
-        since, tail = PlainSum.zero(plan.track_zeros), AdjointSum.zero(plan.track_zeros)
-        # Three zeros: state variables may not be one object.
-        return Pushed(allocate(Frame.blank(plan), self.size), mi.UInt32(0), since, tail, mi.UInt32(0), mi.UInt32(0))
+    def start(self, product: Product) -> StackState:
+        return Frame.empty_stack(self.p.plan, self.ring)
 
-    def concerned(self, state: Pushed) -> mi.Bool:
-        return state.height > 0
+    def concerned(self, state: StackState) -> mi.Bool:
+        return state.count > 0
 
     def seen(self, vertex: Vertex) -> Seen | None:
         return None if self.visibility is None else self.visibility.seen(vertex.depth, vertices(self.p.plan))
 
-    def goes_on(self, state: Pushed, vertex: Vertex) -> mi.Bool:
+    def goes_on(self, state: StackState, vertex: Vertex) -> mi.Bool:
+        if self.end is not None:
+            return state.count < self.end
         return mi.Bool(True) if self.visibility is None else vertex.depth < self.visibility.last
 
     def vertex(
-        self, state: Pushed, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
-    ) -> Pushed:  # fmt: skip
-        p, plan, connected = self.p, self.p.plan, connection.active
+        self, state: StackState, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> StackState:  # fmt: skip
+        p, plan, seen = self.p, self.p.plan, connection.active
         C = contribution(p, vertex, connection)
-        p.splat(connection.u, C.value(), connected)
-        delta = p.delta(connection.u, connected)
-        own = PathAdjoint(dr.select(connected, delta * C.nonzero, 0), C)
-        useful = vertex.active & plan.differentiates(vertex.bsdf)
-        # Beyond the stack a second walk has the derivatives, those of masks before the sensor among them.
-        if plan.differentiate_null and vertices(plan) > self.size:
-            connected = connected & (state.first == 0) & ~(useful & (state.height >= self.size))
-        weight_c = adjoint_of_connection(p, vertex, connection, connected, own)
-        connected = connection.active
-        return push(
-            plan, state, self.size, vertex, useful, connection.wo, weight_c, scattering, [(delta, C, connected)]
-        )
+        p.splat(connection.u, C.value(), seen)
+        delta = p.delta(connection.u, seen)
+        here = vertex.active & plan.differentiates(vertex.bsdf)
+        if self.end is not None:
+            here = here & (state.count < self.end)
+        elif plan.differentiate_null:
+            own = PathAdjoint(dr.select(seen, delta * C.nonzero, 0), C)
+            differentiate_passage(p, vertex.si, vertex.depth, connection, seen, own)
+        weight = dr.select(seen, delta * p.scale * connection.weight * connection.through, 0)
+        return push(plan, state, self.ring, here, vertex, scattering, connection, weight)
 
-
-def push(
-    plan: Plan, state: Pushed, size: int, vertex: Vertex, useful: mi.Bool, wo_c: mi.Vector3f, weight_c: mi.Spectrum,
-    scattering: Scattering, found: list[tuple[mi.Spectrum, Product, mi.Bool]],
-) -> Pushed:  # fmt: skip
-    """The state with a vertex on the stack, where it is `useful` and there is room, and what it has `found`: delta, C,
-    and the lanes."""
-    depth, bounded = vertex.depth, vertices(plan) > size
-    fits, first = useful, state.first
-    if bounded:
-        full = state.height >= size
-        fits = useful & ~full
-        first = dr.select((first == 0) & useful & full, depth, first)
-    since, tail, last = state.since, state.tail, state.last
-    for delta, C, active in found:
-        since = since.plus(delta, C, depth, active & (first == 0))
-        tail = tail.plus(delta, C, depth, active & (first != 0)) if bounded else tail
-        last = dr.select(active, depth, last)
-    zeros = []
-    if plan.track_zeros:
-        rest_s = dr.select(scattering.active, scattering.correction / scattering.pdf, 0)
-        zeros = [rest_s, since.behind_zero[0]]
-    frame = Frame(
-        point=SurfacePoint.of(plan, vertex),
-        wo_c=wo_c,
-        wo_s=scattering.wo,
-        weight_c=weight_c,
-        f_s=dr.select(scattering.active, scattering.f, 0),
-        own=since.value,
-        zeros=zeros,
-        lobe=kept_lobe(plan, scattering),
-    )
-    write(state.stack, frame, dr.select(fits, state.height, size), fits)
-    height = state.height + dr.select(fits, mi.UInt32(1), 0)
-    since = dr.select(fits, PlainSum.zero(plan.track_zeros), since)
-    return Pushed(state.stack, height, since, tail, first, last)
-
-
-def walk_back(p: Pass, pushed: Pushed) -> AdjointSum:
-    """Pop all vertices, differentiate both factors of each, and return S_0. Traces no ray."""
-    plan, form = p.plan, Frame.blank(p.plan)
-
-    def body(height: mi.UInt32, A: AdjointSum, stack: list[dr.Local]) -> tuple[mi.UInt32, AdjointSum, list[dr.Local]]:
-        frame = read(stack, form, height - 1)
-        si, bsdf = frame.point.interaction(plan)
-        rest_s = frame.zeros[0] if frame.zeros else 1
-        weight_s = A.adjoint_of_factor(frame.f_s, Product.one(plan.track_zeros), rest_s)
-        connected, scattered = dr.any(frame.weight_c != 0), dr.any(weight_s != 0)
-        with dr.resume_grad():
-            sampled = event(frame.wo_s, frame.lobe)
-            f_c, f_s = tracked_factors(plan, si, bsdf, frame.wo_c, connected, sampled, scattered)
-            dr.backward_from(dr.select(connected, frame.weight_c * f_c, 0) + dr.select(scattered, weight_s * f_s, 0))
-        behind_zero = [A.behind_zero[0] + frame.zeros[1], A.behind_zero[1]] if frame.zeros else []
-        return height - 1, PlainSum(A.value + frame.own, A.rest, behind_zero), stack
-
-    since, tail = pushed.since, pushed.tail
-    behind_zero = [sum(tail.behind_zero, since.behind_zero[0]), mi.Spectrum(0)] if tail.behind_zero else []
-    A = PlainSum(tail.value + tail.rest + since.value, mi.Spectrum(0), behind_zero)
-    _, A, _ = dr.while_loop(
-        state=(pushed.height, A, pushed.stack),
-        cond=lambda height, A, stack: height > 0,
-        body=body,
-        labels=("height", "A", "stack"),
-        label="walk back",
-    )
-    return A
+    def survived(self, state: StackState, weight: mi.Float) -> StackState:
+        return state.scaled(weight)
 
 
 class Stack(Estimator):
     """Exact, like `gather`, without tracing the paths a second time."""
 
     exact = True
-    attaches = True
 
     OPTIONS: ClassVar[dict[str, Any]] = {"stack_size": STACK_SIZE}
 
     def __init__(self, stack_size: int = STACK_SIZE) -> None:
         at_least_one("stack_size", stack_size)
-        self.stack_size, self.gather = stack_size, Gather()
+        self.stack_size = stack_size
 
-    def forward(self, p: Pass) -> Any:
-        if p.plan.attached:
-            if p.adjoint is not None:
-                return attached.sweep(p, self.stack_size)
-            assert p.block is not None
-            return p.walk(Splat(p.samples, p.block))  # nothing is kept of a path: it is traced again
-        if p.adjoint is None or not p.plan.differentiate_bsdfs:
-            return self.gather.forward(p)
-        return self._sweep(p, None)
+    def forward(self, p: Pass) -> Visibility | mi.Spectrum:
+        """The image pass: B_0 (C,) where delta is known, and otherwise which connections are visible."""
+        if p.adjoint is not None:
+            return self._sweep(p, None)
+        return p.walk(Gathering(p)).visibility
 
-    def backward(self, p: Pass, state: Any) -> None:
-        if p.plan.attached:
-            adjoint = state if isinstance(state, attached.Adjoint) else attached.sweep(p, self.stack_size)
-            attached.differentiate_start(p, adjoint)
-            return
-        if isinstance(state, GatherState):
-            if not p.plan.differentiate_bsdfs:
-                self.gather.backward(p, state)
-                return
-            state = self._sweep(p, state.visibility)
-            dr.eval(state)
-        differentiate_emission(p, state.S.adjoint_of_emission)
-        if vertices(p.plan) > self.stack_size:
-            beyond = Visibility([], state.last)
-            p.walk(Taking(p, beyond, state.tail, state.first), (state.first > 0) & (state.first <= state.last))
+    def backward(self, p: Pass, state: Visibility | mi.Spectrum) -> None:
+        B = self._sweep(p, state) if isinstance(state, Visibility) else state
+        differentiate_emission(p, lambda E: showing(B))
 
     def kept(self, plan: Plan) -> Any:
-        if plan.attached:
-            return []
-        # Visibility is there from an image pass that did not know delta; the sweep's own state comes beside it.
-        S = AdjointSum.zero(plan.track_zeros)
-        return [Visibility.none(vertices(plan)), StackState(S, S, mi.UInt32(0), mi.UInt32(0))]
+        return [Visibility.none(vertices(plan)), mi.Spectrum(0)]  # `forward` keeps one of the two
 
     def scratch_bytes(self, plan: Plan) -> int:
-        if plan.attached:
-            return attached.scratch_bytes(plan, self.stack_size)
-        if not plan.differentiate_bsdfs:
-            return 0
-        return sum(entry_bytes(Frame.blank(plan))) * (places(plan, self.stack_size) + 1)
+        return stack_bytes(plan, self.stack_size)
 
-    def _sweep(self, p: Pass, visibility: Visibility | None) -> StackState:
+    def _sweep(self, p: Pass, visibility: Visibility | None) -> mi.Spectrum:
+        ring, again = Ring.of(p.plan, self.stack_size), Pass(p.samples, None, p.adjoint)
         active = True if visibility is None else visibility.last > 0
-        pushed = p.walk(Pushing(p, visibility, self.stack_size), active)
-        return StackState(walk_back(p, pushed), pushed.tail, pushed.first, pushed.last)
+        state: StackState = p.walk(LightSweep(p, ring, visibility), active)
+
+        def before(end: mi.UInt32) -> StackState:
+            return again.walk(LightSweep(again, ring, end=end), end > 0)
+
+        return walk_back(p, Frame.blank(p.plan), ring, state, state.since, before)
+
+
+def stack_bytes(plan: Plan, stack_size: int) -> int:
+    """Thread-local bytes of each path that is being traced."""
+    if not plan.differentiate_bsdfs:
+        return 0
+    return sum(entry_bytes(Frame.blank(plan))) * (places(plan, stack_size) + 1)

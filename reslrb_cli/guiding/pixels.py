@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from reslrb_cli.guiding.collect import bsdf_groups, meets
 from reslrb_cli.transport.bsdf import Scattering
-from reslrb_cli.transport.camera import CameraHooks, FilmRay, Met, NextEvent, camera_walk
+from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples, passes
@@ -44,7 +44,7 @@ LEAST_PATHS, MOST_PART = 1e7, 0.02  # of a run that has time for it, and what ma
 
 
 @dataclass
-class Noted:
+class NotedSums:
     """Loop state. `counts` says how often each group's BSDFs were met, `sums` are G (C,) of the groups and of emission,
     the radiance last."""
 
@@ -58,13 +58,13 @@ class Noting(CameraHooks):
     def __init__(self, samples: Samples) -> None:
         self.plan, self.groups = samples.plan, bsdf_groups(samples.plan)
 
-    def start(self, first: FilmRay) -> Noted:
+    def start(self, first: FilmRay) -> NotedSums:
         number = len(self.groups) + self.plan.differentiate_emission + 1
-        return Noted([mi.UInt32(0) for _ in self.groups], [mi.Spectrum(0) for _ in range(number)])
+        return NotedSums([mi.UInt32(0) for _ in self.groups], [mi.Spectrum(0) for _ in range(number)])
 
     def vertex(
-        self, state: Noted, vertex: Vertex, met: Met | None, event: NextEvent | None, scattering: Scattering
-    ) -> Noted:  # fmt: skip
+        self, state: NotedSums, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
+    ) -> NotedSums:  # fmt: skip
         P, zero = vertex.product.value(), mi.Spectrum(0)
         H = zero if met is None else dr.select(met.active, P * met.Le * met.weight, 0)
         N = zero if event is None else dr.select(event.active, P * event.c, 0)
@@ -72,7 +72,7 @@ class Noting(CameraHooks):
         parts = [H * mi.Float(n) + N * mi.Float(n + own) for n, own in zip(state.counts, here, strict=True)]
         parts += [H + N] * (1 + self.plan.differentiate_emission)
         counts = [n + dr.select(scattering.active, own, 0) for n, own in zip(state.counts, here, strict=True)]
-        return Noted(counts, [total + part for total, part in zip(state.sums, parts, strict=True)])
+        return NotedSums(counts, [total + part for total, part in zip(state.sums, parts, strict=True)])
 
 
 def note(samples: Samples) -> NDArray[np.float64]:

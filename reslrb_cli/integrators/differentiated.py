@@ -2,8 +2,8 @@
 
 `Motion` says how the latter are taken, `attach` gives a plan with them. `bounces` finds out whether light that moves is
 scattered by a surface that is not specular, and then comes to be seen from another one. Only there do the two ways of
-`attached_sampling`, `follow` and `stay` (`estimators/kept.py`), differ: in a caustic of few segments light ends where
-it lands first.
+`attached_sampling`, `follow` and `stay` (`estimators/attached.py`), differ: in a caustic of few segments light ends
+where it lands first.
 """
 
 from __future__ import annotations

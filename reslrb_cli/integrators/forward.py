@@ -2,9 +2,7 @@
 
 - `TrackedSplat`, `RecordedObjective`: the image, or the objective, with derivatives tracked (naive AD, and Dr.Jit's own
   reversal).
-- `TangentSplat`: the image's forward-mode derivative.
-- `AttachedTangentSplat`: the same where light moves: the derivative of every connection and of where it lands, splatted
-  as it is found.
+- `TangentSplat`, `CameraTangents`: the image's forward-mode derivative, by light paths and by camera paths.
 """
 
 from __future__ import annotations
@@ -14,9 +12,10 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.estimators.attached import Before, segment_again
 from reslrb_cli.estimators.camera import splat_camera_paths
-from reslrb_cli.estimators.kept import Before, segment_again
 from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor
+from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
 from reslrb_cli.transport.connection import Connection, forward_derivatives, passage, transmittance
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.factors import Product
@@ -69,87 +68,64 @@ class RecordedObjective(Hooks):
 
 @dataclass
 class Tangent:
-    """Derivative of the product of the factors so far, (C,)."""
+    """Derivatives along the parameters' tangents: of the product of the factors so far, (C,), and where light moves of
+    the ray's origin and direction. `before` is the vertex before, where vertices stay on their surfaces."""
 
     d_product: mi.Spectrum
+    d_ray: list[mi.Vector3f]
+    before: list[Before]
 
 
-class Tangents(Hooks):
-    """Splats of derivatives along the parameters' tangents; `dE` is that of emission."""
+class TangentSplat(Hooks):
+    """Splat the derivative of every connection, and of where it lands, along the parameters' tangents; `dE` is that of
+    emission.
+
+    By the product rule along the path nothing is divided, so that zero factors need no care:
+
+        d(P s) = dP s + P ds,   dC = dP c + P dc,   d(k_p(u) C) = dk_p/du du C + k_p dC
+
+    with k_p the filter's weight of pixel p. Where light does not move, du is 0.
+    """
 
     connects = False  # they evaluate connections themselves, with their derivatives
 
     def __init__(self, samples: Samples, block: mi.ImageBlock, dE: mi.Spectrum) -> None:
         self.samples, self.block, self.dE = samples, block, dE
 
+    def start(self, product: Product) -> Tangent:
+        plan = self.samples.plan
+        d_ray = [mi.Vector3f(0), mi.Vector3f(0)] if plan.attached else []
+        return Tangent(mi.Spectrum(self.dE), d_ray, Before.start(plan))
+
     def survived(self, state: Tangent, weight: mi.Float) -> Tangent:
         return replace(state, d_product=state.d_product * weight)
-
-
-class TangentSplat(Tangents):
-    """Splat the derivative of every connection in the direction of the parameters' tangents.
-
-    By the product rule along the path, d(P s) = dP s + P ds and dC_i = dP c_i + P dc_i: nothing is divided, so that
-    zero factors need no care.
-    """
-
-    def start(self, product: Product) -> Tangent:
-        return Tangent(mi.Spectrum(self.dE))
 
     def vertex(
         self, state: Tangent, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
     ) -> Tangent:  # fmt: skip
-        s, P, scattered = self.samples, vertex.product.value(), scattering.active
-        if s.plan.needs.has_null:
-            limit = s.plan.max_depth - vertex.depth - 1
-            through = transmittance(
-                s.scene, vertex.si, connection.target, limit, connection.active, tangents=True,
-                past_lamps=s.plan.passes_lamps,
-            )  # fmt: skip
-            seen, passed, d_passed = through.reached, through.value, through.tangent[0]
-        else:
-            (seen, passed), d_passed = passage(s.plan, s.scene, vertex.si, vertex.depth, connection), mi.Spectrum(0)
-        with dr.resume_grad(when=s.plan.differentiate_bsdfs):
+        s, P, dP, plan = self.samples, vertex.product.value(), state.d_product, self.samples.plan
+        if plan.attached:
+            return self._attached(state, vertex, connection, scattering)
+        seen, through, d_through = tangent_of_passage(s, vertex, connection)
+        with dr.resume_grad(when=plan.differentiate_bsdfs):
             # Two indirect calls: Dr.Jit cannot forward-propagate through one of our own (`tracked_factors`) that reads
             # several parameters.
-            f_c = evaluate(s.plan, vertex.si, vertex.bsdf, connection.wo, seen)
-            f_s = tracked_factor(s.plan, vertex.si, vertex.bsdf, scattering, scattered)
-            df_c, df = forward_derivatives(f_c, f_s)
+            f_c = evaluate(plan, vertex.si, vertex.bsdf, connection.wo, seen)
+            f_s = tracked_factor(plan, vertex.si, vertex.bsdf, scattering, scattering.active)
+            df_c, df_s = forward_derivatives(f_c, f_s)
             f_c = dr.detach(f_c)
-        c = f_c * passed * connection.weight
-        dc = (df_c * passed + f_c * d_passed) * connection.weight
-        s.film.put(self.block, connection.u, (state.d_product * c + P * dc) * s.scale, seen)
-        ds = dr.select(scattered, df * (scattering.correction / scattering.pdf), 0)
-        return Tangent(state.d_product * scattering.weight + P * ds)
+        c = f_c * through * connection.weight
+        dc = (df_c * through + f_c * d_through) * connection.weight
+        s.film.put(self.block, connection.u, (dP * c + P * dc) * s.scale, seen)
+        return replace(state, d_product=dP * scattering.weight + P * tangent_of_scattering(scattering, df_s))
 
+    def _attached(self, state: Tangent, vertex: Vertex, connection: Connection, scattering: Scattering) -> Tangent:
+        """The same where light moves.
 
-@dataclass
-class AttachedTangent(Tangent):
-    """Derivatives along the parameters' tangents: of the product of the factors so far, (C,), and of the ray."""
-
-    d_origin: mi.Vector3f
-    d_direction: mi.Vector3f
-    before: list[Before]
-
-
-class AttachedTangentSplat(Tangents):
-    """As `TangentSplat`, with rays, hit points and film positions that move:
-
-    d(k_p(u) C) = dk_p/du du C + k_p dC,   dC = dP c + P dc         k_p: the filter's weight of pixel p
-
-    A segment's derivatives are those by its ray, whose tangents are at hand, and by the scene's parameters, in one
-    propagation.
-    """
-
-    def start(self, product: Product) -> AttachedTangent:
-        before = Before.start(self.samples.plan)
-        return AttachedTangent(mi.Spectrum(self.dE), mi.Vector3f(0), mi.Vector3f(0), before)
-
-    def vertex(
-        self, state: AttachedTangent, vertex: Vertex, connection: Connection, scattering: Scattering,
-        numbers: list[mi.Float],
-    ) -> AttachedTangent:  # fmt: skip
-        s, P, scattered = self.samples, vertex.product.value(), scattering.active
+        A segment's derivatives are those by its ray, whose tangents are at hand, and by the scene's parameters, in one
+        propagation.
+        """
+        s, P, dP, scattered = self.samples, vertex.product.value(), state.d_product, scattering.active
         plan = s.plan
         seen, _ = passage(plan, s.scene, vertex.si, vertex.depth, connection)
         drawn = Numbers(connection.sample, scattering.sample_2, scattering.sample_1)
@@ -157,23 +133,88 @@ class AttachedTangentSplat(Tangents):
             ray = mi.Ray3f(vertex.ray)
             ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
             dr.enable_grad(ray.o, ray.d)
-            dr.set_grad(ray.o, mi.Point3f(state.d_origin))
-            dr.set_grad(ray.d, state.d_direction)
+            d_origin, d_direction = state.d_ray
+            dr.set_grad(ray.o, mi.Point3f(d_origin))
+            dr.set_grad(ray.d, d_direction)
             this, reached = segment_again(s, state.before, ray, vertex.pi, drawn, seen, scattered)
             following, taps = this.next_ray(attached=True), s.film.taps(this.connection.u, plan.attached_normalization)
             # Selected: no other of these hangs on what that makes, which would be cleared on the way.
-            connection, scattering = this.connection, this.scattering
-            c, weight = reached * connection.f * connection.weight, reached * scattering.weight
+            there, sampled = this.connection, this.scattering
+            c, weight = reached * there.f * there.weight, reached * sampled.weight
             outputs = [dr.select(seen, c, 0)]
             outputs += [dr.select(scattered, value, 0) for value in (weight, following.o, following.d)]
-            found = forward_derivatives(*outputs, *(k for _, k in taps))
-        dc, ds, d_origin, d_direction, *d_weights = found
+            dc, ds, d_origin, d_direction, *d_weights = forward_derivatives(*outputs, *(k for _, k in taps))
         c, weight = dr.detach(c), dr.detach(weight)
-        C, dC = P * c * s.scale, (state.d_product * c + P * dc) * s.scale
+        C, dC = P * c * s.scale, (dP * c + P * dc) * s.scale
         for (pixel, k), dk in zip(taps, d_weights, strict=True):
             s.film.add(self.block, pixel, dr.detach(k) * dC + dk * C, seen)
-        d_product = dr.select(scattered, state.d_product * weight + P * ds, 0)
-        return AttachedTangent(d_product, mi.Vector3f(d_origin), d_direction, Before.of(plan, vertex, scattering))
+        d_product = dr.select(scattered, dP * weight + P * ds, 0)
+        return Tangent(d_product, [mi.Vector3f(d_origin), d_direction], Before.of(plan, vertex, sampled))
+
+
+@dataclass
+class CameraTangent:
+    """Derivatives along the parameters' tangents: of the product of the factors so far, and of the radiance, (C,)."""
+
+    d_product: mi.Spectrum
+    d_radiance: mi.Spectrum
+
+
+class CameraTangents(CameraHooks):
+    """The same product rule along camera paths, whose radiance is summed up."""
+
+    def __init__(self, samples: Samples) -> None:
+        self.samples = samples
+
+    def start(self, first: FilmRay) -> CameraTangent:
+        return CameraTangent(mi.Spectrum(0), mi.Spectrum(0))
+
+    def survived(self, state: CameraTangent, weight: mi.Float) -> CameraTangent:
+        return replace(state, d_product=state.d_product * weight)
+
+    def vertex(
+        self, state: CameraTangent, vertex: Vertex, met: MetLight | None, event: NextEvent | None,
+        scattering: Scattering,
+    ) -> CameraTangent:  # fmt: skip
+        s, P, dP, dL = self.samples, vertex.product.value(), state.d_product, state.d_radiance
+        plan, si, bsdf, zero = s.plan, vertex.si, vertex.bsdf, mi.Spectrum(0)
+        through, d_through = mi.Spectrum(1), zero
+        if event is not None and plan.needs.has_null:
+            _, through, d_through = tangent_of_passage(s, vertex, event)
+        with dr.resume_grad():
+            f_s = tracked_factor(plan, si, bsdf, scattering, scattering.active)
+            Le_h = zero if met is None else met.radiance()
+            f_c = zero if event is None else evaluate(plan, si, bsdf, event.wo, event.active)
+            Le_n = zero if event is None else event.radiance(s.scene, si)
+            df_s, dLe_h, df_c, dLe_n = forward_derivatives(f_s, Le_h, f_c, Le_n)
+        if met is not None:
+            dL = dL + dr.select(met.active, (dP * met.Le + P * dLe_h) * met.weight, 0)
+        if event is not None:
+            assert event.f is not None
+            f_c, Le = event.f, event.Le
+            c = f_c * Le * through
+            dc = (df_c * Le + f_c * dLe_n) * through + f_c * Le * d_through
+            dL = dL + dr.select(event.active, (dP * c + P * dc) * event.scale, 0)
+        return CameraTangent(dP * scattering.weight + P * tangent_of_scattering(scattering, df_s), dL)
+
+
+def tangent_of_passage(
+    samples: Samples, vertex: Vertex, connection: Connection
+) -> tuple[mi.Bool, mi.Spectrum, mi.Spectrum]:
+    """Where a connection's target is seen, the transmittance (C,) of masks on the way, and its derivative."""
+    plan, active = samples.plan, connection.active
+    if not plan.needs.has_null:
+        return *passage(plan, samples.scene, vertex.si, vertex.depth, connection), mi.Spectrum(0)
+    limit, past_lamps = plan.max_depth - vertex.depth - 1, plan.passes_lamps
+    passed = transmittance(
+        samples.scene, vertex.si, connection.target, limit, active, tangents=True, past_lamps=past_lamps
+    )
+    return passed.reached, passed.value, passed.tangent[0]
+
+
+def tangent_of_scattering(scattering: Scattering, df: mi.Spectrum) -> mi.Spectrum:
+    """The derivative (C,) of an event's factor, by that of its f."""
+    return dr.select(scattering.active, df * (scattering.correction / scattering.pdf), 0)
 
 
 def reverse_recorded(samples: Samples, adjoint: AdjointImage) -> None:
@@ -199,10 +240,12 @@ def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
             u, C, active = small_splat(samples)
             [tangent] = forward_derivatives(C)
             samples.film.put(block, u, tangent, active)
-    if plan.camera:
-        return
-    hooks = AttachedTangentSplat if plan.attached else TangentSplat
-    walk(samples, hooks(samples, block, dE))
+    for side in samples.sides():
+        if side.plan.camera:
+            first, state = camera_walk(side, CameraTangents(side))
+            side.film.put(block, first.u, state.d_radiance * first.weight, first.active)
+        else:
+            walk(side, TangentSplat(side, block, dE))
 
 
 def splat_tracked(samples: Samples, block: mi.ImageBlock) -> None:

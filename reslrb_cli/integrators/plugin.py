@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 import mitsuba as mi
 
 from reslrb_cli.backend.variant import check_variant, works_under
-from reslrb_cli.estimators import ESTIMATORS
+from reslrb_cli.estimators import ESTIMATORS, options_of
 from reslrb_cli.integrators.baselines import Trajectory, WalkAd
 from reslrb_cli.integrators.context import resolve_sensor
 from reslrb_cli.integrators.protocol import Job
@@ -102,8 +102,8 @@ def _option_names(type: str, estimator: str | None) -> list[str]:
     """The names of an integrator's options, those of its estimator among them."""
     if type != "reslrb":
         return list(WalkAd.OPTIONS if type == "walk_ad" else Trajectory.OPTIONS)
-    kind = ESTIMATORS.get(Reslrb.OPTIONS["estimator"] if estimator is None else estimator)
-    return [*Reslrb.OPTIONS, *(kind.OPTIONS if kind is not None else ())]
+    name = Reslrb.OPTIONS["estimator"] if estimator is None else estimator
+    return [*Reslrb.OPTIONS, *(options_of(name) if name in ESTIMATORS else ())]
 
 
 def _job(scene: mi.Scene, params: Any, sensor: mi.Sensor | int, seed: mi.UInt32 | int, spp: int) -> Job:

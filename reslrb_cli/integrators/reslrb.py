@@ -19,14 +19,13 @@ from numpy.typing import NDArray
 from typing_extensions import Self
 
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.estimators import ESTIMATORS
+from reslrb_cli.estimators import ATTACHED, ESTIMATORS, make_estimator, options_of
 from reslrb_cli.estimators.base import Estimator, Pass, one_of
 from reslrb_cli.estimators.camera import (
-    camera_scratch_bytes,
     differentiate_camera_paths,
     splat_camera_paths,
-    splat_camera_tangents,
 )
+from reslrb_cli.estimators.stack import stack_bytes
 from reslrb_cli.guiding.collect import hear
 from reslrb_cli.guiding.pixels import wanted
 from reslrb_cli.guiding.tables import Purpose, learning_seed
@@ -225,7 +224,7 @@ class LightTracer:
                 raise UnsupportedScene("forward mode has no derivatives of emitters that move; take reverse mode")
             film = parts[0].film
             block = film.block()
-            in_passes(parts, _splat_tangents, block)
+            in_passes(parts, splat_tangents, block)
             return film.develop(block, tangent=True)
 
     def launch(
@@ -279,14 +278,13 @@ class Reslrb(LightTracer):
             )
         if estimator not in ESTIMATORS:
             raise ValueError(f'"estimator" must be one of {", ".join(ESTIMATORS)}, not "{estimator}"')
-        kind = ESTIMATORS[estimator]
-        own = {name: options.pop(name) for name in kind.OPTIONS if name in options}
+        own = {name: options.pop(name) for name in options_of(estimator) if name in options}
         if paths == "camera" and estimator != "stack":
             raise ValueError(
                 f'"estimator" {estimator} chooses among the connections of light paths, of which paths: camera has '
                 "none; leave it out, or take stack"
             )
-        obstacle = None if kind.attaches else _no_attached(estimator)
+        obstacle = None if estimator in ATTACHED else _no_attached(estimator)
         motion = Motion(attached, filter_normalization, obstacle, attached_sampling)
         for name, value, values in (
             ("guiding", guiding, ("on", "off")),
@@ -299,7 +297,7 @@ class Reslrb(LightTracer):
                 )
             one_of(name, value, values)
         options |= {"guided": guiding == "on", "low_discrepancy": sequence == "low_discrepancy"}
-        made = cls(kind(**own), motion=motion, **options)
+        made = cls(make_estimator(estimator, own), motion=motion, **options)
         made.have_paths(paths, light_share)
         made.preparation.shares_out = pixels == "measured"
         return made
@@ -310,12 +308,12 @@ class Reslrb(LightTracer):
 
     def kept(self, plan: Plan) -> Any:
         """All that memory holds of a light path at once, as `Estimator.kept` has it; of camera paths it is nothing."""
-        return [] if plan.paths == "camera" else self.estimator.kept(plan)
+        return [] if plan.paths == "camera" else self.estimator.of(plan).kept(plan)
 
     def scratch_bytes(self, plan: Plan) -> int:
         """Thread-local bytes of each path that is being traced, of either kind."""
-        light = 0 if plan.paths == "camera" else self.estimator.scratch_bytes(plan)
-        return light if plan.paths == "light" else max(light, camera_scratch_bytes(plan, self.estimator.stack_size))
+        light = 0 if plan.paths == "camera" else self.estimator.of(plan).scratch_bytes(plan)
+        return light if plan.paths == "light" else max(light, stack_bytes(plan, self.estimator.stack_size))
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
         """The image, and the gradient of the same samples with the dL/dI that `derivative(image)` returns."""
@@ -352,19 +350,10 @@ class Reslrb(LightTracer):
 
 
 def _no_attached(estimator: str) -> str:
-    able = ", ".join(name for name, kind in ESTIMATORS.items() if kind.attaches)
     return (
         f"estimator {estimator} has no derivatives of what moves light: it would need the Jacobians that reservoir "
-        f"takes at every vertex, and gain nothing by them; take {able}"
+        f"takes at every vertex, and gain nothing by them; take {', '.join(ATTACHED)}"
     )
-
-
-def _splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
-    """Add the forward-mode derivative of all paths' image to the block."""
-    splat_tangents(samples, block)
-    for side in samples.sides():
-        if side.plan.camera:
-            splat_camera_tangents(side, block)
 
 
 def image_of(samples: list[Samples]) -> mi.TensorXf:
@@ -395,7 +384,7 @@ def forward(
     for side in samples.sides():
         p = Pass(side, block, adjoint)
         if not side.plan.camera:
-            state = estimator.forward(p)
+            state = estimator.of(side.plan).forward(p)
         elif adjoint is not None:
             differentiate_camera_paths(p, estimator.stack_size)
         elif block is not None:
@@ -439,7 +428,7 @@ def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointI
     for side in samples.sides():
         p = Pass(side, None, adjoint)
         if not side.plan.camera:
-            estimator.backward(p, state)
+            estimator.of(side.plan).backward(p, state)
         elif not done:
             differentiate_camera_paths(p, estimator.stack_size)
 

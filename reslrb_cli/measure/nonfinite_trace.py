@@ -28,7 +28,7 @@ from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.views import View
 from reslrb_cli.seeds import seed
 from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor
-from reslrb_cli.transport.camera import CameraHooks, FilmRay, Met, NextEvent, camera_walk
+from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
 from reslrb_cli.transport.connection import Connection, forward_derivatives
 from reslrb_cli.transport.emission import Emission, sample_emission
 from reslrb_cli.transport.factors import Product
@@ -249,7 +249,7 @@ class CameraSearch(CameraHooks):
         return Search(Suspect.none(), Suspect.none(), blank, mi.Bool(False), Suspect.none(), blank)
 
     def vertex(
-        self, state: Search, vertex: Vertex, met: Met | None, event: NextEvent | None, scattering: Scattering
+        self, state: Search, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
     ) -> Search:  # fmt: skip
         plan, scene, si, P = self.samples.plan, self.samples.scene, vertex.si, vertex.product
         shape = dr.reinterpret_array(mi.UInt32, si.shape)

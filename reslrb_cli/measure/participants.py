@@ -11,7 +11,7 @@ import numpy as np
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.estimators import ESTIMATORS
+from reslrb_cli.estimators import ATTACHED
 from reslrb_cli.integrators.own import OwnIntegrator
 from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
@@ -246,9 +246,8 @@ class Participants:
         if not self.attached or not others:
             return listed
         if settings.named or not able:
-            names = ", ".join(name for name, kind in ESTIMATORS.items() if kind.attaches)
-            without = others[0].options["estimator"]
-            raise ConfigError("--estimators", "", f"{without} has no derivatives of what moves light; take {names}")
+            without, able_ones = others[0].options["estimator"], ", ".join(ATTACHED)
+            raise ConfigError("--estimators", "", f"{without} has no derivatives of what moves light; take {able_ones}")
         return able
 
     def _with_paths(self, settings: Settings, configs: dict[str, Config], problem: Problem) -> list[Listed]:
@@ -395,7 +394,7 @@ class Participants:
 
 def _attaches(case: Listed) -> bool:
     """Whether this is an estimator of ours with derivatives of what moves light."""
-    return case.type == "reslrb" and ESTIMATORS[case.options["estimator"]].attaches
+    return case.type == "reslrb" and case.options["estimator"] in ATTACHED
 
 
 def _alike(label: str, reference: Reference) -> str:

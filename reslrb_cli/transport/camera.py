@@ -82,7 +82,7 @@ def axis_of(sensor: mi.Sensor) -> mi.Vector3f:
 
 
 @dataclass
-class Met:
+class MetLight:
     """Light that a camera path meets: radiance `Le` (C,), detached, and its weight w_H, 0 where it does not count."""
 
     Le: mi.Spectrum
@@ -142,7 +142,7 @@ class CameraHooks:
         return mi.Bool(True)
 
     def vertex(
-        self, state: Any, vertex: Vertex, met: Met | None, event: NextEvent | None, scattering: Scattering
+        self, state: Any, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
     ) -> Any:  # fmt: skip
         """Called at each vertex, and where a ray leaves the scene; None: there is nothing to meet, or to sample."""
         return state
@@ -287,7 +287,7 @@ def _behind_lamps(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Ray3f:
     return ray
 
 
-def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Met:
+def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> MetLight:
     """The light at `si`, or, where the ray has left the scene, from there."""
     plan, scene = samples.plan, samples.scene
     emitter = si.emitter(scene, path.active)
@@ -328,7 +328,7 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
             e = density_of_rays(plan, table, Place(emitter, place, si.uv, -path.ray.d), indirect)
             rivals = sampled * own.M + dr.select(dr.isfinite(e), e, 0) * own.V
         weight = dr.select(active, dr.select(direct, 1, dr.rcp(1 + rivals)), 0)
-    return Met(dr.select(active, Le, 0), weight, active, emitter, si)
+    return MetLight(dr.select(active, Le, 0), weight, active, emitter, si)
 
 
 def _next_event(

@@ -103,8 +103,8 @@ class Connection:
     `weight` is everything of c_i but the BSDF and the transmittance: sensor importance, geometry, Veach's correction,
     (C,). `u` is the film position in pixels relative to the crop window, `target` the point on the aperture, or, where
     anything stands before the near clip plane, that on the plane on the way there. A walk that evaluates connections
-    sets `f` (C,) to bsdf * cos, `c` to c_i (C,) as a whole, and `active` to where the sensor
-    is seen.
+    sets `f` (C,) to bsdf * cos, `through` (C,) to the transmittance, `c` to c_i (C,) as a whole, and `active` to where
+    the sensor is seen.
     """
 
     weight: mi.Spectrum
@@ -115,6 +115,7 @@ class Connection:
     sample: mi.Point2f  # of the aperture
     f: mi.Spectrum | None = None
     c: mi.Spectrum | None = None
+    through: mi.Spectrum | None = None
     p_cam: mi.Float | None = None  # the density of area here of the camera paths of a pixel, where paths are weighed
 
 

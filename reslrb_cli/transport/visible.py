@@ -52,7 +52,7 @@ def small_splat(samples: Samples) -> tuple[mi.Point2f, mi.Spectrum, mi.Bool]:
     return point.u, dr.select(point.active, point.radiance() * point.weight, 0), point.active
 
 
-def small_points(samples: Samples) -> Points:
+def small_points(samples: Samples) -> LampPoints:
     """Points on the lamps that are smaller than a pixel, which take turns; detached."""
     lamps, numbers = samples.plan.small_lamps, samples.numbers(SMALL_LAMP_STREAM)
     count, lane = dr.opaque(mi.UInt32, samples.width), dr.arange(mi.UInt32, samples.width)
@@ -66,7 +66,7 @@ def small_points(samples: Samples) -> Points:
 
 
 @dataclass
-class Points:
+class LampPoints:
     """Points on lamps as the sensor sees them: `weight` (C,) is C_0 over radiance, as a part of the image."""
 
     emitter: mi.EmitterPtr
@@ -80,7 +80,9 @@ class Points:
         return self.emitter.eval(self.si, self.active)
 
 
-def _points(samples: Samples, lamps: Sequence[Lamp], index: mi.UInt32, numbers: NumberStream, attached: bool) -> Points:
+def _points(
+    samples: Samples, lamps: Sequence[Lamp], index: mi.UInt32, numbers: NumberStream, attached: bool
+) -> LampPoints:
     """A point of each lane's lamp, the one of that index in `scene.emitters()`."""
     plan, sensor = samples.plan, samples.sensor
     time = sample_time(plan, sensor, numbers)
@@ -105,7 +107,7 @@ def _points(samples: Samples, lamps: Sequence[Lamp], index: mi.UInt32, numbers: 
     with dr.suspend_grad():
         active, through = passage(plan, samples.scene, si, mi.UInt32(0), connection)
     weight = through * (cos * weight) * connection.weight * samples.scale
-    return Points(emitter, si, connection.u, weight, active)
+    return LampPoints(emitter, si, connection.u, weight, active)
 
 
 @dataclass

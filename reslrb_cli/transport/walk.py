@@ -262,12 +262,12 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
                 connection.active = connection.active & ~dr.all(connection.f == 0)  # NaN arrives
             with dr.suspend_grad(when=not plan.differentiate_null):
                 shadow = passage(plan, scene, si, path.depth, connection, seen or hooks.seen(vertex), loop_mode)
-            connection.active, transmittance = shadow
+            connection.active, connection.through = shadow
             if hooks.tracked:
                 connection.f = evaluate(plan, si, bsdf, connection.wo, connection.active)
             else:
                 connection.f = dr.select(connection.active, connection.f, 0)
-            connection.c = connection.f * transmittance * connection.weight
+            connection.c = connection.f * connection.through * connection.weight
             chosen_by = [] if selection is None else [selection.next_float32() for _ in range(hooks.numbers)]
         state = hooks.vertex(state, vertex, connection, scattering, chosen_by)
         if hooks.replaying:

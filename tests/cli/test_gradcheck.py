@@ -74,8 +74,8 @@ def test_what_fails_is_named(
 ) -> None:
     from reslrb_cli.estimators import stack
 
-    right = stack.adjoint_of_connection
-    monkeypatch.setattr(stack, "adjoint_of_connection", lambda *arguments: right(*arguments) * 1.5)
+    right = stack.push
+    monkeypatch.setattr(stack, "push", lambda *arguments: right(*arguments[:-1], arguments[-1] * 1.5))
     json_file = tmp_path / "a.jsonl"
     assert call(*SMALL, "--seeds", "8", "--estimators", "stack,gather", "--json", str(json_file)) == 1
     assert {row["estimator"] for row in read(json_file) if row["holds"] is False} == {"stack"}

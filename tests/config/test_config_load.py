@@ -19,7 +19,7 @@ from reslrb_cli.config.optimizers import SGD, Adam
 from reslrb_cli.config.parameters import ImageFile, ParameterSpec
 from reslrb_cli.config.run import memory_bytes
 from reslrb_cli.config.schema import Config
-from reslrb_cli.estimators import ESTIMATORS
+from reslrb_cli.estimators import ESTIMATORS, options_of
 
 # Values that a configuration may hold, its defaults, its paths, and the way back to YAML.
 
@@ -393,7 +393,7 @@ def test_options_and_defaults_are_the_estimators_own(name: str) -> None:
     shared |= {"pixels"}
     #: Those that are constants of every run.
     constants = {"stack_size", "jacobian_damping"}
-    known = {key: value for key, value in ESTIMATORS[name].OPTIONS.items() if key not in constants}
+    known = {key: value for key, value in options_of(name).items() if key not in constants}
     assert {key: value for key, value in options.items() if key not in shared} == known
 
 

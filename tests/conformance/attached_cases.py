@@ -182,7 +182,7 @@ class AttachedFault:
     quick: bool = False
 
 
-BACK = "estimators.attached:walk_back"
+BACK = "estimators.attached:AttachedFrame.differentiate"
 FAULTS = [
     # ---- The walk back: naive AD of our walk is right ----
     AttachedFault("sign_of_adjoint_of_origin", "slab", BACK,
@@ -190,27 +190,25 @@ FAULTS = [
     AttachedFault("direction_has_no_adjoint", "slab", BACK, " + dr.dot(following.d, adjoint.direction)", ""),
     AttachedFault("prefix_missing", "bounces", BACK, "dr.dot(P, reached * (own + later))",
                   "dr.sum(reached * (own + later))"),
-    AttachedFault("own_contribution_not_carried", "bounces", BACK, "dr.detach(own + later))", "dr.detach(later))"),
-    AttachedFault("roulette_weight_missing", "stack_of_2", BACK, "(r * B)", "B"),
+    AttachedFault("own_contribution_not_carried", "bounces", BACK, "dr.detach(own + later)", "dr.detach(later)"),
+    AttachedFault("roulette_weight_missing", "stack_of_2", BACK, " * self.roulette", ""),
     AttachedFault("normalization_the_other_way", "slab", BACK,
                   "plan.attached_normalization)", "not plan.attached_normalization)"),
     AttachedFault("film_position_does_not_move", "slab", BACK,
-                  "image.lookup(there.u,", "image.lookup(dr.detach(there.u),"),
+                  "p.adjoint.lookup(there.u,", "p.adjoint.lookup(dr.detach(there.u),"),
     AttachedFault("connection_without_geometry", "slab", BACK,
                   "there.f * there.weight", "there.f * dr.detach(there.weight)"),
     AttachedFault("rows_of_the_filter_detached", "slab", "transport.film:AdjointImage._filtered",
                   "weights_x[x] * weights_y[y]", "weights_x[x] * dr.detach(weights_y[y])"),
-    AttachedFault("blocks_begin_anew", "stack_of_2", "estimators.attached:sweep",
-                  "walk_back(again, size, pushed, left, bottom, adjoint)",
-                  "walk_back(again, size, pushed, left, bottom, Adjoint.zero())"),
-    AttachedFault("blocks_without_their_last_vertex", "stack_of_2", "estimators.attached:sweep",
-                  "walk_back(again, size, pushed, left, bottom, adjoint)",
-                  "walk_back(again, size, pushed, left - 1, bottom, adjoint)"),
+    AttachedFault("blocks_begin_anew", "stack_of_2", "estimators.stack:walk_back",
+                  "again(left), left, bottom, adjoint)", "again(left), left, bottom, adjoint.zero())"),
+    AttachedFault("blocks_without_their_last_vertex", "stack_of_2", "estimators.stack:walk_back",
+                  "again(left), left, bottom", "again(left), left - 1, bottom"),
     AttachedFault("emission_not_differentiated", "bounces", "estimators.attached:differentiate_start",
                   "concerns_emission(plan)", "plan.moving_emission"),
     AttachedFault("pushed_from_the_second_vertex", "mirror", "estimators.attached:begins",
                   "plan.moves(vertex.si.shape) | ", ""),
-    AttachedFault("another_point_of_the_lens", "thin_lens", "estimators.attached:Pushing.vertex",
+    AttachedFault("another_point_of_the_lens", "thin_lens", "estimators.attached:AttachedSweep.vertex",
                   "aperture=[connection.sample]", "aperture=[mi.Point2f(0.5)]"),
     # ---- The segment: naive AD shares the fault, `ptracer` does not ----
     AttachedFault("next_ray_detached", "slab", "transport.walk:Segment.next_ray",

@@ -214,13 +214,13 @@ class Fault:
 
     right: str
     wrong: str
-    where: str = "integrators.forward:AttachedTangentSplat.vertex"
+    where: str = "integrators.forward:TangentSplat._attached"
 
 
 FORWARD_FAULTS = {
-    "slab": Fault("dr.set_grad(ray.d, state.d_direction)", "pass"),
+    "slab": Fault("dr.set_grad(ray.d, d_direction)", "pass"),
     "mirror": Fault(" + dk * C", ""),
-    "rough_surface": Fault("state.d_product * c + P * dc", "P * dc"),
+    "rough_surface": Fault("dP * c + P * dc", "P * dc"),
 }
 
 

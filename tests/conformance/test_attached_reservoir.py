@@ -216,7 +216,7 @@ FAULTS = {
                   "row_times(row, J) for row, before in zip(jacobian.log_c"),
     "factors_passed_stay": Fault(f"{REPLAY}.vertex", "ahead = row - sum", "ahead = row + 0 * sum"),
     "no_inverse": Fault(f"{REPLAY}.vertex", "row_times(ahead, inverse)", "ahead"),
-    "film_position_stays": Fault("estimators.chain:Kept.of", "[*by_u, *A]", "[*(0 * by_u), *A]"),
+    "film_position_stays": Fault("estimators.chain:KeptConnection.of", "[*by_u, *A]", "[*(0 * by_u), *A]"),
     "own_vertex_left_out": Fault(f"{REPLAY}._differentiate", "own_part + later", "later"),
     "rays_left_out": Fault(f"{REPLAY}._differentiate", "moved + dr.dot(by_s", "0 * moved + dr.dot(by_s"),
 }  # fmt: skip

@@ -227,7 +227,7 @@ def scene(llvm: str) -> dict:
     [
         ("gather", gather.Taking, "__init__", lambda arguments: arguments[1].last),
         ("reservoir", reservoir.ReservoirReplay, "__init__", lambda arguments: arguments[1][0].last),
-        ("stack", stack, "walk_back", lambda arguments: arguments[1].height),
+        ("stack", stack, "walk_back", lambda arguments: arguments[3].count),
     ],
 )
 @pytest.mark.parametrize("adjoint", ["independent", "correlated"])
@@ -275,9 +275,10 @@ def test_connections_without_anything_to_differentiate_are_no_candidates(
 def test_without_an_image_the_others_are_not_even_connected(scene: dict, monkeypatch: pytest.MonkeyPatch) -> None:
     original, shares = stack.walk_back, []
 
-    def noting(p: Any, pushed: stack.Pushed) -> Any:
-        shares.append(float(np.mean(np.array(pushed.last > 0, dtype=float))))
-        return original(p, pushed)
+    def noting(p: Any, form: Any, ring: Any, state: stack.StackState, *rest: Any) -> Any:
+        connected = (state.needed > 0) | dr.any(state.since != 0)
+        shares.append(float(np.mean(np.array(connected, dtype=float))))
+        return original(p, form, ring, state, *rest)
 
     monkeypatch.setattr(stack, "walk_back", noting)
     for keys in (FLOOR_ALONE, ALL):

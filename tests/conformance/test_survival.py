@@ -136,11 +136,14 @@ def moving_means_hold(estimator: str, table: str, rr_depth: int, count: int, spp
 
 def test_a_lost_weight_of_learned_roulette_is_found_where_light_moves(monkeypatch: pytest.MonkeyPatch) -> None:
     """The walk back asks for roulette on throughput alone, as it once did."""
-    import mitsuba as mi
+    from reslrb_cli.estimators.attached import AttachedSweep
 
-    from reslrb_cli.estimators import attached
+    right = AttachedSweep.survived
 
-    monkeypatch.setattr(attached, "blank_roulette", lambda plan: [mi.Float(0)] if plan.roulette else [])
+    def survived(self: AttachedSweep, state: Any, weight: Any) -> Any:
+        return right(self, state, weight) if self.p.plan.roulette else state
+
+    monkeypatch.setattr(AttachedSweep, "survived", survived)
     assert not moving_means_hold("stack", "harsh", 5, 8, 16)
 
 

@@ -424,10 +424,9 @@ def test_a_fault_is_found(name: str, monkeypatch: pytest.MonkeyPatch):
 # A fault of the walk back, which weights know nothing of: at equal seeds naive AD finds it.
 
 WALKS_BACK = {
-    "walk_back_forgets_what_is_met": ("Pushing.vertex", "for C, active in found]",
-                                      "for C, active in found[int(met is not None):]]", 16),
-    "second_walk_forgets_what_is_met": ("Taking.vertex", "self.found(vertex, met, event)",
-                                        "self.found(vertex, None, event)", 1),
+    "walk_back_forgets_what_is_met": ("CameraSweep.vertex", "if met is not None:", "if False:", 16),
+    "blocks_forget_what_is_met": ("CameraSweep.vertex", "if met is not None:",
+                                  "if met is not None and self.end is None:", 1),
 }  # fmt: skip
 
 

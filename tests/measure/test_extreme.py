@@ -79,7 +79,7 @@ def lost(case: str, estimator: str) -> list[str]:
 
 @pytest.mark.long
 def test_selection_by_contribution_alone_loses_what_follows_a_heavy_one(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("reslrb_cli.estimators.reservoir.SHARE", 0.0)
+    monkeypatch.setattr("reslrb_cli.estimators.selection.SHARE", 0.0)
     records = run_suite(["connection_1e8"], ["reservoir", "event"])
     assert {record.estimator for record in records if record.holds is False} == {"reservoir", "event"}
 
@@ -119,5 +119,5 @@ def test_a_replay_leaves_nothing_because_its_sums_are_compensated(monkeypatch: p
         return value + term, rest
 
     assert left() < 1e-10
-    monkeypatch.setattr("reslrb_cli.estimators.kept.AdjointSum._add", staticmethod(add))
+    monkeypatch.setattr("reslrb_cli.estimators.gather.AdjointSum._add", staticmethod(add))
     assert left() > 1e-8

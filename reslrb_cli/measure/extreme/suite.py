@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
-from reslrb_cli.estimators import ESTIMATORS
+from reslrb_cli.estimators import ATTACHED, ESTIMATORS
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.estimators.gather import Gathering, Taking
 from reslrb_cli.integrators.protocol import Job
@@ -354,7 +354,7 @@ def _run_way(
     setup.weights = type(setup.weights)(weights)
     for label, options in members:
         name = options["estimator"]
-        if case.moves is not None and not ESTIMATORS[name].attaches:
+        if case.moves is not None and name not in ATTACHED:
             continue
         gradients, images, refused = _steps(case, setup, name)
         rows = list(_comparisons(case, setup, name, gradients, naive, reference))
