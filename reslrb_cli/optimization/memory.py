@@ -276,8 +276,9 @@ def check_memory(problem: Problem, integrator: Reslrb) -> None:
             needed = integrator.scratch_bytes(plan)
             if needed > most:
                 reason = f"{size} vertices take {in_words(needed)} of a thread's stack for each path, which has "
-                reason += f"{in_words(most)}; take at most {size * most // needed} (longer paths are traced a second "
-                reason += "time, and nothing of them is lost), or raise `ulimit -s`"
+                fits = (size + 1) * most // needed - 1  # there is a place more than vertices
+                reason += f"{in_words(most)}; take at most {fits} (longer paths are traced again, and nothing of them "
+                reason += "is lost), or raise `ulimit -s`"
                 raise ConfigError(config.source, "integrator.stack_size", reason)
     if config.run.memory_budget is not None:
         return
