@@ -76,7 +76,7 @@ FILES = {
     "weights.exr": "target.mask.file",
     "own.py": "loss.file",
 }
-OF_PHOTO = FILES | {"photo.exr": "target.file[0]"}
+OF_PHOTO = FILES | {"photo.exr": "target.file"}
 OF_CAMERAS = FILES | {"shots/transforms.json": "scene.cameras", "shots/a.exr": "scene.cameras (a.exr)"}
 
 
