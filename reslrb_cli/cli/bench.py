@@ -30,7 +30,7 @@ from reslrb_cli.errors import ConfigError
 
 if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
-    from reslrb_cli.measure.bench import Result
+    from reslrb_cli.measure.bench import BenchResult
     from reslrb_cli.measure.methods import Sweep
     from reslrb_cli.records.measurements import BenchRecord
 
@@ -105,14 +105,14 @@ def command(
     return exit_code(interrupted, BenchStatus.OK in states, states)
 
 
-def _run(sweep: Sweep, json_file: Path | None, began: float) -> tuple[list[Result], bool]:
+def _run(sweep: Sweep, json_file: Path | None, began: float) -> tuple[list[BenchResult], bool]:
     """Measure, print and write; returns all results, and whether the user interrupted."""
     from reslrb_cli.measure.bench import Bench
     from reslrb_cli.report.tables import bench_cells, bench_columns
 
     table, notes = bench_columns([case.label for case in sweep.cases], sweep.swept), []
 
-    def show(rows: list[Result]) -> None:
+    def show(rows: list[BenchResult]) -> None:
         for row in rows:
             echo(table.line(bench_cells(row)))
             if row.reason:

@@ -28,7 +28,7 @@ from reslrb_cli.config.optimizers import loss_words
 from reslrb_cli.report.format import WITHOUT_BORDER, Columns
 
 if TYPE_CHECKING:
-    from reslrb_cli.measure.convergence.judgement import Results
+    from reslrb_cli.measure.convergence.judgement import ConvergenceResults
     from reslrb_cli.measure.convergence.session import Session
     from reslrb_cli.measure.methods import Plan
     from reslrb_cli.records.measurements import MethodRecord
@@ -95,7 +95,7 @@ def command(
     return exit_code(interrupted, done, {record.status for record in results.methods})
 
 
-def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[Results, bool]:
+def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[ConvergenceResults, bool]:
     """Measure, print and write; return the results, and whether the user interrupted."""
     from reslrb_cli.measure.convergence.judgement import Judgement
     from reslrb_cli.measure.convergence.session import Session

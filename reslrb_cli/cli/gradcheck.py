@@ -42,7 +42,7 @@ from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verd
 
 if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
-    from reslrb_cli.measure.gradcheck import Gradcheck, Result
+    from reslrb_cli.measure.gradcheck import CheckResult, Gradcheck
 
 
 #: Options that say something about comparisons, of which `--missing` makes none.
@@ -301,7 +301,7 @@ def _run(
     return records, interrupts.requested
 
 
-def _draw(result: Result, folder: Path | None) -> None:
+def _draw(result: CheckResult, folder: Path | None) -> None:
     if folder is None or result.maps is None:
         return
     from reslrb_cli.report.plots import plot_maps

@@ -25,7 +25,7 @@ from reslrb_cli.config.loader import dump, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.methods import Case as Listed
-from reslrb_cli.measure.participants import Participants, Settings
+from reslrb_cli.measure.participants import CheckSettings, Participants
 from reslrb_cli.measure.sampling import Step, step_as, steps_of
 from reslrb_cli.measure.scenes import small
 
@@ -51,12 +51,12 @@ class Steps:
 def participants_in(
     folder: Path, threads: int, variant: str, allows_code: bool, settings: Mapping[str, Any]
 ) -> tuple[Participants, dict[str, float]]:
-    """Who takes part, of the experiment in `folder`; no kernel is warm. `settings` are the others of `Settings`."""
+    """Return who takes part, of the experiment in `folder`; no kernel is warm. `settings`: further `CheckSettings`."""
     set_variant(variant)
     listed = [_with_file(case, lambda file: f"{folder / file}") for case in settings["integrators"]]
     config, initial = _read(folder)
     told = {**settings, "integrators": listed, "initial": initial}
-    participants = Participants(Settings(config.with_code(allows_code), **told))
+    participants = Participants(CheckSettings(config.with_code(allows_code), **told))
     _with_threads(threads)
     return participants, {}
 
@@ -89,7 +89,7 @@ def _with_file(case: Listed, put: Callable[[str], str]) -> Listed:
 # --- where `gradcheck` runs -------------------------------------------------------------------------------------------
 
 
-def check_shareable(settings: Settings) -> None:
+def check_shareable(settings: CheckSettings) -> None:
     """Raise ConfigError where samples depend on who takes them, or when."""
     if settings.seeds is None:
         reason = "a budget of seconds says nothing of other machines; say how many seeds there are with --seeds"
@@ -102,7 +102,7 @@ def check_shareable(settings: Settings) -> None:
 
 @contextlib.contextmanager
 def samples_at(
-    settings: Settings, participants: Participants, place: Place, variant: str, threads: int | None = None
+    settings: CheckSettings, participants: Participants, place: Place, variant: str, threads: int | None = None
 ) -> Iterator[Callable[..., Any]]:
     """What takes samples of `participants` (`sampling.Engine`) on the workers at a place; raises as `Crew.start`."""
     opening, bundle = _opening_of(settings, participants, variant, own=place.address is None)
@@ -119,7 +119,7 @@ def samples_at(
         yield take
 
 
-def _opening_of(settings: Settings, participants: Participants, variant: str, own: bool) -> tuple[Opening, Bundle]:
+def _opening_of(settings: CheckSettings, participants: Participants, variant: str, own: bool) -> tuple[Opening, Bundle]:
     """What workers need to have the same participants, `own`: which are this command's."""
     config = settings.config
     built_in = config.scene.file == small.FILE

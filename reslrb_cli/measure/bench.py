@@ -1,9 +1,9 @@
 """Time and memory of a step against path depth, for several integrators side by side; or against something else.
 
-At each depth (or number of samples, or size of the film or of textures: `sweep` says which) every case (`Run`) has a
-process of its own, and all live at once (`Bench`). They take a cold step each, then as many as it takes until no new
-kernel comes, and then steps in rounds, one each in turn, from round to round in another order. Ratios are taken within
-a round, whose steps also share a seed.
+At each depth (or number of samples, or size of the film or of textures: `sweep` says which) every case (`BenchRun`)
+has a process of its own, and all live at once (`Bench`). They take a cold step each, then as many as it takes until no
+new kernel comes, and then steps in rounds, one each in turn, from round to round in another order. Ratios are taken
+within a round, whose steps also share a seed.
 
 A case that runs out of memory is tried again at greater depths: what is recorded was seen, and a failure costs no more
 time than it takes to fill the memory once. One that nobody named, but the default list, and that refuses the scene, is
@@ -31,7 +31,7 @@ TIMES = ("step_ms", "kernel_ms", "codegen_ms", "tracing_ms")
 
 
 @dataclass(frozen=True)
-class Result:
+class BenchResult:
     """A record, what it is compared with, and what the record has no room for.
 
     `value` is that of what is swept.
@@ -47,7 +47,7 @@ class Result:
 
 
 @dataclass(kw_only=True)
-class Run(Stepping):
+class BenchRun(Stepping):
     """One case at one value; `steps` are by round.
 
     `size` is the film's, width and height in pixels; `texels` those of all textures that are parameters.
@@ -84,12 +84,12 @@ class Run(Stepping):
         self.end = entry["end"] and Ended(**entry["end"])
 
 
-def results(runs: Sequence[Run], value: int, sweep: Sweep) -> list[Result]:
+def results(runs: Sequence[BenchRun], value: int, sweep: Sweep) -> list[BenchResult]:
     """What those of the cases at one value that have anything to say come to."""
     return [_result(run, value, sweep, runs) for run in runs if run.done]
 
 
-def _result(run: Run, value: int, sweep: Sweep, runs: Sequence[Run]) -> Result:
+def _result(run: BenchRun, value: int, sweep: Sweep, runs: Sequence[BenchRun]) -> BenchResult:
     options, figures = run.config.integrator.options(), dict[str, Any]()
     baseline = next(other for other in runs if other.case == sweep.baseline)
     width, height = next((other.size for other in runs if other.size is not None), (None, None))
@@ -114,10 +114,10 @@ def _result(run: Run, value: int, sweep: Sweep, runs: Sequence[Run]) -> Result:
         **figures,
     )
     kernel, step = (_ratio(run, baseline, key) for key in ("kernel_ms", "step_ms"))
-    return Result(run.case, value, record, kernel, step, "" if run.end is None else run.end.reason)
+    return BenchResult(run.case, value, record, kernel, step, "" if run.end is None else run.end.reason)
 
 
-def _ratio(run: Run, baseline: Run, key: str) -> Spread | None:
+def _ratio(run: BenchRun, baseline: BenchRun, key: str) -> Spread | None:
     """Ratios of the rounds that both have; None where there is none, or one of them has ended."""
     both = [(step[key], baseline.steps[round][key]) for round, step in run.steps.items() if round in baseline.steps]
     ratios = [own / its for own, its in both if its and run.end is None and baseline.end is None]
@@ -128,7 +128,7 @@ def _ratio(run: Run, baseline: Run, key: str) -> Spread | None:
 SLOW = 10.0
 
 
-class Bench(Arena[Sweep, Run]):
+class Bench(Arena[Sweep, BenchRun]):
     """A measurement, value by value of what is swept; see `Arena`. No process writes into its folder.
 
     `runs` are by value, `done` the values that are over, `left_out` the cases that refused the scene.
@@ -137,7 +137,7 @@ class Bench(Arena[Sweep, Run]):
     AFTERWARDS, AFTERWARDS_S, MOST_ROUNDS = 0.0, 0.0, MAX_ROUNDS
 
     def _set_up(self, earlier: Earlier | None) -> int:
-        self.runs, self.done, self.left_out = dict[int, list[Run]](), set[int](), list[Case]()
+        self.runs, self.done, self.left_out = dict[int, list[BenchRun]](), set[int](), list[Case]()
         if earlier is not None:
             self._restore(earlier)
         self._to_do = [value for value in self.plan.values if value not in self.done]
@@ -155,11 +155,11 @@ class Bench(Arena[Sweep, Run]):
             if whole and all(run.end is not None or len(run.steps) >= most for run in runs):
                 self.done.add(value)
 
-    def _run(self, case: Case, value: int) -> Run:
+    def _run(self, case: Case, value: int) -> BenchRun:
         may_refuse = self.plan.may_refuse(case)
-        return Run(process=None, may_refuse=may_refuse, case=case, config=self.plan.at(case, value))
+        return BenchRun(process=None, may_refuse=may_refuse, case=case, config=self.plan.at(case, value))
 
-    def results(self, done: bool | None = None) -> list[Result]:
+    def results(self, done: bool | None = None) -> list[BenchResult]:
         """What the runs come to, in the order of the sweep: of all values, or those that are `done`, or are not."""
         return [
             result
@@ -176,7 +176,7 @@ class Bench(Arena[Sweep, Run]):
         left_out = [case.label for case in self.left_out]
         return resume_store.head(self.plan.KIND, self.settings, values=values, left_out=left_out), {}
 
-    def run(self) -> Iterator[list[Result]]:
+    def run(self) -> Iterator[list[BenchResult]]:
         """Measure what is to do; yield the results of each value, and nothing after each round on the way to them.
 
         Ends early, with what is done, once `stop()`. What the budget did not suffice for is said, and, once, what the
@@ -184,7 +184,7 @@ class Bench(Arena[Sweep, Run]):
         """
         return self._taking_turns(self._course())
 
-    def _course(self) -> Iterator[list[Result]]:
+    def _course(self) -> Iterator[list[BenchResult]]:
         plan, values = self.plan, self._to_do
         for number, value in enumerate(values):
             if self._pace.over():

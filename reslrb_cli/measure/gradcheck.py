@@ -26,7 +26,7 @@ from reslrb_cli.measure.comparison import (
     paired_z_scores,
 )
 from reslrb_cli.measure.methods import records_of
-from reslrb_cli.measure.participants import Settings, Way
+from reslrb_cli.measure.participants import CheckSettings, Way
 from reslrb_cli.measure.processes import NO_TIME
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.sampling import NAIVE, Engine, Name, Sampling
@@ -42,7 +42,7 @@ ALONG_DIRECTIONS = (Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE)
 
 
 @dataclass(frozen=True)
-class Maps:
+class GradientMaps:
     """Of a texture: mean gradient and reference (H, W, C), and z (H, W) of the sums over channels."""
 
     gradient: np.ndarray
@@ -51,11 +51,11 @@ class Maps:
 
 
 @dataclass(frozen=True)
-class Result:
+class CheckResult:
     """A record; `maps` where the parameter is a texture and the reference has all its texels."""
 
     record: GradcheckRecord
-    maps: Maps | None = None
+    maps: GradientMaps | None = None
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Gradcheck:
     """A check of one experiment, which goes on from an `earlier` one; `participants` have its scene."""
 
     def __init__(
-        self, settings: Settings, now: Callable[[], float] = time.monotonic, earlier: Earlier | None = None
+        self, settings: CheckSettings, now: Callable[[], float] = time.monotonic, earlier: Earlier | None = None
     ) -> None:
         self.settings, self._sampling = settings, Sampling(settings, now, earlier)
         self.participants = self._sampling.participants
@@ -142,7 +142,7 @@ class Gradcheck:
 
     def run(
         self, stop: Callable[[], bool], say: Callable[[str], None], between: Callable[[], None] = lambda: None
-    ) -> Iterator[Result]:
+    ) -> Iterator[CheckResult]:
         """Measure and compare, row by row; once `stop()`, only what has been measured is compared.
 
         Of what the budget did not suffice for the records say so. `between` is called after each sample.
@@ -156,7 +156,7 @@ class Gradcheck:
                 yield self._result(row, family)
             elif not stop():
                 late = True
-                yield Result(self._record(row, Comparison(Verdict.NOT_MEASURED, message=NO_TIME), 0))
+                yield CheckResult(self._record(row, Comparison(Verdict.NOT_MEASURED, message=NO_TIME), 0))
         if compared or not stop():
             yield from self._without_reference()
         if late and not stop():
@@ -195,7 +195,7 @@ class Gradcheck:
             return len(parts.exact[row.key])
         return entry_count(parts.shape(row.key))
 
-    def _result(self, row: Row, family: Family) -> Result:
+    def _result(self, row: Row, family: Family) -> CheckResult:
         parts, (mine, *its) = self.participants, self._needs(row)
         ours, shape, bias = self._sampling.of(mine), None, np.zeros(1)
         reference = self._sampling.of(its[0]) if its else parts.exact[str(row.key)]
@@ -220,7 +220,7 @@ class Gradcheck:
             rounding = ROUNDING if shape is None or ours_too else STOCK_ROUNDING
             figures = compare_expectations(ours, reference, family, shape=shape, bias=bias, rounding=rounding)
         maps = _maps(ours, reference, shape) if row.key is not None and shape is not None else None
-        return Result(self._record(row, figures, len(ours)), maps)
+        return CheckResult(self._record(row, figures, len(ours)), maps)
 
     def _record(self, row: Row, figures: Comparison, seeds: int) -> GradcheckRecord:
         kind, _, estimator = row.label.partition(":") if row.label.startswith("reslrb") else (row.label, "", "")
@@ -229,7 +229,7 @@ class Gradcheck:
             **vars(figures), **records_of(row.way.paths, row.way.light_share),
         )  # fmt: skip
 
-    def _without_reference(self) -> Iterator[Result]:
+    def _without_reference(self) -> Iterator[CheckResult]:
         """Say so where no stock integrator counts."""
         parts = self.participants
         rows = []
@@ -242,7 +242,7 @@ class Gradcheck:
             if reference is None:
                 rows.append((Row(None, "reslrb", Reference.PATH, Kind.IMAGE, way), why))
         for row, why in rows:
-            yield Result(self._record(row, Comparison(Verdict.NO_REFERENCE, message=why), 0))
+            yield CheckResult(self._record(row, Comparison(Verdict.NO_REFERENCE, message=why), 0))
 
 
 def _draws_plainly(config: Config) -> bool:
@@ -252,10 +252,10 @@ def _draws_plainly(config: Config) -> bool:
     return all(options.get(name, value) == value for name, value in usual.items())
 
 
-def _maps(ours: np.ndarray, reference: np.ndarray, shape: tuple[int, ...]) -> Maps | None:
+def _maps(ours: np.ndarray, reference: np.ndarray, shape: tuple[int, ...]) -> GradientMaps | None:
     if len(shape) != 3:
         return None
     grids = [side.reshape(len(side), *shape) for side in (ours, reference)]
     sums = [grid.sum(-1) for grid in grids]
     floor = ROUNDING * np.maximum(*(np.abs(side.mean(0)) for side in sums))
-    return Maps(grids[0].mean(0), grids[1].mean(0), paired_z_scores(sums[0] - sums[1], floor))
+    return GradientMaps(grids[0].mean(0), grids[1].mean(0), paired_z_scores(sums[0] - sums[1], floor))

@@ -500,7 +500,7 @@ def _set_tangents(problem: Problem) -> None:
 
 
 @dataclass
-class Step:
+class TracedStep:
     """Image (H, W, C) and gradients of a step, and the first entry (x, y, channel) of dL/dI that was refused."""
 
     image: Array
@@ -508,7 +508,7 @@ class Step:
     refused: tuple[int, int, int] | None
 
 
-def _take_step(problem: Problem, view: View, step_seed: int) -> Step:
+def _take_step(problem: Problem, view: View, step_seed: int) -> TracedStep:
     """The view's step, as the run took it; leaves no gradient behind."""
     optimizer, keys = problem.optimizer, problem.selection.keys
     step = gradient_step(
@@ -519,10 +519,10 @@ def _take_step(problem: Problem, view: View, step_seed: int) -> Step:
     gradients = {key: np.array(gradient) for key, gradient in problem.gradients().items()}
     for key in keys:
         optimizer.clear_gradient(key)
-    return Step(np.array(step.image), gradients, step.refused.entry())
+    return TracedStep(np.array(step.image), gradients, step.refused.entry())
 
 
-def _of_step(step: Step, view: View, largest: Offender | None) -> Offender | None:
+def _of_step(step: TracedStep, view: View, largest: Offender | None) -> Offender | None:
     """What is left where no path has anything: the loss, sums that overflow, or paths that were not looked at."""
     image, target = step.image, np.array(view.target)
     if step.refused is not None:

@@ -72,7 +72,7 @@ PILOT_SEEDS = 2
 
 
 @dataclass(frozen=True)
-class Settings:
+class CheckSettings:
     """What is checked. `seeds` and `spp` are None where they are to be chosen.
 
     `named`: the user named the integrators; otherwise those that cannot take part are left out. Of the budget `spent_s`
@@ -103,7 +103,7 @@ class Settings:
 def settings_of(
     config: Config, estimators: str | None, budget_s: float, seeds: int | None, spp: int | None, spent_s: float,
     integrators: str | None = None,
-) -> Settings:  # fmt: skip
+) -> CheckSettings:  # fmt: skip
     """What is checked of `config`: the lists of `estimators`, as `--estimators` has it, and of a user's own
     `integrators`, as `--integrators` has it; all estimators where there is neither.
 
@@ -112,7 +112,7 @@ def settings_of(
     listed = [] if estimators is None else parse_estimators(estimators)
     listed += [] if integrators is None else parse_own(integrators)
     named = estimators is not None or integrators is not None
-    checked = Settings(config, listed if named else all_estimators(config), budget_s, seeds, spp, named, spent_s)
+    checked = CheckSettings(config, listed if named else all_estimators(config), budget_s, seeds, spp, named, spent_s)
     checked.configs()  # before anything is loaded
     return checked
 
@@ -157,7 +157,7 @@ class Participants:
     UnsupportedScene.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: CheckSettings) -> None:
         config, configs, self.known = settings.config, settings.configs(), settings.known
         self._configs = configs
         # Whatever moves, an estimator that follows it can be made.
@@ -238,7 +238,7 @@ class Participants:
         known = {key: known_gradient(self._situation, self.sensor, key, weights) for key in self.case.keys}
         self.exact = {key: value for key, value in known.items() if value is not None}
 
-    def _able(self, settings: Settings, configs: dict[str, Config], problem: Problem) -> list[Listed]:
+    def _able(self, settings: CheckSettings, configs: dict[str, Config], problem: Problem) -> list[Listed]:
         """The estimators that can take part. Raises ConfigError where one was named that cannot, or where none is."""
         listed = self._with_paths(settings, configs, problem)
         others = [case for case in listed if case.type == "reslrb" and not _attaches(case)]
@@ -250,7 +250,7 @@ class Participants:
             raise ConfigError("--estimators", "", f"{without} has no derivatives of what moves light; take {able_ones}")
         return able
 
-    def _with_paths(self, settings: Settings, configs: dict[str, Config], problem: Problem) -> list[Listed]:
+    def _with_paths(self, settings: CheckSettings, configs: dict[str, Config], problem: Problem) -> list[Listed]:
         """The estimators whose paths can render the scene and, where light moves, have derivatives; raises as above."""
         if self._situation.moved:
             ours = [case for case in settings.integrators if case.type == "reslrb"]

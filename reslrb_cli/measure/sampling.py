@@ -17,7 +17,7 @@ import numpy as np
 from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.gradients import seeds
 from reslrb_cli.measure.methods import code_files
-from reslrb_cli.measure.participants import Participants, Settings
+from reslrb_cli.measure.participants import CheckSettings, Participants
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.optimization.shards import in_order, serially
 from reslrb_cli.records.measurement_files import Kept
@@ -53,7 +53,7 @@ def step_as(participants: Participants, steps: Mapping[str, Sequence[Step]]) -> 
         participants.directions[key] = [replace(one, step=step, truncation=error) for one, (step, error) in along]
 
 
-def settings(checked: Settings, variant: str, device: str) -> dict[str, Any]:
+def settings(checked: CheckSettings, variant: str, device: str) -> dict[str, Any]:
     """What has to be the same in all sessions."""
     labels, codes = [case.label for case in checked.integrators], code_files(checked.integrators)
     return resume_store.settings(checked.config, codes, variant, device, estimators=labels, spp=checked.spp)
@@ -89,7 +89,7 @@ class Sampling:
     engine: Engine = staticmethod(serially)
 
     def __init__(
-        self, settings: Settings, now: Callable[[], float] = time.monotonic, earlier: Earlier | None = None
+        self, settings: CheckSettings, now: Callable[[], float] = time.monotonic, earlier: Earlier | None = None
     ) -> None:
         self._now, self.settings = now, settings
         self._start = now() - settings.spent_s

@@ -137,7 +137,7 @@ def shift_between(image: Array, reference: Array) -> Array:
     return -np.asarray(phase_cross_correlation(reference, image, upsample_factor=10)[0])
 
 
-class Bench:
+class OpticalBench:
     """A scene whose parts can be moved, and put back; `params` are those of its own."""
 
     def __init__(
@@ -240,7 +240,7 @@ class Bench:
 
 
 def tolerances(
-    bench: Bench,
+    bench: OpticalBench,
     sheets: Sequence[Sheet],
     planned: Array,
     target: Array,

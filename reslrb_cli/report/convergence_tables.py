@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from reslrb_cli.measure.convergence.judgement import Results
+from reslrb_cli.measure.convergence.judgement import ConvergenceResults
 from reslrb_cli.records.measurement_files import Line
 from reslrb_cli.records.measurements import (
     TARGETS,
@@ -84,7 +84,7 @@ def reference_line(record: ReferenceRecord) -> str:
     return words
 
 
-def result_lines(results: Results) -> list[Line]:
+def result_lines(results: ConvergenceResults) -> list[Line]:
     """All that a convergence is written as: its records, and what they come to in a sentence."""
     summary = SummaryRecord(closing_sentence(results.methods))
     return [*results.points, *results.methods, *results.references, summary]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from reslrb_cli.measure.bench import Result
+from reslrb_cli.measure.bench import BenchResult
 from reslrb_cli.optimization.sensitivity import QUANTITIES, Conditioning
 from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Spread, Verdict
 from reslrb_cli.report.format import Columns, interval, number, table
@@ -17,7 +17,7 @@ def bench_columns(labels: Sequence[str], swept: str = "depth") -> Columns:
     return Columns(titles, (7, max(map(len, labels)), 9, 19, 9, 19, 7, 7, 8, 9, 9, 3), "><>")
 
 
-def bench_cells(row: Result) -> tuple[str, ...]:
+def bench_cells(row: BenchResult) -> tuple[str, ...]:
     """Medians of one result, and ratios with their least and greatest."""
     record, named = row.record, (str(row.value), row.case.label)
     if record.step_ms is None or record.kernel_ms is None:

@@ -29,7 +29,7 @@ from reslrb_cli.lens.solid import (
     within,
 )
 from reslrb_cli.measure.references import DEEPEST, Situation, ptracer_image
-from reslrb_cli.measure.tolerance import Bench, figures, where_light_goes
+from reslrb_cli.measure.tolerance import OpticalBench, figures, where_light_goes
 from reslrb_cli.measure.tolerance import tolerances as measure
 from reslrb_cli.optimization.loading import check_integrator, choose_sensors, load_configured, paths_of
 from reslrb_cli.optimization.moving import moves_anything
@@ -277,11 +277,11 @@ def read_target(config: Config, sensor: mi.Sensor, needed: bool) -> Array | None
 
 def bench_of(
     config: Config, scene: mi.Scene, params: mi.SceneParameters, integrator: dict[str, object], sensor: int
-) -> Bench:
+) -> OpticalBench:
     """What moves the scene's parts, for its tolerances (`measure/tolerance.py`). Raises ConfigError."""
     assert config.fabrication is not None
     try:
-        return Bench(scene, params, config.fabrication, mi.load_dict(dict(integrator)), sensor)
+        return OpticalBench(scene, params, config.fabrication, mi.load_dict(dict(integrator)), sensor)
     except ConfigError as error:
         raise ConfigError(config.source, error.key, error.message) from None
 

@@ -21,7 +21,7 @@ from reslrb_cli.config.schema import Fabrication
 from reslrb_cli.lens.solid import as_sheet
 from reslrb_cli.measure import tolerance
 from reslrb_cli.measure.tolerance import (
-    Bench,
+    OpticalBench,
     closed_by_ball,
     figures,
     shift_between,
@@ -94,9 +94,9 @@ def test_tolerances_leave_the_folder_of_a_run_at_work_alone(tmp_path: Path) -> N
     assert ["is in use by a run" in line for line in said] == [True, False]
 
 
-def bench(folder: Path) -> Bench:
+def bench(folder: Path) -> OpticalBench:
     scene = mi.load_file(str(folder / "out/scene.xml"), optimize=False)
-    return Bench(scene, mi.traverse(scene), FLAT, mi.load_dict(PTRACER), 0)
+    return OpticalBench(scene, mi.traverse(scene), FLAT, mi.load_dict(PTRACER), 0)
 
 
 def in_file(folder: Path, id: str, before: str) -> mi.Scene:
@@ -109,7 +109,7 @@ def in_file(folder: Path, id: str, before: str) -> mi.Scene:
     return mi.load_file(str(folder / "out/moved.xml"), optimize=False)
 
 
-def with_face(folder: Path, heights: Callable[[np.ndarray], np.ndarray]) -> Bench:
+def with_face(folder: Path, heights: Callable[[np.ndarray], np.ndarray]) -> OpticalBench:
     """The exported lens whose face is a function of x."""
     made = bench(folder)
     points = np.array(made.params["face.vertex_positions"]).reshape(-1, 3)
@@ -119,7 +119,7 @@ def with_face(folder: Path, heights: Callable[[np.ndarray], np.ndarray]) -> Benc
     return made
 
 
-def light_of(made: Bench) -> dict[str, float]:
+def light_of(made: OpticalBench) -> dict[str, float]:
     target = np.zeros((40, 40))
     target[4:36, 4:36] = 1  # an eighth of 32 pixels is beside the picture
     with pytest.MonkeyPatch.context() as patch:
@@ -188,7 +188,7 @@ def test_what_is_moved_is_what_a_scene_of_its_own_shows(name: str, folder: Path)
         (folder / "out/moved.xml").write_text(text.replace('value="1.49"', 'value="1.495"'))
         other = mi.load_file(str(folder / "out/moved.xml"), optimize=False)
     seen = made.image(values, 16)
-    wanted = Bench(other, mi.traverse(other), FLAT, mi.load_dict(PTRACER), 0).render(16)
+    wanted = OpticalBench(other, mi.traverse(other), FLAT, mi.load_dict(PTRACER), 0).render(16)
     assert np.abs(seen - wanted).mean() < 3e-4 * wanted.mean()  # the same light paths
     assert np.abs(seen - planned).mean() > 4e-3 * wanted.mean()
     assert np.array_equal(made.render(16), planned)  # all is back in its place

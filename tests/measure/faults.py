@@ -14,7 +14,7 @@ from reslrb_cli.estimators.stack import Stack
 from reslrb_cli.measure.extreme import run_suite
 from reslrb_cli.measure.gradcheck import Gradcheck
 from reslrb_cli.measure.methods import parse_estimators
-from reslrb_cli.measure.participants import Settings
+from reslrb_cli.measure.participants import CheckSettings
 from reslrb_cli.measure.scenes import small
 from reslrb_cli.records.measurements import GradcheckRecord
 
@@ -38,7 +38,7 @@ run: {{spp: 64}}
 
 def checked(config: Config, estimators: str, seeds: int) -> list[GradcheckRecord]:
     """The records of `reslrb gradcheck`."""
-    made = Gradcheck(Settings(config, parse_estimators(estimators), 0, seeds))
+    made = Gradcheck(CheckSettings(config, parse_estimators(estimators), 0, seeds))
     return [result.record for result in made.run(lambda: False, lambda line: None)]
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.config.loader import loads
-from reslrb_cli.measure.convergence.judgement import Judgement, Results
+from reslrb_cli.measure.convergence.judgement import ConvergenceResults, Judgement
 from reslrb_cli.measure.convergence.session import Session
 from reslrb_cli.measure.methods import Plan, parse_cases
 from reslrb_cli.measure.processes import Ended, Refused, Stopped
@@ -208,7 +208,7 @@ def plan(cases: str = LIST, **changes: Any) -> Plan:
 
 def play(
     folder: Path, stage: Stage, what: Plan, stop: Callable[[], bool] = lambda: False, earlier: Any = None
-) -> tuple[Session, Results, list[str]]:
+) -> tuple[Session, ConvergenceResults, list[str]]:
     said: list[str] = []
     session = Session(what, folder, stop, said.append, stage.start, stage.clock, earlier=earlier)
     for _ in session.run():
@@ -217,5 +217,5 @@ def play(
     return session, Judgement(session).results(), said
 
 
-def of(results: Results, label: str, parameter: str = "all") -> MethodRecord:
+def of(results: ConvergenceResults, label: str, parameter: str = "all") -> MethodRecord:
     return next(r for r in results.methods if (r.method.label, r.parameter) == (label, parameter))

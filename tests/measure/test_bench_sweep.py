@@ -14,7 +14,7 @@ from measure.pretended_steps import Pretended
 from reslrb_cli.cli import main
 from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.bench import Bench, Result
+from reslrb_cli.measure.bench import Bench, BenchResult
 from reslrb_cli.measure.methods import Sweep, depths, parse_cases, usual_values
 from reslrb_cli.measure.processes import MAX_ROUNDS, MIN_ROUNDS, Pace, Refused, Stopped
 from reslrb_cli.measure.resume_store import Earlier
@@ -50,14 +50,14 @@ def sweep(list_of: str = LIST, **changes: Any) -> Sweep:
 
 def play(
     what: Sweep, kind: type[Pretended] = Pretended, stop: Callable[[], bool] = lambda: False, **options: Any
-) -> tuple[list[Result], list[str]]:
+) -> tuple[list[BenchResult], list[str]]:
     said: list[str] = []
     rows = [row for depth in Bench(what, Path(), stop, said.append, kind, **options).run() for row in depth]
     assert Pretended.alive == 0
     return rows, said
 
 
-def run(what: Sweep, stop: Callable[[], bool] = lambda: False) -> list[Result]:
+def run(what: Sweep, stop: Callable[[], bool] = lambda: False) -> list[BenchResult]:
     return play(what, stop=stop)[0]
 
 
@@ -331,7 +331,7 @@ def _clean_values() -> None:
     Pretended.log, Pretended.ends, Pretended.refusing, Pretended.alive, Sized.firsts = [], {}, set(), 0, []
 
 
-def run_swept(swept: str, values: list[int], **changes: Any) -> tuple[list[Result], list[str]]:
+def run_swept(swept: str, values: list[int], **changes: Any) -> tuple[list[BenchResult], list[str]]:
     cases = parse_cases(LIST, deep=False)
     settings: dict[str, Any] = {
         "config": loads(CONFIG, Path("x.yaml"), ["integrator.max_depth=5"]), "variant": "llvm_ad_rgb", "cases": cases,

@@ -20,7 +20,7 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.methods import Plan, Sweep, parse_cases
-from reslrb_cli.measure.participants import Settings
+from reslrb_cli.measure.participants import CheckSettings
 from reslrb_cli.measure.resume_store import first_difference
 from reslrb_cli.measure.resume_store import settings as measured_as
 from reslrb_cli.measure.sampling import settings as sampled_as
@@ -76,7 +76,7 @@ FILES = {
     "weights.exr": "target.mask.file",
     "own.py": "loss.file",
 }
-OF_PHOTO = FILES | {"photo.exr": "target.file[0]"}
+OF_PHOTO = FILES | {"photo.exr": "target.file"}
 OF_CAMERAS = FILES | {"shots/transforms.json": "scene.cameras", "shots/a.exr": "scene.cameras (a.exr)"}
 
 
@@ -140,7 +140,7 @@ def measurements(config: Config, ours: str = "reslrb:stack", reference: str = "p
     shared: dict[str, Any] = {"config": config, "variant": "llvm_ad_rgb", "cases": cases, "objective": "fixed",
                               "memory_limit": None, "memory": 2**40, "budget_s": 0.0}  # fmt: skip
     return {
-        "gradcheck": sampled_as(Settings(config, cases, 0), "llvm_ad_rgb", ""),
+        "gradcheck": sampled_as(CheckSettings(config, cases, 0), "llvm_ad_rgb", ""),
         "gradcheck --missing": measured_as(config, {}, "llvm_ad_rgb", ""),
         "bench": Sweep(**shared, values=[2]).settings(),
         "convergence": Plan(**shared, reference=parse_cases(reference, deep=False)[0], spps=(4,)).settings(),

@@ -16,7 +16,7 @@ from reslrb_cli.cli import main
 from reslrb_cli.config.loader import load
 from reslrb_cli.measure.convergence.judgement import HEAVY, Judgement
 from reslrb_cli.measure.convergence.setup import Role, Sampler, survey
-from reslrb_cli.measure.convergence.statistics import GROUPS, Reference, Samples
+from reslrb_cli.measure.convergence.statistics import GROUPS, MethodSamples, ReferenceMean
 from reslrb_cli.measure.methods import IMAGES
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.measurements import BenchStatus
@@ -187,12 +187,14 @@ def noise(random: np.random.Generator, count: int) -> np.ndarray:
 VARIANCE = 3.2 * 40
 
 
-def make(seed: int, steps: int = 48, rows: int = 24, per_row: int = 6, per_turn: int = 2, bias: float = 0.0) -> Samples:
+def make(
+    seed: int, steps: int = 48, rows: int = 24, per_row: int = 6, per_turn: int = 2, bias: float = 0.0
+) -> MethodSamples:
     random = np.random.default_rng(1000 + seed)
     means = TRUTH + noise(random, rows * per_row).reshape(rows, per_row, -1).mean(1)
     values, turns = TRUTH * (1 + bias) + noise(random, steps), np.arange(steps) // per_turn
     seconds = SECONDS * random.gamma(40, 1 / 40, steps // per_turn)
-    return Samples(values, turns, seconds, Reference(means))
+    return MethodSamples(values, turns, seconds, ReferenceMean(means))
 
 
 def test_errors_are_those_of_averages_and_the_references_own_is_subtracted() -> None:
@@ -222,14 +224,14 @@ def test_the_floor_and_the_signal() -> None:
     for values, truth in (([r.noise for r in made], VARIANCE / 144), ([r.signal for r in made], SIGNAL)):
         assert abs(np.mean(values) - truth) < 4 * stats.sem(values)
     assert made[0].floor == pytest.approx(np.sqrt(made[0].noise / made[0].signal))
-    assert Reference(np.random.default_rng(1).standard_normal((8, 5)) * 0.0).floor is None
+    assert ReferenceMean(np.random.default_rng(1).standard_normal((8, 5)) * 0.0).floor is None
 
 
 def test_what_is_left_out_of_a_reference() -> None:
     reference = make(1, rows=5).reference
     moved, noises, signals = reference.without
     for k in range(5):
-        rest = Reference(np.delete(reference.rows, k, axis=0))
+        rest = ReferenceMean(np.delete(reference.rows, k, axis=0))
         np.testing.assert_allclose(reference.mean + moved[k], rest.mean)
         assert (noises[k], signals[k]) == pytest.approx((rest.noise, rest.signal))
 
@@ -257,7 +259,9 @@ def test_the_intervals_of_a_single_colour_cover_too(steps: int) -> None:
     for seed in range(REPETITIONS):
         random = np.random.default_rng(seed)
         own, others = (1 + 0.1 * random.standard_normal((count, 1)) * np.ones(3) for count in (steps, 400))
-        samples = Samples(own, np.arange(steps) // 2, np.ones(steps // 2), Reference(others.reshape(40, 10, 3).mean(1)))
+        samples = MethodSamples(
+            own, np.arange(steps) // 2, np.ones(steps // 2), ReferenceMean(others.reshape(40, 10, 3).mean(1))
+        )
         efficiency, slope = samples.efficiency(), samples.slope()
         assert efficiency is not None
         assert slope is not None
@@ -290,7 +294,7 @@ def test_a_bias_flattens_the_slope() -> None:
 def test_seeds_that_repeat_flatten_the_slope() -> None:
     good = make(4, steps=64)
     values = np.repeat(good.deviations[::4] + good.reference.mean, 4, axis=0)
-    slope = Samples(values, good.turns, good.seconds, good.reference).slope()
+    slope = MethodSamples(values, good.turns, good.seconds, good.reference).slope()
     assert slope is not None
     assert slope.interval().low > -0.45
 
@@ -406,12 +410,12 @@ def test_the_intervals_cover_what_they_say_on_a_scene(tmp_path: Path) -> None:
     repetitions, steps, rows, per_row = 200, 24, 12, 4
     taken = steps + rows * per_row
     pool = np.stack([sampler.step(seed, 16, 0)[0] for seed in range(repetitions * taken)]).astype(np.float64)
-    everything = Reference(pool)
+    everything = ReferenceMean(pool)
     truth = everything.signal / pool.var(0, ddof=1).sum()
     covered = {"efficiency": 0, "slope": 0}
     for part in pool.reshape(repetitions, taken, -1):
-        reference = Reference(part[steps:].reshape(rows, per_row, -1).mean(1))
-        samples = Samples(part[:steps], np.arange(steps) // 2, np.ones(steps // 2), reference)
+        reference = ReferenceMean(part[steps:].reshape(rows, per_row, -1).mean(1))
+        samples = MethodSamples(part[:steps], np.arange(steps) // 2, np.ones(steps // 2), reference)
         efficiency, slope = samples.efficiency(), samples.slope()
         assert efficiency is not None
         assert slope is not None

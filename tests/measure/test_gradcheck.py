@@ -21,7 +21,7 @@ from reslrb_cli.config.loader import load, loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators import forward
 from reslrb_cli.measure import resume_store, sampling
-from reslrb_cli.measure.gradcheck import Gradcheck, Result
+from reslrb_cli.measure.gradcheck import CheckResult, Gradcheck
 from reslrb_cli.measure.gradients import (
     Case,
     choose_step,
@@ -33,7 +33,7 @@ from reslrb_cli.measure.gradients import (
     smooth_weights,
 )
 from reslrb_cli.measure.methods import all_estimators, parse_estimators
-from reslrb_cli.measure.participants import Participants, Settings
+from reslrb_cli.measure.participants import CheckSettings, Participants
 from reslrb_cli.measure.references import (
     Situation,
     of_image,
@@ -59,13 +59,13 @@ SMALL = ["scene.options.size=32", "scene.options.texture=4", "run.spp=8", "integ
 SMALL += ["integrator.guiding=off"]  # guided steps have their own test
 
 
-def check(*overrides: str, estimators: str = "reservoir,event,gather,stack", seeds: int = 8) -> list[Result]:
+def check(*overrides: str, estimators: str = "reservoir,event,gather,stack", seeds: int = 8) -> list[CheckResult]:
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, *overrides])
-    made = Gradcheck(Settings(config, parse_estimators(estimators), 0, seeds))
+    made = Gradcheck(CheckSettings(config, parse_estimators(estimators), 0, seeds))
     return list(made.run(lambda: False, lambda line: None))
 
 
-def failures(results: list[Result]) -> set[tuple[str | None, str]]:
+def failures(results: list[CheckResult]) -> set[tuple[str | None, str]]:
     found = [result.record for result in results if result.record.verdict is not Verdict.HOLDS]
     return {(record.estimator, record.reference.value) for record in found}
 
@@ -175,7 +175,7 @@ def test_a_fault_of_the_walk_is_none_of_its_own_references(monkeypatch: pytest.M
 def test_rows_come_as_they_are_measured():
     """The first is there before the last estimator has taken a step, and what one row measured the next one uses."""
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
-    made = Gradcheck(Settings(config, parse_estimators("event,stack"), 0, 3))
+    made = Gradcheck(CheckSettings(config, parse_estimators("event,stack"), 0, 3))
     said: list[str] = []
     rows = made.run(lambda: False, said.append)
     next(rows)
@@ -194,7 +194,7 @@ def test_rows_come_as_they_are_measured():
 def test_what_the_budget_does_not_suffice_for_is_named():
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
     ticks = iter(range(10_000))
-    made = Gradcheck(Settings(config, parse_estimators("stack,event"), 40), now=lambda: next(ticks))
+    made = Gradcheck(CheckSettings(config, parse_estimators("stack,event"), 40), now=lambda: next(ticks))
     records = [result.record for result in made.run(lambda: False, lambda line: None)]
     assert next(ticks) < 50
     assert [record.verdict for record in records[:2]] == [Verdict.HOLDS] * 2
@@ -210,13 +210,13 @@ def test_what_the_budget_does_not_suffice_for_is_named():
 def test_what_is_interrupted_is_compared_with_what_is_done():
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
     asked = iter(range(10_000))
-    made = Gradcheck(Settings(config, parse_estimators("stack"), 0, 8))
+    made = Gradcheck(CheckSettings(config, parse_estimators("stack"), 0, 8))
     records = [result.record for result in made.run(lambda: next(asked) > 32, lambda line: None)]
     assert [(record.reference, record.seeds) for record in records] == [
         (Reference.PTRACER, 8), (Reference.FINITE_DIFFERENCE, 5)
     ]  # fmt: skip
     assert list(made.run(lambda: True, lambda line: None)) != []
-    fresh = Gradcheck(Settings(config, parse_estimators("stack"), 0, 8))
+    fresh = Gradcheck(CheckSettings(config, parse_estimators("stack"), 0, 8))
     assert list(fresh.run(lambda: True, lambda line: None)) == []
 
 
@@ -411,7 +411,7 @@ def test_of_camera_paths_alone_there_is_one_estimator():
 def test_of_what_moves_light_there_are_light_paths():
     config = room_moving("lamp_over_floor.xml", "lamp.position")
     with pytest.raises(ConfigError, match="what moves light has derivatives on light paths alone"):
-        Gradcheck(Settings(config, parse_estimators("stack(paths=both)"), 0, 3))
+        Gradcheck(CheckSettings(config, parse_estimators("stack(paths=both)"), 0, 3))
 
 
 def _lit(view: str, **more: Any) -> Situation:
@@ -459,25 +459,25 @@ def test_a_lamp_that_moves():
 @pytest.mark.usefixtures("llvm")
 def test_who_takes_part():
     config = room_moving("lamp_over_floor.xml", "lamp.position")
-    some = Gradcheck(Settings(config, all_estimators(config), 0, 3, named=False))
+    some = Gradcheck(CheckSettings(config, all_estimators(config), 0, 3, named=False))
     assert [case.label for case in some.participants.listed] == ["reslrb:reservoir", "reslrb:stack"]
     assert {row.label for row in some.rows if row.key is not None} == {"reslrb:reservoir", "reslrb:stack"}
     with pytest.raises(ConfigError, match="gather has no derivatives of what moves light; take reservoir, stack"):
-        Gradcheck(Settings(config, parse_estimators("gather,stack"), 0, 3))
+        Gradcheck(CheckSettings(config, parse_estimators("gather,stack"), 0, 3))
     still = room_moving("lamp_over_floor.xml", "floor.bsdf.reflectance.value")
-    all_of_them = Gradcheck(Settings(still, all_estimators(still), 0, 3, named=False))
+    all_of_them = Gradcheck(CheckSettings(still, all_estimators(still), 0, 3, named=False))
     assert [case.label for case in all_of_them.participants.listed] == [
         *(f"reslrb:{name}" for name in ("reservoir", "gather", "event", "stack")), "reslrb:stack(paths=both)"
     ]  # fmt: skip
     asked = room_moving("lamp_over_floor.xml", "floor.bsdf.reflectance.value", overrides=["integrator.paths=light"])
-    assert len(Gradcheck(Settings(asked, all_estimators(asked), 0, 3, named=False)).participants.listed) == 4
+    assert len(Gradcheck(CheckSettings(asked, all_estimators(asked), 0, 3, named=False)).participants.listed) == 4
 
 
 @pytest.mark.usefixtures("llvm")
 def test_ways_to_differentiate_the_film():
     """Beside differences the filter's normalisation has its derivative, beside `ptracer` none; naive AD follows."""
     parts = Gradcheck(
-        Settings(room_moving("wavy_glass.xml", "top.vertex_positions"), parse_estimators("stack"), 0, 3)
+        CheckSettings(room_moving("wavy_glass.xml", "top.vertex_positions"), parse_estimators("stack"), 0, 3)
     ).participants
     assert parts.stock == {"top.vertex_positions": Reference.PTRACER}
     assert parts.sampled("reslrb:stack", Reference.WALK_AD) == "reslrb:stack, as walk_ad"
@@ -492,7 +492,7 @@ def test_ways_to_differentiate_the_film():
 def test_forward_mode_of_what_is_a_function(name: str):
     """Heights and motions are not in the scene: tangents have to reach what is, as gradients come back from there."""
     small = ["scene.options={resx: 16, resy: 16}", "run.spp=4", "target.render.spp=4"]
-    parts = Participants(Settings(load(CONFIGS / f"{name}.yaml", small), parse_estimators("stack"), 0, 3))
+    parts = Participants(CheckSettings(load(CONFIGS / f"{name}.yaml", small), parse_estimators("stack"), 0, 3))
     [label] = (case.label for case in parts.listed)
     gradient, slices = parts.sample("gradient", label, 1), parts.case.places
     for key in parts.case.keys:
@@ -546,7 +546,7 @@ def check_again(
 ) -> tuple[list[GradcheckRecord], Earlier]:
     """The records, and what the check keeps, by way of the disk; it is stopped after so many looks at the clock."""
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
-    what = Settings(config, parse_estimators("stack"), 0, seeds)
+    what = CheckSettings(config, parse_estimators("stack"), 0, seeds)
     made, looks = Gradcheck(what, earlier=earlier), iter(range(10**6))
     records = [result.record for result in made.run(lambda: next(looks) > after, lambda line: None)]
     kept = made.kept(settings(what, "llvm_ad_rgb", ""))
@@ -585,7 +585,7 @@ def test_more_seeds_are_added_to_those_of_the_file(llvm: None, tmp_path: Path, m
     ],
 )
 def test_only_the_same_is_gone_on_from(change: dict[str, Any], line: str) -> None:
-    what = Settings(loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE), parse_estimators("stack"), 0, 4)
+    what = CheckSettings(loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE), parse_estimators("stack"), 0, 4)
     head = {"version": VERSION, "kind": KIND, "settings": settings(what, "llvm_ad_rgb", "")}
     with pytest.raises(ConfigError) as caught:
         Earlier(KIND, Path("g.jsonl"), head, {}).check(settings(replace(what, **change), "llvm_ad_rgb", ""))
@@ -593,7 +593,7 @@ def test_only_the_same_is_gone_on_from(change: dict[str, Any], line: str) -> Non
 
 
 def test_samples_of_other_code_are_not_gone_on_from(monkeypatch: pytest.MonkeyPatch) -> None:
-    what = Settings(loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE), parse_estimators("stack"), 0, 4)
+    what = CheckSettings(loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE), parse_estimators("stack"), 0, 4)
     now = settings(what, "llvm_ad_rgb", "")
     earlier = Earlier(KIND, Path("g.jsonl"), {"version": VERSION, "kind": KIND, "settings": now}, {})
     earlier.check(settings(what, "llvm_ad_rgb", ""))

@@ -14,7 +14,7 @@ from reslrb_cli.cluster.connection import Place
 from reslrb_cli.config.loader import load, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.measure.gradcheck import Gradcheck
-from reslrb_cli.measure.participants import Settings, settings_of
+from reslrb_cli.measure.participants import CheckSettings, settings_of
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.sampling import KIND
 from reslrb_cli.measure.scenes import small
@@ -39,11 +39,11 @@ def experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def checked(config: Config, estimators: str | None, own: str | None = None) -> Settings:
+def checked(config: Config, estimators: str | None, own: str | None = None) -> CheckSettings:
     return settings_of(config, estimators, 0.0, 4, None, 0.0, own)
 
 
-def sampled(settings: Settings, place: Place | None, earlier: Kept | None = None) -> tuple[Kept, list[str]]:
+def sampled(settings: CheckSettings, place: Place | None, earlier: Kept | None = None) -> tuple[Kept, list[str]]:
     """What is kept of a check, and its records, in one thread each; it goes on from an `earlier` one."""
     before = None if earlier is None else Earlier(KIND, Path("a.jsonl"), *earlier)
     made = Gradcheck(settings, earlier=before)
@@ -59,7 +59,7 @@ def sampled(settings: Settings, place: Place | None, earlier: Kept | None = None
     return kept, found
 
 
-def check(settings: Settings, workers: int) -> None:
+def check(settings: CheckSettings, workers: int) -> None:
     """Samples, steps and records are the same, also where workers go on from what one process did."""
     alone, table = sampled(settings, None)
     together, same_table = sampled(settings, Place(workers))

@@ -9,7 +9,7 @@ import numpy as np
 from reslrb_cli.measure.comparison import ROUNDING, TAIL, Family, compare_expectations, entry_count, tail_weight
 from reslrb_cli.measure.convergence.session import Session
 from reslrb_cli.measure.convergence.setup import Member, Role
-from reslrb_cli.measure.convergence.statistics import FEWEST, Reference, Samples
+from reslrb_cli.measure.convergence.statistics import FEWEST, MethodSamples, ReferenceMean
 from reslrb_cli.measure.methods import ALL, IMAGES
 from reslrb_cli.records.measurements import (
     TARGETS,
@@ -30,7 +30,7 @@ HEAVY = "single steps carry the variance: intervals are too narrow, and more ste
 
 
 @dataclass(frozen=True)
-class Results:
+class ConvergenceResults:
     """All records of a session."""
 
     points: list[PointRecord]
@@ -57,10 +57,10 @@ class Judgement:
         self._session = session
         self._slices = session.slices() if session.facts else {}
         #: What errors are taken from, by parameter and of all; nothing where there are too few steps of it.
-        self._whole: dict[str, Reference] = {}
+        self._whole: dict[str, ReferenceMean] = {}
         for found in session.of(Role.REFERENCE):
             if len(set(found.turns)) >= FEWEST and not found.message:
-                self._whole = {key: Reference(self._rows(found, place)) for key, place in self._places().items()}
+                self._whole = {key: ReferenceMean(self._rows(found, place)) for key, place in self._places().items()}
 
     def _places(self) -> dict[str, slice]:
         """Where each parameter stands, and all together, unless the image is what is estimated."""
@@ -83,7 +83,7 @@ class Judgement:
         key = next(reversed(self._places()))
         return self._method(member, key, self._places()[key], _Bias())
 
-    def results(self) -> Results:
+    def results(self) -> ConvergenceResults:
         """Everything."""
         session = self._session
         cases, references = session.of(Role.CASE), session.of(Role.REFERENCE)
@@ -102,7 +102,7 @@ class Judgement:
                 methods.append(self._method(member, key, place, judged.get(member.label, {}).get(key, _Bias()), own))
                 points += self._points(member, key, place)
         stood = [self._stood(references[0], key, own[key]) for key in self._places()] if self.ready else []
-        return Results(points, methods, stood)
+        return ConvergenceResults(points, methods, stood)
 
     def _measured(self, member: Member) -> bool:
         """Whether there are figures of a member."""
@@ -160,9 +160,9 @@ class Judgement:
 
     # --- records ------------------------------------------------------------------------------------------------------
 
-    def _samples(self, member: Member, key: str, place: slice) -> Samples:
+    def _samples(self, member: Member, key: str, place: slice) -> MethodSamples:
         rows = np.stack(member.rows)[:, place]
-        return Samples(rows, np.array(member.turns), np.array(member.seconds), self._whole[key])
+        return MethodSamples(rows, np.array(member.turns), np.array(member.seconds), self._whole[key])
 
     def _points(self, member: Member, key: str, place: slice) -> list[PointRecord]:
         if not self._measured(member) or self._whole[key].floor is None:
@@ -183,8 +183,8 @@ class Judgement:
         if biased and references is not None and references[key].biased and key != ALL:
             judge = self._judge(member, key)
             if judge is not None:  # what errors are taken from is biased itself
-                magnitude = Samples(samples.deviations + samples.reference.mean, samples.turns, samples.seconds,
-                                    Reference(self._rows(judge, place)))  # fmt: skip
+                magnitude = MethodSamples(samples.deviations + samples.reference.mean, samples.turns, samples.seconds,
+                                    ReferenceMean(self._rows(judge, place)))  # fmt: skip
         message = bias.message
         if not message and tail_weight(samples.deviations) > TAIL:
             message = HEAVY

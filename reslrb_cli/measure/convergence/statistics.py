@@ -41,7 +41,7 @@ FEWEST_FOR_SLOPE = min(GROUPS)
 
 
 @dataclass(frozen=True)
-class Estimate:
+class JackknifeEstimate:
     """An estimate with its standard error and the degrees of freedom of that."""
 
     value: float
@@ -70,7 +70,7 @@ class Point:
     repeats: int
 
 
-class Reference:
+class ReferenceMean:
     """What errors are taken from: the mean of (K, P) rows, K at least 2."""
 
     def __init__(self, rows: np.ndarray) -> None:
@@ -97,13 +97,13 @@ class Reference:
         return moved, noise, signal
 
 
-class Samples:
+class MethodSamples:
     """Steps (R, P) of one method beside a reference; `turns` (R,) says in which turn each was taken.
 
     `seconds` (T,) are those of one step in each turn.
     """
 
-    def __init__(self, values: np.ndarray, turns: np.ndarray, seconds: np.ndarray, reference: Reference) -> None:
+    def __init__(self, values: np.ndarray, turns: np.ndarray, seconds: np.ndarray, reference: ReferenceMean) -> None:
         self.reference, self.seconds = reference, np.asarray(seconds, np.float64)
         self.deviations = values.astype(np.float64) - reference.mean
         self.turns = np.unique(turns, return_inverse=True)[1]
@@ -135,7 +135,7 @@ class Samples:
             averages, steps = _halved(averages), 2 * steps
         return found
 
-    def slope(self) -> Estimate | None:
+    def slope(self) -> JackknifeEstimate | None:
         """d log RMSE / d log time: -1/2 where steps are independent and unbiased. None where there are too few.
 
         Averages are over steps of one group. Their errors are weighted by how many averages there are of each length.
@@ -164,7 +164,7 @@ class Samples:
         corrected = groups * value - (groups - 1) * left.mean()  # a logarithm of few averages is biased
         return _joined(float(corrected), left, right)
 
-    def efficiency(self, biased: bool = False) -> Estimate | None:
+    def efficiency(self, biased: bool = False) -> JackknifeEstimate | None:
         """Logarithm of 1 / (relative variance * seconds of a step), with squared bias + variance where `biased`.
 
         None where there are too few turns, or no noise at all.
@@ -231,10 +231,10 @@ def _error(squares: np.ndarray, sums: np.ndarray, counts: np.ndarray | int, nois
     return np.asarray(np.maximum(sums / np.square(counts) - variance / counts - noise, 0.0) + variance)
 
 
-def _joined(value: float, left: np.ndarray, right: np.ndarray) -> Estimate:
+def _joined(value: float, left: np.ndarray, right: np.ndarray) -> JackknifeEstimate:
     """With the jackknife's variances of both sides, by Welch and Satterthwaite."""
     sides = [side for side in (left, right) if len(side) > 1]
     variances = [float(jackknife_variance(side)) for side in sides]
     total = sum(variances)
     spread = sum(v**2 / (len(side) - 1) for v, side in zip(variances, sides, strict=True))
-    return Estimate(value, float(np.sqrt(total)), total**2 / spread if spread > 0 else float(len(left) - 1))
+    return JackknifeEstimate(value, float(np.sqrt(total)), total**2 / spread if spread > 0 else float(len(left) - 1))

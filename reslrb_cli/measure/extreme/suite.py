@@ -35,7 +35,7 @@ Scene = Callable[[], dict]
 
 
 @dataclass(frozen=True)
-class Samples:
+class ReferenceGradients:
     """A reference's gradients: (N, P) of seeds of its own, (N, P) of ours (`paired`), or (P,) exact values.
 
     `along` (K, P) are directions in which alone it knows the derivative; None: all entries. By `bias` the reference
@@ -58,9 +58,9 @@ class Stock:
     def reference(self) -> Reference:
         return Reference(self.name)
 
-    def samples(self, case: ExtremeCase, setup: Case) -> Samples:
+    def samples(self, case: ExtremeCase, setup: Case) -> ReferenceGradients:
         tracer = integrator(self.name, **without_roulette(case))
-        return Samples(setup.gradients(tracer, seeds_of(case.seeds, 1), case.spp))
+        return ReferenceGradients(setup.gradients(tracer, seeds_of(case.seeds, 1), case.spp))
 
 
 @dataclass(frozen=True)
@@ -74,12 +74,12 @@ class Twin:
     factors: Mapping[str, float] = field(default_factory=dict)
     reference = Reference.PTRACER
 
-    def samples(self, case: ExtremeCase, setup: Case) -> Samples:
+    def samples(self, case: ExtremeCase, setup: Case) -> ReferenceGradients:
         other = Case(self.scene(), case.keys)
         other.weights = setup.weights
         values = other.gradients(integrator("ptracer", **without_roulette(case)), seeds_of(case.seeds, 1), case.spp)
         scale = [np.full(len(other.initial[key]), self.factors.get(key, 1.0)) for key in case.keys]
-        return Samples(values * np.concatenate(scale))
+        return ReferenceGradients(values * np.concatenate(scale))
 
 
 @dataclass(frozen=True)
@@ -94,14 +94,14 @@ class Differences:
     sides: str = "both"
     reference = Reference.FINITE_DIFFERENCE
 
-    def samples(self, case: ExtremeCase, setup: Case) -> Samples:
+    def samples(self, case: ExtremeCase, setup: Case) -> ReferenceGradients:
         directions = setup.directions(2)
         along = directions if self.sides == "both" else np.abs(directions)
         tracer = integrator("reslrb", **without_roulette(case), **case.way)
         paired = "rr_depth" not in case.options
         chosen = seeds_of(case.seeds, 0 if paired else 1)
         values = setup.differences(tracer, along, chosen, case.spp, self.step, self.sides)
-        return Samples(values, paired=paired, along=along)
+        return ReferenceGradients(values, paired=paired, along=along)
 
 
 @dataclass(frozen=True)
@@ -116,14 +116,14 @@ class Extrapolated:
     left: float = 1e-3
     reference = Reference.FINITE_DIFFERENCE
 
-    def samples(self, case: ExtremeCase, setup: Case) -> Samples:
+    def samples(self, case: ExtremeCase, setup: Case) -> ReferenceGradients:
         along = np.eye(setup.size)
         tracer = integrator("reslrb", **without_roulette(case))
         chosen, steps = seeds_of(case.seeds), (self.step, 2 * self.step)
         near, far = (setup.differences(tracer, along, chosen, case.spp, step) for step in steps)
         values = extrapolated(near, far)
         size = float(np.sqrt(np.mean(np.square(values.mean(0)))))
-        return Samples(values, True, along, bias=np.abs((values - near).mean(0)) / 10 + self.left * size)
+        return ReferenceGradients(values, True, along, bias=np.abs((values - near).mean(0)) / 10 + self.left * size)
 
 
 @dataclass(frozen=True)
@@ -133,8 +133,8 @@ class Exact:
     known: Callable[[], KnownScene]
     reference = Reference.ANALYTIC
 
-    def samples(self, case: ExtremeCase, setup: Case) -> Samples:
-        return Samples(self.known().gradient(setup.weights))
+    def samples(self, case: ExtremeCase, setup: Case) -> ReferenceGradients:
+        return ReferenceGradients(self.known().gradient(setup.weights))
 
 
 @dataclass(frozen=True)
@@ -143,8 +143,8 @@ class Zero:
 
     reference = Reference.ANALYTIC
 
-    def samples(self, case: ExtremeCase, setup: Case) -> Samples:
-        return Samples(np.zeros(setup.size))
+    def samples(self, case: ExtremeCase, setup: Case) -> ReferenceGradients:
+        return ReferenceGradients(np.zeros(setup.size))
 
 
 Source = Stock | Twin | Differences | Extrapolated | Exact | Zero
@@ -400,7 +400,7 @@ def _refusals(weights: np.ndarray, refused: list[int]) -> Comparison:
 
 
 def _comparisons(
-    case: ExtremeCase, setup: Case, name: str, ours: np.ndarray, naive: np.ndarray | None, reference: Samples
+    case: ExtremeCase, setup: Case, name: str, ours: np.ndarray, naive: np.ndarray | None, reference: ReferenceGradients
 ) -> Iterator[tuple[str | None, Reference, Kind, Comparison]]:
     for parameter, columns, shape in _parameters(setup):
         if naive is not None:
