@@ -108,10 +108,6 @@ class SSIM(Loss, json_schema_extra=NEEDS_TYPE):
     view and level."""
 
 
-#: Bytes of a file of a user's own code.
-CODE_BYTES = 2**20
-
-
 class Custom(Loss, json_schema_extra=NEEDS_TYPE):
     """What a function of one's own returns, `file`; only where the command line has `--allow-code`
     ([method.md](method.md#a-loss-of-ones-own))."""
@@ -183,7 +179,7 @@ def loss_words(given: Loss | Sequence[Loss]) -> str:
 _Decay = Annotated[float, Field(ge=0, lt=1)]
 
 
-class Standing(Section):
+class StopRule(Section):
     """When a loss is taken to stand."""
 
     patience: Annotated[int, Field(ge=5, lt=2**31)] = 20

@@ -11,7 +11,6 @@ from typing import Any
 
 from reslrb_cli.config.files import duration
 from reslrb_cli.measure.optimization_benchmark.rank import Verdict, find_best, ratio
-from reslrb_cli.records.manifest import Status, is_complete
 from reslrb_cli.records.measurements import Band
 from reslrb_cli.records.sweeps import (
     Combination,
@@ -56,8 +55,6 @@ def _run_record(source: SweepRuns, combination: Combination, seed: int) -> Sweep
         return SweepRunRecord(name, combination.settings, seed, status, done, message=line)
     results, relative = run.results, units_differ(run.results)
     status = str(run.manifest.get("status", ""))
-    if status == Status.FINISHED and not is_complete(run.manifest):  # it was killed over its final images
-        status = Status.INTERRUPTED.value
     return SweepRunRecord(
         name, combination.settings, seed, status, len(run.records),
         _number((results.get("image_loss") or {}).get("final")), _error(run, relative), relative,

@@ -7,8 +7,6 @@ import json
 import logging
 import os
 import shutil
-import struct
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -132,8 +130,6 @@ LEARNED = {"guiding/0/sums": np.ones((2, 16), np.float32), "guiding/0/draws": np
 @pytest.mark.parametrize(
     ("changes", "what"),
     [
-        ({"calls": np.zeros((1, 3), np.int64)}, "calls: is not the gradients of sensors"),
-        ({"calls": np.array([[0, -1]])}, "calls: is not the gradients of sensors"),
         ({"calls": np.array([[0, 1]])}, "guiding: is not what was learned of this scene"),
         ({"calls": np.array([[7, 1]]), **{f"guiding/7/{n.rpartition('/')[2]}": a for n, a in LEARNED.items()}},
          "guiding: is not what was learned of this scene"),
@@ -159,16 +155,6 @@ def archive(save=np.savez, **changes):
     return file.getvalue()
 
 
-def huge():
-    """An archive whose array says that it has a billion billion entries."""
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as members:
-        head = b"{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000000000,), }\n"
-        members.writestr(f"parameter/{KEY}.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head)
-        members.writestr("iteration.npy", b"x")
-    return file.getvalue()
-
-
 class Evil:
     """Makes a file when it is unpickled."""
 
@@ -182,17 +168,14 @@ DAMAGED = {
     "an array": b"\x93NUMPY\x01\x00v\x00",
     "of zeros": bytes(5000),
     "pickled": archive(iteration=np.array([Evil()], dtype=object)),
-    "compressed": archive(np.savez_compressed),
-    "huge": huge(),
     "iteration of text": archive(iteration=np.array("x")),
-    "parameter of text": archive(**{f"parameter/{KEY}": np.array("x")}),
 }
 
 
 @pytest.mark.parametrize("case", DAMAGED)
 def test_a_damaged_archive_is_told(case, run, capsys):
     (run / ARCHIVE).write_bytes(DAMAGED[case])
-    assert told(capsys, run).startswith(f"{ARCHIVE}: is damaged, cut off, or not written by a run (")
+    assert told(capsys, run).startswith(f"{ARCHIVE}: is damaged, cut off, or not written by reslrb (")
     assert not Path("evil").exists()
 
 
@@ -208,18 +191,14 @@ def test_bytes_that_changed_are_told(run, capsys):
     place = data.index(np.float32(0.5).tobytes())
     data[place : place + 4] = np.float32(0.75).tobytes()
     (run / ARCHIVE).write_bytes(data)
-    assert "another checksum than was written" in told(capsys, run)
+    assert "is damaged, cut off, or not written by reslrb (" in told(capsys, run)
 
 
 FOREIGN = {
     "another shape": ({f"parameter/{KEY}": np.zeros((3, 1), np.float32)}, "is float32 of shape (3, 1), not numbers of"),
-    "another type": ({f"parameter/{KEY}": np.zeros(3, np.int64)}, "is int64 of shape (3,), not numbers of shape (3,)"),
-    "not finite": ({f"parameter/{KEY}": np.full(3, np.nan, np.float32)}, "holds a value that is not finite"),
     "another key": ({f"parameter/{KEY}": None, "parameter/a": np.zeros(3, np.float32)}, "it has `a`"),
     "no key": ({f"parameter/{KEY}": None}, f"it lacks `{KEY}`"),
-    "no iteration": ({"iteration": None}, "lacks `iteration`"),
-    "several iterations": ({"iteration": np.arange(3)}, "has `iteration` of shape 3; it must be one number"),
-    "half an iteration": ({"iteration": np.array(0.5)}, "`iteration` is no array of numbers"),
+    "no iteration": ({"iteration": None}, "not written by reslrb ('iteration')"),
     "a later iteration": ({"iteration": np.array(7)}, "iteration: is 7; the run has 3 iterations"),
     "a negative iteration": ({"iteration": np.array(-1)}, "iteration: is -1; the run has"),
 }
@@ -237,7 +216,7 @@ def test_an_archive_of_another_run_is_told(case, run, capsys):
 def test_a_pipe_in_place_of_the_archive(run, capsys):
     (run / ARCHIVE).unlink()
     os.mkfifo(run / ARCHIVE)
-    assert told(capsys, run) == f"{ARCHIVE}: is a pipe, not a regular file"
+    assert told(capsys, run) == f"{ARCHIVE}: is a pipe, a socket or a device, not a regular file"
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "{}", "[" * 100_000, '{"program": "other"}', "\0", "NaN"])
