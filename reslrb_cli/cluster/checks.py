@@ -1,4 +1,4 @@
-"""The samples of `gradcheck`, and the cases of its suite, on workers (`calls.Workers`).
+"""The samples of `gradcheck`, and the cases of its suite, on workers (`crew.Crew`).
 
 A sample is a function of who takes part, made of an experiment's files, of the steps of finite differences, which are
 chosen where `gradcheck` runs and nowhere else, and of its seed; a case is one of its name.
@@ -18,9 +18,9 @@ import drjit as dr
 
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.cluster.bundle import CONFIG_FILE, Bundle, Values, bundle_of, read_bundle
-from reslrb_cli.cluster.calls import Workers
 from reslrb_cli.cluster.connection import Place, connected
-from reslrb_cli.cluster.worker import Opening
+from reslrb_cli.cluster.crew import Crew
+from reslrb_cli.cluster.worker import Anywhere, Opening
 from reslrb_cli.config.loader import dump, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
@@ -33,7 +33,7 @@ Stop = Callable[[], bool]
 
 
 @dataclass(frozen=True)
-class ChosenSteps:
+class Steps:
     """The steps that finite differences take, by parameter and way (`sampling.steps_of`)."""
 
     steps: Mapping[str, Sequence[Step]]
@@ -50,22 +50,22 @@ class ChosenSteps:
 
 def participants_in(
     folder: Path, threads: int, variant: str, allows_code: bool, settings: Mapping[str, Any]
-) -> Participants:
-    """Who takes part, of the experiment in `folder`. `settings` are the others of `Settings`."""
+) -> tuple[Participants, dict[str, float]]:
+    """Who takes part, of the experiment in `folder`; no kernel is warm. `settings` are the others of `Settings`."""
     set_variant(variant)
     listed = [_with_file(case, lambda file: f"{folder / file}") for case in settings["integrators"]]
     config, initial = _read(folder)
     told = {**settings, "integrators": listed, "initial": initial}
     participants = Participants(Settings(config.with_code(allows_code), **told))
     _with_threads(threads)
-    return participants
+    return participants, {}
 
 
-def nothing_in(folder: Path, threads: int, variant: str) -> Stop:
+def nothing_in(folder: Path, threads: int, variant: str) -> tuple[Stop, dict[str, float]]:
     """What a case of the suite takes beside its name: whether it is to stop, which it is not."""
     set_variant(variant)
     _with_threads(threads)
-    return lambda: False
+    return lambda: False, {}
 
 
 def _with_threads(threads: int) -> None:
@@ -104,22 +104,22 @@ def check_shareable(settings: Settings) -> None:
 def samples_at(
     settings: Settings, participants: Participants, place: Place, variant: str, threads: int | None = None
 ) -> Iterator[Callable[..., Any]]:
-    """What takes samples of `participants` (`sampling.Engine`) on the workers at a place; raises as `Workers`."""
-    opening, bundle = _opening_of(settings, participants, variant, threads or place.threads, place.address is None)
-    with connected(place) as (client, _), Workers(client, opening, bundle.files) as workers:
+    """What takes samples of `participants` (`sampling.Engine`) on the workers at a place; raises as `Crew.start`."""
+    opening, bundle = _opening_of(settings, participants, variant, own=place.address is None)
+    with _crew_at(place, opening, bundle.files, threads) as crew:
 
         def take(
             participants: Participants, function: Callable[..., Any], work: Sequence[tuple[Any, ...]]
         ) -> Iterator[tuple[int, Any]]:
+            kind, of, _ = work[0]
             chosen = steps_of(participants, participants.directions)
-            return workers.run(function, work, ChosenSteps(chosen, repr(chosen)))
+            steps = Steps(chosen, repr(chosen))
+            return crew.run(function, work, steps, cold=f"{kind} {of}")
 
         yield take
 
 
-def _opening_of(
-    settings: Settings, participants: Participants, variant: str, threads: int | None, own: bool
-) -> tuple[Opening, Bundle]:
+def _opening_of(settings: Settings, participants: Participants, variant: str, own: bool) -> tuple[Opening, Bundle]:
     """What workers need to have the same participants, `own`: which are this command's."""
     config = settings.config
     built_in = config.scene.file == small.FILE
@@ -133,16 +133,23 @@ def _opening_of(
         "named": settings.named,
     }
     asks = config.allows_code and not own
-    return Opening(bundle.digest(), participants_in, (variant, config.allows_code, sent), threads, asks), bundle
+    return Opening(bundle.digest(), participants_in, (variant, config.allows_code, sent), asks_for_code=asks), bundle
 
 
 @contextlib.contextmanager
 def cases_at(place: Place, variant: str, threads: int | None = None) -> Iterator[Callable[..., Any]]:
     """What runs cases (`extreme.case_records`, as `shards.serially`) on the workers at a place; raises as above."""
-    opening = Opening(Bundle().digest(), nothing_in, (variant,), threads or place.threads)
-    with connected(place) as (client, _), Workers(client, opening, {}) as workers:
+    with _crew_at(place, Opening(Bundle().digest(), nothing_in, (variant,)), {}, threads) as crew:
 
         def run(stop: Stop, function: Callable[..., Any], work: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:
-            return workers.run(function, work)
+            return crew.run(function, work, Anywhere(), cold="of the suite")
 
         yield run
+
+
+@contextlib.contextmanager
+def _crew_at(place: Place, opening: Opening, files: Mapping[str, bytes], threads: int | None) -> Iterator[Crew]:
+    with connected(place) as (client, _):
+        crew = Crew(client, opening, files, threads)
+        crew.start()
+        yield crew

@@ -60,11 +60,6 @@ OWN_SETTINGS = {
 }
 
 
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 @dataclass(frozen=True)
 class Place:
     """So many `workers` of this machine, or the scheduler at `address`."""
@@ -92,11 +87,6 @@ class Place:
 
     def __str__(self) -> str:
         return self.address or f"local:{self.workers}"
-
-    @property
-    def threads(self) -> int | None:
-        """The threads of each worker: of this machine's its share of the cores; None elsewhere."""
-        return max(cores() // self.workers, 1) if self.workers else None
 
     def check(self) -> None:
         """Raise ConfigError without certificates, and MachineError where the scheduler does not answer."""

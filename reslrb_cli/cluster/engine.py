@@ -1,8 +1,7 @@
-"""The shards of a run's steps on workers (`calls.Workers`): what they assemble, and where its parameters stand.
+"""The shards of a run's steps on workers (`crew.Crew`): what they assemble, and where its parameters stand.
 
-A call is a pure function of an experiment (files, by their digest), where its parameters and tables stand
-(`StepContext`), a shard and its dL/dI, to NumPy arrays. Which worker computes it, how often, and how many workers there
-are, changes nothing.
+A call is a pure function of an experiment (files, by their digest), where its parameters and tables stand (`Standing`),
+a shard and its dL/dI, to NumPy arrays: which worker computes it, how often, and how many there are, is nothing to it.
 Optimiser, checkpoint and page stay where `optimize` runs.
 
 Imports dask: for those that `--cluster` has asked for it.
@@ -12,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,17 +22,18 @@ import numpy as np
 
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.cluster.bundle import Bundle, bundle_of, read_bundle
-from reslrb_cli.cluster.calls import Workers
 from reslrb_cli.cluster.connection import Place, connected
+from reslrb_cli.cluster.crew import Crew
 from reslrb_cli.cluster.worker import Opening
 from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.memory import fit_memory
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.shards import Task, make_tasks, shard_gradient, shard_image
 from reslrb_cli.optimization.state import Settled, begin_as, decide_as, guiding_of, restore_tables
 from reslrb_cli.optimization.views import set_targets, target_arrays
 from reslrb_cli.records.checkpoint import STATE_FILE, write_archive
-from reslrb_cli.records.clock import SharedTime
+from reslrb_cli.records.clock import SharedTime, WorkerTime
 from reslrb_cli.records.tree import Stored, like, to_array
 from reslrb_cli.runs.prepare import RunProgress, digests
 
@@ -43,7 +44,7 @@ TARGETS_FILE = "targets.npz"
 
 
 @dataclass(frozen=True)
-class StepContext:
+class Standing:
     """Where a step's parameters and tables stand: values as the optimiser has them, and what guided emission has
     learned (`Guiding.state`); `digest` is of both."""
 
@@ -53,13 +54,13 @@ class StepContext:
     learned: dict[str, Array]
 
     @staticmethod
-    def of(problem: Problem) -> StepContext:
+    def of(problem: Problem) -> Standing:
         """That of a problem now."""
         guiding = guiding_of(problem)
         calls, learned = ({}, {}) if guiding is None else guiding.state()
         keys = problem.optimizer.keys()
         values = {key: to_array(problem.optimizer[key]) for key in keys}
-        return StepContext(_digest(repr(calls), values, learned), values, dict(calls), learned)
+        return Standing(_digest(repr(calls), values, learned), values, dict(calls), learned)
 
     def take(self, problem: Problem) -> None:
         """Bring a problem there."""
@@ -83,8 +84,9 @@ def _digest(text: str, *mappings: Mapping[str, Array]) -> str:
 # --- on a worker ------------------------------------------------------------------------------------------------------
 
 
-def assembled(folder: Path, threads: int, allows_code: bool) -> Problem:
-    """The problem as the run has it, with its targets and what it has settled, from the experiment's files."""
+def assembled(folder: Path, threads: int, allows_code: bool) -> tuple[Problem, dict[str, float]]:
+    """The problem as the run has it, with its targets and what it has settled, from the experiment's files, with its
+    kernels warm; and the seconds that a shard then takes."""
     stored = Stored(folder / STATE_FILE)
     with np.load(folder / TARGETS_FILE) as targets:
         set_variant(stored.read(Settled).variant)
@@ -95,13 +97,29 @@ def assembled(folder: Path, threads: int, allows_code: bool) -> Problem:
         set_targets(problem.views, dict(targets))
     dr.sync_thread()
     dr.set_thread_count(threads)
-    return problem
+    return problem, _warmed(problem)
+
+
+def _warmed(problem: Problem) -> dict[str, float]:
+    """Compile, and record, what the shards of a step need; returns the seconds of one without that, by function."""
+    task = make_tasks(problem, 0)[0]
+    calls: list[tuple[Callable[..., Any], tuple[Task | Array, ...]]] = [(shard_gradient, (task,))]
+    if problem.config.in_rounds:
+        image = shard_image(problem, task)
+        calls = [(shard_image, (task,)), (shard_gradient, (task, np.zeros_like(image)))]
+    found = {}
+    for function, given in calls:
+        for _ in range(3):  # compiled, recorded, replayed
+            begin = time.perf_counter()
+            function(problem, *given)
+            found[function.__name__] = time.perf_counter() - begin
+    return found
 
 
 # --- where `optimize` runs --------------------------------------------------------------------------------------------
 
 
-def opening_of(course: RunProgress, folder: Path, threads: int | None, own: bool) -> tuple[Opening, Bundle]:
+def opening_of(course: RunProgress, folder: Path, own: bool) -> tuple[Opening, Bundle]:
     """What workers need of a run, `own`: which are this run's; `folder` is to write into.
 
     Raises OSError, and ConfigError where a file has changed since the run began.
@@ -116,34 +134,42 @@ def opening_of(course: RunProgress, folder: Path, threads: int | None, own: bool
     for name in (STATE_FILE, TARGETS_FILE):
         bundle.files[name] = (folder / name).read_bytes()
     allows_code = config.allows_code
-    return Opening(bundle.digest(), assembled, (allows_code,), threads, allows_code and not own), bundle
+    return Opening(bundle.digest(), assembled, (allows_code,), asks_for_code=allows_code and not own), bundle
 
 
 class Engine:
     """Computes shards on workers (`shards.Engine`), who are at a place that is called `where`."""
 
-    def __init__(self, workers: Workers, where: str) -> None:
-        self.workers, self.where = workers, where
+    def __init__(self, crew: Crew, where: str) -> None:
+        self.crew, self.where = crew, where
 
     def __call__(
         self, problem: Problem, function: Callable[..., Any], work: Sequence[tuple[Any, ...]]
     ) -> Iterator[tuple[int, Any]]:
         """Yields place and result of each call as they come, and raises what one raised."""
-        return self.workers.run(function, work, StepContext.of(problem))
+        return self.crew.run(function, work, self.standing(problem))
+
+    @staticmethod
+    def standing(problem: Problem) -> Standing:
+        """What each worker is told before a round."""
+        return Standing.of(problem)
 
     def spent(self) -> SharedTime:
         """The time that it has taken by now."""
-        own = self.workers
-        return SharedTime((self.where,), own.wall, own.computing, own.waiting, dict(own.by_worker))
+        rounds, workers = self.crew.spent, self.crew.by_worker.items()
+        by_worker = {name: WorkerTime(one.calls, one.computing + one.standing, one.again) for name, one in workers}
+        computing = rounds.computing + rounds.standing
+        return SharedTime((self.where,), rounds.wall, computing, rounds.waiting, by_worker)
 
 
 @contextlib.contextmanager
 def engine_at(course: RunProgress, place: Place, threads: int | None = None) -> Iterator[Engine]:
     """The workers at a place, with a run's experiment; each with so many threads, or its share of the cores.
 
-    Raises MachineError where there are none.
+    Raises MachineError where there are none, or none that can be used.
     """
     with connected(place) as (client, folder):
-        opening, bundle = opening_of(course, folder, threads or place.threads, own=place.address is None)
-        with Workers(client, opening, bundle.files) as workers:
-            yield Engine(workers, str(place))
+        opening, bundle = opening_of(course, folder, own=place.address is None)
+        crew = Crew(client, opening, bundle.files, threads)
+        crew.start()
+        yield Engine(crew, str(place))

@@ -1,28 +1,25 @@
-"""What a worker does: it opens an experiment, brings it to where a round of calls has it, and computes calls.
+"""What a worker does: it comes to what it works on, stands where a round of calls has it stand, and performs calls.
 
-A worker is sent the experiment's files once (`Files`). Its first call makes a state of them (`Opening`), and keeps it.
-A call is a function of that state, and of where it stands (`Context`), to a value that can be sent.
+A worker first comes to what it works on (`Opening`): it is sent files, once, and a function makes a state of them,
+which it keeps. A call is a function of that state, and of where it stands (`Context`), to a value that can be sent.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from distributed import Worker, WorkerPlugin, get_worker
+from distributed import get_worker
 
 from reslrb_cli.cluster.bundle import unpack
-from reslrb_cli.cluster.connection import cores
 from reslrb_cli.errors import (
     ConfigError,
     MachineError,
-    OutOfMemory,
     ReslrbError,
     describe,
     is_machine_fault,
@@ -44,133 +41,100 @@ class Context(Protocol):
 
 
 @dataclass(frozen=True)
+class Anywhere:
+    """Where workers stand whose calls are functions of their arguments alone (`Context`)."""
+
+    digest: str = "anywhere"
+
+    def take(self, state: Any) -> None:
+        """Leave the state as it is."""
+
+
+@dataclass(frozen=True)
 class Opening:
     """What workers work on: `function(folder, threads, *arguments)` makes the state of the files in a folder.
 
-    `digest` is that of the files. `threads` is the number of threads of each worker; None: all cores that it may use.
-    `asks_for_code`: whether users' own code is to run, on workers that the run has not started itself.
+    It returns that, and the seconds that a call of each function takes whose kernels it has warmed, by name. `digest`
+    is of the files. `asks_for_code`: whether users' own code is to run, and the workers are not this run's own.
     """
 
     digest: str
-    function: Callable[..., Any]
+    function: Callable[..., tuple[Any, dict[str, float]]]
     arguments: tuple[Any, ...] = ()
-    threads: int | None = None
     asks_for_code: bool = False
     versions: Mapping[str, str] = field(default_factory=versions)
 
 
-class Files(WorkerPlugin):
-    """The files of an opening, which dask sends to each worker, also to those that come later."""
-
-    def __init__(self, digest: str, files: Mapping[str, bytes]) -> None:
-        self.name = f"reslrb-{secrets.token_hex(8)}"  # of this run alone, which forgets it in the end
-        self._digest, self._files = digest, files
-
-    def setup(self, worker: Worker) -> None:
-        """Write them into a folder that dask removes with the worker."""
-        unpack(self._files, _folder(worker, self._digest))
-
-
-def _folder(worker: Worker, digest: str) -> Path:
-    return Path(worker.local_directory) / f"reslrb-{digest}"
-
-
 @dataclass
 class _State:
-    """What a worker works on, the seconds that opening it took, and the digest of where it stands."""
+    """What a worker works on, and the digest of where it stands."""
 
     opening: str
     value: Any
-    seconds: float
     stands: str = ""
 
 
 _state: _State | None = None
-_context: Context | None = None
 
 #: In a worker's environment: 1 where users' own code may run there, if whoever runs the experiment allows it, too.
 ALLOW_CODE = "RESLRB_ALLOW_CODE"
 
 
 @dataclass(frozen=True)
-class Answer:
-    """The value of a call, the seconds that it took to compute, and those that the worker took to open the experiment;
-    `worker` is its address."""
+class Reply:
+    """What a worker says; `worker` is its address."""
 
     worker: str
-    name: str
-    value: Any
-    seconds: float
-    opening_s: float
 
 
 @dataclass(frozen=True)
-class Lacks:
-    """What a worker says that does not have the context of a call."""
+class Answer(Reply):
+    """The value of a call, and the seconds that it took to compute."""
 
-    worker: str
-
-
-def keep_context(context: Context) -> None:
-    """Have this worker keep the context of the calls that come next."""
-    global _context
-    _context = context
+    value: Any
+    seconds: float
 
 
-def perform(opening: Opening, context: str, function: Callable[..., Any], arguments: Sequence[Any]) -> Answer | Lacks:
-    """Call `function` with the state, which stands at the context of that digest ("": anywhere), and `arguments`.
+@dataclass(frozen=True)
+class Lacks(Reply):
+    """What a worker needs first: the opening's `files`, the `opening` itself, or the `context`."""
 
-    Raises MachineError or OutOfMemory if the machine is at fault; the next call then opens the experiment anew.
-    """
+    what: str
+
+
+@dataclass(frozen=True)
+class Fault(Reply):
+    """What is wrong with a worker's machine, and not with what was asked; `memory`: that is out; `stays`: also where
+    the worker is started anew."""
+
+    text: str
+    memory: bool = False
+    stays: bool = False
+
+
+def open_state(opening: Opening, files: Mapping[str, bytes] | None, threads: int) -> Reply:
+    """Have this worker come to what it works on."""
     global _state
-    worker, threads = get_worker(), opening.threads or cores()
-    if context and (_context is None or _context.digest != context):
-        return Lacks(worker.address)
-    try:
-        if _state is None or _state.opening != opening.digest:
-            _state = None
-            _state = _open(opening, worker, threads)
-        if context and _context is not None and _state.stands != context:
-            _state.stands = ""
-            _context.take(_state.value)
-            _state.stands = context
-        begin = time.perf_counter()
-        value = function(_state.value, *arguments)
-        return Answer(worker.address, _name(worker), value, time.perf_counter() - begin, _state.seconds)
-    except Exception as error:
-        if is_out_of_memory(error):
-            _state = None
-            raise OutOfMemory(one_line(str(error))) from None
-        if isinstance(error, MachineError | OSError) or is_machine_fault(error):
-            _state = None
-            raise MachineError(one_line(str(error))) from None
-        if isinstance(error, ConfigError):  # which cannot be pickled
-            raise ReslrbError(str(error)) from None
-        raise
-
-
-def _open(opening: Opening, worker: Worker, threads: int) -> _State:
-    begin, here, name = time.perf_counter(), versions(), _name(worker)
-    for package, version in opening.versions.items():
-        if here.get(package) != version:
-            wrong = f"has {package} {here.get(package)}, and the run {version}: install the same"
-            raise MachineError(f"{name} {wrong}")
+    begin, me = time.perf_counter(), get_worker().address
+    here = versions()
+    for name, version in opening.versions.items():
+        if here.get(name) != version:
+            return Fault(me, f"has {name} {here.get(name)}, and the run {version}: install the same", stays=True)
     if opening.asks_for_code and os.environ.get(ALLOW_CODE) != "1":
-        raise MachineError(f"{name} runs no code of users' own: start it with {ALLOW_CODE}=1 in its environment")
-    _take_device(worker.name)
+        return Fault(me, f"runs no code of users' own: start it with {ALLOW_CODE}=1 in its environment", stays=True)
+    folder = Path(get_worker().local_directory) / f"reslrb-{opening.digest}"  # dask removes it with the worker
+    if files is None and not folder.is_dir():
+        return Lacks(me, "files")
+    _state = None
+    _take_device(get_worker().name)
     logging.getLogger("reslrb_cli").addHandler(logging.NullHandler())  # the run has said what there is to say
     try:
-        value = opening.function(_folder(worker, opening.digest), threads, *opening.arguments)
+        unpack(files or {}, folder)
+        value, seconds = opening.function(folder, threads, *opening.arguments)
     except Exception as error:  # the run could load it: it is this machine that cannot
-        if is_out_of_memory(error):
-            raise
-        raise MachineError(f"{name} cannot open the experiment: {describe(error)}") from None
-    return _State(opening.digest, value, time.perf_counter() - begin)
-
-
-def _name(worker: Worker) -> str:
-    host = worker.address.rpartition(":")[0].removeprefix("tls://")
-    return f"worker {worker.name} ({host})"
+        return Fault(me, f"cannot: {describe(error)}", is_out_of_memory(error))
+    _state = _State(opening.digest, value)
+    return Answer(me, seconds, time.perf_counter() - begin)
 
 
 def _take_device(name: object) -> None:
@@ -179,3 +143,49 @@ def _take_device(name: object) -> None:
     found = listed.split(",") if listed else [str(k) for k, _ in enumerate(Path("/proc/driver/nvidia/gpus").glob("*"))]
     if isinstance(name, int) and len(found) > 1:
         os.environ["CUDA_VISIBLE_DEVICES"] = found[name % len(found)]
+
+
+def stand(opening: str, context: Context) -> Reply:
+    """Bring the state to `context`."""
+    begin, me = time.perf_counter(), get_worker().address
+    if _state is None or _state.opening != opening:
+        return Lacks(me, "opening")
+    if _state.stands != context.digest:
+        _state.stands = ""
+        try:
+            context.take(_state.value)
+        except Exception as error:
+            return _fault(error)
+        _state.stands = context.digest
+    return Answer(me, None, time.perf_counter() - begin)
+
+
+def perform(opening: str, context: str, function: Callable[..., Any], arguments: Sequence[Any]) -> Reply:
+    """What `function` says of the state, which stands at `context`, and of `arguments`."""
+    begin, me = time.perf_counter(), get_worker().address
+    if _state is None or _state.opening != opening:
+        return Lacks(me, "opening")
+    if _state.stands != context:
+        return Lacks(me, "context")
+    try:
+        return Answer(me, function(_state.value, *arguments), time.perf_counter() - begin)
+    except Exception as error:
+        return _fault(error)
+
+
+def _fault(error: Exception) -> Fault:
+    """What a worker's machine failed in. Raises what is the call's own fault, as an error that can be sent."""
+    me = get_worker().address
+    if is_out_of_memory(error):
+        return Fault(me, one_line(str(error)), memory=True)
+    if isinstance(error, MachineError | OSError) or is_machine_fault(error):
+        return Fault(me, one_line(str(error)))
+    if isinstance(error, ConfigError):
+        raise ReslrbError(str(error)) from None
+    raise error
+
+
+def whereabouts() -> tuple[str, tuple[int, ...]]:
+    """This process's machine, and the cores that it may use."""
+    cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+    return os.uname().nodename, tuple(sorted(cores))

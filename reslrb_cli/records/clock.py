@@ -67,13 +67,15 @@ class StepClock:
 
 @dataclass(frozen=True)
 class WorkerTime:
-    """What one worker did: calls that it answered, and seconds of computing them."""
+    """What one worker did: calls that it answered, seconds of computing them, and how many of what it had were asked of
+    others too, since it said nothing for long."""
 
     calls: int = 0
     computing_s: float = 0.0
+    again: int = 0
 
     def __add__(self, other: WorkerTime) -> WorkerTime:
-        return WorkerTime(self.calls + other.calls, self.computing_s + other.computing_s)
+        return WorkerTime(self.calls + other.calls, self.computing_s + other.computing_s, self.again + other.again)
 
 
 @dataclass(frozen=True)

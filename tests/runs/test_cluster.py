@@ -24,7 +24,7 @@ from runs.hosts import hosts, make_certificates, missing
 from reslrb_cli.cluster import bundle
 from reslrb_cli.cluster.connection import Place
 from reslrb_cli.config.loader import load
-from reslrb_cli.errors import ConfigError, MachineError
+from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.state import guiding_of
@@ -193,35 +193,36 @@ def as_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker, "_state", None)
 
 
-def reads(folder: Path, threads: int) -> str:
-    return (folder / "a").read_text()
+def reads(folder: Path, threads: int) -> tuple[str, dict[str, float]]:
+    return (folder / "a").read_text(), {"reads": 0.5}
 
 
-def test_a_worker_says_what_is_wrong(as_worker: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It has another version, may not run code, lacks the context of a call, or cannot read the experiment."""
-    me = worker.get_worker()
-    worker.Files("1", {"a": b"one"}).setup(me)
-
-    def call(opening: object, context: str = "") -> object:
-        return worker.perform(opening, context, str.upper, ())
-
-    with pytest.raises(MachineError, match=r"^worker 1 \(here\) has mitsuba .*, and the run 0.1: install the same$"):
-        call(worker.Opening("1", reads, versions={"mitsuba": "0.1"}))
+def test_a_worker_says_what_it_lacks(as_worker: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another version and code that is not asked for stand against it for good; files are sent once."""
+    opening = worker.Opening("1", reads)
+    other = worker.Opening("1", reads, versions={"mitsuba": "0.1"})
+    said = worker.open_state(other, None, 1)
+    assert said.stays
+    assert said.text.startswith("has mitsuba ")
+    assert said.text.endswith("and the run 0.1: install the same")
     asking = worker.Opening("1", reads, asks_for_code=True)
-    with pytest.raises(MachineError, match="runs no code of users' own"):
-        call(asking)
+    assert worker.open_state(asking, None, 1).stays
     monkeypatch.setenv(worker.ALLOW_CODE, "1")
-    assert call(asking).value == "ONE"
-    assert call(asking, "elsewhere") == worker.Lacks("tls://here:1")
-    with pytest.raises(MachineError, match=r"^worker 1 \(here\) cannot open the experiment: .*No such file"):
-        call(worker.Opening("2", reads))
+    assert worker.open_state(asking, None, 1) == worker.Lacks("tls://here:1", "files")
+    assert worker.perform("1", "", reads, ()) == worker.Lacks("tls://here:1", "opening")
+    assert worker.open_state(opening, {"a": b"one"}, 1).value == {"reads": 0.5}
+    assert worker.open_state(opening, None, 1).value == {"reads": 0.5}
+    assert worker.perform("1", "elsewhere", reads, ()) == worker.Lacks("tls://here:1", "context")
+    assert worker.perform("1", "", str.upper, ()).value == "ONE"
+    broken = worker.open_state(worker.Opening("2", reads), {"b": b""}, 1)
+    assert not broken.stays
+    assert "No such file" in broken.text
 
 
 @pytest.mark.parametrize(("shown", "seen"), [("3,5", "5"), ("7", "7"), ("0,1,2", "1")])
 def test_workers_see_a_gpu_each(as_worker: None, monkeypatch: pytest.MonkeyPatch, shown: str, seen: str) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", shown)
-    worker.Files("1", {"a": b""}).setup(worker.get_worker())
-    worker.perform(worker.Opening("1", reads), "", str.upper, ())
+    worker.open_state(worker.Opening("1", reads), {"a": b""}, 1)
     assert os.environ["CUDA_VISIBLE_DEVICES"] == seen
 
 
@@ -235,7 +236,7 @@ def beside(folder: Path, workers: int, iterations: int, *sets: str):
     alone, course = both(folder, *sets)
     with engine.engine_at(course, Place(workers), threads=1) as local:
         course.compute_with(local)
-        yield course, local.workers
+        yield course, local.crew
         together = end(course)
     assert {name: array.tobytes() for name, array in alone.items()} == {
         name: array.tobytes() for name, array in together.items()
@@ -292,10 +293,40 @@ def test_workers_that_fail_are_started_anew(
             longest, before = max(longest, time.monotonic() - before), time.monotonic()
             course.state = state
             if state.iteration == 2:
-                found.client.run(fault, workers=found._here()[:1])
+                found.client.run(fault, workers=found.ready[:1])
             if state.iteration == 6:
                 break
     assert longest < 60
+
+
+@pytest.mark.long
+def test_who_takes_twenty_times_as_long_is_not_waited_for(experiment: Path) -> None:
+    """A worker that has a twentieth of its time, from the second iteration on."""
+    stopped = threading.Event()
+
+    def slow(pid: int) -> None:
+        while not stopped.is_set():
+            os.kill(pid, signal.SIGSTOP)
+            time.sleep(0.19)
+            os.kill(pid, signal.SIGCONT)
+            time.sleep(0.01)
+
+    with beside(experiment, 3, 30, "run.spp=16384") as (course, found):
+        times: list[float] = []
+        before = time.monotonic()
+        for state, _ in iterate(course.stages, course.state):
+            times.append(time.monotonic() - before)
+            before = time.monotonic()
+            course.state = state
+            if state.iteration == 6:
+                pid = found.client.run(os.getpid)[found.ready[0]]
+                threading.Thread(target=slow, args=(pid,), daemon=True).start()
+            if state.iteration == 24:
+                break
+        stopped.set()
+        again = found.spent.again
+    assert again > 0
+    assert np.median(times[6:]) < 6 * np.median(times[2:6])
 
 
 @pytest.mark.long
@@ -341,7 +372,7 @@ def test_memory_does_not_grow(experiment: Path) -> None:
         with one_thread():
             for state, _ in iterate(course.stages, course.state):
                 if state.iteration in (200, 2000):
-                    pids = [os.getpid(), *sorted(local.workers.client.run(os.getpid).values())]
+                    pids = [os.getpid(), *sorted(local.crew.client.run(os.getpid).values())]
                     sizes[state.iteration] = [psutil.Process(pid).memory_info().rss for pid in pids]
     growth = [late / early for early, late in zip(sizes[200], sizes[2000], strict=True)]
     assert max(growth) < 1.05, growth

@@ -1,0 +1,435 @@
+"""Calls on the workers of a dask scheduler: who is there, what comes back, and what becomes of those that fail.
+
+dask hands calls out to the workers that are ready, and sends those again that a worker has died of. What is ours is to
+ask again: of a worker that says nothing for three times as long as calls take, another is asked, and the first answer
+counts; one that says nothing for much longer has dask start it anew. What a worker does: `worker.py`.
+
+Everything goes by way of the scheduler: nobody needs a way to a worker.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import statistics
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from distributed import CancelledError, Client, Future, KilledWorker
+from distributed.comm import CommClosedError
+
+from reslrb_cli.cluster.worker import (
+    Answer,
+    Context,
+    Fault,
+    Lacks,
+    Opening,
+    Reply,
+    open_state,
+    perform,
+    stand,
+    whereabouts,
+)
+from reslrb_cli.errors import MachineError, OutOfMemory
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+#: How many times as long as its calls take a worker may say nothing, and seconds beside that, until another is asked.
+LATE, LATE_S = 3.0, 0.2
+#: The same until dask is asked to start it anew, where others are there and where nobody is; seconds that dask has.
+HUNG, HUNG_ALONE, HUNG_S, RESTART_S = 30.0, 10.0, 20.0, 20.0
+#: Seconds that a worker may take to come to what it works on, while kernels are compiled; and, once one is there, how
+#: many times as long as that one and seconds beside that the others are waited for.
+OPENING_S, OTHERS, OTHERS_S = 900.0, 2.0, 10.0
+#: Seconds for which nobody may be there, and between looks at who is.
+NOBODY_S, LOOK_S = 60.0, 1.0
+#: How many workers may fail in one call by a fault of their machine's; how often one is started anew for such faults.
+FAULTS, RESTARTS = 3, 3
+#: Seconds for which a value may be on its way, again and again: each time from the beginning.
+GATHER_S = (5.0, 15.0, 60.0, 240.0)
+#: How often what has got lost is sent again in one round.
+LOSSES = 100
+
+
+@dataclass
+class Spent:
+    """Seconds of a worker, or of all rounds of calls: `computing` and before that `standing`, being brought to where
+    calls are of, of a round the mean of its workers; `waiting`, which these did for the one that had most; `wall`, from
+    the first question to the last answer, of which the rest went into sending. `calls` were answered, `again` were
+    asked for once more."""
+
+    wall: float = 0.0
+    computing: float = 0.0
+    standing: float = 0.0
+    waiting: float = 0.0
+    calls: int = 0
+    again: int = 0
+
+
+@dataclass
+class _Round:
+    """Calls that are being answered: what is `left`, by place, and for each future its place and who may answer."""
+
+    function: Callable[..., Any]
+    context: Context
+    left: dict[int, Sequence[Any]]
+    flying: dict[Future, tuple[int, frozenset[str]]] = field(default_factory=dict)
+    faults: Counter[int] = field(default_factory=Counter)
+    cold: str | None = None
+    losses: int = 0
+    size: int = 0
+    computing: dict[str, float] = field(default_factory=dict)
+    standing: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """What calls that take about as long have in common."""
+        return self.function.__name__ if self.cold is None else f"{self.function.__name__} {self.cold}"
+
+    def answerable(self, workers: Mapping[str, Any]) -> set[int]:
+        """The places that one of these workers may answer."""
+        return {place for place, allowed in self.flying.values() if not allowed.isdisjoint(workers)}
+
+
+class Crew:
+    """The workers of a client that have come to what `opening` says; `files` are sent to those that have none.
+
+    `threads` is the number of each worker's, None: its share of the cores that it may use.
+    """
+
+    def __init__(
+        self, client: Client, opening: Opening, files: Mapping[str, bytes] | None = None, threads: int | None = None
+    ) -> None:  # fmt: skip
+        self.client, self.opening, self._files, self._threads = client, opening, files, threads
+        self._done: queue.SimpleQueue[Future] = queue.SimpleQueue()
+        self._opening: dict[str, tuple[Future, float]] = {}
+        self._own_threads: dict[str, int] = {}
+        #: When each worker that has come last said anything, or was asked; `_late` are those that take long.
+        self._heard: dict[str, float] = {}
+        self._late: set[str] = set()
+        self._left_out: dict[str, str] = {}  # and why
+        self._anew: set[str] = set()  # those that are being started anew
+        self._restarts: Counter[str] = Counter()
+        self._looked = -LOOK_S
+        self._nobody_since: float | None = None
+        self._seconds: dict[str, deque[float]] = {}  # from one answer of a worker to its next, by function
+        self._names: dict[str, str] = {}
+        self.spent, self.by_worker = Spent(), dict[str, Spent]()
+
+    # --- who there is -------------------------------------------------------------------------------------------------
+
+    @property
+    def ready(self) -> list[str]:
+        """The workers that are asked."""
+        return [worker for worker in self._heard if worker not in self._late] or [*self._heard]
+
+    def start(self) -> None:
+        """Wait until one is ready, and some time for the others.
+
+        Raises MachineError where there is none, with what is wrong with those that are not, and what is wrong with the
+        experiment.
+        """
+        begin = time.monotonic()
+        first_s: float | None = None
+        while first_s is None or (self._opening and time.monotonic() - begin < OTHERS * first_s + OTHERS_S):
+            self._look()
+            if (future := self._next(LOOK_S / 4)) is not None:
+                self._take_opened(future)
+            if self._heard and first_s is None:
+                first_s = time.monotonic() - begin
+
+    def _next(self, seconds: float) -> Future | None:
+        """The next future that is done, if one is within so many seconds."""
+        try:
+            return self._done.get(timeout=seconds)
+        except queue.Empty:
+            return None
+
+    def _look(self) -> None:
+        """See who has come and gone; those that have come are opened. Raises MachineError where nobody is there."""
+        now = time.monotonic()
+        if now - self._looked < LOOK_S:
+            return
+        self._looked = now
+        here = self._scheduler(lambda: self.client.scheduler_info(n_workers=-1))["workers"]
+        known = {*self._heard, *self._opening, *self._left_out, *self._anew}
+        for gone in known.difference(here):
+            self._forget(gone)
+            self._left_out.pop(gone, None)
+            self._anew.discard(gone)
+        new = [worker for worker in here if worker not in known]
+        if new:
+            self._open(new, here)
+        for worker, (_, began) in [*self._opening.items()]:
+            if now - began > OPENING_S:
+                self._leave_out(worker, f"did not come to the experiment within {OPENING_S:.0f} s")
+        self._nobody_since = None if self._heard or self._opening else self._nobody_since or now
+        wait_s = 0 if self._left_out and not self._restarts else NOBODY_S
+        if self._nobody_since is not None and now - self._nobody_since > wait_s:
+            raise MachineError(self._nobody())
+
+    def _scheduler(self, call: Callable[[], T]) -> T:
+        """What the scheduler answers. Raises MachineError where it has gone."""
+        try:
+            if self.client.status == "running" and self.client.scheduler is not None:
+                return call()
+        except (OSError, CancelledError, TimeoutError):
+            pass
+        raise MachineError("--cluster: the scheduler has gone; --resume goes on where the run was")
+
+    def _forget(self, worker: str) -> None:
+        self._heard.pop(worker, None)
+        self._late.discard(worker)
+        if worker in self._opening:
+            self._opening.pop(worker)[0].release()
+
+    def _open(self, workers: Sequence[str], here: Mapping[str, Any]) -> None:
+        """Have workers come to what they work on, each with its share of the cores that it may use."""
+        found: dict[str, tuple[str, tuple[int, ...]]] = {}
+        if self._threads is None:
+            found = self._scheduler(lambda: self.client.run(whereabouts, on_error="ignore", workers=[*here]))
+        sharing = Counter(found.values())
+        for worker in workers:
+            cores = found.get(worker, ("", ()))
+            self._own_threads[worker] = self._threads or max(len(cores[1]) // max(sharing[cores], 1), 1)
+            self._names[worker] = f"worker {here[worker].get('name', worker)} ({here[worker].get('host', worker)})"
+            self._ask_to_open(worker, None)
+
+    def _ask_to_open(self, worker: str, files: Mapping[str, bytes] | None) -> None:
+        future = self._send(worker, open_state, self.opening, files, self._own_threads[worker])
+        self._opening[worker] = future, time.monotonic()
+
+    def _send(self, worker: str, function: Callable[..., Reply], *arguments: Any) -> Future:
+        future = self.client.submit(function, *arguments, pure=False, workers=[worker], priority=10)
+        future.add_done_callback(self._done.put)
+        return future
+
+    def _nobody(self) -> str:
+        if not self._left_out:
+            return f"--cluster: no worker was there for {NOBODY_S:.0f} s"
+        worker, reason = next(iter(self._left_out.items()))
+        more = f" (so it is with {len(self._left_out)} of them)" if len(self._left_out) > 1 else ""
+        return f"--cluster: no worker can be used: {self._name(worker)} {reason}{more}"
+
+    def _name(self, worker: str) -> str:
+        return self._names.get(worker, "a worker")
+
+    def _take_opened(self, future: Future) -> bool:
+        """Note that a worker has come to what it works on, or what stands against it; False of another future."""
+        worker = next((worker for worker, (own, _) in self._opening.items() if own is future), None)
+        if worker is None:
+            return False
+        del self._opening[worker]
+        answer = _reply(future)
+        if isinstance(answer, Lacks):
+            self._ask_to_open(worker, self._files)
+        elif isinstance(answer, Fault) and answer.stays:
+            self._leave_out(worker, answer.text)
+        elif isinstance(answer, Fault):
+            self._start_anew(worker, answer.text)
+        elif isinstance(answer, Answer):
+            self._heard[worker] = time.monotonic()
+            for name, seconds in answer.value.items():
+                self._note(name, seconds)
+        return True
+
+    def _leave_out(self, worker: str, reason: str) -> None:
+        self._forget(worker)
+        self._left_out[worker] = reason
+        logger.warning(f"--cluster: {self._name(worker)} {reason}; it takes no part")
+
+    def _start_anew(self, worker: str, reason: str) -> None:
+        """Have dask start a worker anew, which takes some time."""
+        name = self._name(worker)
+        self._restarts[name] += 1
+        if self._restarts[name] > RESTARTS:
+            self._leave_out(worker, f"{reason}, again and again")
+            return
+        logger.warning(f"--cluster: {name} {reason}; it is started anew")
+        self._forget(worker)
+        self._anew.add(worker)
+
+        def start_anew() -> None:
+            try:
+                self.client.restart_workers([worker], timeout=RESTART_S, raise_for_error=False)
+            except (ValueError, OSError, TimeoutError):
+                if self.client.status == "running":  # else the run has ended
+                    self._left_out[worker] = f"{reason}, and has nobody to start it anew"
+                    logger.warning(f"--cluster: {name} has nobody to start it anew; it takes no part")
+            self._anew.discard(worker)
+
+        threading.Thread(target=start_anew, daemon=True).start()
+
+    # --- calls --------------------------------------------------------------------------------------------------------
+
+    def run(
+        self, function: Callable[..., Any], work: Sequence[Sequence[Any]], context: Context, cold: str | None = None
+    ) -> Iterator[tuple[int, Any]]:
+        """Yields place and value of each call, as they come; raises what a call raised.
+
+        `cold` names what no worker has warmed kernels for: the first call of each compiles, and nobody hangs who does.
+        Raises MachineError or OutOfMemory where worker after worker fails, or none is there.
+        """
+        begin = time.monotonic()
+        todo = _Round(function, context, dict(enumerate(work)), cold=cold, size=len(work))
+        self._look()
+        beside = [self._send(worker, stand, self.opening.digest, context) for worker in self._heard]
+        for worker in self.ready:
+            self._heard[worker] = begin
+        try:
+            while todo.left:
+                self._submit(todo, [place for place in todo.left if place not in todo.answerable(self._heard)])
+                future = self._next(min(max(self._limit(todo, LATE, LATE_S) / 4, 0.05), LOOK_S))
+                if future is not None:
+                    yield from self._take(todo, future, beside)
+                if future is None or time.monotonic() - self._looked > LOOK_S:
+                    self._look()
+                    self._ask_again(todo)
+        finally:
+            for future in [*todo.flying, *beside]:
+                future.release()
+        workers = {*todo.computing, *todo.standing, *self._heard}
+        both = [todo.computing.get(worker, 0.0) + todo.standing.get(worker, 0.0) for worker in workers]
+        computing, standing = (sum(each.values()) / max(len(workers), 1) for each in (todo.computing, todo.standing))
+        self.spent.wall += time.monotonic() - begin
+        self.spent.computing += computing
+        self.spent.standing += standing
+        self.spent.waiting += max(both, default=0.0) - computing - standing
+
+    def _submit(self, todo: _Round, places: Sequence[int]) -> None:
+        """Ask for calls, those that have come to the experiment; nothing where nobody has."""
+        workers = self.ready
+        for place in places if workers else ():
+            future = self.client.submit(
+                perform, self.opening.digest, todo.context.digest, todo.function, todo.left[place], pure=False,
+                workers=workers,
+            )  # fmt: skip
+            todo.flying[future] = place, frozenset(workers)
+            future.add_done_callback(self._done.put)
+
+    def _take(self, todo: _Round, future: Future, beside: list[Future]) -> Iterator[tuple[int, Any]]:
+        """What comes of a future: the value of a call, or nothing; what has no answer then is asked for once more."""
+        if self._take_opened(future):
+            return
+        place = todo.flying.pop(future, (None, None))[0]
+        answer = _reply(future)
+        if answer is None:
+            if place is not None:
+                self._count_loss(todo)
+            time.sleep(min(0.02 * todo.losses, 0.5))  # until it is noticed who has ended
+            return
+        if isinstance(answer, Fault):
+            self._take_fault(todo, answer, place)
+            return
+        now = time.monotonic()
+        silent_s = 0.0
+        if answer.worker in self._heard:
+            silent_s = now - self._heard[answer.worker]
+            self._heard[answer.worker] = now
+            self._late.discard(answer.worker)
+        if isinstance(answer, Lacks):
+            self._count_loss(todo)
+            if answer.what == "opening":  # a worker that was started anew, at the same address
+                self._forget(answer.worker)
+                self._looked = -LOOK_S
+            else:
+                beside.append(self._send(answer.worker, stand, self.opening.digest, todo.context))
+        elif isinstance(answer, Answer) and future in beside:
+            todo.standing[answer.worker] = todo.standing.get(answer.worker, 0.0) + answer.seconds
+            self.by_worker.setdefault(self._name(answer.worker), Spent()).standing += answer.seconds
+        elif isinstance(answer, Answer) and place in todo.left:
+            del todo.left[place]
+            for other in [other for other, (its, _) in todo.flying.items() if its == place]:
+                del todo.flying[other]  # nobody needs to begin with it
+                other.release()
+            self._note(todo.name, max(answer.seconds, silent_s))
+            todo.computing[answer.worker] = todo.computing.get(answer.worker, 0.0) + answer.seconds
+            of_worker = self.by_worker.setdefault(self._name(answer.worker), Spent())
+            of_worker.computing += answer.seconds
+            of_worker.calls += 1
+            self.spent.calls += 1
+            yield place, answer.value
+
+    def _count_loss(self, todo: _Round) -> None:
+        """Count a call without an answer. Raises MachineError where there are too many."""
+        todo.losses += 1
+        if todo.losses > LOSSES + todo.size:
+            left = len(todo.left)
+            raise MachineError(f"--cluster: asked again {todo.losses} times; calls without an answer: {left}")
+
+    def _take_fault(self, todo: _Round, fault: Fault, place: int | None) -> None:
+        """Ask others, and have the worker started anew. Raises MachineError or OutOfMemory once that was of no use."""
+        if place is not None:
+            todo.faults[place] += 1
+            if todo.faults[place] >= FAULTS:
+                raise (OutOfMemory if fault.memory else MachineError)(f"--cluster: {fault.text}")
+        if fault.worker in self._heard:
+            self._start_anew(fault.worker, f"failed: {fault.text}")
+
+    def _note(self, name: str, seconds: float) -> None:
+        self._seconds.setdefault(name, deque(maxlen=64)).append(seconds)
+
+    # --- who says nothing ---------------------------------------------------------------------------------------------
+
+    def _limit(self, todo: _Round, times: float, beside_s: float) -> float:
+        """Seconds that a worker may say nothing."""
+        known = self._seconds.get(todo.name)
+        return times * statistics.median(known) + beside_s if known else OPENING_S
+
+    def _ask_again(self, todo: _Round) -> None:
+        """Ask others for what workers have that said nothing for too long; have those started anew that hang."""
+        now = time.monotonic()
+        late_s = self._limit(todo, LATE, LATE_S)
+        silent = [worker for worker, heard in self._heard.items() if now - heard > late_s]
+        if not silent:
+            return
+        holding = self._scheduler(self.client.processing)
+        places = {future.key: place for future, (place, _) in todo.flying.items() if place in todo.left}
+        held = {worker: [key for key in holding.get(worker, ()) if key in places] for worker in silent}
+        self._late |= {worker for worker in silent if held[worker]}
+        late = {key for worker in self._late.intersection(silent) for key in held[worker]}
+        others = {place for key, place in places.items() if key not in late}
+        again = sorted({places[key] for key in late} - others)
+        if again and not self._late.issuperset(self._heard):
+            self.spent.again += len(again)
+            for worker in self._late.intersection(silent):
+                of_worker = self.by_worker.setdefault(self._name(worker), Spent())
+                of_worker.again += len({places[key] for key in held[worker]}.intersection(again))
+            self._submit(todo, again)
+        alone = self._late.issuperset(self._heard)
+        hung_s = self._limit(todo, HUNG_ALONE if alone else HUNG, HUNG_S)
+        compiling = {worker for worker in silent if todo.cold is not None and worker not in todo.computing}
+        limits = {worker: OPENING_S if worker in compiling else hung_s for worker in silent if worker in self._late}
+        for worker in [worker for worker, limit in limits.items() if now - self._heard[worker] > limit]:
+            self._start_anew(worker, f"said nothing for {now - self._heard[worker]:.0f} s")
+
+
+def _reply(future: Future) -> Reply | None:
+    """What came back; None where it was lost with a worker. Raises what the call did.
+
+    What a worker has computed is lost with it until it is here: dask then takes the future for one that is to be
+    computed again.
+    """
+    try:
+        for seconds in GATHER_S:
+            if future.status not in ("finished", "error"):
+                return None
+            try:
+                found = future.result(timeout=seconds)
+            except TimeoutError:
+                continue
+            assert isinstance(found, Reply)
+            return found
+        return None
+    except KilledWorker as error:
+        return Fault("", f"worker after worker ended over one shard, the last one of them {error.last_worker.address}")
+    except (CancelledError, CommClosedError):
+        return None
+    finally:
+        future.release()
