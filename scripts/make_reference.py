@@ -29,8 +29,8 @@ _HEAD = """\
 
 One YAML file is one experiment. Unknown keys are errors. Paths are relative to the file they stand in, except
 `run.output`, which is relative to the working directory. The file is read as YAML 1.2: `1e-3` is a number, `yes` and
-`no` are text, and text that begins with `*`, `&`, `!`, `%`, `@` or a brace wants quotes: `key: "*.data"`. A file has at
-most 256 KiB and 20,000 values, aliases spelt out. What it names is read where it is a regular file.
+`no` are text, and text that begins with `*`, `&`, `!`, `%`, `@` or a brace wants quotes: `key: "*.data"`. It names
+regular files only, no pipes or devices.
 [config.schema.json](config.schema.json) is the same as JSON Schema, for editors.
 
 On the command line `--set KEY=VALUE` changes a value; VALUE is YAML too, and later ones win:

@@ -26,7 +26,7 @@ from reslrb_cli.optimization.problem import saved_spp
 from reslrb_cli.records.manifest import Status
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.records.run_folder import check_output
-from reslrb_cli.runs.prepare import Begun, begin
+from reslrb_cli.runs.prepare import PreparedRun, begin
 from reslrb_cli.runs.recorder import Recording
 from reslrb_cli.runs.resume import open_earlier
 
@@ -56,7 +56,7 @@ class Run:
     Runs of one process share nothing but the device, and may take turns: `zip(run_a, run_b)`.
     """
 
-    def __init__(self, stack: contextlib.ExitStack, begun: Begun, writes: bool) -> None:
+    def __init__(self, stack: contextlib.ExitStack, begun: PreparedRun, writes: bool) -> None:
         self._begun, self._writes, self._stack = begun, writes, stack
         self._records: list[Record] = []
         self._folder: Path | None = None
@@ -332,12 +332,12 @@ def _reopened(
     put_in: Sequence[Override],
     loss: Loss | None,
     allow_code: bool,
-) -> tuple[contextlib.ExitStack, Begun, bool]:
+) -> tuple[contextlib.ExitStack, PreparedRun, bool]:
     """What holds the folder of a run that goes on, that run, and whether there is anything left to be written."""
     with contextlib.ExitStack() as stack:
         earlier = stack.enter_context(open_earlier(folder, wanted, put_in))
         earlier.config = _with_own(earlier.config, loss, allow_code)
-        variant = keep_variant(earlier.variant, earlier.config.source)
+        variant = keep_variant(earlier.settled.variant, earlier.config.source)
         begun = earlier.begin(variant, logger.info, logger.warning)
         if earlier.is_done:
             logger.warning("%s", earlier.done_line("the override", ": "))

@@ -6,6 +6,7 @@ named `command`; it is loaded when it is called.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import importlib
 import logging
@@ -17,7 +18,7 @@ from typing import Any
 
 import click
 
-from reslrb_cli.cli.terminal import Interrupts, LogLines, forgiving_output, tell
+from reslrb_cli.cli.terminal import Interrupts, LogLines, tell
 from reslrb_cli.errors import LINE_LENGTH, ExitCode, one_line
 from reslrb_cli.version import __version__
 
@@ -80,16 +81,16 @@ class _Main(click.Group):
         if not standalone_mode or os.environ.get(COMPLETE_VARIABLE):  # by which a shell asks: the answer is in bytes
             return super().main(args, prog_name, complete_var, standalone_mode=False, **extra)
         self.debug = os.environ.get("RESLRB_DEBUG", "0") not in ("", "0")
-        with forgiving_output():
-            try:
-                code = super().main(args, prog_name, complete_var, standalone_mode=False, **extra)
-            except BaseException as error:
-                told = tell(_explained(error))
-                if told is None:
-                    raise
-                if self.debug:
-                    traceback.print_exc()
-                line, code = told
+        try:
+            code = super().main(args, prog_name, complete_var, standalone_mode=False, **extra)
+        except BaseException as error:
+            told = tell(_explained(error))
+            if told is None:
+                raise
+            if self.debug:
+                traceback.print_exc()
+            line, code = told
+            with contextlib.suppress(OSError):  # the terminal may have gone
                 click.echo(one_line(line, LINE_LENGTH), err=True)
         sys.exit(code if isinstance(code, int) else ExitCode.DONE)
 

@@ -27,7 +27,7 @@ from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
-    from reslrb_cli.runs.prepare import Begun
+    from reslrb_cli.runs.prepare import PreparedRun
 
 
 def show_forecast(config: Config) -> None:
@@ -166,13 +166,13 @@ def _resume(
         _check_shards(config, workers)
         if workers is not None:
             workers.check()
-        variant = start_variant(config.model_copy(update={"variant": earlier.variant}))
+        variant = start_variant(config.model_copy(update={"variant": earlier.settled.variant}))
         begun = earlier.begin(variant, logger.info, logger.warning)
         logger.info(f"going on with {run} after {earlier.iteration} of {config.run.iterations} iterations")
         return _run(begun, workers, quiet)
 
 
-def _run(begun: Begun, workers: Place | None, quiet: bool) -> int:
+def _run(begun: PreparedRun, workers: Place | None, quiet: bool) -> int:
     """Run it in the folder, which is not made before signals are watched: from then on it is to say how it ended."""
     if workers is not None:
         from reslrb_cli.cluster.engine import engine_at
@@ -198,8 +198,8 @@ def _run(begun: Begun, workers: Place | None, quiet: bool) -> int:
             echo(line)
     kept = course.nonfinite, course.clamped, course.regularized
     tallies = [str(tally) for tally in kept if tally.iterations]
-    page = place.path if "page" in manifest.missing else place.path / "report.html"
-    echo(last_line(status.value, manifest.results, tallies, os.path.relpath(page)))
+    page = place.path / "report.html"
+    echo(last_line(status.value, manifest.results, tallies, os.path.relpath(page if page.exists() else place.path)))
     if not quiet and status is Status.INTERRUPTED:
         echo(f"next: `reslrb optimize --resume {os.path.relpath(place.path)}` goes on from here")
     if not quiet and status is Status.FINISHED and course.problem.config.fabrication is not None:

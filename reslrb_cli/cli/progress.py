@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from pathlib import Path
@@ -43,8 +44,9 @@ class Progress:
     """
 
     def __init__(self, total: int, quiet: bool, meter: ErrorMeter, done: int = 0) -> None:
-        self._total, self._quiet, self._meter = total, quiet, meter
         self._stream = sys.stderr
+        quiet = quiet or self._stream is None  # the program was started without one
+        self._total, self._quiet, self._meter = total, quiet, meter
         self._bar: Any = None
         self._width: int | None = None
         self._choice = 0
@@ -57,7 +59,11 @@ class Progress:
             )
 
     def show(self, record: Record) -> None:
-        """Show that the iteration of `record` is done."""
+        """Show that the iteration of `record` is done; a terminal that has gone ends no run."""
+        with contextlib.suppress(OSError):
+            self._show(record)
+
+    def _show(self, record: Record) -> None:
         if self._bar is not None:
             self._fit(descriptions(record, self._meter))
             self._bar.update()
@@ -98,7 +104,8 @@ class Progress:
 
     def __exit__(self, *_: object) -> None:
         if self._bar is not None:
-            self._bar.close()
+            with contextlib.suppress(OSError):
+                self._bar.close()
 
 
 class Reading:

@@ -1,12 +1,7 @@
-"""The terminal: streams on which nothing fails, what an error comes to, and signals.
+"""The terminal: what is printed on it, what an error comes to, and signals.
 
 What commands print and log (`echo`, `LogLines`): keys, names and paths are a user's or a file's, and must not
 command the terminal.
-
-Standard output and error of a command, as streams on which nothing fails: a terminal that was closed, a disk that is
-full behind a redirection, a pipe whose reader has gone, a stream that was closed before the program began: none of them
-is a reason to end a run of hours. While `forgiving_output` is entered, `sys.stdout` and `sys.stderr` take everything
-(of `click.echo`, of the log, of a progress bar), pass on what can be passed on, and drop the rest without a word.
 
 What an error comes to on the command line (`tell`): those of its own arguments, and all others (`errors.tell`).
 
@@ -24,18 +19,16 @@ descriptor that Python's C code writes to. It can do its work while a kernel run
 from __future__ import annotations
 
 import contextlib
-import io
 import logging
 import os
 import select
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn, TextIO
+from typing import Any, NoReturn
 
 import click
 
@@ -157,69 +150,6 @@ def fill(template: str, filters: Mapping[str, Callable[..., object]], **values: 
     )  # fmt: skip
     made.filters.update(filters)
     return made.get_template(template).render(values)
-
-
-class Forgiving:
-    """Passes text on to `stream`, and goes on where that fails; else it is that stream. None shows nothing.
-
-    It has no `buffer`, so that nobody writes past it. Characters that the stream's encoding lacks become `\\u...`.
-    """
-
-    def __init__(self, stream: TextIO | None) -> None:
-        self._stream = stream if stream is not None else open(os.devnull, "w")  # noqa: SIM115 (until the end)
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
-
-    def write(self, text: str) -> int:
-        """Write what can be written."""
-        with contextlib.suppress(OSError, ValueError):
-            self._stream.write(text)
-        return len(text)
-
-    def flush(self) -> None:
-        """Pass on what is held back, if it can be."""
-        with contextlib.suppress(OSError, ValueError):
-            self._stream.flush()
-
-    def isatty(self) -> bool:
-        """Whether it is a terminal; a stream that is closed is none."""
-        with contextlib.suppress(ValueError):
-            return self._stream.isatty()
-        return False
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "buffer":
-            raise AttributeError(name)
-        return getattr(self._stream, name)
-
-    def settle(self) -> None:
-        """Flush for the last time: what still cannot be written leads nowhere, so that Python does not try it again."""
-        try:
-            self._stream.flush()
-        except (OSError, ValueError):
-            with contextlib.suppress(OSError, ValueError):  # ValueError: it is closed, or has no descriptor at all
-                nowhere = os.open(os.devnull, os.O_WRONLY)
-                os.dup2(nowhere, self._stream.fileno())
-                os.close(nowhere)
-
-
-@contextmanager
-def forgiving_output() -> Iterator[None]:
-    """Have `sys.stdout` and `sys.stderr` forgive everything, until the end of the block."""
-    # Of standard descriptors that the program was started without, the next files to be opened would take the numbers,
-    # and what libraries print would end up in these.
-    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
-        pass
-    os.close(number)
-    before = sys.stdout, sys.stderr
-    forgiving = Forgiving(before[0]), Forgiving(before[1])
-    sys.stdout, sys.stderr = forgiving
-    try:
-        yield
-    finally:
-        for stream in forgiving:
-            stream.settle()
-        sys.stdout, sys.stderr = before
 
 
 class LogLines(logging.Handler):

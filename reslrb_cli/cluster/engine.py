@@ -32,10 +32,10 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.shards import Task, make_tasks, shard_gradient, shard_image
 from reslrb_cli.optimization.state import Settled, begin_as, decide_as, guiding_of, restore_tables
 from reslrb_cli.optimization.views import set_targets, target_arrays
-from reslrb_cli.records.checkpoint import STATE_FILE, open_state, write_archive
+from reslrb_cli.records.checkpoint import STATE_FILE, write_archive
 from reslrb_cli.records.clock import SharedTime, WorkerTime
 from reslrb_cli.records.tree import Stored, like, to_array
-from reslrb_cli.runs.prepare import Course, digests
+from reslrb_cli.runs.prepare import RunProgress, digests
 
 Array = np.ndarray[Any, Any]
 
@@ -87,9 +87,8 @@ def _digest(text: str, *mappings: Mapping[str, Array]) -> str:
 def assembled(folder: Path, threads: int, allows_code: bool) -> tuple[Problem, dict[str, float]]:
     """The problem as the run has it, with its targets and what it has settled, from the experiment's files, with its
     kernels warm; and the seconds that a shard then takes."""
-    archive, values = open_state(folder / STATE_FILE)
-    with contextlib.closing(archive), np.load(folder / TARGETS_FILE) as targets:
-        stored = Stored(archive, values)
+    stored = Stored(folder / STATE_FILE)
+    with np.load(folder / TARGETS_FILE) as targets:
         set_variant(stored.read(Settled).variant)
         config, initial = read_bundle(folder)
         problem = assemble_scene(config.with_code(allows_code), values=initial)
@@ -120,7 +119,7 @@ def _warmed(problem: Problem) -> dict[str, float]:
 # --- where `optimize` runs --------------------------------------------------------------------------------------------
 
 
-def opening_of(course: Course, folder: Path, own: bool) -> tuple[Opening, Bundle]:
+def opening_of(course: RunProgress, folder: Path, own: bool) -> tuple[Opening, Bundle]:
     """What workers need of a run, `own`: which are this run's; `folder` is to write into.
 
     Raises OSError, and ConfigError where a file has changed since the run began.
@@ -164,7 +163,7 @@ class Engine:
 
 
 @contextlib.contextmanager
-def engine_at(course: Course, place: Place, threads: int | None = None) -> Iterator[Engine]:
+def engine_at(course: RunProgress, place: Place, threads: int | None = None) -> Iterator[Engine]:
     """The workers at a place, with a run's experiment; each with so many threads, or its share of the cores.
 
     Raises MachineError where there are none, or none that can be used.

@@ -20,7 +20,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, PydanticCustomError
 
-from reslrb_cli.config.files import PART_BYTES, PATH_BYTES, PIXELS
+from reslrb_cli.config.files import PIXELS
 
 #: Largest seed plus one: Mitsuba's seeds are uint32.
 SEED_END = 2**32
@@ -90,11 +90,9 @@ def _path(folder: Path, value: Any) -> Path:
     except RuntimeError:
         raise wrong("must be a path: there is no such user") from None
     try:
-        sizes = [len(part.encode()) for part in (str(path), *path.parts)]
+        str(path).encode()
     except UnicodeEncodeError:
         raise wrong("names a file or a folder whose name is not UTF-8; rename it, since Mitsuba opens none") from None
-    if max(sizes[1:]) > PART_BYTES or sizes[0] > PATH_BYTES:
-        raise wrong(f"must be a path of at most {PATH_BYTES} bytes, and each name in it of at most {PART_BYTES}")
     return path
 
 

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 from reslrb_cli.config.files import read_file
-from reslrb_cli.config.optimizers import CODE_BYTES
 from reslrb_cli.errors import ConfigError, describe, is_machine_fault, is_out_of_memory
 
 
@@ -27,7 +26,7 @@ def load_named(file: Path, name: str, source: object, key: str) -> Callable[...,
     name.
     """
     try:
-        text = read_file(file, CODE_BYTES)
+        text = read_file(file)
     except ConfigError as error:
         raise ConfigError(source, key, f"{file}: {error.message}") from None
     module = types.ModuleType(f"reslrb_own_{hashlib.blake2b(str(file).encode(), digest_size=6).hexdigest()}")

@@ -1,8 +1,4 @@
-"""The bounds of what a user hands in, and the one door for files that a user names.
-
-Each bound stands with its reason; beyond one, input is refused at once. A file that is named has to be regular and not
-too large, or there is one located line.
-"""
+"""Bounds of settings, each with its reason, and the reading of files that a user names."""
 
 from __future__ import annotations
 
@@ -13,41 +9,8 @@ from typing import BinaryIO
 
 from reslrb_cli.errors import ConfigError, one_line
 
-# --- configurations: read within a second or two, at some 50 microseconds a value -------------------------------------
-
-#: Bytes of a configuration's file. One with every default written out takes 2 kB.
-CONFIG_BYTES = 2**18
-
-#: Number of `--set`, and characters of all of them together.
-OVERRIDES = 1000
-OVERRIDES_LENGTH = 2**16
-
-#: Values and keys of a configuration, with every alias and every `<<` spelt out: a few hundred bytes of aliases of
-#: aliases can stand for billions. A parameter with every default written out has some 20.
-NODES = 20_000
-
-#: Sections within sections. The deepest setting, `target.render.parameters.KEY.file`, is five deep.
-DEPTH = 20
-
-#: Characters of a parameter's key or glob. To make a pattern of one takes time that grows with the square of it.
-KEY_LENGTH = 1000
-
-#: Integers are below this, and above its negative: nothing that a file counts has more than 64 bits.
-INTEGER_END = 2**64
-
-# --- names and paths --------------------------------------------------------------------------------------------------
-
-#: Bytes of a part of a path: no file system in use takes more.
-PART_BYTES = 255
-
-#: Bytes of a whole path. Linux takes 4095; the rest is for what a run adds to it below its folder.
-PATH_BYTES = 3000
-
-#: Bytes of a run's folder: PART_BYTES, less what is put before and behind it: `-2` and so on, and the mark of a
-#: folder that is not whole yet.
+#: Bytes of the name of a run's folder. File systems take 255; the rest is for what is put before and behind it.
 NAME_BYTES = 200
-
-# --- paths of light ---------------------------------------------------------------------------------------------------
 
 #: Segments of a path that a limit can name; beyond it -1 says the same. Roulette lets at most 95 % of the paths go on
 #: at each vertex: of 10^20 paths not one is a thousand vertices longer than `rr_depth`.
@@ -70,13 +33,8 @@ PASS_SAMPLES = 2**18
 #: Passes of a step, each of which is launched by itself and has a seed that is made before the first of them.
 PASSES = 2**16
 
-# --- files that a configuration names ---------------------------------------------------------------------------------
-
 #: Pixels of an image: 16384 x 8192, the largest environment map in use. Decoded they take 1.5 GiB.
 PIXELS = 2**27
-
-#: Bytes of an image's file: that many pixels of four floats, not compressed, and something for the file's head.
-IMAGE_BYTES = 16 * PIXELS + 2**20
 
 
 def as_path(given: object, name: str, what: str) -> Path:
@@ -87,37 +45,31 @@ def as_path(given: object, name: str, what: str) -> Path:
     raise ConfigError(name, "", f"is {one_line(repr(given), 60)}, not {what}")
 
 
-def open_file(path: Path, most: int | None = None) -> BinaryIO:
-    """Open the file `path` to read it. Raises ConfigError, located in it, where it cannot be.
+def open_file(path: Path) -> BinaryIO:
+    """Open the file `path` to read it. Raises ConfigError, located in it, if it cannot be read.
 
-    Refused are folders, everything that is no regular file (to read a pipe, a socket or a device may take for ever) and
-    files of more than `most` bytes; None for any size, where it is not read as a whole.
+    Refuses pipes, sockets and devices: to read one may take for ever.
     """
     try:
-        _check(path, os.stat(path), most)  # before it is opened: to open some devices does something already
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-        try:
-            _check(path, os.fstat(descriptor), most)  # it may have been replaced in between
-        except BaseException:
-            os.close(descriptor)
-            raise
-        return os.fdopen(descriptor, "rb")
+        mode = os.stat(path).st_mode  # before it is opened: to open some devices does something already
+        if stat.S_ISDIR(mode):
+            raise ConfigError(path, "", "is a folder, not a file")
+        if not stat.S_ISREG(mode):
+            raise ConfigError(path, "", "is a pipe, a socket or a device, not a regular file")
+        return path.open("rb")
     except FileNotFoundError:
         raise ConfigError(path, "", "no such file") from None
     except (OSError, ValueError) as error:  # ValueError: a null character, or half of a surrogate pair
         raise ConfigError(path, "", f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
-def read_file(path: Path, most: int) -> bytes:
-    """All bytes of the file `path`; raises as `open_file`, also where it turns out to be larger than it says."""
-    with open_file(path, most) as file:
+def read_file(path: Path) -> bytes:
+    """Return all bytes of the file `path`. Raises ConfigError as `open_file` does."""
+    with open_file(path) as file:
         try:
-            data = file.read(most + 1) or b""  # None of a file of the system's own that would make wait
+            return file.read()
         except OSError as error:
             raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
-    if len(data) > most:
-        raise ConfigError(path, "", f"has more than {in_words(most)}")
-    return data
 
 
 def in_words(count: float) -> str:
@@ -126,17 +78,6 @@ def in_words(count: float) -> str:
         if count >= unit:
             return f"{count / unit:.1f}".removesuffix(".0") + f" {name}"
     return f"{count:.0f} B"
-
-
-def _check(path: Path, status: os.stat_result, most: int | None) -> None:
-    kind = stat.S_IFMT(status.st_mode)
-    if kind == stat.S_IFDIR:
-        raise ConfigError(path, "", "is a folder, not a file")
-    if kind != stat.S_IFREG:
-        names = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device"}
-        raise ConfigError(path, "", f"is {names.get(kind, 'something else')}, not a regular file")
-    if most is not None and status.st_size > most:
-        raise ConfigError(path, "", f"has {in_words(status.st_size)}; more than {in_words(most)} are not read")
 
 
 def duration(seconds: float) -> str:

@@ -15,11 +15,11 @@ from typing import Any
 from pydantic import ValidationError
 
 from reslrb_cli.config.errors import Problem, problems
-from reslrb_cli.config.files import CONFIG_BYTES, DEPTH, NODES, OVERRIDES, OVERRIDES_LENGTH, read_file
+from reslrb_cli.config.files import read_file
 from reslrb_cli.config.integrators import Own
 from reslrb_cli.config.optimizers import Custom
 from reslrb_cli.config.schema import Config
-from reslrb_cli.config.yaml_text import UNFIT, Location, count_values, format_location, parse, write
+from reslrb_cli.config.yaml_text import UNFIT, Location, format_location, parse, write
 from reslrb_cli.errors import ConfigError, one_line
 
 #: Mappings whose keys are the user's own and may hold dots: what follows their name is one key.
@@ -65,8 +65,6 @@ def _parse_location(path: str, label: str) -> Location:
         index, name = match.groups()
         location.append(int(index[:9]) if index else name)
         position = match.end()
-        if len(location) > DEPTH:
-            raise ConfigError(label, "", f"leads deeper than {DEPTH} levels; no setting lies there")
         if tuple(location) in FREE_MAPPINGS and path[position : position + 1] == "." and path[position + 1 :]:
             return (*location, path[position + 1 :])
     return tuple(location)
@@ -115,10 +113,6 @@ def load(path: Path | str, overrides: Sequence[str | Override] = ()) -> Config:
 
 def loads(text: str, path: Path | str, overrides: Sequence[str | Override] = ()) -> Config:
     """The same from the text of a file; `path` names it, and paths in it are relative to where that is."""
-    if len(overrides) > OVERRIDES:
-        raise ConfigError("--set", "", f"is given {len(overrides)} times; more than {OVERRIDES} belong in a file")
-    if sum(len(each) for each in overrides if isinstance(each, str)) > OVERRIDES_LENGTH:
-        raise ConfigError("--set", "", f"holds more than {OVERRIDES_LENGTH} characters; so many belong in a file")
     parsed = [parse_override(each) if isinstance(each, str) else each for each in overrides]
     return resolve(parse(text, str(path)), path, parsed)
 
@@ -146,19 +140,17 @@ def overrides_of(given: Mapping[str, object] | None) -> list[Override]:
     return list(found.values())
 
 
-def plain(value: Any, source: object, key: str = "", depth: int = 0) -> Any:
+def plain(value: Any, source: object, key: str = "") -> Any:
     """What YAML would have made of a value from a script: paths are text, tuples lists, NumPy's numbers and arrays
     Python's. Raises ConfigError, located by `source` and `key`, for what YAML does not have."""
-    if depth > DEPTH:
-        raise ConfigError(source, "", f"leads deeper than {DEPTH} levels; no setting lies there")
     if isinstance(value, Mapping):
         for name in value:
             if not isinstance(name, str):
                 raise ConfigError(source, key, f"has the key {one_line(repr(name), 40)}; keys are text")
         places = {name: f"{key}.{name}" if key else name for name in value}
-        return {name: plain(each, source, places[name], depth + 1) for name, each in value.items()}
+        return {name: plain(each, source, places[name]) for name, each in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(each, source, f"{key}[{place}]", depth + 1) for place, each in enumerate(value)]
+        return [plain(each, source, f"{key}[{place}]") for place, each in enumerate(value)]
     if isinstance(value, Path):
         return str(value)
     if hasattr(value, "tolist"):  # of NumPy, which is not imported here
@@ -189,13 +181,13 @@ def resolve(data: Any, path: Path | str, parsed: Sequence[Override] = ()) -> Con
         raise ConfigError(source, "", "is empty; it needs at least scene, target and parameters")
     if not isinstance(data, dict) and data is not None:
         raise ConfigError(source, "", "must hold sections (scene: ...) at its top level, not a list or a single value")
-    if sum(count_values(value) for value in (data, *(override.value for override in parsed))) > NODES:
-        raise ConfigError(source, "", f"holds more than {NODES} values, together with what --set puts in")
     stages: list[dict[str, Any]] = [data or {}]
-    for override in parsed:
-        stages.append(apply(stages[-1], override))
-
-    config, found = _validate(stages[-1], Path(path))
+    try:
+        for override in parsed:
+            stages.append(apply(stages[-1], override))
+        config, found = _validate(stages[-1], Path(path))
+    except RecursionError:
+        raise ConfigError(parsed[-1].label if parsed else source, "", "is nested too deeply") from None
     if config is not None:
         return config
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
@@ -260,7 +252,7 @@ def dump(config: Config) -> str:
 def read_text(path: Path, source: str) -> str:
     """The text of a configuration file, which `source` names in errors. Raises ConfigError where it is none."""
     try:
-        return read_file(path, CONFIG_BYTES).decode("utf-8-sig")
+        return read_file(path).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise ConfigError(source, "", "is not UTF-8 text; a configuration is a YAML file") from None
 

@@ -85,10 +85,6 @@ class SSIM(Loss, json_schema_extra=NEEDS_TYPE):
     type: Literal["ssim"] = Field(default="ssim", description="1 - mean SSIM (Wang et al. 2004).")
 
 
-#: Bytes of a file of a user's own code.
-CODE_BYTES = 2**20
-
-
 class Custom(Loss, json_schema_extra=NEEDS_TYPE):
     """What a function of one's own returns, `file`; only where the command line has `--allow-code`
     ([method.md](method.md#a-loss-of-ones-own))."""
@@ -160,7 +156,7 @@ def loss_words(given: Loss | Sequence[Loss]) -> str:
 _Decay = Annotated[float, Field(ge=0, lt=1)]
 
 
-class Standing(Section):
+class StopRule(Section):
     """When a loss is taken to stand."""
 
     patience: Annotated[int, Field(ge=5, lt=2**31)] = 20

@@ -32,7 +32,7 @@ from reslrb_cli.config.base import (
     mark,
     must,
 )
-from reslrb_cli.config.files import KEY_LENGTH, PIXELS
+from reslrb_cli.config.files import PIXELS
 
 Numbers = Annotated[list[float], Field(min_length=1)]
 
@@ -118,8 +118,8 @@ class MotionRates(ByWord):
 
 # --- what moves -------------------------------------------------------------------------------------------------------
 
-Name = Annotated[str, Field(min_length=1, max_length=KEY_LENGTH)]
-_NAME = {"type": "string", "minLength": 1, "maxLength": KEY_LENGTH}
+Name = Annotated[str, Field(min_length=1)]
+_NAME = {"type": "string", "minLength": 1}
 _NAMES = WithJsonSchema({"anyOf": [_NAME, {"type": "array", "items": _NAME, "minItems": 1}]})
 _EACH_ONCE = must(each_once, lambda _: "must name each once")
 

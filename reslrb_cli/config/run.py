@@ -19,7 +19,7 @@ from typing_extensions import Self
 
 from reslrb_cli.config.base import Count, Positive, Section, Seed, WorkPath, by_kind, located, mark, wrong
 from reslrb_cli.config.files import NAME_BYTES
-from reslrb_cli.config.optimizers import Stage, Standing
+from reslrb_cli.config.optimizers import Stage, StopRule
 from reslrb_cli.config.views import SensorName
 
 #: Names that Windows takes for devices, whatever suffix they have: a folder that is called so cannot be copied there.
@@ -204,7 +204,7 @@ class RunConfig(Section):
     After the last of them it is as configured. Where resolution or film change, the optimizer begins anew, and so does
     what `optimizer.scale` measures."""
 
-    stop: Standing | None = None
+    stop: StopRule | None = None
     """End the run before its last iteration, as finished, once its loss stands: that of held-out views where there are
     any, else that of the iterations; with `schedule: plateau` not before the rate is at its least. At most 5 % of runs
     are stopped whose loss still falls by more than `relative` a window. With the defaults, a run goes on for about 300

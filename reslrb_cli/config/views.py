@@ -19,7 +19,6 @@ from pydantic_core import CoreSchema
 from typing_extensions import Self
 
 from reslrb_cli.config.base import ConfigPath, Count, Positive, Section, located, must, wrong
-from reslrb_cli.config.files import KEY_LENGTH
 from reslrb_cli.config.integrators import AnyIntegrator
 from reslrb_cli.config.parameters import COLOR_SPACE, ColorSpace, Value
 
@@ -120,10 +119,7 @@ class Rendering(Section):
 
     parameters: Annotated[
         dict[str, Value],
-        must(
-            lambda values: all(0 < len(key) <= KEY_LENGTH for key in values),
-            lambda _: f"must have keys that are not empty, and have at most {KEY_LENGTH} characters",
-        ),
+        must(lambda values: all(values), lambda _: "must have keys that are not empty"),
     ] = Field(default={})
     """True values by key, as in `parameters`: a number, a list of numbers, or an image file. Empty: the scene as it
     stands."""

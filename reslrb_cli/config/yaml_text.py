@@ -1,4 +1,4 @@
-"""YAML 1.2 to plain data and back, bounded before anything of it is built.
+"""YAML 1.2 to plain data and back.
 
 PyYAML alone reads YAML 1.1, where `1e-3` is text, `no` is false, `010` is 8 and `1:30` is 90. `Loader` has it read by
 the rules of YAML 1.2, and build plain data alone; `parse` and `write` are the two ways.
@@ -12,7 +12,6 @@ from typing import Any
 
 import yaml
 
-from reslrb_cli.config.files import DEPTH, INTEGER_END, NODES
 from reslrb_cli.errors import ConfigError
 
 #: Text, lists, mappings, null: what PyYAML builds of its own that is plain data in YAML 1.2 too.
@@ -24,6 +23,8 @@ TEXT_TAGS = (f"{_TAG}str", f"{_TAG}merge")
 FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$")
 INTEGER = re.compile(r"[-+]?[0-9]+$|0o[0-7]+$|0x[0-9a-fA-F]+$")
 DIGITS = list("-+.0123456789")
+#: Integers are below this, and above its negative: nothing that a file counts has more than 64 bits.
+INTEGER_END = 2**64
 
 
 class Loader(yaml.SafeLoader):
@@ -39,32 +40,10 @@ class Loader(yaml.SafeLoader):
     def __init__(self, text: str, at: Callable[[int], str]) -> None:
         super().__init__(text)
         self._at = at
-        self._nodes = self._depth = 0
-        #: Of each node that is complete, by its identity, the number of nodes that it stands for.
-        self._sizes: dict[int, int] = {}
 
     def fail(self, mark: yaml.Mark | None, message: str) -> ConfigError:
         """The error for what stands at `mark`."""
         return ConfigError(self._at(0 if mark is None else mark.line + 1), "", message)
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """The next node, as PyYAML makes it, unless it is too deep or one too many."""
-        mark, before, is_alias = self.peek_event().start_mark, self._nodes, self.check_event(yaml.AliasEvent)
-        self._depth += 1
-        if self._depth > DEPTH:
-            raise self.fail(mark, f"nested too deeply: more than {DEPTH} lists and mappings within each other")
-        node = super().compose_node(parent, index)
-        self._depth -= 1
-        if not is_alias:
-            self._nodes += 1
-            self._sizes[id(node)] = self._nodes - before
-        elif id(node) not in self._sizes:
-            raise self.fail(mark, "an alias (*name) of a list or mapping that it stands in itself")
-        else:
-            self._nodes += self._sizes[id(node)]
-        if self._nodes > NODES:
-            raise self.fail(mark, f"holds more than {NODES} values, aliases (*name) spelt out")
-        return node
 
 
 def _construct_text(loader: Loader, node: yaml.ScalarNode) -> str:
@@ -135,7 +114,7 @@ def parse(text: str, source: str, name_line: bool = True, example: Callable[[str
 
     The keys of all mappings are text without control characters. `example` shows how a mended text is to be written
     where it came from. Raises ConfigError where the text is not YAML, holds a tag that is not plain data, a key twice,
-    or one that is no text; where it is too deep, and where it holds more than NODES values.
+    or one that is no text, or nests its values too deeply.
     """
 
     def at(line: int) -> str:
@@ -159,6 +138,8 @@ def parse(text: str, source: str, name_line: bool = True, example: Callable[[str
         line = text.count("\n", 0, error.position) + 1
         reason = "holds a control character, or bytes that are not UTF-8"
         raise ConfigError(at(line), "", f"not valid YAML: {reason}") from None
+    except RecursionError:
+        raise ConfigError(source, "", "lists and mappings are nested too deeply") from None
     except (ValueError, KeyError, AttributeError, TypeError):  # PyYAML on `!!bool x`
         raise ConfigError(source, "", "not valid YAML: a value contradicts its explicit !! tag") from None
 
@@ -176,13 +157,6 @@ def _problem(error: yaml.MarkedYAMLError, text: str, example: Callable[[str], st
         return "not valid YAML: a tab; YAML allows only spaces for indentation and after a colon"
     hint = "; put text that begins with it in quotes" if "cannot start any token" in problem else ""
     return f"not valid YAML: {problem}{hint}"
-
-
-def count_values(data: Any) -> int:
-    """How many values and keys plain `data`, as `parse` bounds it, holds: the same list stands twice, counted twice."""
-    if isinstance(data, dict):
-        return 1 + len(data) + sum(map(count_values, data.values()))
-    return 1 + sum(map(count_values, data)) if isinstance(data, list) else 1
 
 
 def _check_keys(node: yaml.Node, at: Callable[[int], str], location: Location, seen: set[int]) -> None:

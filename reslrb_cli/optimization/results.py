@@ -23,7 +23,6 @@ import numpy as np
 
 from reslrb_cli.optimization.errors import nearest
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.state import Count, Number
 from reslrb_cli.optimization.trend import LEAST_ITERATIONS, find_trend, window
 from reslrb_cli.optimization.views import View
 from reslrb_cli.records.metrics import Figure, Record, finite
@@ -36,8 +35,8 @@ WINDOW = 10
 class Least:
     """The least loss so far, and after how many updates it was."""
 
-    iteration: Count
-    loss: Number
+    iteration: int
+    loss: float
 
 
 class Best:

@@ -15,13 +15,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any
+from typing import Any
 
 import drjit as dr
-import numpy as np
-from pydantic import Field
 
-from reslrb_cli.config.files import CONFIG_BYTES
 from reslrb_cli.guiding.tables import KNOWN, Guiding
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.optimization.autotune.race import is_auto
@@ -30,13 +27,9 @@ from reslrb_cli.optimization.decisions import MemoryPlan, Scaled
 from reslrb_cli.optimization.memory import in_passes
 from reslrb_cli.optimization.optimizers import SUMS
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.records.checkpoint import entries_below
 from reslrb_cli.records.decisions import GuidedRecord, PathsRecord, PixelsRecord, SequenceRecord
 from reslrb_cli.records.tree import PASSING, Array, Arrays, Stored, entry, expected, like, to_array
-
-Count = Annotated[int, Field(ge=0, lt=2**31)]
-FromOne = Annotated[int, Field(ge=1, lt=2**31)]
-Number = Annotated[float, Field(ge=0, lt=1e300)]
-Positive = Annotated[float, Field(gt=0, lt=1e300)]
 
 
 @dataclass(frozen=True)
@@ -56,25 +49,25 @@ class State:
     them.
     """
 
-    iteration: Count
-    elapsed_s: Number
-    peak_mib: Number
-    standstill: Count
-    units: dict[str, tuple[Positive, Positive]]
-    clamp: dict[str, FromOne]
+    iteration: int
+    elapsed_s: float
+    peak_mib: float
+    standstill: int
+    units: dict[str, tuple[float, float]]
+    clamp: dict[str, int]
     scaling: list[Scaled] | None = None
-    guiding: dict[str, Count] | None = None
-    stage: Count = 0
-    drops: Count = 0
-    since: Count = 0
+    guiding: dict[str, int] | None = None
+    stage: int = 0
+    drops: int = 0
+    since: int = 0
     stopped: str = ""
-    first_s: Number = 0.0
-    values: Arrays = field(default_factory=dict, metadata=entry("parameter", "finite"))
-    halo: Arrays = field(default_factory=dict, metadata=entry("parameter with halo", "finite"))
+    first_s: float = 0.0
+    values: Arrays = field(default_factory=dict, metadata=entry("parameter"))
+    halo: Arrays = field(default_factory=dict, metadata=entry("parameter with halo"))
     moments: Arrays = field(default_factory=dict, metadata=entry("optimizer"))
     clamp_sums: Arrays = field(default_factory=dict, metadata=entry("clamp"))
-    learned: Arrays = field(default_factory=dict, metadata=entry("guiding", "finite"))
-    base: Arrays = field(default_factory=dict, metadata=entry("base", "finite"))
+    learned: Arrays = field(default_factory=dict, metadata=entry("guiding"))
+    base: Arrays = field(default_factory=dict, metadata=entry("base"))
     end: str = field(default="", metadata=PASSING)
     gradients: dict[str, Any] = field(default_factory=dict, metadata=PASSING)
 
@@ -114,19 +107,8 @@ def load(problem: Problem, stored: Stored, whole: Problem) -> State:
     Raises ConfigError where it is another experiment's.
     """
     told, optimizer, keys = stored.read(State), problem.optimizer, problem.selection.keys
-    for name, found in (("units", told.units), ("clamp", told.clamp)):
-        for key in found:
-            if key not in keys:
-                raise stored.wrong(f"{name}.{key}", "is of a parameter that the run does not have")
-    if told.scaling is not None and [row.key for row in told.scaling] != list(keys):
-        raise stored.wrong("scaling", "does not have the run's parameters")
-    for key in keys:
-        if key in told.units:
-            optimizer.set_variable(key, replace(optimizer.variable(key), length=told.units[key][0]))
-        elif key in optimizer.units():
-            raise stored.wrong(f"units.{key}", "is missing")
-    if guiding_of(problem) is not None and told.guiding is None:
-        raise stored.wrong("guiding", "is missing")
+    for key, (length, _) in told.units.items():
+        optimizer.set_variable(key, replace(optimizer.variable(key), length=length))
     learned = dict.fromkeys(f"{number}/{name}" for number in told.guiding or () for name in KNOWN)
     sums = {key: dict.fromkeys(SUMS, dr.detach(optimizer[key])) for key in told.clamp}
     values = _stored_values(problem, stored, "parameter")
@@ -178,34 +160,14 @@ def on_file(problem: Problem, values: Mapping[str, Any]) -> tuple[dict[str, Arra
 
 
 def _stored_values(problem: Problem, stored: Stored, prefix: str) -> dict[str, Any]:
-    """What `on_file` made of values, as the optimiser has them; `prefix` is that of their entries.
-
-    Raises ConfigError for one that is out of its bounds.
-    """
+    """What `on_file` made of values, as the optimiser has them; `prefix` is that of their entries."""
     found = {}
     for key in problem.selection.keys:
         now, name, shape = dr.detach(problem.optimizer[key]), f"{prefix}/{key}", problem.selection.array(key).shape
         if math.prod(shape) != math.prod(dr.shape(now)):
             name, shape = f"{prefix} with halo/{key}", tuple(dr.shape(now))
-        array = stored.take(name, expected(shape), "finite")
-        check_bounds(problem, stored, name, key, array)
-        found[key] = like(now, array.reshape(dr.shape(now)))
+        found[key] = like(now, stored.take(name, expected(shape)).reshape(dr.shape(now)))
     return found
-
-
-def check_bounds(problem: Problem, stored: Stored, name: str, key: str, array: Array) -> None:
-    """Raise ConfigError where an entry of the value `name` of the parameter `key` is none that a run comes to.
-
-    A run goes on with the bounds that it began with, and each of its updates ends within them: what lies outside was
-    not written by it. (Bounds cannot change: `runs.prepare.changes`.)
-    """
-    spec = problem.selection.spec(key)
-    low, high = spec.bounds or (-math.inf, math.inf)
-    if spec.transform in ("log", "softplus"):
-        low = max(low, np.finfo(np.float32).tiny)  # these yield nothing else
-    outside = (array < np.float32(low)) | (array > np.float32(high))
-    if outside.any():
-        raise stored.wrong(name, f"holds {array[outside].flat[0]:g}, outside of {low:g} to {high:g}, its bounds")
 
 
 # --- what was settled before the first iteration ----------------------------------------------------------------------
@@ -217,32 +179,27 @@ class Settled:
     that they name, what was decided by measurement, the parameters' values at the start, and `masks` as a `Problem`
     has them."""
 
-    #: With every default written out, so that it is longer than a file may be.
-    config: Annotated[str, Field(max_length=4 * CONFIG_BYTES)]
+    config: str
     variant: str
     files: dict[str, str] = field(default_factory=dict)
     guided: GuidedRecord | None = None
     sequence: SequenceRecord | None = None
     paths: PathsRecord | None = None
     memory: MemoryPlan | None = None
-    initial: Arrays = field(default_factory=dict, metadata=entry("initial", "finite"))
-    initial_halo: Arrays = field(default_factory=dict, metadata=entry("initial with halo", "finite"))
+    initial: Arrays = field(default_factory=dict, metadata=entry("initial"))
+    initial_halo: Arrays = field(default_factory=dict, metadata=entry("initial with halo"))
     masks: Arrays = field(default_factory=dict, metadata=entry("mask"))
     pixels: PixelsRecord | None = None
     #: How camera paths are shared out over the pixels, by the number of their sensor, (H, W).
-    shares: Arrays = field(default_factory=dict, metadata=entry("pixels", "finite"))
+    shares: Arrays = field(default_factory=dict, metadata=entry("pixels"))
 
 
 def begin_as(problem: Problem, stored: Stored) -> None:
     """Give the parameters the values that the run began with."""
-    keys = problem.selection.keys
-    found = [name for name in stored.archive.names("parameter/") if name not in keys]
-    if found:
-        raise stored.wrong(f"parameter/{found[0]}", "is no parameter of this run")
     values = _stored_values(problem, stored, "initial")
     problem.selection.set_arrays({key: problem.selection.shown(key, value) for key, value in values.items()})
-    for key in keys:
-        problem.optimizer.set_value(key, values[key])
+    for key, value in values.items():
+        problem.optimizer.set_value(key, value)
     problem.apply()
 
 
@@ -253,33 +210,18 @@ def decide_as(problem: Problem, stored: Stored) -> Problem:
     sequence = settled.sequence if is_auto(problem.config, "sequence") else None
     sides = settled.paths if is_auto(problem.config, "paths") else None
     pixels = settled.pixels if is_auto(problem.config, "pixels") else None
-    if problem.memory is not None:
-        problem = in_passes(problem, _as_planned(stored, settled.memory, problem.memory))
+    if problem.memory is not None and settled.memory is not None:
+        before = settled.memory  # the passes decide in what order samples are summed up
+        plan = MemoryPlan(problem.memory.budget_bytes, before.samples_per_pass, before.passes, before.expected_bytes)
+        problem = in_passes(problem, plan)
     integrator = as_decided(with_sides(problem.integrator, sides), guided, sequence)
-    if names := stored.archive.names("pixels/"):
-        films = {str(k): sensor.film().crop_size() for k, sensor in enumerate(problem.scene.sensors())}
-        for name in names:
-            if name not in films:
-                raise stored.wrong(f"pixels/{name}", "is of a sensor that the scene does not have")
-        sizes = {name: expected((int(films[name][1]), int(films[name][0]))) for name in names}
-        integrator = integrator.shared_out(
-            {name: stored.take(f"pixels/{name}", size, "finite") for name, size in sizes.items()}
-        )
+    if shares := entries_below(stored.arrays, "pixels/"):
+        integrator = integrator.shared_out(shares)
     return replace(problem, sides=sides, guided=guided, sequence=sequence, pixels=pixels, integrator=integrator)
-
-
-def _as_planned(stored: Stored, before: MemoryPlan | None, now: MemoryPlan) -> MemoryPlan:
-    """The plan of the run, whose passes decide in what order samples are summed up."""
-    if before is None:
-        raise stored.wrong("memory", "is missing")
-    size, passes = before.samples_per_pass, before.passes
-    if min(size, passes) < 1 or size * passes != now.samples_per_pass * now.passes:
-        raise stored.wrong("memory", f"has {passes} passes of {size} samples")
-    return MemoryPlan(now.budget_bytes, size, passes, before.expected_bytes)
 
 
 def reach_as(problem: Problem, stored: Stored) -> Problem:
     """Take up what light and sensor reach, of the parameters whose true value is known."""
     shapes = {key: problem.selection.array(key).shape for key in problem.truth}
-    asked = {key: expected(shape[:2] if len(shape) == 3 else shape, bool) for key, shape in shapes.items()}
+    asked = {key: expected(shape[:2] if len(shape) == 3 else shape) for key, shape in shapes.items()}
     return replace(problem, masks={key: stored.take(f"mask/{key}", mask) for key, mask in asked.items()})

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from reslrb_cli.config.optimizers import AnyOptimizer, Standing
+from reslrb_cli.config.optimizers import AnyOptimizer, StopRule
 from reslrb_cli.config.schema import Config
 from reslrb_cli.optimization.state import State
 from reslrb_cli.optimization.trend import SPANS, levels_of, line, stands
@@ -69,7 +69,7 @@ class Watch:
         stop, optimizer, done = self.config.run.stop, self.config.optimizer, state.iteration
         began = max(self._first, state.since)
         if optimizer.schedule == "plateau" and lowered(optimizer, state.drops) > optimizer.final_fraction:
-            if self._stands(stop or Standing(), began, done):
+            if self._stands(stop or StopRule(), began, done):
                 return replace(state, drops=state.drops + 1, since=done)
         elif stop is not None and (said := self._stands(stop, began, done)):
             return replace(state, stopped=said)
@@ -81,7 +81,7 @@ class Watch:
         stages, iterations = self.config.run.stages, self.config.run.iterations
         return math.ceil(stages[-1].until * iterations) + 1 if stages else 0
 
-    def _stands(self, asked: Standing, began: int, done: int) -> str:
+    def _stands(self, asked: StopRule, began: int, done: int) -> str:
         """Say how the loss stands after `done` iterations; "" where that is not shown, or no window is at its end."""
         span = asked.patience
         if (done - began) % span:

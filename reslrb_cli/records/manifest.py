@@ -56,15 +56,6 @@ class Status(str, enum.Enum):
     FAILED = "failed"
 
 
-#: Why a part is missing from a folder whose process ended before it came to that part.
-NOT_YET = "not written yet"
-
-
-def is_complete(content: Mapping[str, Any]) -> bool:
-    """Whether a manifest is that of a run that is finished, and came to the end of writing what it found."""
-    return content.get("status") == Status.FINISHED and NOT_YET not in content.get("missing", {}).values()
-
-
 @dataclass
 class Manifest:
     """Provenance and outcome of one run.
@@ -79,8 +70,7 @@ class Manifest:
     `results` is what the run found (`iterations`, values and errors by key,
     `certainty`, `warnings`, and `seen`, errors as people see them, ...); `error` is the line that the user saw where
     the run failed. `resumed` says of each time that the run was gone on with after how many iterations, when, by what
-    command, from which state, and what had changed: settings, from and to, and versions. `missing` names the parts of
-    the folder that are not there (not yet, where the process ended among them), and says why.
+    command, from which state, and what had changed: settings, from and to, and versions.
     """
 
     variant: str
@@ -95,7 +85,6 @@ class Manifest:
     started: str = field(default_factory=now)
     ended: str | None = None
     error: str | None = None
-    missing: dict[str, str] = field(default_factory=dict)
     plan: dict[str, Any] | None = None
     guided: dict[str, Any] | None = None
     sequence: dict[str, Any] | None = None
@@ -133,10 +122,6 @@ class Manifest:
 MANIFEST_FILE = "manifest.json"
 PROGRAM = "reslrb"
 
-#: Bytes of a manifest; the largest part of one is the verdicts, of some kB.
-MOST_BYTES = 2**24
-
-
 #: Checks the types of the fields, and of what they hold as far as `Manifest` says.
 _CHECK = TypeAdapter(Manifest)
 
@@ -148,7 +133,7 @@ def read_content(folder: Path) -> dict[str, Any] | None:
     located by the first field of another type.
     """
     try:
-        text = read_file(folder / MANIFEST_FILE, MOST_BYTES)
+        text = read_file(folder / MANIFEST_FILE)
         content = json.loads(text)
     except (ConfigError, ValueError, RecursionError):
         return None

@@ -15,18 +15,17 @@ import os
 import platform
 import sys
 import time
-import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, ClassVar
 
-from reslrb_cli.config.files import in_words, open_file
+from reslrb_cli.config.files import open_file
 from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.records.atomic import remove_parts_of, write_atomically
 from reslrb_cli.records.manifest import now, versions
-from reslrb_cli.records.metrics import MOST_BYTES, Line
+from reslrb_cli.records.metrics import Line
 
 if TYPE_CHECKING:
     import numpy as np
@@ -60,13 +59,11 @@ def read_lines(path: Path, tell: Tell | None = None) -> Lines:
     found, done = Lines(), 0
     # Numbers that are not finite are found as they are parsed: to go through all that was parsed takes twice as long.
     decoder = json.JSONDecoder(parse_float=_finite, parse_constant=lambda name: None)
-    with open_file(path, MOST_BYTES) as file, _without_collecting():
+    with open_file(path) as file, _without_collecting():
         size = os.fstat(file.fileno()).st_size
         try:
             for number, line in enumerate(file, 1):
                 done += len(line)
-                if done > MOST_BYTES:
-                    raise ConfigError(path, "", f"has more than {in_words(MOST_BYTES)}")
                 if tell is not None and number % _LINES == 0:
                     tell(path, done, max(done, size))
                 if not line.strip():
@@ -203,21 +200,12 @@ def write_samples(path: Path, head: Mapping[str, Any], arrays: Mapping[str, np.n
 
 def read_samples(path: Path) -> Kept:
     """What `write_samples` wrote. Raises ConfigError, located in the file, where it is none of that."""
-    import numpy as np
+    from reslrb_cli.records.checkpoint import open_archive
 
-    try:
-        with open_file(path) as file, np.load(file, allow_pickle=False) as arrays:
-            if any(entry.compress_type != zipfile.ZIP_STORED for entry in arrays.zip.infolist()):
-                raise ValueError("compressed, so that a small file may stand for large arrays")
-            head = json.loads(str(arrays[_HEAD]))
-            if not isinstance(head, dict):
-                raise ValueError("its head is no object")
-            return head, {name: arrays[name] for name in arrays.files if name != _HEAD}
-    except ConfigError:
-        raise
-    except Exception as error:  # of many kinds, from the readers of archives, arrays and their heads
-        reason = str(error) or type(error).__name__
-        raise ConfigError(path, "", f"is damaged, cut off, or not written beside --json ({reason})") from None
+    with open_archive(path) as archive:
+        arrays = dict(archive)
+        head: dict[str, Any] = json.loads(str(arrays.pop(_HEAD)))
+        return head, arrays
 
 
 #: Seconds between two pages, at least; and the times as long as the last page took: pages take a twentieth of a run,

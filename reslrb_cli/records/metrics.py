@@ -25,9 +25,6 @@ from reslrb_cli.records.atomic import write_atomically
 
 METRICS_FILE = "metrics.jsonl"
 
-#: Bytes of such a file. A million iterations of a run with ten parameters take as much.
-MOST_BYTES = 2**30
-
 
 class Line:
     """A line of JSON: a dataclass's fields in their order, behind `kind` where the class has a `KIND`.
@@ -180,7 +177,7 @@ def read_records(folder: Path, count: int, last: Record | None) -> tuple[list[Re
     located in the file and the line, where others are missing or are not what a run writes.
     """
     path = folder / METRICS_FILE
-    content = read_file(path, MOST_BYTES) if count and os.path.lexists(path) else b""
+    content = read_file(path) if count and os.path.lexists(path) else b""
     whole = [line for line in content.splitlines(keepends=True)[:count] if line.endswith(b"\n")]
     records = [_record(line, number, path) for number, line in enumerate(whole)]
     if len(records) == count - 1 and last is not None and last.iteration == count - 1:
@@ -197,7 +194,7 @@ def cut_back(folder: Path, records: list[Record], size: int) -> None:
     if not records:
         path.unlink(missing_ok=True)
         return
-    content = read_file(path, MOST_BYTES)[:size] if size else b""
+    content = read_file(path)[:size] if size else b""
     if content.count(b"\n") < len(records):
         content += records[-1].to_json().encode() + b"\n"
     write_atomically(path, lambda file: file.write(content), durable=True)

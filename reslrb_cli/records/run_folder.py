@@ -29,7 +29,7 @@ from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.records import manifest as manifests
 from reslrb_cli.records import metrics
 from reslrb_cli.records.atomic import FOLDER_PREFIX, remove_parts, unfinished_folder, write_atomically
-from reslrb_cli.records.checkpoint import STATE_FILE, Archive, newest_checkpoint
+from reslrb_cli.records.checkpoint import STATE_FILE, newest_checkpoint, open_archive
 from reslrb_cli.records.lock import READER_WAIT_SECONDS, FolderLock, Holder, InUse
 from reslrb_cli.records.manifest import Manifest, Status, read_manifest
 
@@ -50,10 +50,10 @@ def read_value(run: Path, key: str) -> Array:
     it is no run's, damaged, or the run did not recover `key`.
     """
     path = checkpoint_of(run)
-    with Archive(path, whole=False) as archive:
-        known = archive.names("parameter/")
+    with open_archive(path) as archive:
+        known = [name.removeprefix("parameter/") for name in archive if name.startswith("parameter/")]
         if key in known:
-            return archive.array(f"parameter/{key}", kind="f", values="any")
+            return archive[f"parameter/{key}"].astype(np.float32)
     near = difflib.get_close_matches(key, known, n=_SHOWN, cutoff=0.5) or known[:_SHOWN]
     has = " and ".join(f"`{name}`" for name in near) or "nothing"
     more = f" and {len(known) - len(near)} more" if len(known) > len(near) else ""
@@ -109,9 +109,6 @@ OWN_ENTRIES = (
     "config.yaml", manifests.MANIFEST_FILE, metrics.METRICS_FILE, "report.html", FABRICATION_FILE, *SUBFOLDERS
 )  # fmt: skip
 
-#: 56 KiB, which are tried to be written first: for a configuration, a manifest, and what it is to say of the run's end.
-_ROOM = "is there room?" * 4096
-
 #: An unfinished folder without a process is removed when it is so old: nobody is just about to lock it.
 LEFT_SECONDS = 60.0
 
@@ -126,7 +123,7 @@ def check_output(source: object, output: Path, name: str, force: bool) -> None:
         raise ConfigError(source, "run.output", f"{ancestor} is not a folder; give a folder that can be written to")
     try:
         with unfinished_folder(ancestor) as folder:
-            (folder / "file").write_text(_ROOM)
+            (folder / "file").write_text("is there room?")
             _try_name(source, folder, name)
     except OSError as error:
         raise _output_error(source, ancestor, error) from None
@@ -340,16 +337,13 @@ def opened(path: Path) -> Iterator[tuple[RunFolder, dict[str, Any]]]:
 def check_writable(folder: RunFolder) -> None:
     """Raise ConfigError, located in the folder, where nothing can be written to it, MachineError for a full disk.
 
-    What is written has to stay in the folder, so that links in it are refused, which no run makes. What a process that
-    is no more never came to finish is removed.
+    What a process that is no more never came to finish is removed.
     """
-    _check_links(folder.path)
     try:
         for name in SUBFOLDERS:
             (folder.path / name).mkdir(exist_ok=True)
         for place in (folder.path, *(folder.path / name for name in SUBFOLDERS)):
-            with tempfile.TemporaryFile(dir=place) as file:
-                file.write(_ROOM.encode())
+            tempfile.TemporaryFile(dir=place).close()
         metrics.mend(folder.path)
         remove_parts(folder.path)
     except OSError as error:
@@ -357,18 +351,6 @@ def check_writable(folder: RunFolder) -> None:
             raise MachineError(f"{folder.path}: {error.strerror}; nothing of the run was changed") from None
         reason = f"cannot be written to ({error.strerror}); to go on in another folder, add --set run.output=FOLDER"
         raise ConfigError(folder.path, "", reason) from None
-
-
-def _check_links(folder: Path) -> None:
-    """Raise ConfigError for links in a run's folder by which it would write elsewhere: those to folders, and that of
-    the metrics, which are added to. All other files are replaced, links and all."""
-    entries = [folder / metrics.METRICS_FILE, *(folder / name for name in SUBFOLDERS)]
-    for name in SUBFOLDERS:
-        entries += [Path(parent, below) for parent, folders, _ in os.walk(folder / name) for below in folders]
-    for entry in entries:
-        if entry.is_symlink():
-            reason = "is a link, by which the run would write elsewhere; put what it leads to in its place"
-            raise ConfigError(entry, "", f"{reason}, or add --set run.output=FOLDER")
 
 
 def copy_into(folder: RunFolder, earlier: Path) -> None:
@@ -379,8 +361,6 @@ def copy_into(folder: RunFolder, earlier: Path) -> None:
     for name in SUBFOLDERS:
         for path in sorted((earlier / name).rglob("*")):
             target = folder.path / name / path.relative_to(earlier / name)
-            if path.is_symlink() or not (path.is_file() or path.is_dir()):
-                continue  # nothing that a run writes
             if path.is_dir():
                 target.mkdir(exist_ok=True)
             else:

@@ -29,9 +29,6 @@ SWEEP_FILE, PAGE_FILE, CONFIGS = "sweep.json", "sweep.html", "configs"
 #: Of the file; another one is not read.
 VERSION = 1
 
-#: Bytes of the file: a thousand runs, each with the line that it failed by.
-MOST_BYTES = 2**22
-
 #: What a combination may be called: the name of a folder, and no way out of it.
 _NAME = re.compile(r"[\w+=-][\w.+=-]*")
 
@@ -149,7 +146,7 @@ def read_sweep(folder: Path) -> Sweep:
     if folder.is_dir() and not path.exists():
         raise ConfigError(folder, "", f"is no sweep's folder: it has no {SWEEP_FILE}")
     try:
-        sweep = _READER.validate_json(read_file(path, MOST_BYTES))
+        sweep = _READER.validate_json(read_file(path))
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"]))

@@ -1,4 +1,4 @@
-"""Trees of plain dataclasses, kept as arrays by name with JSON beside them, and read back strictly.
+"""Trees of plain dataclasses, kept as arrays by name with JSON beside them, and read back.
 
 A tree's fields are plain values, checked by their types, or, by the metadata `entry`, mappings of names to arrays. Its
 `entries` are those of an archive; `Stored` reads them back, as what a tree of the same kind expects.
@@ -18,7 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.records.checkpoint import Archive, Values
+from reslrb_cli.records.checkpoint import read_state
 from reslrb_cli.records.metrics import finite
 
 Array = np.ndarray[Any, Any]
@@ -27,16 +27,14 @@ Arrays = dict[str, Any]
 T = TypeVar("T")
 
 _ENTRY = "entry"
-_TYPES = {dr.VarType.Float32: "float32", dr.VarType.Float64: "float64", dr.VarType.UInt32: "uint32"}
 
 #: Metadata of a field that no file has.
 PASSING = {_ENTRY: None}
 
 
-def entry(name: str, values: Values = "no NaN") -> dict[str, Any]:
-    """The metadata of a field that maps names to arrays, or to more such mappings: the entries `<name>/...` of an
-    archive, with such `values`."""
-    return {_ENTRY: (name, values)}
+def entry(name: str) -> dict[str, Any]:
+    """Return the metadata of a field that maps names to arrays, or to more such mappings: the entries `<name>/...`."""
+    return {_ENTRY: name}
 
 
 def to_array(value: Any) -> Array:
@@ -63,9 +61,9 @@ def like(value: Any, array: Array) -> Any:
     return kind(*parts)
 
 
-def expected(shape: tuple[int, ...], dtype: Any = np.float32) -> Array:
-    """An array of zeros that takes no memory, for one of a file that is to be like it."""
-    return np.broadcast_to(np.zeros((), dtype), shape)
+def expected(shape: tuple[int, ...]) -> Array:
+    """An array of zeros that takes no memory, for one of a file that is to have its shape."""
+    return np.broadcast_to(np.zeros(()), shape)
 
 
 def entries(*trees: Any) -> tuple[dict[str, Array], dict[str, Any]]:
@@ -73,15 +71,16 @@ def entries(*trees: Any) -> tuple[dict[str, Array], dict[str, Any]]:
     found: dict[str, Array] = {}
     values: dict[str, Any] = {}
     for tree in trees:
-        for each, (name, _) in _array_fields(tree):
-            found |= {place: to_array(leaf) for place, leaf in _leaves(name, getattr(tree, each.name))}
+        for each in _array_fields(tree):
+            leaves = _leaves(each.metadata[_ENTRY], getattr(tree, each.name))
+            found |= {place: to_array(leaf) for place, leaf in leaves}
         beside = {each.name for each in fields(tree) if _ENTRY in each.metadata}
         values |= TypeAdapter(type(tree)).dump_python(tree, mode="json", exclude=beside)
     return found, finite(values)
 
 
-def _array_fields(tree: Any) -> Iterator[tuple[Field[Any], tuple[str, Values]]]:
-    return ((each, each.metadata[_ENTRY]) for each in fields(tree) if each.metadata.get(_ENTRY) is not None)
+def _array_fields(tree: Any) -> list[Field[Any]]:
+    return [each for each in fields(tree) if each.metadata.get(_ENTRY) is not None]
 
 
 def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:
@@ -93,16 +92,14 @@ def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 class Stored:
-    """The arrays of an archive and the JSON beside them. Whatever asks for what is not so raises ConfigError, located
-    in the file and by the name of the value."""
+    """The arrays of a state's file and the JSON beside them.
 
-    def __init__(self, archive: Archive, values: Mapping[str, Any]) -> None:
-        self.archive, self._values = archive, values
+    Raises ConfigError, located in the file and by the name of the value, for a value that is missing or does not fit.
+    """
 
-    @property
-    def path(self) -> Path:
-        """The file."""
-        return self.archive.path
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.arrays, self._values = read_state(path)
 
     def wrong(self, name: str, message: str) -> ConfigError:
         """The error for a value."""
@@ -119,27 +116,28 @@ class Stored:
             raise self.wrong(".".join(map(str, first["loc"])), first["msg"]) from None
 
     def fill(self, tree: T) -> T:
-        """The same tree with each of its arrays as the archive has it, of the type and shape of the one before.
+        """The same tree with each of its arrays as the file has it, of the type and shape of the one before.
 
-        In place of None stands an array of floats of any shape.
+        In place of None stands an array of any shape.
         """
 
-        def filled(name: str, other: Any, values: Values) -> Any:
+        def filled(name: str, other: Any) -> Any:
             if isinstance(other, Mapping):
-                return {key: filled(f"{name}/{key}", each, values) for key, each in other.items()}
-            return self.take(name, other, values)
+                return {key: filled(f"{name}/{key}", each) for key, each in other.items()}
+            return self.take(name, other)
 
-        found = {each.name: filled(name, getattr(tree, each.name), kind) for each, (name, kind) in _array_fields(tree)}
+        found = {each.name: filled(each.metadata[_ENTRY], getattr(tree, each.name)) for each in _array_fields(tree)}
         return replace(tree, **found)  # type: ignore[type-var]  # a dataclass
 
-    def take(self, name: str, other: Any, values: Values = "no NaN") -> Any:
-        """The array of a name, of the type and shape of `other`; what is added up may be infinite, never NaN."""
+    def take(self, name: str, other: Any) -> Any:
+        """Return the array of a name, as a value of the type of `other`, whose shape it must have; None for any."""
+        array = self.arrays.get(name)
+        if array is None:
+            raise self.wrong(name, "is missing")
         if other is None:
-            return self.archive.array(name, kind="f")
+            return array
         is_own = dr.is_array_v(other)
-        wanted = np.dtype(_TYPES[dr.type_v(other)]) if is_own else other.dtype
-        head = self.archive.heads.get(name)
-        if head is not None and head.dtype != wanted:
-            raise self.wrong(name, f"is {head.dtype} in place of {wanted}")
-        array = self.archive.array(name, tuple(dr.shape(other)) if is_own else other.shape, values=values)
+        shape = tuple(dr.shape(other)) if is_own else other.shape
+        if array.shape != shape:
+            raise self.wrong(name, f"has shape {array.shape}, not {shape}")
         return like(other, array) if is_own else array

@@ -14,7 +14,6 @@ import numpy as np
 from scipy import stats
 
 from reslrb_cli.config.files import duration
-from reslrb_cli.records.manifest import Status, is_complete
 from reslrb_cli.records.measurements import Band, Range
 from reslrb_cli.records.sweeps import (
     Combination,
@@ -62,8 +61,6 @@ def _run_record(source: SweepRuns, combination: Combination, seed: int) -> Sweep
         return SweepRunRecord(name, combination.settings, seed, status, done, message=line)
     results, relative = run.results, units_differ(run.results)
     status = str(run.manifest.get("status", ""))
-    if status == Status.FINISHED and not is_complete(run.manifest):  # it was killed over its final images
-        status = Status.INTERRUPTED.value
     return SweepRunRecord(
         name, combination.settings, seed, status, len(run.records),
         _number((results.get("image_loss") or {}).get("final")), _error(run, relative), relative,

@@ -1,11 +1,11 @@
-"""The course of a run: what its iterations go on from, and what has been found on the way; kept, and taken up again.
+"""A run as it goes on: how it is prepared, what its iterations go on from, what has been found, and how that is kept.
 
 - `plan_record`: what a run's manifest says of the plan of its step.
 - `changes`, `check_changes`: what of an experiment may change while its run goes on, and what may not.
 - `prepare`, `manifest_of`: from a configuration to a problem that is ready to run, and the manifest that says what was
   settled on the way.
-- `Begun`: a run that is to be made, or gone on with; `begin`: one that is new.
-- `Course`: the course itself.
+- `PreparedRun`: a run that is to be made, or gone on with; `begin`: one that is new.
+- `RunProgress`: what a run has come to.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from reslrb_cli.optimization.moving import warn_of_border
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import WINDOW, Best, Images, Least, Results
 from reslrb_cli.optimization.stages import Stages
-from reslrb_cli.optimization.state import Settled, State, check_bounds, load, noted_of, on_file, put, standing
+from reslrb_cli.optimization.state import Settled, State, load, noted_of, on_file, put, standing
 from reslrb_cli.optimization.stopping import Watch
 from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
 from reslrb_cli.optimization.views import view_records
@@ -143,7 +143,7 @@ def _shown(value: Any) -> str:
 Say = Callable[[str], None]
 
 
-def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[Course, Manifest]:
+def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[RunProgress, Manifest]:
     """Assemble a new run, and measure what is to be known before it; a variant must be set.
 
     `say` is told what takes long, `warn` what to look at. Raises ConfigError and UnsupportedScene.
@@ -155,7 +155,7 @@ def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[Course, 
         problem = problem.afresh(problem.values())
     manifest = manifest_of(problem, variant, config.source)
     manifest.incomplete = [asdict(record) for record in missing]
-    return Course(problem, variant), manifest
+    return RunProgress(problem, variant), manifest
 
 
 def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
@@ -194,7 +194,7 @@ Array = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)
-class Met:
+class SavedResults:
     """What a run has met on its way, beside the records of its iterations, of which `last` is the newest."""
 
     images: Images
@@ -202,12 +202,12 @@ class Met:
     best: Least | None = None
     last: Record | None = None
     shared: SharedTime | None = None
-    best_values: Arrays = field(default_factory=dict, metadata=entry("best", "finite"))
+    best_values: Arrays = field(default_factory=dict, metadata=entry("best"))
     squares: Arrays = field(default_factory=dict, metadata=entry("squares"))
-    last_steps: Arrays = field(default_factory=dict, metadata=entry("last steps", "finite"))
+    last_steps: Arrays = field(default_factory=dict, metadata=entry("last steps"))
 
 
-class Course:
+class RunProgress:
     """Of one run of `problem`, whose parameters stand at their initial values when this is made.
 
     `state` is that after the last whole iteration; of the one that is at work nothing is in it.
@@ -322,8 +322,8 @@ class Course:
         save_checkpoint(folder, begun.iteration, {}, *found, name=NONFINITE_FILE_NAME)
 
     def _entries(self, state: State) -> tuple[Arrays, dict[str, Any]]:
-        """Return what a file has of the course at a state, as `tree.entries` has it."""
-        met = Met(
+        """Return the arrays and the other values of a checkpoint at a state, as `tree.entries` does."""
+        met = SavedResults(
             self.results.images["initial"], self.certainty.noted, self.best.least, self.last, self.shared,
             self.best_values(), self.certainty.squares, self.certainty.last_steps(),
         )  # fmt: skip
@@ -334,7 +334,7 @@ class Course:
 
         Raises ConfigError, located in the file, where something there is not what this run can have left.
         """
-        problem, met = self.problem, stored.read(Met)
+        problem, met = self.problem, stored.read(SavedResults)
         self.state = load(self.stages.at(stored.read(State).stage), stored, problem)
         squares = {key: problem.optimizer.squares(key) for key in met.certainty.keys if key in problem.selection.keys}
         wanted = {key: expected(problem.selection.array(key).shape) for key in problem.selection.keys if met.best}
@@ -345,8 +345,6 @@ class Course:
             self._take(record)
             self.watch.add(record)
         self.best.recent.extend(record.loss for record in records[-WINDOW:] if self._counts(record.iteration))
-        for key, array in met.best_values.items():
-            check_bounds(problem, stored, f"best/{key}", key, array)
         self.best.least, self.best.values = met.best, met.best_values
         self.results.images["initial"] = met.images
         self.certainty.restore(met.certainty, met.squares, met.last_steps)
@@ -354,23 +352,23 @@ class Course:
 
 
 @dataclass(frozen=True)
-class Begun:
+class PreparedRun:
     """A run that is to be made, or gone on with: its course, its manifest, and `place`, which makes its folder or takes
     it over, and has it locked while the block works."""
 
-    course: Course
+    course: RunProgress
     manifest: Manifest
     place: Callable[[], contextlib.AbstractContextManager[RunFolder]]
 
 
-def begin(config: Config, variant: str, force: bool, say: Say, warn: Say) -> Begun:
+def begin(config: Config, variant: str, force: bool, say: Say, warn: Say) -> PreparedRun:
     """A new run, prepared as `prepare` does, in a folder of its own; a variant must be set.
 
     Whether there can be one is asked before (`check_output`). Raises ConfigError and UnsupportedScene.
     """
     course, manifest = prepare(config, variant, say, warn)
     run = config.run
-    return Begun(
+    return PreparedRun(
         course,
         manifest,
         lambda: RunFolder.create(config.source, run.output, run.folder_name, force, dump(config), manifest),

@@ -1,8 +1,4 @@
-"""The recording of a run: its optimisation is run, and its folder written; one that is resumed goes on where it was.
-
-- `Recording`: one run being recorded.
-- `Ending`: the end of a run, part by part. Each stands alone, the manifest comes first, and it says what is missing.
-"""
+"""The recording of a run: its optimisation is run, and its folder written; one that is resumed goes on where it was."""
 
 from __future__ import annotations
 
@@ -13,12 +9,11 @@ import shlex
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from reslrb_cli.errors import MachineError, NonFinite, describe, is_machine_fault, tell
+from reslrb_cli.errors import MachineError, NonFinite, describe, is_machine_fault
 from reslrb_cli.optimization.decisions import Scaled
 from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.nonfinite import Findings
@@ -27,15 +22,14 @@ from reslrb_cli.optimization.sensitivity import curvature_line, step_line
 from reslrb_cli.optimization.state import State
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
-from reslrb_cli.records.atomic import Reserve, remove_parts, size_of
+from reslrb_cli.records.atomic import remove_parts
 from reslrb_cli.records.checkpoint import (
     NONFINITE_FILE_NAME,
     STATE_FILE,
     newest_checkpoint,
 )
-from reslrb_cli.records.images import PARAMETERS_FILE as PARAMETERS_FILE_NAME
 from reslrb_cli.records.images import load_image, write_image, write_mask, write_parameters
-from reslrb_cli.records.manifest import NOT_YET, Manifest, Status
+from reslrb_cli.records.manifest import Manifest, Status
 from reslrb_cli.records.measurement_files import LivePage
 from reslrb_cli.records.measurements import incomplete_records
 from reslrb_cli.records.metrics import MetricsWriter, Record, finite
@@ -44,125 +38,20 @@ from reslrb_cli.report.page import write_report
 from reslrb_cli.report.perceptual import seen_errors
 from reslrb_cli.report.run_summary import warnings
 from reslrb_cli.report.tonemap import shown_exposures, write_error_map
-from reslrb_cli.runs.prepare import Course
+from reslrb_cli.runs.prepare import RunProgress
 
 logger = logging.getLogger(__name__)
 
 
-class Ending:
-    """How the run in `folder` ends: with `status`, and with `failure` where something failed before.
-
-    A part that fails is noted in `manifest.missing`, and the others are still done. The first failure of all is that of
-    the run, unless it is the page's: what the run is for is there without it. `kept` says what a reader will find.
-    """
-
-    def __init__(
-        self,
-        folder: Path,
-        manifest: Manifest,
-        status: Status,
-        failure: BaseException | None,
-        kept: Callable[[], str],
-    ) -> None:
-        self._folder, self._manifest, self._kept = folder, manifest, kept
-        self._status, self._failure = status, failure
-
-    def begin(self, parts: Sequence[str]) -> None:
-        """Write the manifest, from here on the truth: these parts are still missing."""
-        self._manifest.missing = dict.fromkeys(parts, NOT_YET)
-        self._write_manifest()
-
-    def part(self, name: str, work: Callable[[], object]) -> None:
-        """Do a part. Only what was begun with is ever missing from the manifest of a run that ended well."""
-        try:
-            work()
-        except Exception as error:
-            self._manifest.missing[name] = describe(error)
-            if self._failure is None:
-                self._status, self._failure = Status.FAILED, error
-            elif not self._is_like_failure(error):  # else one line says it all
-                logger.warning("%s: not written: %s", name, describe(error))
-        else:
-            self._manifest.missing.pop(name, None)
-
-    def finish(self, write_page: Callable[[], object]) -> Status:
-        """Complete the manifest, write the page from it, and say how the run ended, or raise what it failed of."""
-        self._write_manifest()
-        try:
-            write_page()
-        except Exception as error:
-            self._manifest.missing["page"] = describe(error)
-            if not self._is_like_failure(error):
-                logger.warning("the page was not written: %s; all else is in %s", describe(error), self._folder)
-            self._write_manifest()
-        remove_parts(self._folder)
-        return self._outcome()
-
-    def give_up(self, fault: OSError) -> Status:
-        """Write nothing, for the folder has gone: raise what the run failed of, or else that."""
-        if self._failure is None:
-            self._failure = fault
-        return self._outcome()
-
-    def _outcome(self) -> Status:
-        if self._failure is None:
-            return self._status
-        if self._machine_failed():
-            raise MachineError(self._line()) from self._failure
-        raise self._failure
-
-    def _write_manifest(self) -> None:
-        def write() -> None:
-            self._manifest.end(self._folder, self._status, None if self._failure is None else self._line())
-
-        self.part("manifest", write)
-
-    def _is_like_failure(self, error: Exception) -> bool:
-        told, before = tell(error), None if self._failure is None else tell(self._failure)
-        return told is not None and before is not None and told[1] == before[1]
-
-    def _machine_failed(self) -> bool:
-        # Nothing but files of the run folder is open by now, and that could be written to when the run began.
-        return self._failure is not None and (isinstance(self._failure, OSError) or is_machine_fault(self._failure))
-
-    def _line(self) -> str:
-        assert self._failure is not None
-        line = describe(self._failure)
-        return f"{line}; {self._kept()}" if self._machine_failed() else line
-
-
-def what_is_kept(folder: RunFolder, saved: int | None, done: int, parameters: bool) -> str:
-    """What a reader will find of a run of `done` iterations that ends by the machine's fault, in words.
-
-    `saved` is the number of iterations of the last state that it wrote (None: none), `parameters` says whether the
-    values of its end were written; either may have been removed since.
-    """
-    if not folder.is_there:
-        taken = "; what is there now is another's, and was left as it is" * folder.path.exists()
-        return f"{folder.path} was removed or moved away{taken}"
-    state = newest_checkpoint(folder.checkpoint)
-    if saved is not None and state is not None:
-        if state.name != STATE_FILE:
-            return f"kept: an earlier state than that after {saved} of {done} iterations, in {state}"
-        which = f"the state after {saved} of {done} iterations" if saved else "the initial state"
-        return f"kept: {which}, in {folder.checkpoint}"
-    if parameters and (folder.parameters / PARAMETERS_FILE_NAME).exists():
-        return f"kept: the values after {done} iterations, in {folder.parameters}; no state to go on from"
-    return "nothing of the run was kept"
-
-
 #: Images with more pixels take some seconds to be compared, and that is said.
 MANY_PIXELS = 5e5
-
-#: What the end of a run writes beside checkpoint and parameters, for which room is kept: a manifest, and lists.
-RESERVE_BYTES = 1 << 16
 
 
 @dataclass
 class Recording:
     """One run being recorded: `course` is what it has come to, from where it began or was gone on with."""
 
-    course: Course
+    course: RunProgress
     folder: RunFolder
     manifest: Manifest
     page: LivePage = field(init=False)
@@ -208,24 +97,19 @@ class Recording:
         """The record of each iteration until the end, until `stop()`, or until nobody asks for more (`close`); then
         the folder is completed, and `status` says how the run ended.
 
-        Whatever ends the run, its folder has a manifest that says so, the parameters, a checkpoint and the report, and
-        final images where it did not fail; what could not be written is noted in the manifest. Raises what the run
-        failed of, a MachineError where the folder could not be written to.
+        Whatever ends the run, its folder has a checkpoint, the parameters, a manifest that says how it ended, and the
+        report; and final images if it did not fail. Raises the run's failure, as MachineError if the folder could not
+        be written to.
         """
         self._stop = stop
-        reserve = Reserve(self.folder.checkpoint)
         status: Status = Status.FAILED
         failure: BaseException | None = None
         try:
             self.page.refresh()
-            values = self.folder.parameters
             if self.done:  # what `_begin` writes is there: a run has a state after an iteration only then
                 self._saved = self.done
             else:
                 self._begin()
-                values = values / "initial"
-            # the state at the end has the best values too, and what the clamp and the optimiser then know
-            reserve.hold(2 * size_of(self.folder.checkpoint) + size_of(values) + RESERVE_BYTES)
             (self.folder.path / FABRICATION_FILE).unlink(missing_ok=True)  # of where it was before it went on
             yield from self._iterate(stop)
             left = self.done < self.problem.config.run.iterations and not self.course.state.stopped
@@ -240,7 +124,6 @@ class Recording:
             failure = NonFinite(f"{error}; {self._where()}") if self._saved_nonfinite else error
         except BaseException as error:
             failure = error
-        reserve.release()
         self.status = self._end(status, failure)
 
     def abandon(self) -> None:
@@ -331,24 +214,41 @@ class Recording:
         return f"where: reslrb inspect {shlex.quote(os.path.relpath(self.folder.path / 'config.yaml'))} --nonfinite"
 
     def _end(self, status: Status, failure: BaseException | None) -> Status:
-        ending = Ending(self.folder.path, self.manifest, status, failure, self._kept)
+        """Complete the folder, the state first, and return how the run ended; raise its first failure."""
         if (fault := self.folder.fault) is not None:
-            return ending.give_up(fault)
-        ending.part("results", self._note_results)
-        ending.part("folder", self.folder.make_whole)
-        ending.begin(["checkpoint", "parameters", "final images"])
-        ending.part("checkpoint", self._save_last_checkpoint)
-        ending.part("parameters", self._write_parameters)
-        if failure is None:
-            ending.part("final images", self._write_final_images)
-            if status is Status.FINISHED:  # who interrupts does not want to wait; `reslrb report` finds them as well
-                self._add("how certain the values are was", self._measure_certainty)
-                self._add("errors as people see them were", self._measure_seen_errors)
-                if self.problem.config.fabrication is not None:
-                    self._add("what a maker has to know of the solid was", self._measure_solid)
-        else:
-            self.manifest.missing["final images"] = "the run failed"
-        return ending.finish(self._write_page)
+            failure = failure or fault
+            raise MachineError(describe(failure)) if isinstance(failure, OSError) else failure
+        parts = [self.folder.make_whole, self._save_last_checkpoint, self._write_parameters, self._note_results]
+        for part in parts if failure is not None else [*parts, self._write_final_images]:
+            try:
+                part()
+            except Exception as error:
+                failure = failure or error
+        if failure is not None:
+            status = Status.FAILED
+        elif status is Status.FINISHED:  # who interrupts does not want to wait; `reslrb report` finds them as well
+            self._add("how certain the values are was", self._measure_certainty)
+            self._add("errors as people see them were", self._measure_seen_errors)
+            if self.problem.config.fabrication is not None:
+                self._add("what a maker has to know of the solid was", self._measure_solid)
+        # Nothing but files of the run folder is open by now, and that could be written to when the run began.
+        if isinstance(failure, OSError) or (failure is not None and is_machine_fault(failure)):
+            failure = MachineError(f"{describe(failure)}; {self._kept()}")
+        try:
+            self.manifest.end(self.folder.path, status, None if failure is None else describe(failure))
+        except OSError as error:
+            failure = failure or MachineError(f"{describe(error)}; {self._kept()}")
+        try:
+            write_report(self.folder.path)
+        except Exception as error:
+            if failure is None:
+                logger.warning("the page was not written: %s; all else is in %s", describe(error), self.folder.path)
+            with contextlib.suppress(OSError):  # the last one says that the run is at work
+                (self.folder.path / "report.html").unlink(missing_ok=True)
+        remove_parts(self.folder.path)
+        if failure is not None:
+            raise failure
+        return status
 
     def _write_parameters(self) -> None:
         """Write the last values, and beside them the best so far, where there are any."""
@@ -356,15 +256,6 @@ class Recording:
         best = self.course.best_values()
         if best:
             write_parameters(self.folder.parameters / "best", best)
-
-    def _write_page(self) -> None:
-        """Write the page for the last time; where that fails, none is left that says the run is at work."""
-        try:
-            write_report(self.folder.path)
-        except Exception:
-            with contextlib.suppress(OSError):
-                (self.folder.path / "report.html").unlink(missing_ok=True)
-            raise
 
     def _write_live_page(self) -> None:
         if self.course.last is None:  # nothing is there to be drawn, so that this takes no time
@@ -463,9 +354,10 @@ class Recording:
         return {**results.to_json(), **stopped}
 
     def _kept(self) -> str:
-        """What of the run a reader will find."""
-        written = "parameters" not in self.manifest.missing
-        return what_is_kept(self.folder, self._saved, self.done, written)
+        """Say which state of the run is on the disk."""
+        if self._saved is None or newest_checkpoint(self.folder.checkpoint) is None:
+            return "nothing of the run was kept"
+        return f"kept: the state after {self._saved} of {self.done} iterations, in {self.folder.checkpoint}"
 
     def _save_last_checkpoint(self) -> None:
         """Keep the state, unless it is there already: the one before it then is an earlier one."""

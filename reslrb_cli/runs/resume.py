@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.config.loader import OVERRIDDEN, Override, changed, dump, load, loads
@@ -18,8 +18,8 @@ from reslrb_cli.optimization.stages import Stages
 from reslrb_cli.optimization.state import Settled, State
 from reslrb_cli.optimization.state import load as load_state
 from reslrb_cli.optimization.stopping import OUT_OF_TIME
-from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, PREVIOUS_FILE_NAME, STATE_FILE, open_state
-from reslrb_cli.records.manifest import Manifest, is_complete, now, versions
+from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, PREVIOUS_FILE_NAME, STATE_FILE
+from reslrb_cli.records.manifest import Manifest, Status, now, versions
 from reslrb_cli.records.metrics import Record, cut_back, read_records
 from reslrb_cli.records.run_folder import (
     RunFolder,
@@ -30,16 +30,22 @@ from reslrb_cli.records.run_folder import (
     write_beginning,
 )
 from reslrb_cli.records.tree import Stored
-from reslrb_cli.runs.prepare import Begun, Change, Course, Met, changes, check_changes, digests, manifest_of
+from reslrb_cli.runs.prepare import (
+    Change,
+    PreparedRun,
+    RunProgress,
+    SavedResults,
+    changes,
+    check_changes,
+    digests,
+    manifest_of,
+)
 
 Say = Callable[[str], None]
 
-#: The variants that `variant` may name, `auto` left out.
-VARIANTS = [name for name in get_args(Config.model_fields["variant"].annotation) if name != "auto"]
-
 
 @dataclass
-class Earlier:
+class OpenedRun:
     """A run that is to go on: its folder, which is locked, what its manifest says, its state, and what is now asked.
 
     `changed` are the settings that differ from those that it began with; `elsewhere` says whether it goes on in a new
@@ -63,14 +69,10 @@ class Earlier:
         return len(self.records)
 
     @property
-    def variant(self) -> str:
-        """The variant that the run began with, whatever `auto` would choose here. Raises ConfigError."""
-        return _variant_of(self.stored)
-
-    @property
     def is_done(self) -> bool:
         """Whether nothing is left to do."""
-        return is_complete(self.manifest) and (self.config.run.iterations == self.iteration or self.has_stopped)
+        is_finished = self.manifest.get("status") == Status.FINISHED
+        return is_finished and (self.config.run.iterations == self.iteration or self.has_stopped)
 
     @property
     def has_stopped(self) -> bool:
@@ -88,14 +90,14 @@ class Earlier:
         done = f"{self.iteration} of {iterations} iterations"
         return f"{self.folder.path}: is finished, after {done}; {option} {more} goes on"
 
-    def begin(self, variant: str, say: Say, warn: Say) -> Begun:
+    def begin(self, variant: str, say: Say, warn: Say) -> PreparedRun:
         """Assemble the problem as it was, and bring it to where it is; a variant must be set.
 
         Raises ConfigError, UnsupportedScene.
         """
         problem = assemble(self.config, say, to_run=True, settled=self.stored)
         manifest = self._manifest(manifest_of(problem, variant, self.config.source))
-        course = Course(problem, variant)
+        course = RunProgress(problem, variant)
         course.restore(self.stored, self.records)
         if not self.has_stopped:
             course.go_on()
@@ -103,7 +105,7 @@ class Earlier:
         manifest.scaling = None if measured is None else [row.to_json() for row in measured]
         for line in self.said:
             warn(line)
-        return Begun(course, manifest, lambda: self._take_over(manifest))
+        return PreparedRun(course, manifest, lambda: self._take_over(manifest))
 
     def _manifest(self, manifest: Manifest) -> Manifest:
         before, here = self.manifest, versions()
@@ -154,17 +156,16 @@ class Earlier:
 
 
 @contextlib.contextmanager
-def open_earlier(run: Path, wanted: Path | Config | None, overrides: Sequence[str | Override]) -> Iterator[Earlier]:
+def open_earlier(run: Path, wanted: Path | Config | None, overrides: Sequence[str | Override]) -> Iterator[OpenedRun]:
     """The run in the folder `run`, to go on, locked while the block works.
 
     `wanted` is what it is to agree with, in place of the `config.yaml` in its folder. Raises ConfigError: where it
     is no run, or one at work; where its state is damaged, and the one before that too; where the settings differ in
     what cannot change.
     """
-    with opened(run) as (folder, manifest), contextlib.ExitStack() as stack:
+    with opened(run) as (folder, manifest):
         said: list[str] = []
         stored = _read_state(folder, said)
-        stack.callback(stored.archive.close)
         settled, iteration = stored.read(Settled), stored.read(State).iteration
         began = loads(settled.config, stored.path)
         config, source = _read_config(run, wanted, overrides, settled.config)
@@ -177,8 +178,8 @@ def open_earlier(run: Path, wanted: Path | Config | None, overrides: Sequence[st
             reason = f"is {config.run.iterations}; the run has done {iteration} already"
             raise ConfigError(config.source, "run.iterations", reason)
         _check_files(settled.files, config, run)
-        records, size = read_records(folder.path, iteration, stored.read(Met).last)
-        earlier = Earlier(folder, manifest, stored, settled, config, differing, elsewhere, records, size, said)
+        records, size = read_records(folder.path, iteration, stored.read(SavedResults).last)
+        earlier = OpenedRun(folder, manifest, stored, settled, config, differing, elsewhere, records, size, said)
         if not earlier.is_done:
             if elsewhere:
                 check_output(config.source, config.run.output, config.run.folder_name, False)
@@ -187,29 +188,20 @@ def open_earlier(run: Path, wanted: Path | Config | None, overrides: Sequence[st
         yield earlier
 
 
-def _variant_of(stored: Stored) -> str:
-    variant = stored.read(Settled).variant
-    if variant not in VARIANTS:
-        raise stored.wrong("variant", "is none of those that a run can have")
-    return variant
-
-
 def problem_before_nonfinite(run: Path, say: Say) -> tuple[Problem, int]:
     """Return the problem as the first iteration began that met a value that is not finite, and that iteration, from 0.
 
     Sets the run's variant. The run may be at work: nothing is locked. Raises ConfigError and UnsupportedScene.
     """
-    with contextlib.ExitStack() as stack:
-        stored = Stored(*open_state(RunFolder(run).checkpoint / NONFINITE_FILE_NAME))
-        stack.callback(stored.archive.close)
-        set_variant(_variant_of(stored))
-        settled = stored.read(Settled)
-        config = loads(settled.config, run / "config.yaml")
-        _check_files(settled.files, config, run)
-        stages = Stages(assemble(config, say, settled=stored))
-        state = load_state(stages.at(stored.read(State).stage), stored, stages.whole)
-        problem, state = stages.enter(state)
-        return problem, state.iteration
+    stored = Stored(RunFolder(run).checkpoint / NONFINITE_FILE_NAME)
+    settled = stored.read(Settled)
+    set_variant(settled.variant)
+    config = loads(settled.config, run / "config.yaml")
+    _check_files(settled.files, config, run)
+    stages = Stages(assemble(config, say, settled=stored))
+    state = load_state(stages.at(stored.read(State).stage), stored, stages.whole)
+    problem, state = stages.enter(state)
+    return problem, state.iteration
 
 
 def _read_state(folder: RunFolder, said: list[str]) -> Stored:
@@ -220,7 +212,7 @@ def _read_state(folder: RunFolder, said: list[str]) -> Stored:
         if not path.exists():
             continue
         try:
-            stored = Stored(*open_state(path))
+            stored = Stored(path)
         except ConfigError as error:
             failures.append(error)
             continue

@@ -26,7 +26,7 @@ from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.records.atomic import remove_parts_of, write_atomically
 from reslrb_cli.records.checkpoint import newest_checkpoint
 from reslrb_cli.records.lock import FolderLock, InUse
-from reslrb_cli.records.manifest import Status, is_complete, read_manifest
+from reslrb_cli.records.manifest import Status, read_manifest
 from reslrb_cli.records.sweeps import (
     SWEEP_FILE,
     Combination,
@@ -319,7 +319,7 @@ def _grown(kept: Sweep, planned: Sequence[int] | None, seeds: int | None) -> Swe
 
 def is_left(folder: Path, sweep: Sweep, name: str) -> bool:
     """Whether a run of the sweep is still to be done, or to be gone on with."""
-    return name not in sweep.failures and not is_complete(read_manifest(folder / name) or {})
+    return name not in sweep.failures and (read_manifest(folder / name) or {}).get("status") != Status.FINISHED
 
 
 def command(folder: Path, sweep: Sweep, combination: Combination, seed: int) -> list[str]:

@@ -21,8 +21,6 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.images import FORMATS, image_size
 from reslrb_cli.scene.xml.read import Description, Element
 
-#: Bytes of such a file, at most.
-MOST_BYTES = 2**26
 #: By how much the focal lengths of rows and columns may differ, relative to them.
 SQUARE = 1e-3
 
@@ -113,7 +111,7 @@ def _copy(element: Element) -> Element:
 
 def _nerf(file: Path) -> list[Camera]:
     try:
-        data = json.loads(read_file(file, MOST_BYTES))
+        data = json.loads(read_file(file))
         frames = [{**data, **frame} for frame in data["frames"]]
     except (ValueError, KeyError, TypeError, RecursionError):
         raise ConfigError(file, "", "is not a transforms.json: a JSON object with a list of `frames`") from None
@@ -224,7 +222,7 @@ def _models(file: Path) -> Iterator[tuple[int, tuple[tuple[int, int], float, tup
 
 def _lines(file: Path) -> Iterator[tuple[str, list[str]]]:
     """File and number, and words of each line that is no comment; a line of points may be empty."""
-    text = read_file(file, MOST_BYTES).decode("utf-8", errors="replace")
+    text = read_file(file).decode("utf-8", errors="replace")
     for number, line in enumerate(text.splitlines(), 1):
         if not line.startswith("#"):
             yield f"{file}:{number}", line.split()

@@ -22,7 +22,7 @@ from typing import Any, BinaryIO
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.files import IMAGE_BYTES, PIXELS, open_file
+from reslrb_cli.config.files import PIXELS, open_file
 from reslrb_cli.errors import ConfigError, is_out_of_memory
 
 logger = logging.getLogger(__name__)
@@ -131,7 +131,7 @@ def _examine(path: Path) -> _Header:
     """What a file says of its image. Raises ConfigError, located in it, where it is none, or a PNG or JPEG without its
     end, which readers of the other formats tell themselves."""
     header: _Header | None = None
-    with open_file(path, IMAGE_BYTES) as file:
+    with open_file(path) as file:
         try:
             head = file.read(_HEAD) or b""
             reader = next((reader for magic, reader in _READERS.items() if head.startswith(magic)), None)

@@ -201,7 +201,7 @@ def test_a_run_that_lacks_a_value_or_has_a_bad_one_is_refused_in_a_line(folder: 
     save_checkpoint(run / "checkpoint", 1, values | {tiny.KEY: np.full((4, 4, 3), 2, np.float32)}, {})
     assert "exclude the initial value" in refusal()
     (run / "checkpoint" / STATE_FILE).write_bytes(b"PK\x03\x04 and then nothing")
-    assert "is damaged, cut off, or not written by a run" in refusal()
+    assert "is damaged, cut off, or not written by reslrb" in refusal()
 
 
 def test_an_exported_scene_is_rendered_by_path_where_ptracer_is_wrong(tmp_path: Path) -> None:

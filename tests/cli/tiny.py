@@ -166,6 +166,6 @@ def faults(folder: Path, code: int, err: str) -> list[str]:
         found += [] if iterations == list(range(len(iterations))) and lines[-1].endswith("\n") else ["torn metrics"]
     absent = {name for name in COMPLETE if not (folder / name).exists()}
     absent -= {"report.html"} if code == -signal.SIGKILL else set()  # the page is written from what the folder says
-    if status == "finished" and absent and not read["missing"]:
+    if status == "finished" and absent - {"report.html"}:
         found.append(f"absent: {sorted(absent)}")
     return found

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 from pathlib import Path
 
@@ -68,10 +67,10 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
     "two documents": (GOOD + "---\n" + GOOD, ":5: not valid YAML"),
     "python object": ("scene: !!python/object:os.x {}", ":1: not valid YAML"),
     "contradicting tag": ("variant: !!bool maybe", "not valid YAML"),
-    "deep nesting": ("[" * 20_000, ":1: nested too deeply"),
+    "deep nesting": ("[" * 20_000, "lists and mappings are nested too deeply"),
     "endless integer": ("variant: " + "1" * 6000, ":1: the integer 1111", "more than 64 bits"),
     "unhashable key": (GOOD + "? [a]\n: 1\n", ":5: has a key that is a list"),
-    "value that holds itself": (changed(f"\n  - {PARAMETER}", " &a [*a]"), ":3: an alias", "stands in itself"),
+    "value that holds itself": (changed(f"\n  - {PARAMETER}", " &a [*a]"), "parameters[0]: must be a mapping"),
     "duplicate key": (GOOD + "run: {spp: 1}\nrun: {spp: 2}\n", ":6: run: given twice", "line 5"),
     "duplicate in a list": (parameter("key: b"), ":4: parameters[0].key: given twice"),
     "key is a number": (GOOD + "1: 2\n", ":5: 1: a key must be text"),
@@ -296,12 +295,6 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
     "name of the folder": (GOOD + "run: {name: '..'}\n", "run.name: must be a name and not a path"),
     "name of a drive": (GOOD + "run: {name: 'C:\\x'}\n", "run.name: must be a name and not a path"),
     "name of a device": (GOOD + "run: {name: Aux.1}\n", "run.name: must be another name: Aux.1"),
-    "long part of a path": (scene("a" * 300), "scene.file: must be a path of at most"),
-    "long path": (GOOD + f"run: {{output: {'a/' * 2000}}}\n", "run.output: must be a path of at most 3000"),
-    "long glob": (
-        changed("floor.reflectance.data", "'" + "[" * 2000 + "'"),
-        "parameters[0].key: must be text of at most 1000 characters",
-    ),
     "empty key of a target": (
         target("{render: {parameters: {'': 1}}}"),
         "target.render.parameters: must have keys that are not empty",
@@ -335,7 +328,7 @@ OVERRIDES: dict[str, tuple[str, ...]] = {
         """wants quotes: --set 'parameters[0].key="*.data"'""",
     ),
     "parameters=[{key: *.data}]": ("""wants quotes: --set 'parameters=[{key: "*.data"}]'""",),
-    "a" + ".a" * 3000 + "=1": (": leads deeper than 20 levels",),
+    "a" + ".a" * 3000 + "=1": ("is nested too deeply",),
     "run.name=\udcff": (
         "--set run.name=\\udcff: not valid YAML: holds a control character, or bytes that are not UTF-8",
     ),
@@ -412,7 +405,7 @@ def test_unreadable_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         raise PermissionError(13, "Permission denied")
 
     (tmp_path / "x.yaml").write_text(GOOD)
-    monkeypatch.setattr(os, "open", refuse)  # root may read what chmod forbids
+    monkeypatch.setattr("pathlib.Path.open", refuse)  # root may read what chmod forbids
     with pytest.raises(ConfigError, match=r"x\.yaml: cannot be read: Permission denied"):
         load(tmp_path / "x.yaml")
 

@@ -54,30 +54,16 @@ def test_mutated_configurations(count: int, tmp_path: Path) -> None:
     assert count / 100 < loaded < count / 2  # neither all wrong at the first look, nor hardly any
 
 
-# Input that would take minutes, or all of the memory, is refused at once, with the bound that it is over.
+# Large input, and files that are no regular files, are refused at once.
 
 #: Of processor time; a second or two on a quiet machine, and half a minute to hours where nothing bounds it.
 SECONDS_OF_ONE = 10
 
 
-def aliases(kind: str, depth: int) -> str:
-    """Some hundred bytes of aliases of aliases, nine of the one before in each."""
-    lines = ["b0: &b0 {x: 1, y: 2}"]
-    for i in range(depth):
-        nine = f"[{', '.join([f'*b{i}'] * 9)}]"
-        lines.append(f"b{i + 1}: &b{i + 1} " + (f"{{<<: {nine}}}" if kind == "merged" else nine))
-    return "\n".join(lines) + "\n"
-
-
-#: What would take minutes, or all of the memory.
 LARGE = {
-    "aliases": (aliases("plain", 12), "holds more than 20000 values"),
-    "merged aliases": (aliases("merged", 12), "holds more than 20000 values"),
-    "values": (GOOD + "run: [" + "1, " * 30_000 + "]", "holds more than 20000 values"),
-    "depth": ("a: " + "[" * 1000, "nested too deeply"),
+    "depth": ("a: " + "[" * 1000, "are nested too deeply"),
     "unknown keys": (GOOD + "".join(f"k{i}: 1\n" for i in range(9_000)), "unknown key; known here: variant"),
     "a word": (GOOD + f"? {'x' * 100_000}\n: 1\n", "unknown key; known here: variant"),
-    "bytes": (GOOD + "#" * 300_000, "has 293.1 KiB; more than 256 KiB are not read"),
 }
 
 
@@ -89,17 +75,6 @@ def test_large_input_is_refused_at_once(case: str, tmp_path: Path) -> None:
     assert time.process_time() - begin < SECONDS_OF_ONE
     assert what in line
     assert len(line) < 1200
-
-
-def test_overrides_are_bounded_together(tmp_path: Path) -> None:
-    begin = time.process_time()
-    many = tuple(f"run.x{i}=1" for i in range(1000))
-    assert line_of(tmp_path, GOOD, many).startswith("--set run.x0=1: run.x0: unknown key")
-    assert line_of(tmp_path, GOOD, (*many, "run.spp=1")).startswith("--set: is given 1001 times")
-    assert line_of(tmp_path, GOOD, ("run.name=" + "x" * 70_000,)).startswith("--set: holds more than 65536 characters")
-    half = "[" + "1, " * 11_000 + "]"
-    assert "holds more than 20000 values" in line_of(tmp_path, GOOD + f"a: {half}\n", (f"b={half}",))
-    assert time.process_time() - begin < SECONDS_OF_ONE
 
 
 def test_the_override_that_brings_a_problem_is_found_among_many(tmp_path: Path) -> None:
@@ -118,7 +93,7 @@ def test_an_override_leaves_what_an_alias_shares(tmp_path: Path) -> None:
     assert config.target.render.integrator == Prb()
 
 
-@pytest.mark.parametrize("kind", ["pipe", "socket", "device", "sparse", "endless"])
+@pytest.mark.parametrize("kind", ["pipe", "socket", "device"])
 def test_what_is_no_regular_file_is_not_read(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "x"
     if kind == "pipe":
@@ -126,17 +101,10 @@ def test_what_is_no_regular_file_is_not_read(kind: str, tmp_path: Path) -> None:
     elif kind == "socket":
         with socket.socket(socket.AF_UNIX) as server:
             server.bind(str(path))
-    elif kind == "sparse":
-        path.touch()
-        os.truncate(path, 2**40)
     else:
-        path = Path("/dev/zero" if kind == "device" else "/proc/self/pagemap")  # the latter says that it is empty
-    what = {"sparse": "has 1 TiB; more than 256 KiB", "endless": "has more than 256 KiB"}.get(
-        kind, f"is a {kind}, not a"
-    )
-    with pytest.raises(ConfigError) as caught:
+        path = Path("/dev/zero")
+    with pytest.raises(ConfigError, match=f"{path}: is a pipe, a socket or a device, not a regular file"):
         load(path)
-    assert str(caught.value).startswith(f"{path}: {what}")
 
 
 def test_paths_that_are_not_utf8(tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ from reslrb_cli.optimization.autotune.sampling import (
 from reslrb_cli.optimization.forecast import _with_learning
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.cache import PilotCache
-from reslrb_cli.records.checkpoint import STATE_FILE, open_state
+from reslrb_cli.records.checkpoint import STATE_FILE, read_state
 from reslrb_cli.records.decisions import GuidedRecord, PaidRecord, SequenceRecord
 from reslrb_cli.records.manifest import read_manifest
 
@@ -219,8 +219,7 @@ def test_a_run_says_so_once_remembers_it_and_writes_it_down(
     assert f"{line}{found['low']:.2g} to {found['high']:.2g})" in said
     assert f"{option}: auto" in (RUN / "config.yaml").read_text()
     assert line in (RUN / "report.html").read_text()
-    archive, values = open_state(RUN / "checkpoint" / STATE_FILE)
-    archive.close()
+    _, values = read_state(RUN / "checkpoint" / STATE_FILE)
     assert values[name] == found
     assert option != "guiding" or values["guiding"]["0"] > 0
     told: list[str] = []

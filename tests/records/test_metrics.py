@@ -13,7 +13,6 @@ import pytest
 from cli.tiny import read_metrics
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.records import measurement_files
 from reslrb_cli.records.checkpoint import save_checkpoint
 from reslrb_cli.records.manifest import versions
 from reslrb_cli.records.measurement_files import Origin, read_lines, read_origin
@@ -114,17 +113,6 @@ def test_what_is_not_finite_or_no_line_is_told_when_a_file_is_read(tmp_path):
     assert found.damaged == [3, 4, 5]
     file.write_text('{"a": 2}\n{"a"')
     assert read_lines(file).damaged == []  # somebody is about to end it
-
-
-def test_a_file_that_grows_too_large_while_it_is_read_is_refused(tmp_path, monkeypatch):
-    file = tmp_path / "metrics.jsonl"
-    file.write_text("{}\n" * 10)
-    monkeypatch.setattr(measurement_files, "MOST_BYTES", 20)
-    with pytest.raises(ConfigError, match="has 30 B"):
-        read_lines(file)
-    monkeypatch.setattr(measurement_files, "open_file", lambda path, most: path.open("rb"))
-    with pytest.raises(ConfigError, match="has more than 20 B"):
-        read_lines(file)
 
 
 # The part of `metrics.jsonl` that a run goes on from.

@@ -19,7 +19,7 @@ from cli import tiny
 from reslrb_cli.cli import main, progress
 from reslrb_cli.optimization import loop, optimizers, problem, sensitivity, targets
 from reslrb_cli.optimization.uncertainty import measuring
-from reslrb_cli.records.checkpoint import open_state
+from reslrb_cli.records.checkpoint import read_state
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.runs import recorder as recording
 
@@ -143,9 +143,7 @@ def found_of(run: Path) -> dict[str, Any]:
 
 def noted_by(run: Path) -> Any:
     """What the newest state says of what certainty has taken note of, but for arrays."""
-    archive, values = open_state(run / "checkpoint/state.npz")
-    archive.close()
-    return values["certainty"]
+    return read_state(run / "checkpoint/state.npz")[1]["certainty"]
 
 
 def differences(first: Path, second: Path) -> list[str]:

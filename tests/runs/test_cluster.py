@@ -29,7 +29,7 @@ from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.views import set_targets, target_arrays
-from reslrb_cli.runs.prepare import Course, prepare
+from reslrb_cli.runs.prepare import RunProgress, prepare
 
 worker = pytest.importorskip("reslrb_cli.cluster.worker", reason="pip install reslrb[cluster]", exc_type=ImportError)
 engine = pytest.importorskip("reslrb_cli.cluster.engine", reason="pip install reslrb[cluster]", exc_type=ImportError)
@@ -48,13 +48,13 @@ CASES = {
 VIEWS = "views=[{sensor: 0}, {sensor: 1, weight: 2}, {sensor: 2}]"
 
 
-def make(folder: Path, *sets: str) -> Course:
+def make(folder: Path, *sets: str) -> RunProgress:
     views = [VIEWS] if "passes" not in sets else []
     config = load(folder / "tiny.yaml", [*SETS, *views, *sets]).with_code()
     return prepare(config, "llvm_ad_rgb", lambda line: None, lambda line: None)[0]
 
 
-def both(folder: Path, *sets: str) -> tuple[dict[str, np.ndarray], Course]:
+def both(folder: Path, *sets: str) -> tuple[dict[str, np.ndarray], RunProgress]:
     """What a course comes to in this process, and another with the same targets: these are rendered on all threads, so
     that now and then two renderings differ in their last bits."""
     first = make(folder, *sets)
@@ -66,7 +66,7 @@ def both(folder: Path, *sets: str) -> tuple[dict[str, np.ndarray], Course]:
     return alone, course
 
 
-def end(course: Course, after: Callable[[int], object] = lambda iteration: None) -> dict[str, np.ndarray]:
+def end(course: RunProgress, after: Callable[[int], object] = lambda iteration: None) -> dict[str, np.ndarray]:
     """The values after the iterations, and what tables have learned."""
     with one_thread():
         for state, _ in iterate(course.stages, course.state):

@@ -14,7 +14,7 @@ from reslrb_cli.optimization.identifiability import shown_texels
 from reslrb_cli.optimization.loop import learning_rate_factor
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
-from reslrb_cli.optimization.state import Count, FromOne, Positive, State
+from reslrb_cli.optimization.state import State
 from reslrb_cli.optimization.uncertainty.curvature import MOST_ENTRIES, Curvature, Direction, plan_changes, row_of
 from reslrb_cli.optimization.uncertainty.posterior import LastSteps, Measured
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord, Gradients, ParameterCertainty, weigh
@@ -51,10 +51,10 @@ class Noted:
     steps of small ones since; and after so many iterations how far a step moved each parameter, per unit of gradient.
     """
 
-    seen: Count
+    seen: int
     keys: list[str]
-    steps: dict[str, FromOne] = field(default_factory=dict)
-    paces: dict[str, list[tuple[FromOne, Positive]]] = field(default_factory=dict)
+    steps: dict[str, int] = field(default_factory=dict)
+    paces: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
 
 
 class Certainty:
@@ -94,7 +94,7 @@ class Certainty:
     def expects(self, noted: Noted) -> dict[str, dict[str, Array]]:
         """What `restore` is to be given as `last`, by shape, of a run's own parameters."""
         sizes = {key: (rows, self._initial[key].size) for key, rows in noted.steps.items() if key in self._initial}
-        shapes = {key: expected(size, np.float64) for key, size in sizes.items()}
+        shapes = {key: expected(size) for key, size in sizes.items()}
         return {each.name: shapes for each in fields(LastSteps)}
 
     def see(self, before: State, state: State) -> None:

@@ -75,8 +75,6 @@ def workers(shared: Mapping[str, Any] | None, elapsed_s: float | None) -> Markup
     return lay_out("run.workers", time, parts, sum(parts.values()) or 1.0)
 
 
-#: Bytes of a configuration that is shown, at most.
-MOST_CONFIG = 2**20
 DAMAGED = "This part cannot be shown: what was recorded of it is damaged."
 
 
@@ -176,6 +174,6 @@ def _read(path: Path) -> str:
     from reslrb_cli.config.files import read_file
 
     try:
-        return read_file(path, MOST_CONFIG).decode("utf-8", errors="replace")
+        return read_file(path).decode("utf-8", errors="replace")
     except ConfigError:
         return ""

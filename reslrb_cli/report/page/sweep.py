@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from reslrb_cli.records.images import load_image, read_parameters
-from reslrb_cli.records.manifest import is_complete
+from reslrb_cli.records.manifest import Status
 from reslrb_cli.records.sweeps import Combination, in_words, label, run_name, short_keys
 from reslrb_cli.report.format import count, number, shorten
 from reslrb_cli.report.page.images import Picture, show
@@ -145,7 +145,7 @@ def _shown(source: SweepRuns) -> tuple[list[tuple[Combination, Run]], Markup]:
     """Of each combination the first run that is finished, and a line that says which they are."""
     found = []
     for combination in source.sweep.combinations:
-        done = [run for run in _runs(source, combination) if is_complete(run.manifest)]
+        done = [run for run in _runs(source, combination) if run.manifest.get("status") == Status.FINISHED]
         found += [(combination, done[0])] if done else []
     more = len(found) - MOST_PICTURES
     line = "Of each combination the first seed that is finished." if found else ""

@@ -1,6 +1,6 @@
 """The refusals of what a scene's files must not say, before Mitsuba sees any of it.
 
-These are plugins that are not Mitsuba's, endless files, chains without end, and sizes for which no machine has room.
+These are plugins that are not Mitsuba's, files that never end, and sizes for which the machine has no room.
 """
 
 from __future__ import annotations
@@ -9,17 +9,14 @@ import os
 import re
 import stat
 from dataclasses import dataclass
-from graphlib import CycleError, TopologicalSorter
-from pathlib import Path
 
 import mitsuba as mi
 
 from reslrb_cli.backend.installation import is_known, nearest_plugin, plugin_type
-from reslrb_cli.backend.memory import free_bytes
-from reslrb_cli.config.files import PIXELS, in_words
+from reslrb_cli.config.files import PIXELS
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.images import DamagedImage, image_size
-from reslrb_cli.scene.xml.read import MAX_DEPTH, Description, Element, quoted
+from reslrb_cli.scene.xml.read import Description, Element, quoted
 
 #: Plugins of Mitsuba 0.6 that Mitsuba 3 does not have, and what comes near them.
 LOST_PLUGINS = {
@@ -70,7 +67,6 @@ def check(description: Description) -> None:
         if element.tag == "film" and (size := _size_of(element)).width * size.height > PIXELS:
             why = f"it must have at most {PIXELS}, since each image of a step takes 12 bytes or more of every one"
             raise element.fail("", f"a film of {size.width}x{size.height} pixels; {why}")
-    _check_chains(description.root)
     check_files(description)
 
 
@@ -124,36 +120,6 @@ def _object_type(tag: str) -> mi.ObjectType:
     return getattr(mi.ObjectType, others.get(tag, tag.capitalize()))
 
 
-def _check_chains(root: Element) -> None:
-    """Refuse objects that use themselves, or others in chains so long that Mitsuba's stack would not hold them."""
-    owners = root.by_id()
-    uses = {
-        element: [child for child in element.children if child.is_object]
-        + [owners[child.id] for child in element.children if child.tag == "ref" and child.id in owners]
-        for element in root.objects()
-    }
-    try:
-        order = list(TopologicalSorter(uses).static_order())
-    except CycleError as error:
-        circle: list[Element] = error.args[1]
-        names = " uses ".join(element.id or element.tag for element in reversed(circle[:_SHOWN]))
-        raise circle[0].fail("", f"objects use one another in a circle: {names}") from None
-    lengths: dict[Element, int] = {}
-    for element in order:  # those that are used come first
-        lengths[element] = 1 + max((lengths[other] for other in uses[element]), default=0)
-        if lengths[element] > MAX_DEPTH:
-            raise element.fail("", f"objects use one another in a chain of more than {MAX_DEPTH}")
-
-
-#: Bytes of memory that a pixel of an image takes as a texture at the least: Mitsuba keeps three half floats of it, or
-#: floats where the scene says so.
-_TEXEL_BYTES, _FLOAT_BYTES = 6, 12
-#: Bytes in which a mesh says what it consists of.
-_HEAD = 2**16
-#: What Git's extension for large files writes in place of one.
-_LFS = b"version https://git-lfs.github.com/"
-
-
 @dataclass(frozen=True)
 class FilmSize:
     """Width and height of a film in pixels, how many of them its crop window has, and channels of a pixel; 0 pixels
@@ -181,30 +147,20 @@ def _size_of(film: Element) -> FilmSize:
 
 
 def check_files(description: Description) -> None:
-    """Raise ConfigError, located by file and line, for files that are not there, or larger than can be held."""
-    named = list(description.named_files())
-    free = free_bytes(mi.variant()) if named else 0
-    for owner, element, name in named:
-        as_floats = any(child.name == "format" and child.value == "variant" for child in owner.children)
-        wrong = _wrong_file(name, description, free, _FLOAT_BYTES if as_floats else _TEXEL_BYTES)
-        if wrong is not None:
+    """Raise ConfigError, located by file and line, for files that are missing, damaged or too large."""
+    for _, element, name in description.named_files():
+        if (wrong := _wrong_file(name, description)) is not None:
             raise element.fail("material" if element.name == "material" else "filename", wrong)
 
 
-def _wrong_file(name: str, description: Description, free: int, texel: int) -> str | None:
-    """What is wrong with a file: it is not there, a pipe or a device, which might never end, or takes more memory than
-    is free, by its size or by what an image says of itself. `texel` are the bytes that a pixel of it takes."""
+def _wrong_file(name: str, description: Description) -> str | None:
+    """Say what is wrong with a file: missing, a pipe or a device, which might never end, or not a whole image."""
     path = description.find_file(name)
     if path is None:
         looked = "" if os.path.isabs(name) else f"; looked for in {', '.join(map(str, description.folders))}"
         return f"{quoted(name)}: no such file{looked}"
     if not stat.S_ISREG(path.stat().st_mode):
         return f"{path} is no regular file"
-    size = os.path.getsize(path)
-    if size > free:
-        return f"{path} has {in_words(size)}, and {in_words(free)} of memory are free"
-    if (wrong := _wrong_head(path, size)) is not None:
-        return wrong
     try:
         width, height = image_size(path)
     except DamagedImage as error:
@@ -213,28 +169,6 @@ def _wrong_file(name: str, description: Description, free: int, texel: int) -> s
         return None  # no image, or none that we know
     if width * height > PIXELS:
         return f"{path} is {width}x{height} pixels; more than {PIXELS} are not read"
-    needed = width * height * texel
-    if needed > free:
-        return f"{path} is {width}x{height} pixels, which take {in_words(needed)}; {in_words(free)} are free"
-    return None
-
-
-def _wrong_head(path: Path, size: int) -> str | None:
-    """What is wrong with the beginning of a file: what Git LFS leaves where a file was not brought, and a PLY mesh
-    whose elements have names that are no text, which Mitsuba prints as they come, or that says to have more of them
-    than it has bytes, for which Mitsuba makes room."""
-    with path.open("rb") as file:
-        head = file.read(_HEAD)
-    if head.startswith(_LFS):
-        return f"{path} is a pointer of Git LFS, not the file; `git lfs pull` brings it"
-    for line in head.partition(b"end_header")[0].splitlines() if head.startswith(b"ply") else ():
-        text = line.decode("ascii", errors="replace")
-        if not line.startswith((b"comment", b"obj_info")) and not all(c == "\t" or " " <= c <= "~" for c in text):
-            return f"{path}: its head holds what is no text, {quoted(text)}; write it again"
-        count = re.fullmatch(r"\s*element\s+(\S+)\s+(\d+)\s*", text)
-        if count is not None and float(count[2]) > size:
-            what = f"says that it has {quoted(count[2])} of the element {quoted(count[1])}"
-            return f"{path} {what}, and has {in_words(size)}; write it again"
     return None
 
 

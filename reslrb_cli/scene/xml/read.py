@@ -1,6 +1,6 @@
 """Scene files as elements: read, included files and variables put in, and written for Mitsuba's parser.
 
-Each element knows the file and the line that it comes from. What would take the parser down or never end is refused.
+Each element knows the file and the line that it comes from.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
@@ -145,29 +144,16 @@ class Element:
         return Element(tag, attributes, self.source, self.line, list(children))
 
 
-#: XML of all files of a scene together, each counted as often as it is included.
-MAX_BYTES = 64 * 2**20
-#: Elements within one another. Mitsuba's parser calls itself for each level, until the stack is full.
-MAX_DEPTH = 100
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 #: An ampersand that begins none of XML's own references: Mitsuba's parser takes it for itself.
 _BARE_AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[0-9a-fA-F]+);)")
 _DECLARED_ENCODING = re.compile(rb"""^\s*<\?xml[^>]*\bencoding\s*=\s*["']([\w.-]+)["']""")
 
 
-def read_document(file: Path, max_bytes: int) -> tuple[Element, int]:
-    """The root element of an XML file, and the file's size in bytes.
-
-    Raises ConfigError, located in the file, where it cannot be read, is no regular file or larger than `max_bytes`, is
-    not XML, is nested more than MAX_DEPTH levels deep, or declares entities.
-    """
-    data = read_file(file, MAX_BYTES)
-    if len(data) > max_bytes:
-        raise ConfigError(
-            file, "", f"is too large: a scene may have {MAX_BYTES >> 20} MiB of XML, with all that it includes"
-        )
-    text = _COMMENT.sub(lambda comment: "\n" * comment[0].count("\n"), _decode(data))
-    return _parse(file, _BARE_AMPERSAND.sub("&amp;", text)), len(data)
+def read_document(file: Path) -> Element:
+    """Return the root element of an XML file. Raises ConfigError, located in the file, if it is not XML."""
+    text = _COMMENT.sub(lambda comment: "\n" * comment[0].count("\n"), _decode(read_file(file)))
+    return _parse(file, _BARE_AMPERSAND.sub("&amp;", text))
 
 
 def _decode(data: bytes) -> str:
@@ -188,18 +174,11 @@ def _parse(file: Path, text: str) -> Element:
     def start(tag: str, attributes: dict[str, str]) -> None:
         source = stack[0].source if stack else Source(file, _version(attributes.get("version", "")))
         element = Element(tag, attributes, source, parser.CurrentLineNumber)
-        if len(stack) == MAX_DEPTH:
-            raise element.fail("", f"elements are nested more than {MAX_DEPTH} levels deep")
         (stack[-1].children if stack else roots).append(element)
         stack.append(element)
 
-    def declare_entity(*_: Any) -> None:
-        said = "declares an XML entity, which no Mitsuba scene needs; write out what it stands for"
-        raise ConfigError(f"{file}:{parser.CurrentLineNumber}", "", said)
-
     parser.StartElementHandler = start
     parser.EndElementHandler = lambda tag: stack.pop()
-    parser.EntityDeclHandler = declare_entity
     try:
         parser.Parse(text.encode("utf-8"), True)
     except expat.ExpatError as error:
@@ -212,11 +191,8 @@ def _version(text: str) -> tuple[int, ...] | None:
     return tuple(map(int, text.split("."))) if re.fullmatch(r"\d+\.\d+\.\d+", text) else None
 
 
-#: Characters of one attribute, after its variables are put in: variables of variables can grow at each step.
-MAX_LENGTH = 2**20
 #: A `$` that stands for no other sign, and what may be the name of a variable behind it: longer ones are never found.
 _VARIABLE = re.compile(r"(?<!\\)\$([^$]{0,256})")
-MAX_INCLUDES = 1000
 #: Includes within one another; that of Mitsuba's parser.
 MAX_INCLUDE_DEPTH = 15
 
@@ -262,7 +238,10 @@ def read_description(file: Path, options: Mapping[str, str]) -> Description:
     """
     reader = _Reader(dict(options), set(options))
     folders = [file.absolute().parent]
-    root = reader.read(file, folders, None)
+    try:
+        root = reader.read(file, folders, None)
+    except RecursionError:
+        raise ConfigError(file, "", "elements are nested too deeply") from None
     if reader.unused:
         names = quoted(", ".join(f"${name}" for name in options if name in reader.unused), "")
         raise ConfigError(file, names, "is set in scene.options, but the scene file does not use it")
@@ -279,37 +258,28 @@ class _Reader:
 
     values: dict[str, str]
     unused: set[str]
-    bytes_left: int = field(default_factory=lambda: MAX_BYTES)
-    includes: int = 0
     including: int = 0
     files: list[Path] = field(default_factory=list)
 
-    def read(self, file: Path, folders: list[Path], include: Element | None, depth: int = 0) -> Element:
+    def read(self, file: Path, folders: list[Path], include: Element | None) -> Element:
         """The root of `file`, complete. `folders` grows by what its <path> elements name."""
-        if include is not None:
-            self.includes += 1
-            if self.including + 1 >= MAX_INCLUDE_DEPTH:
-                raise include.fail("", f"files are included more than {MAX_INCLUDE_DEPTH} levels deep")
-            if self.includes > MAX_INCLUDES:
-                raise include.fail("", f"more than {MAX_INCLUDES} files are included")
+        if include is not None and self.including + 1 >= MAX_INCLUDE_DEPTH:
+            raise include.fail("", f"files are included more than {MAX_INCLUDE_DEPTH} levels deep")
         try:
-            root, size = read_document(file, self.bytes_left)
+            root = read_document(file)
         except ConfigError as error:
             if include is None or error.source != str(file):
                 raise
             raise include.fail("", f"includes {file}, which {error.message}") from None
         self.files.append(file)
-        self.bytes_left -= size
         self.including += 1
         self._put_variables(root)
-        self._complete(root, root, folders, depth)
+        self._complete(root, root, folders)
         self.including -= 1
         return root
 
-    def _complete(self, element: Element, root: Element, folders: list[Path], depth: int) -> None:
+    def _complete(self, element: Element, root: Element, folders: list[Path]) -> None:
         """Put variables into `element` and all below it, and what is included in the place of its includes."""
-        if depth >= MAX_DEPTH:
-            raise element.fail("", f"elements are nested more than {MAX_DEPTH} levels deep")
         if element.tag == "spectrum" and "filename" in element.attributes:
             # Mitsuba opens it while it parses, from the folder of the file that is being parsed.
             name = element.attributes["filename"]
@@ -324,9 +294,9 @@ class _Reader:
                     raise child.fail("", "<path> can only stand directly below the root")
                 folders.insert(0, _folder(child, folders))
             elif child.tag == "include":
-                children += self._include(child, folders, depth)
+                children += self._include(child, folders)
             else:
-                self._complete(child, root, folders, depth + 1)
+                self._complete(child, root, folders)
                 children.append(child)
         element.children[:] = children
 
@@ -337,19 +307,13 @@ class _Reader:
                 element.attributes[key] = self._replace(text, element)
 
     def _replace(self, text: str, element: Element) -> str:
-        length = len(text)
-
         def value_of(found: re.Match[str]) -> str:
             """The value of the longest name: one may be the beginning of another."""
-            nonlocal length
             behind = found[1]
             name = next((behind[:n] for n in range(len(behind), 0, -1) if behind[:n] in self.values), None)
             if name is None:
                 raise self._fail(behind, element)
             self.unused.discard(name)
-            length += len(self.values[name])
-            if length > MAX_LENGTH:
-                raise element.fail(f"${name}", f"makes a text of more than {MAX_LENGTH} characters")
             return self.values[name] + behind[len(name) :]
 
         return _VARIABLE.sub(value_of, text).replace("\\$", "$")
@@ -360,12 +324,12 @@ class _Reader:
         message = f"has no value and no default; {how}" if name else "is no variable; write \\$"
         return element.fail(f"${name}", message)
 
-    def _include(self, include: Element, folders: list[Path], depth: int) -> list[Element]:
+    def _include(self, include: Element, folders: list[Path]) -> list[Element]:
         """What stands in the place of `include`: the objects of a scene, or the one object that a file holds."""
         here = [include.source.file.absolute().parent, *folders]
         if (file := _find(_required(include, "filename"), here)) is None:
             raise include.fail("", f"included file {quoted(include.attributes['filename'])} not found")
-        root = self.read(file, here, include, depth)
+        root = self.read(file, here, include)
         if root.type == "scene":
             # Parameters of the included <scene> itself, and references right below it, are nobody's: so with Mitsuba.
             return [child for child in root.children if not child.is_value and child.tag != "ref"]
