@@ -70,7 +70,7 @@ def experiment_record(experiment: str) -> str:
 MEASUREMENTS = {
     name: shlex.split(command)
     for name, command in {
-        "depth": "bench --max-depth 128 --budget 480",
+        "depth": "bench --max-depth 128",
         "spp": "bench --sweep spp --values 1,4,16,64 --integrators ptracer,reslrb:reservoir,reslrb:stack --budget 120",
         "moving": _GLASS,
         "extreme": "gradcheck --suite extreme",

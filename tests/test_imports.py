@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import subprocess
 import sys
@@ -70,10 +71,16 @@ def violations(root: Path) -> list[str]:
     return found
 
 
+@functools.cache
+def _tree(path: Path) -> ast.Module:
+    """The syntax tree of a module, which takes most of the time."""
+    return ast.parse(path.read_text())
+
+
 def _imports(path: Path, parts: tuple[str, ...]) -> list[tuple[int, str]]:
     """(line, absolute dotted name) of each import of a module, those inside functions too."""
     names = []
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(_tree(path)):
         if isinstance(node, ast.Import):
             names += [(node.lineno, alias.name) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -108,7 +115,7 @@ def _module(package: str, path: Path) -> str:
 
 def _names_in_text(path: Path, package: str) -> list[str]:
     """Dotted names of the package that stand in the text of a module, but for docstrings."""
-    tree = ast.parse(path.read_text())
+    tree = _tree(path)
     has_docstring = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
     docstrings = {id(node.body[0].value) for node in ast.walk(tree)
                   if isinstance(node, has_docstring) and node.body and isinstance(node.body[0], ast.Expr)}  # fmt: skip

@@ -11,7 +11,6 @@ import errno
 import json
 import math
 import os
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -231,13 +230,14 @@ class NonFiniteTally(_Tally):
 
     iterations: int = 0
     values: int = 0
-    by_parameter: Counter[str] = field(default_factory=Counter)
+    by_parameter: dict[str, int] = field(default_factory=dict)
 
     def add(self, record: Record) -> None:
         """Count one iteration."""
         self.iterations += record.nonfinite > 0
         self.values += record.nonfinite
-        self.by_parameter.update(record.nonfinite_by_parameter)
+        for key, count in record.nonfinite_by_parameter.items():
+            self.by_parameter[key] = self.by_parameter.get(key, 0) + count
 
     def __str__(self) -> str:
         """For the last line of a run; empty where all was finite."""

@@ -10,7 +10,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from cli.tiny import KEY, ROOT, write_experiment
 from compilation import search_path
@@ -148,15 +147,10 @@ def test_bad_input_is_one_located_line(
     assert len(printed.err.splitlines()) == 1
 
 
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut off", "compressed"])
-def test_steps_that_cannot_be_gone_on_from(
-    folder: Path, content: bytes | str, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut off"])
+def test_steps_that_cannot_be_gone_on_from(folder: Path, content: bytes, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "c.jsonl").write_text("kept\n")
-    if isinstance(content, bytes):
-        (folder / "c.samples.npz").write_bytes(content)
-    else:
-        np.savez_compressed(folder / "c.samples.npz", head=np.array("{}"))
+    (folder / "c.samples.npz").write_bytes(content)
     assert call("tiny.yaml", "--json", "c.jsonl") == 2
     assert "c.samples.npz: " in capsys.readouterr().err
     assert (folder / "c.jsonl").read_text() == "kept\n"

@@ -296,7 +296,7 @@ def test_the_run_s_own_step_is_traced_again(spoilt_experiment, capsys):
     file.write_bytes(data[: len(data) // 2])
     code, _, err = reslrb_nonfinite(capsys, *command)
     assert (code, len(err.splitlines())) == (2, 1)
-    assert err.startswith(f"{file}: is damaged, cut off, or not written by a run")
+    assert err.startswith(f"{file}: is damaged, cut off, or not written by reslrb")
 
 
 @pytest.mark.parametrize("sequence", ["independent", "low_discrepancy", "auto"])

@@ -74,7 +74,7 @@ def test_of_one_run_its_own_page_is_written_anew(report, tmp_path):
         (["a", "-o", "gone/page.html"], "--output: cannot write gone/page.html"),
         (["a", "-o", "empty"], "--output: cannot write empty"),
         (["a"] * 101, "RUN: 101 are given; a page shows at most 100"),
-        (["pipe"], "pipe: is a pipe, not a regular file"),
+        (["pipe"], "pipe: is a pipe, a socket or a device, not a regular file"),
         (["\x1b[31m"], "\\x1b[31m: no such file"),
     ],
 )
