@@ -99,7 +99,6 @@ MEASUREMENTS = {measurement.name: measurement for measurement in _all()}
 
 #: What of a run's manifest is kept: figures, not what the page of the run is for.
 RESULTS = ("iterations", "loss", "elapsed_s", "rmse", "parameter_rmse", "relative_error", "worse")
-PILOT = ("label", "advantage", "next_label", "measure_s", "compile_s", "share")
 #: Iterations that the median step is taken without: they compile.
 COLD = 5
 
@@ -173,7 +172,7 @@ def measure(measurement: Measurement) -> None:
         print(f"== {shlex.join(measurement.command)}", flush=True)
         start = time.monotonic()
         command = [sys.executable, "-m", "reslrb_cli", *measurement.words, *map(str, files)]
-        # As on a new machine: no kernels of Dr.Jit, which lie below HOME, and no pilots have been kept.
+        # As on a new machine: no kernels of Dr.Jit, which lie below HOME, and no decisions.
         environment = os.environ | {"HOME": name, "RESLRB_CACHE": name}
         code = subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
         seconds = time.monotonic() - start
@@ -199,7 +198,6 @@ def run_lines(folder: Path) -> list[dict[str, Any]]:
     steps = _read(folder / "metrics.jsonl")
     origin = {"kind": "origin"} | {name: manifest[name] for name in ("device", "variant", "versions", "platform")}
     results = {name: manifest["results"].get(name) for name in RESULTS}
-    pilot = manifest.get("pilot")
     warm = steps[COLD:] or steps
     figures = {
         "kind": "run",
@@ -209,7 +207,6 @@ def run_lines(folder: Path) -> list[dict[str, Any]]:
         "peak_mib": max(step["peak_mib"] for step in steps),
         "estimator": (manifest.get("plan") or {}).get("estimator"),
         **traced(manifest),
-        "pilot": pilot and {name: pilot.get(name) for name in PILOT},
     }
     return [origin | {"written": manifest["started"]}, figures]
 
@@ -221,8 +218,7 @@ def traced(manifest: Mapping[str, Any]) -> dict[str, Any]:
     if camera is None:
         return {"paths": None, "light_share": None, "guided": None}
     paths = re.match(r"paths: (\w+)", camera["reason"])[1] if camera["needed"] else "light"
-    chosen = (manifest.get("paths") or {}).get("light_share")
-    share = {"light": 1.0, "camera": 0.0}.get(paths, chosen)
+    share = {"light": 1.0, "camera": 0.0}.get(paths)  # of both kinds the configuration says it
     return {"paths": paths, "light_share": share, "guided": rows["guided emission"]["needed"]}
 
 

@@ -321,17 +321,16 @@ class Blocks:
         return f"{text}\n\n{measured_at({name: record.origin for name, record in records.items()})}"
 
     def runs(self) -> str:
-        """Time and memory of whole runs, and what a pilot chose."""
+        """Time and memory of whole runs, and the paths that they have."""
         head = ("run", "iterations", "spp", "a step, ms", "iterations in all, s", "with everything, s", "peak, MiB",
-                "estimator", "chosen by a pilot, share of the run", "paths")  # fmt: skip
+                "estimator", "paths")  # fmt: skip
         rows, records = [], {name: self.record(experiment_record(name)) for name in self.recorded()}
         for name, record in records.items():
             row, paths = record.rows[0], paths_of(record)
-            pilot = "" if row["pilot"] is None else f"{row['pilot']['label']}, {row['pilot']['share']:.1%}"
             rows.append([
                 f"`{name}`", str(row["iterations"]), str(row["spp"]),
                 figure(row["step_ms"]), figure(row["elapsed_s"]), f"{record.origin['seconds']:.0f}",
-                f"{row['peak_mib']:.1f}", f"`{row['estimator']}`" if row["estimator"] else "", pilot, paths,
+                f"{row['peak_mib']:.1f}", f"`{row['estimator']}`" if row["estimator"] else "", paths,
             ])  # fmt: skip
         return self._with_commits(table(head, rows), records)
 

@@ -135,8 +135,7 @@ def compare(name: str) -> dict[str, Any]:
     tried = min(runs, key=lambda curve: curve.points[-1][2])
     best = min(grid, key=lambda curve: curve.points[-1][2])
     best.label = f"plain, rate {best.label}"
-    sides = experiment.model.sides
-    paths = "" if sides is None else f"; {sides.decision()}"
+    paths = "".join(f"; {each.setting} {each.value}" for each in experiment.model.decisions)
     print(f"\n{name}: {TITLES[name]}; error at the start {auto.points[0][2]:.3f}{paths}")
     for curve in (best, tried, *bare, auto):
         time = min(curve.end, auto.end)

@@ -15,18 +15,16 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.cli.terminal import echo
-from reslrb_cli.config.integrators import UNDECIDED
-from reslrb_cli.config.loader import with_integrator
 from reslrb_cli.config.optimizers import AS_CONFIGURED
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.optimization.assemble import assemble_scene, at_stage
-from reslrb_cli.optimization.autotune.sampling import as_decided, with_sides
+from reslrb_cli.optimization.autotune.sampling import as_decided, decided
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.state import guiding_of, restore_tables
 from reslrb_cli.optimization.views import color_channels, to_tensor
 from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, NonFiniteStep, load_nonfinite
-from reslrb_cli.records.decisions import GuidedRecord, PathsRecord, SequenceRecord
+from reslrb_cli.records.decisions import Decision
 from reslrb_cli.records.manifest import MANIFEST_FILE as MANIFEST
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.metrics import finite
@@ -65,10 +63,12 @@ def load_replay(config: Config) -> Replay:
         raise ConfigError(config.source, OPTION, f"runs no code of your own, which {next(iter(config.codes))} names")
     iteration, values = saved.iteration, saved.parameters
     archive, written = folder.checkpoint / NONFINITE_FILE_NAME, path / MANIFEST
-    guided = _guided(config, manifest, written)
     if not 0 <= iteration < config.run.iterations:
         raise ConfigError(archive, "iteration", f"is {iteration}; the run has {config.run.iterations} iterations")
-    config = _settled(config, manifest, written)
+    try:
+        decisions = decided(config, map(Decision.from_json, manifest.get("decisions", ())))
+    except TypeError:
+        raise ConfigError(written, "decisions", "is not what a run decided, as it writes it") from None
     number = config.stage_number(iteration / config.run.iterations)
     coarse = config.stage(number).grain != AS_CONFIGURED.grain
     with _fitting(archive, config):
@@ -77,12 +77,10 @@ def load_replay(config: Config) -> Replay:
     if manifest.get("memory"):
         size = _samples_per_pass(manifest["memory"], written)
         integrator = integrator.with_options(samples_per_pass=size, freeze=integrator.freeze)
-    if manifest.get("paths"):
-        integrator = with_sides(integrator, PathsRecord.from_json(manifest["paths"]))
-    integrator = as_decided(integrator, guided, None)
+    integrator = as_decided(integrator, decisions)
     if saved.shares:
         integrator = integrator.shared_out(saved.shares)
-    problem = replace(problem, guided=guided, integrator=integrator, samples_per_pass=size)
+    problem = replace(problem, decisions=decisions, integrator=integrator, samples_per_pass=size)
     for view in problem.views:
         suffix = "" if len(problem.views) == 1 else f"-{view.sensor}"
         view.made = _read_image(folder.images / f"target{suffix}.exr", problem, view.sensor)
@@ -104,38 +102,6 @@ def _fitting(archive: Path, config: Config) -> Iterator[None]:
         yield
     except ValueError as error:
         raise ConfigError(archive, "", f"does not fit to {config.source}: {error}") from None
-
-
-@contextmanager
-def _as_written(path: Path, place: str, what: str) -> Iterator[None]:
-    """Raise ConfigError where the entry at `place` of the manifest at `path` is not what a run writes."""
-    try:
-        yield
-    except (AttributeError, KeyError, TypeError, ValueError):  # pydantic's error is a ValueError
-        raise ConfigError(path, place, f"is not {what}, as a run writes it") from None
-
-
-def _settled(config: Config, manifest: dict[str, Any], path: Path) -> Config:
-    """Return the configuration with the paths and the sequence that the run decided on."""
-    options = config.integrator.options()
-    if manifest.get("paths"):
-        with _as_written(path, "paths", "which paths paid"):
-            sides = PathsRecord.from_json(manifest["paths"])
-        options |= {"paths": sides.paths, "light_share": sides.light_share or UNDECIDED["light_share"]}
-        config = with_integrator(config, {"type": config.integrator.type} | options, str(path), {})
-    if options.get("sequence") == "auto":
-        with _as_written(path, "sequence", "whether a sequence paid"):
-            options["sequence"] = SequenceRecord.from_json(manifest["sequence"]).setting
-        config = with_integrator(config, {"type": config.integrator.type} | options, str(path), {})
-    return config
-
-
-def _guided(config: Config, manifest: dict[str, Any], path: Path) -> GuidedRecord | None:
-    """Whether guided emission was measured to pay, by the manifest at `path`; None where that was not measured."""
-    if config.integrator.options().get("guiding") != "auto" or manifest.get("guided") is None:
-        return None
-    with _as_written(path, "guided", "whether guiding paid"):
-        return GuidedRecord.from_json(manifest["guided"])
 
 
 def _teach(problem: Problem, saved: NonFiniteStep, archive: Path) -> None:

@@ -108,10 +108,10 @@ ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
     "stack": ("stack_size",),
 }
 
-#: Those that `auto` leaves to measurement beside any estimator, with what they are where nothing is measured.
-UNDECIDED: dict[str, str | float] = {
+#: The settings that may be `auto` beside any estimator, and their values before a run decides them
+#: (`optimization/autotune/sampling.py`).
+UNDECIDED: dict[str, str] = {
     "paths": "light",
-    "light_share": 0.5,
     "guiding": "off",
     "sequence": "independent",
     "pixels": "even",
@@ -155,16 +155,11 @@ class Reslrb(AttachingTracer):
     caustics of small lamps (with estimators `auto` and `stack`); `both`: each path is weighed by how likely either
     side was to find it, so that the image has all light. `auto`: `both`, or `camera` where that finds all light and a
     few steps of each, before the first iteration, show that it is the more efficient; `light` where nothing else can
-    render the scene, or finds any of its light. What moves light has light paths alone. Left out it is `auto` with
-    estimator `auto`, and `light` with one that is named."""
-    light_share: Annotated[
-        Annotated[float, Field(ge=0, le=1, allow_inf_nan=False), mark("number")]
-        | Annotated[Literal["auto"], mark("text")],
-        Discriminator(lambda value: MARK + ("text" if isinstance(value, str) else "number")),
-    ] = "auto"
+    render the scene, or finds any of its light, or where guided light paths are the most efficient. What moves light
+    has light paths alone. Left out it is `auto` with estimator `auto`, and `light` with one that is named."""
+    light_share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = 0.5
     """Which share of the samples are light paths where `paths` are `both`; with 0 or 1 nothing of the other side is
-    compiled. `auto`: the most efficient by a few steps of each before the first iteration, 0.5 where nothing is
-    measured."""
+    compiled."""
     guiding: Literal["auto", "on", "off"] = "auto"
     """Whether light paths start where those of earlier steps had something to say about gradient and image, at least a
     quarter of them anywhere, and end where those had little left to say; in scenes with glossy surfaces they are also
@@ -175,9 +170,8 @@ class Reslrb(AttachingTracer):
     sequence: Literal["auto", "independent", "low_discrepancy"] = "auto"
     """The random numbers that say where light paths start and how they first scatter. `low_discrepancy`: evenly spread
     over all paths of a step, and independent from one step to the next; less noise where little but these numbers says
-    where light goes (a beam through glass), a little less elsewhere. `auto`: where a few steps with and without it,
-    before the first iteration, show that it pays here. Left out it is `auto` with estimator `auto`, and `independent`
-    with one that is named."""
+    where light goes (a beam through glass), a little less elsewhere. `auto`: `low_discrepancy`, or `independent` where
+    paths are guided. Left out it is `auto` with estimator `auto`, and `independent` with one that is named."""
     pixels: Literal["auto", "even", "measured"] = "auto"
     """Number of camera paths in each pixel. `even`: the same in all pixels. `measured`: a quarter is spread evenly. The
     other paths go to the pixels whose noise weighs most in the gradient, by the curvature of the loss, 0 in pixels that
@@ -323,8 +317,8 @@ AnyIntegrator = Annotated[
 ]
 
 
-def _check_share(paths: str, light_share: float | str) -> None:
-    if light_share not in ("auto", UNDECIDED["light_share"]) and paths in ("light", "camera"):
+def _check_share(paths: str, light_share: float) -> None:
+    if light_share != 0.5 and paths in ("light", "camera"):
         raise located("light_share", f"has no effect with paths: {paths}, but with both; remove it")
 
 

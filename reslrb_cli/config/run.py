@@ -179,10 +179,10 @@ class RunConfig(Section):
     """Sensors whose views are not trained on, by index or id, which for those of `scene.cameras` is the image's name
     without its suffix; their loss is recorded every 10 iterations (`held_out`), and of the first and the last image."""
     measuring: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.1
-    """What is `auto` in the integrator is measured before the first iteration. This is what all of that may take,
-    kernels that are compiled for it included, as a share of what the run itself is expected to take; first steps of
-    camera paths, which most runs need anyway, may take more. What there is no time for is decided by the scene's
-    features; 0: all of it, and nothing is measured."""
+    """The time for measurements before the first iteration, as a share of the time that the run itself is expected to
+    take. They decide `integrator.paths` and `integrator.guiding` where these are `auto`. The time includes kernels that
+    are compiled for them; first steps of camera paths, which most runs need anyway, may take more. Without time for a
+    measurement `paths` are `both`, and `guiding` is `off`. 0: nothing is measured."""
     accept_incomplete: bool = False
     """Run although more than half of the loss's derivative is missing for a parameter that moves light. The derivative
     lacks silhouettes and edges of shadows. A run measures their share before its first iteration, for `measuring` of

@@ -87,24 +87,26 @@ class LightTracer:
 
     def afresh(
         self, *, guided: bool | None = None, images: bool | None = None, low_discrepancy: bool | None = None,
-        light_share: float | None = None,
+        light_share: float | None = None, shares_out: bool | None = None,
     ) -> Self:  # fmt: skip
         """The same, which knows nothing of any scene yet, with other ways of drawing samples; None: as it has it.
 
         Guided emission or none, `images`: of images too; low-discrepancy numbers or independent ones; paths from both
-        sides, of which `light_share` are light paths: images have the film's border of both, whatever that share is.
+        sides, of which `light_share` are light paths: images have the film's border of both, whatever that share is;
+        camera paths that are shared out over the pixels, or evenly spread.
         """
         other = copy.copy(self)
         other.preparation = self.preparation.afresh(guided, images, low_discrepancy)
         if light_share is not None:
             other.have_paths("both", light_share, whole=True)
+        if shares_out is not None:
+            other.preparation.shares_out = shares_out
         return other
 
     def shared_out(self, noted: Mapping[str, NDArray[np.float32]]) -> Self:
         """The same, which knows nothing of any scene yet, with camera paths shared out over the pixels as was noted of
         them, by the number of the sensor (`note_pixels`)."""
-        other = self.afresh()
-        other.preparation.shares_out = True
+        other = self.afresh(shares_out=True)
         other.preparation.given = {int(number): density for number, density in noted.items()}
         return other
 

@@ -28,7 +28,7 @@ from reslrb_cli.records.measurements import Method
 #: Options that a case takes over from the configuration's integrator, where it knows them.
 SHARED = (
     *("rr_depth", "hide_emitters", "samples_per_pass", "attached", "filter_normalization", "attached_sampling"),
-    *("sppc", "sppp", "sppi", *UNDECIDED),
+    *("sppc", "sppp", "sppi", *UNDECIDED, "light_share"),
 )
 
 #: Options that say which paths there are.
@@ -45,11 +45,11 @@ def paths_in_records(config: Config) -> dict[str, Any]:
     """Those of an integrator; `auto` where that is left to measurement."""
     options = config.integrator.options()
     usual = "light" if isinstance(config.integrator, LightTracerOptions) else "camera"
-    return records_of(str(options.get("paths", usual)), options.get("light_share", UNDECIDED["light_share"]))
+    return records_of(str(options.get("paths", usual)), options.get("light_share", BOTH_SHARE))
 
 
 #: The share of light paths where there are both kinds, and nothing else is asked for.
-BOTH_SHARE = float(UNDECIDED["light_share"])
+BOTH_SHARE = 0.5
 
 #: The estimator of a case that names none, as that of the plugin.
 PLUGIN_ESTIMATOR = "reservoir"
@@ -60,7 +60,7 @@ _TYPES = {str(kind.model_fields["type"].default): kind for kind in get_args(get_
 
 #: Options that make an estimator another one, in records.
 _ESTIMATOR_OPTIONS = {option for options in ESTIMATOR_OPTIONS.values() for option in options} - {"capacity"}
-_ESTIMATOR_OPTIONS |= set(UNDECIDED)
+_ESTIMATOR_OPTIONS |= {*UNDECIDED, "light_share"}
 
 _OPTION = "--integrators"
 #: A user's own integrator.
@@ -103,11 +103,11 @@ class Case:
         values |= given
         if self.type == "reslrb" and values.setdefault("estimator", PLUGIN_ESTIMATOR) == "auto" and not auto:
             raise ConfigError(blame, "estimator", "`auto` is for whole runs; take `stack`")
-        ways = {"guiding": "`on` with `off`", "sequence": "`independent` with `low_discrepancy`",
-                "pixels": "`even` with `measured`"}  # fmt: skip
-        for option, compared in (ways | {"paths": "`light`, `camera` and `both`"}).items():
+        for option in UNDECIDED:
             if values.get(option) == "auto" and not auto:
-                raise ConfigError(blame, option, f"`auto` measures whether it pays; compare {compared}")
+                ways = [each for each in get_args(ReslrbConfig.model_fields[option].annotation) if each != "auto"]
+                compared = " with ".join(f"`{way}`" for way in ways)
+                raise ConfigError(blame, option, f"`auto` is for whole runs; compare {compared}")
         made = with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
         if self.type == "custom" and not config.allows_code:
             raise ConfigError(blame, "", "would be run, with all your rights; --allow-code has it run")

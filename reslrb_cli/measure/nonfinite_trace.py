@@ -452,11 +452,11 @@ def _parts(
     """
     scene, sensor = problem.scene, problem.scene.sensors()[view.sensor]
     given = problem.config.integrator.options()
-    names = ("max_depth", "rr_depth", "hide_emitters", "sequence")
-    shared = {name: given[name] for name in names if name in given}
+    shared = {name: given[name] for name in ("max_depth", "rr_depth", "hide_emitters") if name in given}
     tracer = Reslrb.of(estimator="gather", **shared)
     if isinstance(problem.integrator, Reslrb):
         own = problem.integrator
+        tracer = tracer.afresh(low_discrepancy=own.plan(scene, sensor).sequence is not None)
         tracer.have_paths(own.paths, own.light_share, own.preparation.whole)
     # Of what moves light, contributions alone are looked at: `gather` has no derivatives of it.
     params = None if is_attached(problem) else problem.selection.params

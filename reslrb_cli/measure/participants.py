@@ -128,8 +128,7 @@ class Way:
     def of(cls, config: Config) -> Way:
         """That of an integrator; whoever leaves nobody a choice has light paths."""
         options = config.integrator.options()
-        paths, share = options.get("paths", "light"), options.get("light_share", "auto")
-        share = 0.5 if share == "auto" else share
+        paths, share = options.get("paths", "light"), options.get("light_share", 0.5)
         if paths == "both" and share in (0, 1):
             paths = "light" if share else "camera"
         return cls(paths, share) if paths == "both" else cls(paths)

@@ -29,8 +29,8 @@ from reslrb_cli.optimization.problem import Problem, saved_spp
 from reslrb_cli.optimization.stages import Stages
 from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
-from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.clock import MIB
+from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.metrics import Record
 
 #: Seconds of a step beyond which steps of fewer samples stand for it, and that those are to take.
@@ -184,7 +184,7 @@ class Forecast(Steps):
 def make_forecast(
     config: Config,
     say: Callable[[str], None],
-    cache: PilotCache | None = None,
+    cache: DecisionCache | None = None,
     before: Callable[[Problem], object] = lambda problem: None,
 ) -> Forecast:
     """Measure a few steps of the run that `config` describes; a variant must be set.
@@ -203,7 +203,7 @@ def make_forecast(
     steps, scratch, integrator = measure_steps(problem), 0, problem.integrator
     if isinstance(integrator, Reslrb):  # of all paths that are traced at a time
         scratch = max(integrator.scratch_bytes(plan) for plan in plans(problem, integrator)) * resident_paths()
-    run, measured = config.run, (problem.sides, problem.guided, problem.sequence)
+    run = config.run
     parts = _parts(problem)
     rest = max(steps.peak - sum(parts.values()), 0)
     parts["images of a step, gradients, what is kept of paths (reservoir)"] = rest
@@ -217,7 +217,7 @@ def make_forecast(
         free=free_bytes(mi.variant()),
         iterations=run.iterations,
         before_s=before_s,
-        measuring_s=sum(each.measure_s + each.compile_s for each in measured if each and not each.cached),
+        measuring_s=sum(each.seconds for each in problem.decisions if not each.cached),
         kept=cache is not None and cache.keeps,
         target_s=image_s * config.target.render.spp * views if config.target.render else 0.0,
         images_s=image_s * images * views,

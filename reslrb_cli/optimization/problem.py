@@ -15,20 +15,13 @@ from reslrb_cli.config.parameters import HEIGHTMAP, Laplacian, Thickness
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import OnSamples
-from reslrb_cli.optimization.decisions import Allowance, MemoryPlan
 from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.optimization.loading import BETWEEN_SPP, render_in_passes
 from reslrb_cli.optimization.optimizers import Optimizer, make_transform
 from reslrb_cli.optimization.precondition import make_smoother
 from reslrb_cli.optimization.regularizers import Cost, Plate, Span, make_cost, make_plate, mesh_cost, spans_of
 from reslrb_cli.optimization.views import View, slope, to_tensor
-from reslrb_cli.records.decisions import (
-    GuidedRecord,
-    Jsonable,
-    PathsRecord,
-    PixelsRecord,
-    SequenceRecord,
-)
+from reslrb_cli.records.decisions import Decision, MemoryPlan
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.seeds import seed
 
@@ -72,13 +65,8 @@ class Problem:
     paths: str = "light"
     #: Whether parameters move anything that light leaves from or meets.
     moves: bool = False
-    #: What measuring before the first iteration may take, where anything was left to it, and was not known already.
-    allowance: Allowance | None = None
-    #: What was measured and planned before the first iteration, where it was.
-    sides: PathsRecord | None = None
-    guided: GuidedRecord | None = None
-    sequence: SequenceRecord | None = None
-    pixels: PixelsRecord | None = None
+    #: Settings of the integrator that were left to `auto`, as they were decided (`autotune/sampling.py`).
+    decisions: list[Decision] = field(default_factory=list)
     memory: MemoryPlan | None = None
     #: What values cost by themselves, by key and type.
     regularizers: dict[str, dict[str, Cost | Plate]] = field(default_factory=dict)
@@ -86,13 +74,6 @@ class Problem:
     engine: Callable[..., Any] | None = None
     #: What learning rates are multiplied by, beside their schedule.
     pace: float = 1.0
-
-    def decisions(self) -> dict[str, dict[str, Any] | None]:
-        """What was measured and planned before the first iteration, as manifests and checkpoints have it, by name."""
-        made: dict[str, Jsonable | None] = {"guided": self.guided, "sequence": self.sequence}
-        made["memory"] = self.memory
-        made |= {name: own for name, own in (("paths", self.sides), ("pixels", self.pixels)) if own is not None}
-        return {name: None if each is None else each.to_json() for name, each in made.items()}
 
     def apply(self, others: Mapping[str, Any] | None = None) -> None:
         """Hand the optimiser's values to the scene, or, of the keys in `others`, those; masks follow what moves."""

@@ -24,13 +24,11 @@ from pydantic import Field
 from reslrb_cli.config.files import CONFIG_BYTES
 from reslrb_cli.guiding.tables import KNOWN, Guiding
 from reslrb_cli.integrators.reslrb import Reslrb
-from reslrb_cli.optimization.autotune.race import is_auto
-from reslrb_cli.optimization.autotune.sampling import as_decided, with_sides
-from reslrb_cli.optimization.decisions import MemoryPlan, Scaled
+from reslrb_cli.optimization.autotune.sampling import as_decided, decided
 from reslrb_cli.optimization.memory import in_passes
 from reslrb_cli.optimization.optimizers import SUMS
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.records.decisions import GuidedRecord, PathsRecord, PixelsRecord, SequenceRecord
+from reslrb_cli.records.decisions import Decision, MemoryPlan, Scaled
 from reslrb_cli.records.tree import PASSING, Array, Arrays, Stored, entry, expected, like, to_array
 
 Count = Annotated[int, Field(ge=0, lt=2**31)]
@@ -212,21 +210,17 @@ def check_bounds(problem: Problem, stored: Stored, name: str, key: str, array: A
 @dataclass(frozen=True)
 class Settled:
     """What every process of a run has alike: its settings, in a file's words, and `variant`, the digests of the `files`
-    that they name, what was decided by measurement, the parameters' values at the start, and `masks` as a `Problem`
-    has them."""
+    that they name, `decisions`, the parameters' values at the start, and `masks` as a `Problem` has them."""
 
     #: With every default written out, so that it is longer than a file may be.
     config: Annotated[str, Field(max_length=4 * CONFIG_BYTES)]
     variant: str
     files: dict[str, str] = field(default_factory=dict)
-    guided: GuidedRecord | None = None
-    sequence: SequenceRecord | None = None
-    paths: PathsRecord | None = None
+    decisions: list[Decision] = field(default_factory=list)
     memory: MemoryPlan | None = None
     initial: Arrays = field(default_factory=dict, metadata=entry("initial", "finite"))
     initial_halo: Arrays = field(default_factory=dict, metadata=entry("initial with halo", "finite"))
     masks: Arrays = field(default_factory=dict, metadata=entry("mask"))
-    pixels: PixelsRecord | None = None
     #: How camera paths are shared out over the pixels, by the number of their sensor, (H, W).
     shares: Arrays = field(default_factory=dict, metadata=entry("pixels", "finite"))
 
@@ -247,13 +241,10 @@ def begin_as(problem: Problem, stored: Stored) -> None:
 def decide_as(problem: Problem, stored: Stored) -> Problem:
     """Return `problem` with the decisions of the run: the samples of a pass, and how samples are drawn."""
     settled = stored.read(Settled)
-    guided = settled.guided if is_auto(problem.config, "guiding") else None
-    sequence = settled.sequence if is_auto(problem.config, "sequence") else None
-    sides = settled.paths if is_auto(problem.config, "paths") else None
-    pixels = settled.pixels if is_auto(problem.config, "pixels") else None
+    decisions = decided(problem.config, settled.decisions)
     if problem.memory is not None:
         problem = in_passes(problem, _as_planned(stored, settled.memory, problem.memory))
-    integrator = as_decided(with_sides(problem.integrator, sides), guided, sequence)
+    integrator = as_decided(problem.integrator, decisions)
     if names := stored.archive.names("pixels/"):
         films = {str(k): sensor.film().crop_size() for k, sensor in enumerate(problem.scene.sensors())}
         for name in names:
@@ -263,7 +254,7 @@ def decide_as(problem: Problem, stored: Stored) -> Problem:
         integrator = integrator.shared_out(
             {name: stored.take(f"pixels/{name}", size, "finite") for name, size in sizes.items()}
         )
-    return replace(problem, sides=sides, guided=guided, sequence=sequence, pixels=pixels, integrator=integrator)
+    return replace(problem, decisions=decisions, integrator=integrator)
 
 
 def _as_planned(stored: Stored, before: MemoryPlan | None, now: MemoryPlan) -> MemoryPlan:

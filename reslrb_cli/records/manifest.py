@@ -69,9 +69,8 @@ def is_complete(content: Mapping[str, Any]) -> bool:
 class Manifest:
     """Provenance and outcome of one run.
 
-    `process` is who works in the folder. `plan` is what a step consists of, `paths` which paths paid, `guided` whether
-    guided emission did, `sequence` whether low-discrepancy numbers did, `pixels` whether camera paths are shared out
-    over the pixels, `incomplete` what the derivative of each parameter that moves light lacks (`MissingRecord`),
+    `process` is who works in the folder. `plan` is what a step consists of, `decisions` the settings that were left to
+    `auto` (`Decision`), `incomplete` what the derivative of each parameter that moves light lacks (`MissingRecord`),
     `memory` how a memory budget is kept, `scaling` what was measured of each parameter for `scale: auto`, `shared` the
     time that workers took (`SharedTime`); each is None, or empty, where that was not asked for. `views` has, of each
     view, its share of the loss, how many of its pixels are left out, by kind, and what its images are multiplied by to
@@ -97,10 +96,7 @@ class Manifest:
     error: str | None = None
     missing: dict[str, str] = field(default_factory=dict)
     plan: dict[str, Any] | None = None
-    guided: dict[str, Any] | None = None
-    sequence: dict[str, Any] | None = None
-    paths: dict[str, Any] | None = None
-    pixels: dict[str, Any] | None = None
+    decisions: list[dict[str, Any]] = field(default_factory=list)
     memory: dict[str, Any] | None = None
     scaling: list[dict[str, Any]] | None = None
     views: list[dict[str, Any]] | None = None

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.errors import MachineError, NonFinite, describe, is_machine_fault, tell
-from reslrb_cli.optimization.decisions import Scaled
 from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.nonfinite import Findings
 from reslrb_cli.optimization.problem import Problem, saved_spp
@@ -35,6 +34,7 @@ from reslrb_cli.records.checkpoint import (
     newest_checkpoint,
     save_nonfinite,
 )
+from reslrb_cli.records.decisions import Scaled
 from reslrb_cli.records.images import PARAMETERS_FILE as PARAMETERS_FILE_NAME
 from reslrb_cli.records.images import load_image, write_image, write_mask, write_parameters
 from reslrb_cli.records.manifest import NOT_YET, Manifest, Status

@@ -17,7 +17,7 @@ from cli.test_nonfinite import CONFIG, KEY, PLAIN, SCENE
 from cli.test_nonfinite import reslrb_nonfinite as reslrb
 
 from reslrb_cli.cli import main
-from reslrb_cli.records.decisions import GuidedRecord
+from reslrb_cli.records.decisions import Decision
 
 ARCHIVE, MANIFEST, TARGET = "checkpoint/nonfinite.npz", "manifest.json", "images/target.exr"
 
@@ -80,26 +80,23 @@ def test_paths_are_of_the_run_s_sequence(run):
         assert {samples.plan.sequence for samples, *_ in _parts(problem, problem.views[0], 1)} == {own}
 
 
-def test_paths_are_of_the_sequence_that_was_measured_to_pay(run, capsys):
+def test_paths_are_of_the_sequence_that_was_decided(run, capsys):
     from reslrb_cli.cli.nonfinite import load_replay
     from reslrb_cli.config.loader import load
     from reslrb_cli.measure.nonfinite_trace import _parts
-    from reslrb_cli.records.decisions import SequenceRecord
 
     config = (run / "config.yaml").read_text()
     assert "sequence: independent" in config
     (run / "config.yaml").write_text(config.replace("sequence: independent", "sequence: auto"))
     manifest = json.loads((run / "manifest.json").read_text())
     for paid in (True, False):
-        measured = SequenceRecord(low_discrepancy=paid).to_json()
-        (run / "manifest.json").write_text(json.dumps(manifest | {"sequence": measured}))
+        value = "low_discrepancy" if paid else "independent"
+        found = Decision(setting="sequence", value=value, why="").to_json()
+        (run / "manifest.json").write_text(json.dumps(manifest | {"decisions": [found]}))
         problem = load_replay(load(run / "config.yaml")).problem
         own = problem.integrator.plan(problem.scene, problem.scene.sensors()[0]).sequence
         assert (own is not None) == paid
         assert {samples.plan.sequence for samples, *_ in _parts(problem, problem.views[0], 1)} == {own}
-    for wrong in (None, {"low_discrepancy": "maybe"}):
-        (run / "manifest.json").write_text(json.dumps(manifest | {"sequence": wrong}))
-        assert told(capsys, run) == "manifest.json: sequence: is not whether a sequence paid, as a run writes it"
 
 
 def test_a_guided_run_without_its_tables_is_refused(run, capsys):
@@ -108,16 +105,16 @@ def test_a_guided_run_without_its_tables_is_refused(run, capsys):
     refused = f"{ARCHIVE}: calls: is missing: what the paths of a guided step were drawn from"
     (run / "config.yaml").write_text(config.replace("guiding: 'off'", "guiding: 'on'"))
     assert told(capsys, run) == refused
-    # And one of which measuring said so; what was left off by it is replayed.
+    # And one of which a decision said so; what was left off by it is replayed.
     (run / "config.yaml").write_text(config.replace("guiding: 'off'", "guiding: auto"))
     assert reslrb(capsys, "inspect", run / "config.yaml", "--nonfinite")[0] == 0
     manifest = json.loads((run / "manifest.json").read_text())
-    for measured, line in (
-        (GuidedRecord(guided=True).to_json(), refused),
-        (None, ""),
-        ({"guided": "on"}, "manifest.json: guided: is not whether guiding paid, as a run writes it"),
+    for found, line in (
+        ([Decision(setting="guiding", value="on", why="").to_json()], refused),
+        ([], ""),
+        ([{"guided": "on"}], "manifest.json: decisions: is not what a run decided, as it writes it"),
     ):
-        (run / "manifest.json").write_text(json.dumps(manifest | {"guided": measured}))
+        (run / "manifest.json").write_text(json.dumps(manifest | {"decisions": found}))
         if line:
             assert told(capsys, run) == line
         else:

@@ -69,7 +69,7 @@ def test_defaults(tmp_path: Path) -> None:
     assert config.integrator.options() == {
         "max_depth": 8, "rr_depth": 5, "hide_emitters": False, "estimator": "auto", "freeze": True,
         "attached": "auto", "attached_sampling": "auto", "filter_normalization": "attached", "guiding": "auto",
-        "paths": "auto", "light_share": "auto",
+        "paths": "auto", "light_share": 0.5,
         "sequence": "auto", "pixels": "auto",
     }  # fmt: skip
     assert config.loss.type == "l2"
@@ -391,7 +391,7 @@ def test_options_and_defaults_are_the_estimators_own(name: str) -> None:
 
 
 def test_paths_that_an_estimator_named_leaves_to_nobody() -> None:
-    assert (Reslrb().paths, Reslrb().light_share) == ("auto", "auto")
+    assert (Reslrb().paths, Reslrb().light_share) == ("auto", 0.5)
     assert Reslrb(estimator="stack").paths == "light"
     named = Reslrb(estimator="stack", paths="both")
     assert (named.paths, named.light_share) == ("both", 0.5)
@@ -407,6 +407,7 @@ def test_paths_that_an_estimator_named_leaves_to_nobody() -> None:
         ({"paths": "camera", "estimator": "gather"}, "chooses among the connections of light paths"),
         ({"paths": "light", "light_share": 0.3}, "has no effect with paths: light, but with both"),
         ({"paths": "both", "light_share": 1.5}, "less than or equal to 1"),
+        ({"paths": "both", "light_share": "auto"}, "valid number"),
         ({"paths": "sideways"}, "'auto', 'light', 'camera' or 'both'"),
     ],
 )

@@ -1,8 +1,8 @@
-"""No scene loses by `guiding: auto` and `sequence: auto`: all shipped configurations, and scenes of the extreme suite.
+"""No scene loses by `guiding: auto`: all shipped configurations, and scenes of the extreme suite.
 
-What is on has a gain whose interval lies above 1; what is off traces what `off` does, operation by operation; and all
-that is measured takes what it may. Shipped films are as they are, or smaller where an iteration takes seconds; those of
-the extreme suite have so many samples that there is time to measure.
+What is on has a gain whose interval lies above 1; what is off traces what `off` does, operation by operation. Shipped
+films are as they are, or smaller where an iteration takes seconds; those of the extreme suite have so many samples that
+there is time to measure.
 """
 
 from __future__ import annotations
@@ -12,11 +12,10 @@ import gc
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from optimization.deciding import operations
+from optimization.deciding import decision, operations
 
 from reslrb_cli.config.loader import load, loads
 from reslrb_cli.config.schema import Config
@@ -26,12 +25,11 @@ from reslrb_cli.measure.extreme.suite import ExtremeCase
 from reslrb_cli.measure.gradients import integrator
 from reslrb_cli.measure.scenes.small import load as load_scene
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.autotune.race import NOTHING, SHARE, Gain, is_auto
-from reslrb_cli.optimization.autotune.sampling import GuidingPilot, SequencePilot, settle
+from reslrb_cli.optimization.autotune.race import Finding, Turns
+from reslrb_cli.optimization.autotune.sampling import is_auto, settle
 from reslrb_cli.optimization.memory import fit_memory
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import make_targets
-from reslrb_cli.records.decisions import LEAST_IMAGE, PaidRecord
 from reslrb_cli.records.images import write_file
 
 pytestmark = [pytest.mark.usefixtures("llvm"), pytest.mark.long]
@@ -51,9 +49,6 @@ EXTREME = ["sun_1e6", "lamp_of_area_1e-8", "grazing_light", "nested_dielectrics"
 PREFIX = "extreme/"
 #: Light paths of a step of theirs.
 PATHS = 2**20
-#: The last round is begun while there is time for one like that before it. Beside others' work on the machine it may
-#: take so many times as long as the mean of all: where steps take milliseconds, that is a part that counts.
-OVERRUN = 2
 #: What decides on the integrator.
 SETTLE: dict[str, Callable[[Problem, Callable[[str], None]], Problem]] = {"settle": settle}
 
@@ -95,58 +90,23 @@ def config_of(name: str, case: ExtremeCase | None, folder: Path, *settings: str)
     return load(FOLDER / f"{name}.yaml", [*target, *SMALLER.get(name, ()), *settings])
 
 
-def judged(record: PaidRecord | None, on: bool, alone: bool) -> list[str]:
-    """What a decision has that it may not."""
-    if record is None:
-        return ["nothing was decided"]
-    if not on:
-        return []
-    assert record.low is not None
-    assert record.image_high is not None
-    found = [f"on, and the gain is {record.low:.3g} at least"] if record.low <= 1 else []
-    if not alone and record.image_high < LEAST_IMAGE:
-        found.append(f"on, and the image's efficiency falls to {record.image_high:.3g} at most")
-    return found
-
-
 @pytest.mark.parametrize("name", [*SHIPPED, *(PREFIX + name for name in EXTREME)])
 def test_no_scene_loses(name: str, tmp_path: Path) -> None:
     case = CASES[name.removeprefix(PREFIX)] if name.startswith(PREFIX) else None
     problem = decided(config_of(name, case, tmp_path, *AUTO), case)
-    sides, guided, sequence = problem.sides, problem.guided, problem.sequence
-    share = sum(each.share for each in (sides, guided, sequence) if each is not None)
-    round_share = max(each.share / max(each.rounds, 1) for each in (guided, sequence) if each is not None)
-    print(name, *(each.line() for each in (sides, guided, sequence) if each is not None), f"{share:.2%}", sep="\n  ")
+    print(name, *(each.line(cost=True) for each in problem.decisions), sep="\n  ")
+    guided, values = decision(problem, "guiding"), {each.setting: each.value for each in problem.decisions}
     assert guided is not None
-    alone = problem.config.adjoint == "independent"
-    assert judged(guided, guided.guided, alone) == []
-    assert share <= SHARE + OVERRUN * round_share
-    if guided.guided:
+    if guided.value != "off":
+        assert guided.low is not None
+        assert guided.low > 1
         return
-    camera = problem.integrator.paths == "camera"
-    settings = ["integrator.estimator=stack", f"integrator.guiding={guided.setting}"]
-    if problem.sides is not None:
-        both = [f"integrator.light_share={problem.sides.light_share}"] if problem.sides.paths == "both" else []
-        settings += [f"integrator.paths={problem.sides.paths}", *both]
-    if camera:  # of which none begins at a lamp
-        assert sequence is None
-    else:
-        assert sequence is not None
-        assert judged(sequence, sequence.low_discrepancy, False) == []
-        settings += [f"integrator.sequence={sequence.setting}"]
+    settings = [f"integrator.{setting}={value}" for setting, value in values.items()]
+    assert ("sequence" in values) == (problem.integrator.paths != "camera")  # of which none begins at a lamp
     found = operations(problem)
     del problem
     gc.collect()
-    assert found == operations(decided(config_of(name, case, tmp_path, *settings), case))
-
-
-def forced(record: Callable[..., PaidRecord], on: bool) -> Callable[..., PaidRecord]:
-    """A pilot's way to its record, with another decision."""
-
-    def decided(pilot: Any, note: str, gain: Gain = NOTHING, picture: Gain = NOTHING, *decision: bool) -> PaidRecord:
-        return record(pilot, note, gain, picture, on, on)
-
-    return decided
+    assert found == operations(decided(config_of(name, case, tmp_path, "integrator.estimator=stack", *settings), case))
 
 
 @pytest.mark.parametrize("fault", ["on whatever is found", "off with a grid"])
@@ -155,9 +115,12 @@ def test_losses_are_seen(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
     cells."""
     monkeypatch.setattr(sys.modules[__name__], "AUTO", [*AUTO, "integrator.paths=light"])
     if fault == "on whatever is found":
-        monkeypatch.setattr(GuidingPilot, "_record", forced(GuidingPilot._record, True))
-        # What would take the place of guiding here.
-        monkeypatch.setattr(SequencePilot, "_record", forced(SequencePilot._record, False))
+        run = Turns.run
+
+        def forced(self: Turns) -> Finding:
+            return dataclasses.replace(run(self), other=True, images=True)
+
+        monkeypatch.setattr(Turns, "run", forced)
     else:
 
         def wrong(problem: Problem, say: Callable[[str], None]) -> Problem:

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cli import tiny
-from optimization.deciding import SMALL, begin, fix_times
+from optimization.deciding import SMALL, begin, decision, fix_times
 from runs.going_on import optimize
 
 from reslrb_cli.config.integrators import Reslrb
@@ -17,13 +17,12 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble, assemble_scene
 from reslrb_cli.optimization.autotune import race, sampling
-from reslrb_cli.optimization.autotune.sampling import FEWER, FIRST_SHARE, MORE, CameraPilot, with_sides
+from reslrb_cli.optimization.autotune.sampling import as_decided
 from reslrb_cli.optimization.loading import paths_of
 from reslrb_cli.optimization.losses import make_loss
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import View
-from reslrb_cli.records.cache import PilotCache
-from reslrb_cli.records.decisions import PathsRecord
+from reslrb_cli.records.decisions import Decision, DecisionCache
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.scene.needs import camera_finds_all, light_finds_all
 from reslrb_cli.transport.film import PixelShares
@@ -31,7 +30,6 @@ from reslrb_cli.transport.film import PixelShares
 pytestmark = pytest.mark.usefixtures("llvm")
 
 AUTO = ["integrator.paths=auto", "integrator.estimator=stack", *SMALL]
-OTHERS = (0.0, *FEWER, *MORE)
 #: A run of a second: its measuring may take a tenth of that.
 SHORT = ["integrator.paths=auto", "integrator.estimator=stack", "scene.size=[32, 32]", "run.spp=16"]
 SHORT += ["run.iterations=100", "run.certainty=false"]
@@ -51,12 +49,10 @@ def experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def decided(
-    monkeypatch: pytest.MonkeyPatch, other_ms: float, *settings: str, cache: PilotCache | None = None,
-    apart: dict[float, float] | None = None,
-) -> Problem:  # fmt: skip
-    """The problem, where steps of another share take so many times as long as those of the best so far; those of some
-    shares `apart`."""
-    fix_times(monkeypatch, {f"paths {share:g}": (apart or {}).get(share, other_ms) for share in OTHERS})
+    monkeypatch: pytest.MonkeyPatch, camera_ms: float, *settings: str, cache: DecisionCache | None = None
+) -> Problem:
+    """The problem, where steps of camera paths alone take so many times as long as those of both kinds."""
+    fix_times(monkeypatch, {"paths": camera_ms})
     return assemble(load("tiny.yaml", [*AUTO, *settings]), cache=cache)
 
 
@@ -70,64 +66,60 @@ def share_of(problem: Problem) -> tuple[str, float]:
     return problem.integrator.paths, problem.integrator.light_share
 
 
-def test_camera_paths_alone_are_tried_first_where_they_find_all(monkeypatch: pytest.MonkeyPatch):
-    """All surfaces are diffuse."""
-    problem = decided(monkeypatch, 100.0, apart={0.0: 0.01})
-    assert problem.sides is not None
-    assert (problem.sides.paths, problem.sides.light_share) == ("camera", 0.0)
-    assert share_of(problem)[0] == "camera"
-    assert problem.sides.low > 1
+def test_camera_paths_alone_are_taken_where_they_find_all_light_faster(monkeypatch: pytest.MonkeyPatch):
+    """All surfaces are diffuse. Nothing is drawn from a sequence then, and nothing said of it."""
+    problem = decided(monkeypatch, 0.01, "integrator.sequence=auto")
+    [found] = problem.decisions
+    assert (found.setting, found.value, share_of(problem)[0]) == ("paths", "camera", "camera")
+    assert found.low is not None
+    assert found.low > 1
+    assert found.why.startswith(f"camera paths have {found.gain:.2g} times the efficiency here (")
 
 
-def test_what_is_faster_is_taken_as_far_as_it_goes(monkeypatch: pytest.MonkeyPatch):
-    """A few light paths after all, and then more; and from a half on fewer, where there have to be some."""
-    assert share_of(decided(monkeypatch, 0.01)) == ("both", FEWER[0])
-    assert share_of(decided(monkeypatch, 0.01, apart={FEWER[0]: 100.0})) == ("both", FEWER[1])
-    assert share_of(decided(monkeypatch, 0.01, apart={0.0: 100.0})) == ("both", FEWER[1])
+def test_camera_paths_that_are_slower_are_left(monkeypatch: pytest.MonkeyPatch):
+    for settings, share in ([], 0.5), (["integrator.light_share=0.25"], 0.25):
+        problem = decided(monkeypatch, 100.0, *settings)
+        [found] = problem.decisions
+        assert (found.value, *share_of(problem)) == ("both", "both", share)
+        assert found.gain is not None
+        assert found.gain < 1
+
+
+def test_nothing_is_measured_where_camera_paths_miss_light_or_paths_are_named(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(race.Turns, "run", lambda *args: pytest.fail("measured"))
+    assert decided(monkeypatch, 0.01, "integrator.paths=both").decisions == []
     monkeypatch.setattr(sampling, "camera_finds_all", lambda *scene: False)
-    assert share_of(decided(monkeypatch, 0.01)) == ("both", FEWER[1])
-
-
-def test_what_is_slower_is_left(monkeypatch: pytest.MonkeyPatch):
-    problem = decided(monkeypatch, 100.0)
-    assert share_of(problem) == ("both", FIRST_SHARE)
-    assert problem.sides.gain < 1
-
-
-def test_a_share_alone_is_measured_too(monkeypatch: pytest.MonkeyPatch):
-    problem = decided(monkeypatch, 100.0, "integrator.paths=both", "integrator.light_share=auto")
-    assert share_of(problem) == ("both", FIRST_SHARE)
-    assert problem.sides is not None
-    problem = decided(monkeypatch, 100.0, "integrator.paths=both", "integrator.light_share=0.25")
-    assert share_of(problem) == ("both", 0.25)
-    assert problem.sides is None
+    problem = decided(monkeypatch, 0.01)
+    assert [each.line() for each in problem.decisions] == ["paths both: camera paths do not find all light here"]
+    assert share_of(problem) == ("both", 0.5)
 
 
 def test_without_time_half_of_the_paths_are_light_paths(monkeypatch: pytest.MonkeyPatch):
-    problem = decided(monkeypatch, 1.0, "run.measuring=0")
-    assert share_of(problem) == ("both", FIRST_SHARE)
-    assert "not measured" in problem.sides.note
+    problem = decided(monkeypatch, 0.01, "run.measuring=0")
+    assert share_of(problem) == ("both", 0.5)
+    assert "not measured" in problem.decisions[0].why
 
 
 def test_it_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    cache = PilotCache(tmp_path / "kept")
+    cache = DecisionCache(tmp_path / "kept")
     first, second = (decided(monkeypatch, 0.01, cache=cache) for _ in range(2))
-    assert not first.sides.cached
-    assert second.sides.cached
+    assert [each.decisions[0].cached for each in (first, second)] == [False, True]
     assert share_of(first) == share_of(second)
 
 
 def test_light_paths_alone_are_what_is_guided_where_they_find_all(monkeypatch: pytest.MonkeyPatch):
     """With the border of both, which the target has; and that is what goes on from a checkpoint."""
-    fix_times(monkeypatch, {f"paths {share:g}": 100.0 for share in OTHERS} | {"guiding": 1e-6})
-    problem = assemble(load("tiny.yaml", [*AUTO, "integrator.guiding=auto"]))
-    assert problem.guided.guided
-    assert (problem.sides.paths, problem.sides.light_share) == ("both", 1.0)
-    assert problem.sides.line().startswith("paths both, 100 % light paths: guided, they have ")
+    fix_times(monkeypatch, {"paths": 100.0, "guiding": 1e-6})
+    problem = assemble(load("tiny.yaml", [*AUTO, "integrator.guiding=auto", "integrator.sequence=auto"]))
+    values = {each.setting: each.value for each in problem.decisions}
+    assert values == {"paths": "light", "guiding": "on", "sequence": "independent"}
+    paths = decision(problem, "paths")
+    assert paths is not None
+    assert paths.line().startswith("paths light: guided, they have ")
     assert problem.integrator.paths == "light"
     assert problem.integrator.preparation.whole
     assert problem.integrator.plan(problem.scene, problem.scene.sensors()[0]).whole
-    assert with_sides(problem.integrator, problem.sides).preparation.whole
+    assert as_decided(problem.integrator, problem.decisions).preparation.whole
 
 
 def test_light_paths_find_all_but_mirrors_and_what_hidden_lamps_cover():
@@ -162,14 +154,17 @@ def test_a_run_of_a_second_has_camera_paths_where_they_find_all():
     """In the furnace they have a thousand times the efficiency, and more."""
     problem = assemble(load(ROOT / "configs" / "furnace.yaml", ["target.render.spp=64"]))
     assert problem.config.run.measuring == 0.1
-    assert (problem.sides.paths, problem.integrator.paths) == ("camera", "camera")
-    assert problem.sides.low > 10
+    found = decision(problem, "paths")
+    assert found is not None
+    assert (found.value, problem.integrator.paths) == ("camera", "camera")
+    assert found.low is not None
+    assert found.low > 10
 
 
 @pytest.mark.parametrize("paths", ["auto", "camera"])
 def test_camera_paths_of_a_guided_run_are_traced_as_they_are(paths: str, monkeypatch: pytest.MonkeyPatch):
     """Whether they were found to pay or asked for: no table says where they begin."""
-    fix_times(monkeypatch, {f"paths {share:g}": 0.01 if share == 0 else 100.0 for share in OTHERS})
+    fix_times(monkeypatch, {"paths": 0.01})
     words = [*SMALL, "integrator.guiding=on", "integrator.estimator=stack", f"integrator.paths={paths}"]
     assert optimize("tiny.yaml", *tiny.settings(*words)) == 0
     rows = {row["feature"]: row for row in read_manifest(RUN)["plan"]["rows"]}
@@ -182,8 +177,7 @@ def test_a_run_of_a_second_keeps_its_caustic():
     """Which no camera path finds, so that they seem to have hardly any noise."""
     _put_glass()
     problem = assemble(load("tiny.yaml", [*SHORT, "integrator.max_depth=6"]))
-    assert problem.sides.paths == "both"
-    assert problem.integrator.light_share >= min(FEWER)
+    assert share_of(problem) == ("both", 0.5)
 
 
 @pytest.mark.parametrize(("spp", "rounds"), [(1, race.LEAST_ROUNDS), (8, 8), (16, 16), (1024, 16)])
@@ -198,9 +192,9 @@ def test_camera_paths_alone_are_judged_by_all_rounds_whatever_python_takes(spp: 
         return taken[-1]
 
     sizes = race.Sizes(spp, spp, spp, False, 16, 0.0, 2.0, planned=1.2)
-    found = CameraPilot(take, sizes, 1.0, share=1e-9).run()
+    found = race.Turns(take, sizes, 1e-9, sure=True).run()
     assert found.rounds == rounds
-    assert found.paths == "other"
+    assert found.other
 
 
 def test_beams_alone_and_scaled_ones_are_left_to_light_paths():
@@ -231,19 +225,15 @@ def test_a_run_goes_on_with_the_paths_that_it_had(settings: list[str], monkeypat
     words = tiny.settings(*settings)
     assert optimize("tiny.yaml", *words) == 0
     found = read_manifest(RUN)
-    assert found["paths"]["paths"] in ("both", "camera")
-    assert "not measured" not in found["paths"]["note"]
-    assert PathsRecord.from_json(found["paths"]).line() in (RUN / "report.html").read_text()
-    for decision in ("decide", "allowance"):  # nothing is measured again
-
-        def refuse(*given: Any, **options: Any) -> Any:
-            raise AssertionError("measured")
-
-        monkeypatch.setattr(race.Tuner, decision, refuse)
+    [paths] = map(Decision.from_json, found["decisions"])
+    assert (paths.setting, paths.gain is None) == ("paths", False)
+    assert paths.line() in (RUN / "report.html").read_text()
+    # Nothing is measured again.
+    monkeypatch.setattr(sampling.Tuner, "race", lambda *given: pytest.fail("measured"))
     iterations = load("tiny.yaml", settings).run.iterations + 2
     assert optimize("--resume", str(RUN), "--set", f"run.iterations={iterations}") == 0
     again = read_manifest(RUN)
-    assert again["paths"] == found["paths"]
+    assert again["decisions"] == found["decisions"]
     assert again["plan"] == found["plan"]
 
 
@@ -275,8 +265,9 @@ def test_auto_shares_paths_out_by_l2_alone(monkeypatch: pytest.MonkeyPatch):
     ):  # fmt: skip
         integrator = f"integrator={{estimator: stack, paths: both, pixels: {pixels}}}"
         problem = assemble(load("tiny.yaml", [integrator, *SMALL, *settings]))
-        assert (problem.pixels is None) == (pixels == "measured")
-        assert problem.pixels is None or problem.pixels.measured is shared
+        found = decision(problem, "pixels")
+        assert (found is None) == (pixels == "measured")
+        assert found is None or found.value == ("measured" if shared else "even")
         assert problem.integrator.preparation.shares_out is shared
         densities += [problem.integrator.preparation.given[0]] if shared else []
         assert not shared or bool(densities[-1][:4].any()) == (mask not in settings)

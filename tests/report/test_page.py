@@ -26,11 +26,12 @@ from report.measured import (
 )
 
 from reslrb_cli.records.clock import SharedTime, WorkerTime
-from reslrb_cli.records.decisions import GuidedRecord, PathsRecord, SequenceRecord
+from reslrb_cli.records.decisions import Decision
 from reslrb_cli.records.images import read_layers
 from reslrb_cli.records.manifest import Status, read_manifest
 from reslrb_cli.report import page as page_module
 from reslrb_cli.report.page import render, write_page, write_report
+from reslrb_cli.report.page.run import DAMAGED
 from reslrb_cli.report.page.values import parameter_table, texture_pictures
 from reslrb_cli.report.perceptual import with_seen_errors
 from reslrb_cli.report.sources import Run, read_sources
@@ -240,30 +241,22 @@ def test_what_workers_took_is_told_by_part_and_by_worker(tmp_path):
 
 
 def test_paths_and_how_they_are_drawn_are_told(tmp_path):
-    """In the order in which they are decided, each where it was left to measurement."""
-    paths = PathsRecord(paths="both", light_share=0.125, gain=1.5, low=1.2, high=1.9, measure_s=2.0, compile_s=3.0)
-    guided, sequence = GuidedRecord(guided=False, note="<b>"), SequenceRecord(low_discrepancy=False, note="alike")
-    decided = {"paths": paths, "guided": guided, "sequence": sequence}
-    records = {name: each.to_json() for name, each in decided.items()}
-    told = page_of(make_run(tmp_path / "all", iterations=0, **records)).sections["Choice of the samples"]
-    lines = [
-        "paths both, 12.5 % light paths: 1.5 times the efficiency here (1.2 to 1.9)"
-        " (measured in 2.0 s and 3.0 s of first steps)",
-        "guiding off: <b>",
-        "sequence independent: alike",
-    ]
+    """In the order in which they are decided, each where it was left to `auto`."""
+    why = "camera paths have 1.5 times the efficiency here (1.2 to 1.9)"
+    decisions = [Decision(setting="paths", value="camera", why=why, gain=1.5, low=1.2, high=1.9, seconds=2.0)]
+    decisions += [Decision(setting="guiding", value="off", why="<b>")]
+    records = [each.to_json() for each in decisions]
+    told = page_of(make_run(tmp_path / "all", iterations=0, decisions=records)).sections["Choice of the samples"]
+    lines = [f"paths camera: {why} (measured in 2.0 s)", "guiding off: <b>"]
     assert [told.count(line) for line in lines] == [1] * len(lines)
     assert sorted(lines, key=told.index) == lines
 
 
-def test_paths_alone_are_told(tmp_path):
-    """Where the estimator is given."""
-    camera = PathsRecord(paths="camera", light_share=0.0, note="all is diffuse").to_json()
+def test_without_decisions_none_are_told(tmp_path):
     title = "Choice of the samples"
-    page = page_of(make_run(tmp_path / "camera", iterations=0, paths=camera))
-    assert page.sections[title].strip() == f"{title}paths camera: all is diffuse"
-    for number, unread in enumerate((None, {}, {"paths": "both", "of another": "version"})):
-        assert title not in page_of(make_run(tmp_path / f"{number}", iterations=0, paths=unread)).sections
+    assert title not in page_of(make_run(tmp_path / "none", iterations=0)).sections
+    other = page_of(make_run(tmp_path / "other", iterations=0, decisions=[{"of another": "version"}]))
+    assert DAMAGED in other.sections[title]
 
 
 def test_what_went_wrong_stands_first(tmp_path):

@@ -116,7 +116,7 @@ EVIL: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
     "another variant": ({}, {"variant": "scalar_rgb"}, "variant: is none of those that a run can have"),
     "keys": ({}, {"certainty": {"seen": 0, "keys": 5}}, "certainty.keys: Input should be a valid array"),
     "a long configuration": ({}, {"config": "a" * 2000000}, "config: String should have at most "),
-    "a decision": ({}, {"guided": {"rows": 3}}, "guided."),
+    "a decision": ({}, {"decisions": [{"setting": 3}]}, "decisions.0."),
     "a variant": ({}, {"variant": 3}, "variant: Input should be a valid string"),
     "a mask": ({f"mask/{tiny.KEY}": np.ones((9, 9), bool)}, {}, "of shape 9x9; it must be 4x4"),
     "a best that is none": ({}, {"best": 0}, "best: Input should be an object"),

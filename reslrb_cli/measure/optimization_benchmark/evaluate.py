@@ -257,8 +257,8 @@ def begin_run(first: dict[str, Any]) -> Begun:
 
 
 def decisions(problem: Problem) -> list[str]:
-    """What was decided by measurement, in words; of how samples are drawn without figures, which differ every time."""
-    return [each.decision() for each in (problem.guided, problem.sequence) if each is not None]
+    """What was decided, in words, without figures, which differ every time."""
+    return [f"{each.setting} {each.value}" for each in problem.decisions]
 
 
 def copies(problem: Problem) -> dict[str, Array]:

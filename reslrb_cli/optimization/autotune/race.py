@@ -1,7 +1,6 @@
-"""Races of candidates before a run's first iteration: what they may cost, how they compare, what is kept of them.
+"""Races of two ways to sample a gradient, before a run's first iteration, by steps of both.
 
-- `Tuner.decide`: one decision, which is what an earlier run kept, or what is measured now, in a run long enough.
-- `compare`: how much more efficient one way of sampling a gradient is than another, by steps of both, and how sure:
+- `compare`: how much more efficient one way is than another, and how sure:
 
       gain = (variance * time of the one) / (variance * time of the other)
 
@@ -10,193 +9,51 @@
 - `Turns`: whether another way of taking steps pays, by steps of both in turns, whose gradients estimate the same. Times
   are those of kernels, and, alike for both, what goes on beside them in a run for as many samples, which counts where
   iterations take milliseconds. A table that steps draw from is learned first, of other paths than theirs, and held.
+- `StepTrial`: the steps of a problem, with dL/dI held at one image's.
 
-For another option of which two ways are compared: its record in `records/decisions.py` (a `PaidRecord`); its row in
-`LATER`; in `sampling.py` a `Turns` that makes the record (`SequencePilot`), a function beside `_sequence` that has
-`Tuner.decide` find it, by a `StepTrial` of two integrators, and lines in `settle_sampling` that take it. If an option
-has more than two values, each takes turns with the best so far.
+`sampling.py` says what is raced.
 """
 
 from __future__ import annotations
 
-import logging
 import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Generic, TypeVar
+from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.config.schema import Config
-from reslrb_cli.guiding.tables import learnings
+from reslrb_cli.guiding.tables import Guiding, Purpose, learnings
+from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
-from reslrb_cli.optimization.decisions import Allowance, Need
+from reslrb_cli.integrators.step import render_image
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
-from reslrb_cli.records.cache import PilotCache, key_of
+from reslrb_cli.optimization.sensitivity import finite, sample_gradient, take_gradient
+from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.clock import StepClock, StepTimes
-from reslrb_cli.records.decisions import LEAST_IMAGE, Finding
-from reslrb_cli.records.manifest import versions
-from reslrb_cli.scene.files import file_digests, files_of
+from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array, jackknife_variance, sum_of_squares
 
-#: Iterations of the run that what measuring costs is a share of.
-ITERATIONS = 200
-#: Shares of a run of ITERATIONS, compilation left out: the limit for all measuring, and the plans for guiding, sequence
-#: and paths. If guiding is not decided after its plan, it may go on to the limit, less the plan for the sequence.
-SHARE, GUIDING_SHARE, SEQUENCE_SHARE, PATHS_SHARE = 0.05, 0.025, 0.005, 0.015
-#: What measurements take at least that say anything. Compiling is that of both kinds of steps, and of walks that are
-#: learned from.
-GUIDING_NEEDS, SEQUENCE_NEEDS, PATHS_NEEDS = (2.5, 3.0), (2.5, 1.0), (1.5, 2.0)
-#: The same of camera paths alone beside half of each kind: kernels are those of the run, whichever wins, and few steps
-#: of few samples tell.
-CAMERA_NEEDS = (0.0, 3.0)
-#: The decisions by option: the time that is kept aside for each, and its plan.
-#: What it takes at the least would be too little where kernels are there: first steps take their time all the same.
-LATER = {
-    "paths": (PATHS_NEEDS[0], PATHS_SHARE * ITERATIONS),
-    "guiding": (GUIDING_NEEDS[0], GUIDING_SHARE * ITERATIONS),
-    "sequence": (SEQUENCE_NEEDS[0], SEQUENCE_SHARE * ITERATIONS),
-}
 #: Relative error of a single time that must not decide anything.
 TIMING_NOISE = 1.1
 CONFIDENCE = 0.95
+#: An image that serves the gradient too may lose so much of its efficiency.
+LEAST_IMAGE = 0.95
 #: What is left of a sum where nothing should be, as a share of it.
 ROUNDING = 1e-12
-Say = Callable[[str], None]
-Record = TypeVar("Record", bound=Finding)
+#: Views that are looked at, spread over those that are trained on, and values of each one's image.
+MOST_VIEWS, MOST_VALUES = 4, 2**15
+#: Samples of the image that dL/dI is held at, as a share of a step's.
+IMAGE_SHARE = 0.25
 Gradients = dict[str, Array]
 #: A gain and the ends of its interval; nothing where it cannot be told.
 Gain = tuple[float, float, float] | tuple[None, None, None]
 NOTHING: Gain = (None, None, None)
-logger = logging.getLogger(__name__)
-
-
-# --- one decision -----------------------------------------------------------------------------------------------------
-
-
-class Tuner:
-    """Decides; `problem` is the one that was given, with what has been decided since.
-
-    `say` is told what is decided, and once that something is measured; `cache` holds what earlier runs measured.
-    """
-
-    def __init__(self, problem: Problem, say: Say, cache: PilotCache | None = None) -> None:
-        self.problem, self.say, self._cache = problem, say, cache
-        self._unmeasured: list[Finding] = []
-
-    def take(self, **decided: Any) -> None:
-        """Have fields of `problem` from now on."""
-        self.problem = replace(self.problem, **decided)
-
-    def set_aside(self, size: int) -> None:
-        """Expect so many more bytes in all steps, where a memory budget is kept."""
-        if (memory := self.problem.memory) is not None:
-            expected = replace(memory.expected_bytes, fixed=memory.expected_bytes.fixed + size)
-            self.take(memory=replace(memory, expected_bytes=expected))
-
-    def tell(self) -> None:
-        """Say the decisions that were taken; all that there was no time to measure are one line."""
-        decided = self.problem.sides, self.problem.guided, self.problem.sequence, self.problem.pixels
-        verbose, found = logger.isEnabledFor(logging.DEBUG), [each for each in decided if each is not None]
-        brief = [each for each in found if each in self._unmeasured and not verbose]
-        if brief and self.problem.allowance is not None:
-            self.say(f"{self.problem.allowance.note()}: {', '.join(each.decision() for each in brief)}")
-        for each in found:
-            if each not in brief:
-                self.say(each.line(cost=verbose))
-
-    def decide(
-        self,
-        kind: type[Record],
-        of: dict[str, Any],
-        needs: Sequence[Need],
-        integrator: Tracer,
-        measure: Callable[[Allowance], Record],
-        unmeasured: Callable[[str], Record],
-        fits: Callable[[Record], bool] = lambda record: True,
-        later: Sequence[Need] = (),
-    ) -> Record:
-        """What an earlier run measured and kept, if it `fits`; else what `measure` finds now, which is kept.
-
-        `of` is what that depends on besides the situation, `needs` what measuring by steps of `integrator` and others
-        takes at least that says anything (`Allowance.affords`), `unmeasured` the decision without, with a note. What is
-        to be measured `later` has its time kept aside, where there is enough for both.
-        """
-        key = ""
-        if self._cache is not None:
-            key = key_of({**of, **situation(self.problem)})
-            try:
-                kept = replace(kind.from_json(self._cache.get(key)), cached=True)
-                if fits(kept):
-                    return kept
-            except TypeError:
-                pass  # nothing there, or nothing that this version wrote
-        allowance = self.allowance(integrator)
-        if not allowance.affords(*needs):
-            record = unmeasured(allowance.note())
-            self._unmeasured.append(record)
-            return record
-        if not allowance.spent_s:
-            self.say("measuring what pays here, before the first iteration")
-        with allowance.spending(later if allowance.affords(*needs, *later) else ()):
-            record = measure(allowance)
-        logger.debug(allowance.line())
-        if self._cache is not None:
-            self._cache.put(key, record.to_json())
-        return record
-
-    def allowance(self, integrator: Tracer) -> Allowance:
-        """What may be spent: as begun before, or by two first steps of `integrator` now, of few samples."""
-        problem, run = self.problem, self.problem.config.run
-        if problem.allowance is not None:
-            return problem.allowance
-        unit = sets_of(problem.config)
-        own = integrator.to_measure().with_options(samples_per_pass=None, freeze=False)
-        clock = StepClock()
-        first, second = (measured_step(problem, own, clock, 0, unit) for _ in range(2))
-        compile_ms = max(first.wall_ms + first.compile_ms - second.wall_ms, 0.0)
-        iteration_ms = second.beside_ms + second.kernel_ms * run.spp / unit
-        run_ms = compile_ms + run.iterations * iteration_ms
-        found = Allowance(run.measuring, run_ms / 1e3, compile_ms / 1e3, iteration_ms / 1e3)
-        self.take(allowance=found)
-        return found
-
-
-def is_auto(config: Config, option: str) -> bool:
-    """Whether this option of the integrator is left to measurement."""
-    options = config.integrator.options()
-    if option == "paths":  # of both kinds the share is measured alike
-        return options.get("paths") == "auto" or (options.get("paths"), options.get("light_share")) == ("both", "auto")
-    return bool(options.get(option) == "auto")
-
-
-def sets_of(config: Config) -> int:
-    """The sets that a step's samples are traced in: those that have one dL/dI each, or the halves of these."""
-    return (config.run.batches if config.adjoint == "batched" else 1) * config.halves * config.shares
-
-
-def situation(problem: Problem) -> dict[str, Any]:
-    """Return all that a decision depends on, as plain values: settings, and the contents of the files they name."""
-    config = problem.config
-    settings = config.model_dump(mode="json", include={"scene", "target", "views", "parameters", "integrator", "loss"})
-    for spec in settings["parameters"]:
-        del spec["learning_rate"]
-    return {
-        "settings": settings,
-        "files": file_digests(files_of(config)),
-        "sensors": problem.sensors,
-        "views": [[view.share, view.held_out, *(own.token for own in view.codes)] for view in problem.views],
-        "parameters": {key: list(problem.selection.array(key).shape) for key in problem.selection.keys},
-        "run": config.step_options() | {"memory_budget": config.run.memory_budget},
-        "versions": versions(),
-        "variant": mi.variant(),
-        "device": device_name(mi.variant()),
-    }
 
 
 # --- steps, and how they compare --------------------------------------------------------------------------------------
@@ -290,7 +147,9 @@ def _log_variances(gradients: Sequence[Gradients], scales: dict[str, float]) -> 
 
 #: Fewer rounds than these say nothing.
 LEAST_ROUNDS = 4
-#: Whenever as many rounds have been taken as are planned for it is asked whether it is clear, so often at the most.
+#: Rounds that are planned for, of gradients of many entries, and of few, which tell less each.
+ROUNDS, ROUNDS_OF_FEW, FEW_ENTRIES = 8, 16, 64
+#: After the planned rounds, and after each such number more, the race ends if it is clear; so often at the most.
 LOOKS = 3
 #: What is on before the last of these looks has to be surer than it would have to be at the end: looking again and
 #: again must not make what is worth nothing pass.
@@ -300,6 +159,11 @@ PLANNED = 3.4
 #: Samples of each walk that a table learns from, as a share of a step's, and walks that it learns from before it is
 #: tried, where there is time for more than one.
 LEARNING_SHARE, LEARNINGS = 0.4, 2
+
+
+def sets_of(config: Config) -> int:
+    """The sets that a step's samples are traced in: those that have one dL/dI each, or the halves of these."""
+    return (config.run.batches if config.adjoint == "batched" else 1) * config.halves * config.shares
 
 
 def lessons(problem: Problem) -> float:
@@ -338,6 +202,17 @@ class Sizes:
         return max(min(int(LEARNING_SHARE * self.step), self.part), 1)
 
 
+def sizes(problem: Problem, longer: float, planned: float = PLANNED) -> Sizes:
+    """The samples of the run's steps, and what is planned of those that are taken here."""
+    run, adjoint = problem.config.run, problem.config.adjoint
+    call = run.spp // sets_of(problem.config)
+    part = min(problem.samples_per_pass or call, call)
+    entries = sum(problem.selection.array(key).size for key in problem.selection.keys)
+    learned = lessons(problem) / (run.spp / call * len(problem.drawn(0)))
+    rounds = ROUNDS_OF_FEW if entries < FEW_ENTRIES else ROUNDS
+    return Sizes(run.spp, call, part, adjoint == "independent", rounds, learned, longer, planned)
+
+
 #: A step as it is, or one the other way, of a round and so many samples per pixel; from what the table has learned,
 #: which stays as it is. Equal rounds have equal seeds, others than those of any walk that is learned from.
 Take = Callable[[bool, int, int], Step]
@@ -345,39 +220,65 @@ Take = Callable[[bool, int, int], Step]
 Learn = Callable[[int, int], Step]
 
 
-class Turns(Generic[Record]):
-    """One decision, by steps that `take` takes, and walks that `learn` does, where a table has yet to learn. `views` is
-    how many times the views of an iteration are those of a step here, `share` what of ITERATIONS this may cost, and
-    `most` what of them the least number of rounds may, where that is more."""
+@dataclass(frozen=True)
+class Finding:
+    """The result of a race: whether the `other` way is better, and whether `images` of their own samples are drawn that
+    way too; the gain of the other way, and a `note` where the gain alone does not decide."""
 
-    LEAST, LOOKS = LEAST_ROUNDS, LOOKS
-    #: Whether it is decided apart for images that have samples of their own.
-    APART = False
+    other: bool
+    images: bool
+    gain: Gain
+    note: str
+    rounds: int
+    spent_s: float
+
+    def why(self) -> str:
+        """Return the gain, or why there is none, in words."""
+        gain, low, high = self.gain
+        if gain is None:
+            return self.note
+        found = f"{gain:.2g} times the efficiency here ({low:.2g} to {high:.2g})"
+        return f"{found}; {self.note}" if self.note else found
+
+
+class Turns:
+    """A race, by steps that `take` takes, and walks that `learn` does, where a table has yet to learn.
+
+    It ends when `limit_s` seconds are spent. With `sure` it takes all planned rounds first, or as many as a step has
+    samples: steps of milliseconds, whose time is Python's, are measured too. With `guides` the other way is guided:
+    it costs what tables go on learning in the run, and images that have samples of their own are decided apart.
+    """
 
     def __init__(
-        self, take: Take, sizes: Sizes, views: float, share: float, most: float = 0.0, learn: Learn | None = None
+        self,
+        take: Take,
+        sizes: Sizes,
+        limit_s: float,
+        learn: Learn | None = None,
+        guides: bool = False,
+        sure: bool = False,
     ) -> None:
-        self._spent_ms = self._compile_ms = 0.0
-        self._take, self._learn, self._sizes, self._views = take, learn, sizes, views
-        self._share, self._most = share, max(share, most)
-        self._apart = self.APART and sizes.alone
+        self._spent_ms = 0.0
+        self._take, self._learn, self._sizes = take, learn, sizes
+        self._limit_ms, self._guides = 1e3 * limit_s, guides
+        self._sure = max(min(sizes.rounds, sizes.step), LEAST_ROUNDS) if sure else 0
+        self._apart = guides and sizes.alone
         self._plain: list[Step] = []  # all steps as they are whose times count
         self._steps: tuple[list[Step], list[Step]] = ([], [])  # of either kind
         self._walk = Step()
 
-    def run(self) -> Record:
+    def run(self) -> Finding:
         """Measure, and decide."""
         spp, take = self._sizes.trial, self._take
-        self._spend(take(False, 0, spp), first=True)
+        self._spend(take(False, 0, spp))  # compiles kernels
         plain = self._spend(take(False, 0, spp))
         self._plain.append(plain)
         # What Python takes is the same for both.
         kernels = (1 + self._sizes.longer) * (plain.kernel_ms + plain.image_ms)
         if not self._learned(kernels + 2 * plain.beside_ms):
-            most = f"{self._most * ITERATIONS:.2g}"
-            return self._record(f"to measure it would cost more than {most} iteration{'s' * (most != '1')}")
-        self._spend(take(True, 0, spp), first=True)
-        for round in range(1, 1 + self.LOOKS * self._sizes.rounds):
+            return self._found(f"to measure it would take more than {self._limit_ms / 1e3:.2g} s")
+        self._spend(take(True, 0, spp))
+        for round in range(1, 1 + LOOKS * self._sizes.rounds):
             for other in (False, True):
                 self._steps[other].append(self._spend(take(other, round, spp)))
             self._plain.append(self._steps[False][-1])
@@ -390,24 +291,16 @@ class Turns(Generic[Record]):
     def _learned(self, round_ms: float) -> bool:
         """Have the table learn, if it has not; False where that, and rounds of so long, cannot be afforded."""
         if self._learn is None:
-            return self._affords(self.LEAST * round_ms)
-        walk = self._learn(0, self._sizes.learning)
-        if not self._affords(walk.wall_ms + self.LEAST * round_ms):
-            self._spend(walk, first=True)
+            return self._affords(LEAST_ROUNDS * round_ms)
+        self._walk = self._spend(self._learn(0, self._sizes.learning))
+        if not self._affords(LEAST_ROUNDS * round_ms):
             return False
-        self._walk = self._spend(walk)
         # What one walk more would gain is little beside what rounds that are too few leave open.
-        rounds = max(self._sizes.rounds // 2, self.LEAST)
+        rounds = max(self._sizes.rounds // 2, LEAST_ROUNDS)
         for number in range(1, LEARNINGS):
             if self._affords(self._walk.wall_ms + rounds * round_ms):
                 self._walk = self._spend(self._learn(number, self._sizes.learning))
         return True
-
-    @property
-    def _iteration_ms(self) -> float:
-        """Of the run: kernels of all its samples, and what goes on beside them for each set that has one dL/dI."""
-        kernels = statistics.median(step.kernel_ms + step.image_ms for step in self._plain)
-        return self._views * (kernels + self._python_ms) * self._sizes.step / self._sizes.trial
 
     @property
     def _python_ms(self) -> float:
@@ -416,20 +309,17 @@ class Turns(Generic[Record]):
         return beside * self._sizes.trial / self._sizes.call
 
     def _affords(self, more_ms: float) -> bool:
-        share = self._share if len(self._steps[True]) >= self.LEAST else self._most
-        return self._spent_ms + more_ms <= share * ITERATIONS * self._iteration_ms
+        return len(self._steps[True]) < self._sure or self._spent_ms + more_ms <= self._limit_ms
 
-    def _more_ms(self) -> float:
-        """What a step of the other kind, of `trial` samples, takes in a run beside its own kernels."""
-        return 0.0
-
-    def _decide(self, other: bool, images: bool, found: dict[str, Any]) -> Record:
-        """The record of a decision, `found` what all of them hold."""
-        raise NotImplementedError
+    def _learning_ms(self) -> float:
+        """What tables that learn add to a guided step of `trial` samples, in the mean over the run."""
+        sizes = self._sizes
+        kernel = self._walk.kernel_ms * sizes.part / sizes.learning
+        return (kernel + self._walk.beside_ms) * sizes.lessons * sizes.trial / sizes.call
 
     def _times(self, other: bool, images: bool) -> list[float]:
         """Of steps of one kind, whose images, where they have samples of their own, are drawn the other way or not."""
-        beside = self._python_ms + (self._more_ms() if other else 0.0)
+        beside = self._python_ms + (self._learning_ms() if other and self._guides else 0.0)
         if self._sizes.alone:
             beside += statistics.median(step.image_ms for step in self._steps[other and images])
         return [step.kernel_ms + beside for step in self._steps[other]]
@@ -458,35 +348,141 @@ class Turns(Generic[Record]):
             return gain[1] is not None and gain[1] > 1
         return gain[2] is None or gain[2] >= LEAST_IMAGE
 
-    def _decided(self) -> Record:
-        if len(self._steps[False]) < self.LEAST:
-            return self._record(f"{len(self._steps[False])} steps of both are too few to tell")
+    def _decided(self) -> Finding:
+        if len(self._steps[False]) < LEAST_ROUNDS:
+            return self._found(f"{len(self._steps[False])} steps of both are too few to tell")
         picture = self._image_gain()
         images = self._images(picture)
         gain = self._gain(images or not self._apart)
         if gain[1] is None:
-            return self._record("gradients have no noise")
+            return self._found("gradients have no noise")
         note = ""
         if gain[1] > 1 and not (images or self._apart):
             whose = "images have" if self._sizes.alone else "the image, of the same samples, has"
             note = f"{whose} {picture[0]:.2g} times the efficiency"
         on = gain[1] > 1 and not note
-        return self._record(note, gain, picture, on, on and images)
+        return self._found(note, gain, on, on and images)
 
-    def _record(
-        self, note: str, gain: Gain = NOTHING, picture: Gain = NOTHING, other: bool = False, images: bool = False
-    ) -> Record:
-        found = self._found(note) | dict(zip(("gain", "low", "high"), gain, strict=True))
-        found |= dict(zip(("image_gain", "image_low", "image_high"), picture, strict=True))
-        return self._decide(other, images, found | {"share": self._spent_ms / (ITERATIONS * self._iteration_ms)})
+    def _found(self, note: str, gain: Gain = NOTHING, other: bool = False, images: bool = False) -> Finding:
+        return Finding(other, images, gain, note, len(self._steps[True]), self._spent_ms / 1e3)
 
-    def _found(self, note: str) -> dict[str, Any]:
-        """Return the fields that all records of decisions by turns have."""
-        cost = {"measure_s": self._spent_ms / 1e3, "compile_s": self._compile_ms / 1e3}
-        return {"rounds": len(self._steps[True]), "spp": self._sizes.trial, "note": note, **cost}
-
-    def _spend(self, step: Step, first: bool = False) -> Step:
-        """Count the time of a step. A `first` step compiles kernels, so all of its time counts as compilation."""
-        self._spent_ms += 0.0 if first else step.wall_ms
-        self._compile_ms += step.compile_ms + (step.wall_ms if first else 0.0)
+    def _spend(self, step: Step) -> Step:
+        self._spent_ms += step.wall_ms + step.compile_ms
         return step
+
+
+# --- steps ------------------------------------------------------------------------------------------------------------
+
+
+class StepTrial:
+    """Steps of a problem by `plain`, or by `other`; they leave neither gradient nor change behind.
+
+    `views` are those that are looked at. All guided steps draw from one table, which `learn` fills. Seeds depend on
+    `what` is decided.
+    """
+
+    def __init__(self, problem: Problem, what: str, plain: Tracer, other: Tracer) -> None:
+        self._problem, self._what, self._clock = problem, what, StepClock()
+        self._adjoint = problem.config.adjoint
+        # Of their own: tables and recordings of other sample counts end with them.
+        self._tracers = [one.with_options(samples_per_pass=None, freeze=one.freeze) for one in (plain, other)]
+        self._guided = [one for one in self._tracers if one.preparation.guiding is not None]
+        self.table: Guiding | None = self._guided[0].preparation.guiding if self._guided else None
+        if self.table is not None:
+            self.table.held = True  # steps are not to teach it
+            for tracer in self._guided:
+                tracer.preparation.draw_from(self.table, problem.scene)
+        problem.apply()
+        trained = problem.trained
+        count = min(len(trained), MOST_VIEWS)
+        self.views = [trained[k * len(trained) // count] for k in range(count)]
+        self._slopes = [self._slope(view) for view in self.views]
+        take_gradient(problem)  # recovered exposures have some of these
+
+    def race(self, sizes: Sizes, limit_s: float, guides: bool = False, sure: bool = False) -> Finding:
+        """Have these steps take turns."""
+        learn = None if self.table is None else self.learn
+        return Turns(self.take, sizes, limit_s, learn, guides, sure).run()
+
+    def _slope(self, view: View) -> mi.TensorXf:
+        """dL/dI, which is held; 0 where it is not finite."""
+        spp = max(int(IMAGE_SHARE * self._problem.config.run.spp), 1)
+        image = render_image(self._tracers[False], self._problem.scene, view.sensor, self._seed(0, view, "image"), spp)
+        return to_tensor(finite(slope(view.objective, np.array(image))))
+
+    def learn(self, round: int, spp: int) -> Step:
+        """Have the table learn, and be ready to be drawn from, as it is from then on.
+
+        The first time all of it is done before as well, and forgotten: what that compiles and records is no part of the
+        time.
+        """
+        jobs = [self._job(view, self._seed(round, view, "learned from"), spp) for view in self.views]
+        compile_ms = 0.0
+        assert self.table is not None
+        if not self.table.learned:
+            compile_ms = self._teach(self.table, jobs).wall_ms
+            self.table.forget()
+        taken = timed(self._teach(self.table, jobs))
+        taken.compile_ms += compile_ms
+        return taken
+
+    def _teach(self, table: Guiding, jobs: list[Job]) -> StepTimes:
+        with self._clock.step() as times:
+            for view, job, gradient in zip(self.views, jobs, self._slopes, strict=True):
+                self._guided[0].learn_now(job, gradient)
+                for purpose in Purpose if self._adjoint == "independent" else (Purpose.BOTH, Purpose.IMAGE):
+                    table.table(view.sensor, purpose)
+        return times
+
+    def take(self, other: bool, round: int, spp: int) -> Step:
+        """One step of all views."""
+        problem, images = self._problem, {}
+        tracer, name = self._tracers[other], "on" if other else "off"
+        problem.apply()
+        with self._clock.step() as times:
+            for view, gradient in zip(self.views, self._slopes, strict=True):
+                job = self._job(view, self._seed(round, view, name), spp)
+                image = self._differentiate(tracer, view, job, gradient)
+                gradients = problem.gradients()
+                dr.eval(image, gradients)
+                images[str(view.sensor)] = image
+        taken = timed(times)
+        taken.gradients = take_gradient(problem)
+        if self._adjoint == "independent":
+            with self._clock.step() as times:
+                for view in self.views:
+                    job = self._job(view, self._seed(round, view, f"image, {name}"), spp)
+                    images[str(view.sensor)] = tracer.image(job)
+            apart = timed(times)
+            taken.image_ms = apart.kernel_ms
+            taken.wall_ms, taken.compile_ms = taken.wall_ms + apart.wall_ms, taken.compile_ms + apart.compile_ms
+        taken.images = {name: _few(image) for name, image in images.items()}
+        return taken
+
+    def _differentiate(self, tracer: Tracer, view: View, job: Job, gradient: mi.TensorXf) -> mi.TensorXf | None:
+        """Add the gradient of a job's samples, as a step of the run does; their image, where there is one."""
+        on_samples = self._problem.on_samples(view)
+        if self._adjoint == "correlated":
+            image = tracer.correlated(job, lambda image: gradient)
+        elif self._adjoint == "independent" and on_samples is None:
+            tracer.backward(job, gradient)
+            return None
+        else:
+            image = tracer.known(job, gradient)
+        if on_samples is not None:
+            on_samples(image, gradient)
+        return image
+
+    def _job(self, view: View, number: int, spp: int) -> Job:
+        scene = self._problem.scene
+        opaque = dr.opaque(mi.UInt32, number)
+        return Job(scene, scene.sensors()[view.sensor], opaque, spp, self._problem.selection.params)
+
+    def _seed(self, round: int, view: View, what: str) -> int:
+        return seed(self._problem.config.run.seed, round, view.sensor, f"{self._what}, {what}")
+
+
+def _few(image: mi.TensorXf) -> Array:
+    """Values of an image, spread over it, 0 where they are not finite."""
+    values = np.array(image, dtype=np.float32).ravel()
+    return finite(values[:: -(-values.size // MOST_VALUES)])
