@@ -100,6 +100,8 @@ from compilation import compute_alone
 compute_alone()
 import drjit
 drjit.set_flag(drjit.JitFlag.KernelFreezing, {recorded})
+from reslrb_cli.optimization import identifiability
+identifiability.REACH_SPP = 8  # guided tables learn from these samples, too
 from reslrb_cli.cli import main
 main.main(sys.argv[1:], prog_name="reslrb")
 """
