@@ -151,6 +151,15 @@ def test_images_that_guiding_does_not_pay_for_are_not_guided(experiment: Path, m
     np.testing.assert_allclose(images[0], images[1], rtol=1e-5)  # the same paths
 
 
+@pytest.mark.usefixtures("llvm")
+def test_what_moves_light_has_evenly_spread_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Turns, "run", lambda self: pytest.fail("measured"))
+    settings = ["target.render.spp=4", "scene.size=[16, 16]", "run.measuring=1000"]
+    problem = assemble(load(Path(__file__).parents[2] / "configs" / "lens_pose.yaml", settings))
+    values = {each.setting: each.value for each in problem.decisions}
+    assert values == {"sequence": "low_discrepancy", "guiding": "off"}
+
+
 def seeds_of_parts(monkeypatch: pytest.MonkeyPatch, experiment: Path) -> tuple[set[int], set[int]]:
     """The seeds of walks that a table learned from, and those of steps; whatever learned in between has failed."""
     drawn: dict[str, set[int]] = {"learn": set(), "take": set()}
