@@ -34,7 +34,7 @@ BUILD, DEPTHS = ROOT / "build" / "paper", ["--max-depth", "128"]
 
 
 def main(arguments: list[str]) -> int:
-    """Do what the command line says; the exit code."""
+    """Run the command line and return the exit code."""
     parser = argparse.ArgumentParser(prog="scripts/paper", description=__doc__)
     figures = parser.add_subparsers(dest="name", required=True)
     helps = {"figure1": "a caustic and the gradient of its glass", "figure5": "the gradient of a room's floor",
@@ -48,7 +48,7 @@ def main(arguments: list[str]) -> int:
         if name in SEEDS:
             figure.add_argument("--seeds", type=int, default=SEEDS[name][0], help="default: %(default)s")
             figure.add_argument("--set", dest="sets", action="append", metavar="KEY=VALUE", help="change a setting")
-    write = figures.add_parser("write", help="docs/paper.md, after records were taken over from FOLDER, if it is named")
+    write = figures.add_parser("write", help="write docs/paper.md; copies the records in FOLDER first, if given")
     write.add_argument("folder", type=Path, nargs="?")
     options, others = parser.parse_known_args(arguments)
     if others and options.name != "figure6":
@@ -71,7 +71,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _figure(options: argparse.Namespace) -> int:
-    """Measure, check and draw a figure of gradients; the exit code."""
+    """Measure, check and draw a figure of gradients; return the exit code."""
     from make_figures import write_panels
 
     def say(line: str) -> None:
@@ -95,7 +95,7 @@ def _figure(options: argparse.Namespace) -> int:
 
 
 def _bench(options: argparse.Namespace, others: list[str]) -> int:
-    """Run `reslrb bench` in the room, which writes figure6.jsonl and figure6.png; its exit code."""
+    """Run `reslrb bench` in the room, write figure6.jsonl and figure6.png, and return the exit code."""
     from paper.figure5 import CONFIG, room_settings
 
     file = options.folder / "figure6.jsonl"

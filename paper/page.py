@@ -28,7 +28,7 @@ MEANS = "Means of the gradients, compared in standard errors"
 
 
 def write(folder: Path | None = None) -> int:
-    """Write the page, after records and pictures were taken over from `folder`; the exit code. Raises ConfigError."""
+    """Copy records and pictures from `folder`, if any, and write the page; return the exit code. Raises ConfigError."""
     names = [f"figure{number}.{ending}" for number in (1, 5, 6) for ending in ("json", "jsonl", "png")]
     found = [] if folder is None else [folder / name for name in names if (folder / name).exists()]
     if folder is not None and not found:

@@ -79,7 +79,7 @@ class Ring:
 
     @staticmethod
     def of(plan: Plan, stack_size: int) -> Ring:
-        """That of at most so many places, for the paths of a plan."""
+        """Return a ring of at most `stack_size` places, for the paths of a plan."""
         size = places(plan, stack_size)
         return Ring(size, vertices(plan) > size)
 
