@@ -73,11 +73,9 @@ def test_the_pages_script_runs(where: str, request: pytest.FixtureRequest) -> No
 
 
 @pytest.mark.long  # its target has many samples
-def test_the_readmes_first_script_runs(checkout: Path) -> None:
-    """The others: tests/conformance/test_plugin.py."""
+def test_the_readmes_script_runs(checkout: Path) -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    section = text[text.index("## In a script") : text.index("## Scenes")]
-    block = re.findall(r"^```python\n(.*?)^```", section, re.MULTILINE | re.DOTALL)[0]
+    (block,) = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     lines = run(block, checkout)
     assert [line.split()[0] for line in lines] == [str(number) for number in range(len(lines))]
     assert len(lines) >= 5
@@ -89,7 +87,7 @@ def blocks(name: str) -> list[str]:
 
 
 #: Pages with Python, and their blocks, each of which a test runs: here, or tests/conformance/test_plugin.py.
-PYTHON = {"README.md": 3, "docs/python.md": 7, "docs/method.md": 2, "docs/benchmarks.md": 1,
+PYTHON = {"README.md": 1, "docs/python.md": 7, "docs/integrator.md": 2, "docs/method.md": 2, "docs/benchmarks.md": 1,
           "docs/benchmarks/page.md": 1, "docs/your_integrator.md": 1}  # fmt: skip
 
 

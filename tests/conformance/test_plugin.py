@@ -85,12 +85,10 @@ def test_variants_that_do_not_work_are_refused_with_those_that_do():
     assert others == ["BackendError", "BackendError", "RuntimeError"] * 3 + ["3"]
 
 
-def test_the_readmes_script_runs():
-    """What stands under "In a script", one block after the other."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    section = text[text.index("## In a script") : text.index("## Scenes")]
-    # the first block is tests/api's
-    script = "\n".join(re.findall(r"^```python\n(.*?)^```", section, re.MULTILINE | re.DOTALL)[1:])
+def test_the_script_of_the_docs_runs():
+    """Run the blocks of docs/integrator.md, one after the other."""
+    text = (ROOT / "docs" / "integrator.md").read_text(encoding="utf-8")
+    script = "\n".join(re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL))
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300, cwd=ROOT)
     assert run.returncode == 0, run.stderr
     lines = run.stdout.splitlines()
