@@ -6,6 +6,7 @@ all changes were committed (`clean`; null where that is not known), the device, 
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import re
@@ -129,15 +130,31 @@ def stale() -> list[str]:
         if not commit or _git("cat-file", "-e", f"{commit}^{{commit}}") is None:
             lines.append(f"{name}: the commit that it was measured at is not known")
             continue
-        since = {
-            place: _git("rev-list", "--count", f"{commit}..", "--", place) for place in measures(origin["command"])
-        }
-        changed = [f"{place} ({count})" for place, count in since.items() if count != "0"]
-        if changed:
-            lines.append(f"{name}: measured at {commit}; commits since then change {', '.join(changed)}")
+        changed = {place: _changed(commit, place) for place in measures(origin["command"])}
+        places = [f"{place} ({count})" for place, count in changed.items() if count]
+        if places:
+            lines.append(f"{name}: measured at {commit}; files changed since then: {', '.join(places)}")
         elif origin["clean"] is False:
             lines.append(f"{name}: measured at {commit} with changes that were not committed")
     return lines
+
+
+def _changed(commit: str, place: str) -> int:
+    """Return how many files of a folder have changed since a commit, not counting comments and docstrings."""
+    files = (_git("diff", "--name-only", "--no-renames", commit, "HEAD", "--", place) or "").splitlines()
+    return sum(not file.endswith(".py") or _syntax(commit, file) != _syntax("HEAD", file) for file in files)
+
+
+def _syntax(commit: str, file: str) -> str | None:
+    """Return the syntax tree of a Python file at a commit without docstrings; None if there is no such file."""
+    text = _git("show", f"{commit}:{file}")
+    if text is None:
+        return None
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(node) is not None:
+            del node.body[0]
+    return ast.dump(tree)
 
 
 def record_file(name: str) -> Path:

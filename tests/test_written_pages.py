@@ -100,7 +100,8 @@ def test_a_record_is_stale_once_the_code_that_it_measures_has_changed(
     for name, command in commands.items():
         origin = {"kind": "origin", "command": command} | state
         (tmp_path / "docs" / "benchmarks" / f"{name}.jsonl").write_text(json.dumps(origin) + "\n")
-    (tmp_path / "reslrb_cli/cli/bench.py").write_text("1")  # changes no figure
+    (tmp_path / "reslrb_cli/cli/bench.py").write_text("1")  # changes no figure, nor do words
+    (tmp_path / "reslrb_cli/transport/walk.py").write_text('"""Walk."""  # along a path\n')
     assert benchmarks_measure.code_state()["clean"] is False
     commit_all(tmp_path)
     assert main(["stale"]) == 0
@@ -109,13 +110,13 @@ def test_a_record_is_stale_once_the_code_that_it_measures_has_changed(
         "reslrb_cli/transport/walk.py": ["depth", "room"],
     }.items():  # fmt: skip
         capsys.readouterr()
-        (tmp_path / place).write_text("1")
+        (tmp_path / place).write_text('"""Walk."""\n1')
         commit_all(tmp_path)
         assert main(["stale"]) == 1
         lines = capsys.readouterr().out.splitlines()
         assert [line.split(":")[0] for line in lines] == names
     assert lines[1] == (
-        f"room: measured at {state['commit']}; commits since then change reslrb_cli/transport (1), scenes/room (1)"
+        f"room: measured at {state['commit']}; files changed since then: reslrb_cli/transport (1), scenes/room (1)"
     )
     record = tmp_path / "docs" / "benchmarks" / "room.jsonl"
     record.write_text(json.dumps({"kind": "origin", "command": commands["room"], "commit": "0" * 12}) + "\n")
