@@ -123,7 +123,7 @@ ONE_WAY = "not the same with light and view exchanged"
 NO_POINTS = "where Mitsuba draws no points for light to start from"
 NO_RAYS = "Mitsuba cannot sample the rays of emitter"
 PINHOLE = "light paths connect to `perspective` and `thinlens` sensors"
-OWN_INTEGRATOR = "the experiment's own integrator takes its place"
+OWN_INTEGRATOR = "replaced by the integrator of the configuration"
 ABOVE = '<transform name="to_world"><lookat origin="0, 2, 1" target="0, 0, 0" up="0, 0, 1"/></transform>'
 IRREGULAR = """<spectrum type="irregular" name="{}"><string name="wavelengths" value="400, 500, 700"/>
 <string name="values" value="0.1, 0.4, 0.8"/></spectrum>"""
@@ -166,10 +166,10 @@ MATERIALS = {
 }
 #: What the page says of some of them: of what light paths leave out, and of both.
 SMOOTH = dict.fromkeys(("conductor", "dielectric", "thindielectric", "plastic"),
-                       "without what the sensor sees in its smooth lobe")  # fmt: skip
+                       "its smooth lobe is black where the sensor sees it directly")  # fmt: skip
 SAID_OF = {
-    **dict.fromkeys(("polarizer", "retarder", "circular"), "as without polarisation: light is only attenuated"),
-    "pplastic": "without its polarisation",
+    **dict.fromkeys(("polarizer", "retarder", "circular"), "no polarisation: it only attenuates light"),
+    "pplastic": "no polarisation",
 }  # fmt: skip
 FILTERS = ("box", "catmullrom", "gaussian", "lanczos", "mitchell", "tent")
 PHASES = {
@@ -189,7 +189,7 @@ MENDED = "RGB variants have no spectrum `{}`: read as the colour of it"
 ROWS: tuple[Row, ...] = (
     *(Row("bsdf", name, scene=thing(xml), note=SAID_OF.get(name, ""), without=SMOOTH.get(name, ""))
       for name, xml in MATERIALS.items()),
-    Row("bsdf", "twosided", "of a blend of rough ones",
+    Row("bsdf", "twosided", "with a blend of rough BSDFs",
         thing(f'<bsdf type="twosided">{MATERIALS["blendbsdf"]}</bsdf>')),
     Row("bsdf", "roughconductor", "with spectra", thing(
         '<bsdf type="roughconductor"><spectrum name="eta" value="400:1.5, 700:0.2"/>'
@@ -200,13 +200,13 @@ ROWS: tuple[Row, ...] = (
         '<rgb name="sigma_a" value="0.2, 0.3, 0.4"/></bsdf></bsdf>'), light=ONE_WAY),
     Row("bsdf", "measured", scene=thing(
         '<bsdf type="measured"><string name="filename" value="paint.bsdf"/></bsdf>'), light=ONE_WAY,
-        note="files of RGB; those of spectra Mitsuba refuses"),
+        note="RGB files; Mitsuba refuses spectral files"),
     Row("bsdf", "measured", "without its file", thing(
         '<bsdf type="measured"><string name="filename" value="none.bsdf"/></bsdf>'),
         loading='`none.bsdf`: no such file'),
     Row("bsdf", "measured_polarized", scene=thing(
         '<bsdf type="measured_polarized"><string name="filename" value="paint.pbsdf"/>'
-        '<float name="wavelength" value="500"/></bsdf>'), light=ONE_WAY, note="at its one wavelength"),
+        '<float name="wavelength" value="500"/></bsdf>'), light=ONE_WAY, note="at its single wavelength"),
     Row("bsdf", "measured_polarized", "without `wavelength`", thing(
         '<bsdf type="measured_polarized"><string name="filename" value="paint.pbsdf"/></bsdf>'),
         loading="can only render a specific wavelength specified by the `wavelength` parameter"),
@@ -250,12 +250,12 @@ ROWS: tuple[Row, ...] = (
     *(Row("texture", name, form, place(xml), mended=MENDED.format(name), note=note)
       for name, xml in (("regular", REGULAR), ("irregular", IRREGULAR))
       for form, place, note in (("on a lamp", lit, ""), ("in a material", painted, "its colour under D65"))),
-    Row("texture", "irregular", "referred to", IRREGULAR.replace('name="{}"', 'id="s"')
+    Row("texture", "irregular", "by reference", IRREGULAR.replace('name="{}"', 'id="s"')
         + painted('<ref id="s" name="{}"/>'), mended=MENDED.format("irregular")),
-    Row("texture", "irregular", "of unequal lists", painted(IRREGULAR.replace("0.1, ", "")),
+    Row("texture", "irregular", "with lists of different lengths", painted(IRREGULAR.replace("0.1, ", "")),
         loading="irregular has 3 wavelengths and 2 values"),
     Row("texture", "blackbody", "on a lamp", lit(BLACK_BODY), mended=MENDED.format("blackbody"),
-        note="in W/(m² sr), as by wavelength: thousands"),
+        note="in W/(m² sr), so its values are in the thousands"),
     Row("texture", "blackbody", "in a material", painted(BLACK_BODY),
         loading="a blackbody is what an emitter emits; a bsdf can have <rgb>"),
     Row("texture", "d65", "on a lamp", lit('<spectrum type="d65" name="{}"/>')),
@@ -266,24 +266,24 @@ ROWS: tuple[Row, ...] = (
     Row("texture", "srgb", scene=painted('<spectrum type="srgb" name="{}"><rgb name="color" '
         'value="0.3, 0.4, 0.5"/></spectrum>')),
     Row("texture", "rawconstant", scene=painted(RAW)),
-    Row("texture", "rawconstant", "of three numbers where one is asked for",
+    Row("texture", "rawconstant", "with three numbers in place of one",
         thing(f'<bsdf type="roughconductor">{RAW.format("alpha")}</bsdf>'), light="eval_1() is not defined",
         camera="eval_1() is not defined"),
     Row("texture", "spectrum", "on a lamp", lit('<spectrum name="{}" value="400:1, 700:9"/>')),
     Row("texture", "spectrum", "in a material", painted('<spectrum name="{}" value="400:0.1, 700:0.9"/>')),
     Row("texture", "rgb", scene=painted('<rgb name="{}" value="0.3, 0.4, 0.5"/>')),
     Row("medium", "homogeneous", scene=fog(), light=MEDIUM, camera=MEDIUM),
-    Row("medium", "homogeneous", "around a thing", fog(name="exterior"), light=MEDIUM, camera=MEDIUM),
+    Row("medium", "homogeneous", "around a shape", fog(name="exterior"), light=MEDIUM, camera=MEDIUM),
     Row("medium", "homogeneous", "in glass", fog(bsdf='<bsdf type="dielectric"/>'), light=MEDIUM, camera=MEDIUM),
-    Row("medium", "homogeneous", "in a group that is instanced",
+    Row("medium", "homogeneous", "in a group with instances",
         f'<shape type="shapegroup" id="g">{fog()}</shape><shape type="instance"><ref id="g"/></shape>',
         light=MEDIUM, camera=MEDIUM),
-    Row("medium", "homogeneous", "in a group that is not", f'<shape type="shapegroup" id="g">{fog()}</shape>'),
+    Row("medium", "homogeneous", "in a group without instances", f'<shape type="shapegroup" id="g">{fog()}</shape>'),
     Row("medium", "homogeneous", "around the sensor",
         sensor(inner='<float name="fov" value="50"/><medium type="homogeneous"/>'), light=MEDIUM, camera=MEDIUM),
     Row("medium", "homogeneous", "around a lamp", '<emitter type="point"><medium type="homogeneous"/></emitter>',
         light=MEDIUM, camera=MEDIUM),
-    Row("medium", "homogeneous", "that nothing has", '<medium type="homogeneous" id="m"/>'),
+    Row("medium", "homogeneous", "that is not used", '<medium type="homogeneous" id="m"/>'),
     Row("medium", "heterogeneous", scene=fog('<volume type="gridvolume" name="sigma_t"><string name="filename" '
         'value="density.vol"/></volume>', "heterogeneous"), light=MEDIUM, camera=MEDIUM),
     *(Row("phase", name, scene=phase(xml), light=MEDIUM, camera=MEDIUM) for name, xml in PHASES.items()),
@@ -310,9 +310,9 @@ ROWS: tuple[Row, ...] = (
         loading="can only be used in Mitsuba variants that perform a spectral simulation"),
     *(Row("rfilter", name, scene=sensor(on=film(f'<rfilter type="{name}"/>'))) for name in FILTERS),
     *(Row("sampler", name, scene=sensor(inner=f'<float name="fov" value="50"/><sampler type="{name}"/>'),
-          note="" if name == "independent" else "not loaded: `independent` takes its place, with `run.spp` samples")
+          note="" if name == "independent" else "replaced by `independent` with `run.spp` samples")
       for name in ("independent", "ldsampler", "multijitter", "orthogonal", "stratified")),
-    *(Row("integrator", name, scene=f'<integrator type="{name}"/>', note=f"not loaded: {OWN_INTEGRATOR}")
+    *(Row("integrator", name, scene=f'<integrator type="{name}"/>', note=OWN_INTEGRATOR)
       for name in INTEGRATORS),
 )  # fmt: skip
 #: By default these are taken through three iterations, too: of each kind one, and those whose ways differ.
@@ -393,18 +393,40 @@ def write_files(folder: Path) -> None:
           wvls=np.uint16([450, 500, 550, 600, 650]))  # fmt: skip
 
 
+#: Reasons as the page gives them, by parts of the errors.
+REASONS = {
+    MEDIUM: "participating media are not supported",
+    ONE_WAY: "not the same if light and view are exchanged",
+    NO_POINTS: "Mitsuba cannot sample points on it for light to start from",
+    NO_RAYS: "Mitsuba cannot sample rays from this emitter",
+    PINHOLE: "light paths need a `perspective` or `thinlens` sensor",
+    "which Mitsuba cannot have emit": "Mitsuba does not support it as an emitter",
+    "camera paths cannot find": "camera paths cannot find its light",
+    "take a `sunsky`": "use `sunsky` instead",
+    "eval_1() is not defined": "this parameter takes one number",
+    "`none.bsdf`: no such file": "the file does not exist",
+    "can only render a specific wavelength specified by the `wavelength` parameter": "it needs `wavelength`",
+    "reads the memory of a running Blender": "it reads the memory of a running Blender",
+    "irregular has 3 wavelengths and 2 values": "both lists must have the same length",
+    "a blackbody is what an emitter emits; a bsdf can have <rgb>": "only emitters can have it; use `rgb` instead",
+    "belongs to Mitsuba's own RayDataLoader": "it belongs to Mitsuba's own RayDataLoader",
+    "can only be used in Mitsuba variants that perform a spectral simulation": "it needs a spectral variant of Mitsuba",
+}
+
 HEAD = """# Mitsuba's plugins
 
-What becomes of a scene with each plugin that Mitsuba 3.9.1 ships. Each row is a scene that a test takes through
-`inspect`, `init`, three iterations of `optimize`, and `export` (`pytest -m long tests/cli/test_every_plugin.py`; those
-that are refused, and a few others, without `-m long`). Written by `python tests/cli/every_plugin.py`.
+This page lists every plugin of Mitsuba 3.9.1, and whether `reslrb` supports it. Each row is a scene that a test runs
+through `inspect`, `init`, three iterations of `optimize`, and `export`.
 
-- **light paths**: `reslrb`, `ptracer`, `walk_ad` and `trajectory`; **`prb`**: paths from the sensor. `init` takes light
-  paths where they work, else `prb`.
-- **works**: what is said in brackets holds for it. Which of its numbers can be recovered `reslrb inspect` lists.
-- **refused**: with exit code 2 and a line that holds what stands there, by every command. What both refuse, or loading
-  does, has to be changed in the scene file.
-- **mended**: read in another form, with that warning.
+- **light paths**: the integrators `reslrb`, `ptracer`, `walk_ad` and `trajectory`. **`prb`**: paths from the sensor.
+  `init` uses light paths if they work, and paths from the sensor otherwise.
+- **works**: supported, with the restriction in brackets. `reslrb inspect` lists the parameters that can be recovered.
+- **refused**: every command prints the reason in one line and ends with exit code 2. If both columns refuse a plugin,
+  or loading refuses it, change the scene file.
+- **converted**: read as an RGB colour, with a warning, because RGB variants of Mitsuba do not have this spectrum.
+
+`python tests/cli/every_plugin.py` writes this page. `pytest -m long tests/cli/test_every_plugin.py` runs all rows;
+without `-m long` it runs the refused plugins and a few others.
 """
 
 
@@ -417,20 +439,18 @@ def page() -> str:
             note = f" ({row.note})" if row.note else ""
             name = f"`{row.plugin}`{f' {row.where}' if row.where else ''}"
             if row.loading:
-                parts.append(f"| {name} | refused on loading: {_cell(row.loading)} | the same |\n")
+                parts.append(f"| {name} | refused on loading: {REASONS[row.loading]} | the same |\n")
             elif row.mended:
-                parts.append(f"| {name} | mended: {_cell(row.mended)}{note} | the same |\n")
+                parts.append(f"| {name} | converted{note} | the same |\n")
             elif row.light and row.light == row.camera:
-                parts.append(f"| {name} | refused: {_cell(row.light)} | the same |\n")
+                parts.append(f"| {name} | refused: {REASONS[row.light]} | the same |\n")
             else:
                 without = f" ({row.without})" if row.without else ""
-                light, camera = (f"refused: {_cell(why)}" if why else f"works{note}" for why in (row.light, row.camera))
+                light, camera = (
+                    f"refused: {REASONS[why]}" if why else f"works{note}" for why in (row.light, row.camera)
+                )
                 parts.append(f"| {name} | {light}{without} | {camera} |\n")
     return "".join(parts)
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("<", "&lt;")
 
 
 if __name__ == "__main__":
