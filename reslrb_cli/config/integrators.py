@@ -1,6 +1,6 @@
-"""The integrators, each with the options that it knows.
+"""The integrators and their options.
 
-How the samples of a step are split into passes, and what is too many of them, is known before a scene is loaded.
+The limits on samples, passes and paths are checked here, before a scene is loaded.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ _RECORD = must(
 _CAPACITY = must(
     lambda capacity: capacity <= CAPACITY,
     lambda capacity: (
-        f"must be at most {CAPACITY}, not {capacity}: each connection that is kept is code of its own in the "
-        "kernel, which would take hours to compile; estimator gather keeps all of them"
+        f"must be at most {CAPACITY}, not {capacity}: each stored connection adds code to the kernel, which would "
+        "take hours to compile; estimator gather uses all connections"
     ),
 )
 
@@ -60,41 +60,41 @@ Samples = Annotated[int, Field(ge=0, le=PASS_SAMPLES)]
 
 
 class Integrator(Choice):
-    """Options that all integrators share."""
+    """Options of all integrators."""
 
     type: str
     max_depth: Annotated[int, _DEPTH] = Field(default=8, ge=-1, json_schema_extra={"maximum": PATH_LENGTH})
-    """Longest path in segments, from the emitter to the sensor: 1 shows only directly visible emitters, 2 adds direct
-    light; -1: no limit (Russian roulette alone ends a path)."""
-    rr_depth: Count = Field(default=5, description="Path depth at which Russian roulette begins.")
+    """Length of the longest path in segments, from the emitter to the sensor. 1: only emitters that the sensor sees
+    directly. 2: also direct light. -1: no limit; only Russian roulette ends paths."""
+    rr_depth: Count = Field(default=5, description="Path depth at which Russian roulette starts.")
     hide_emitters: bool = False
-    """Whether directly visible emitters are left out of the image."""
+    """Whether the image leaves out emitters that the sensor sees directly."""
 
 
 class LightTracerOptions(Integrator):
     """Options of integrators that trace from the emitters; `prb` traces all samples in one pass."""
 
     samples_per_pass: Count | None = None
-    """Samples per pixel that one pass traces, to bound its memory; it must divide the samples per pixel. null: all in
-    one pass."""
+    """Samples per pixel in one pass. Fewer samples need less memory. Must divide the samples per pixel. null: all
+    samples in one pass."""
 
 
 class AttachingTracer(LightTracerOptions):
-    """Options of light tracers that have derivatives of what moves light."""
+    """Options of light tracers that can differentiate the geometry of light paths."""
 
     attached: Annotated[
         Annotated[bool, mark("flag")] | Annotated[Literal["auto"], mark("text")],
         Discriminator(lambda value: MARK + ("flag" if isinstance(value, bool) else "text")),
     ] = "auto"
-    """Whether derivatives follow light where it goes: of rays, hit points and film positions, beside those of what
-    light carries. `auto`: where a parameter moves anything that light leaves from or meets; true: for roughness and
-    index of refraction too, whose derivatives are detached otherwise."""
+    """Whether to differentiate the geometry of light paths (rays, hit points and film positions) in addition to their
+    throughput. `auto`: if a parameter moves emitters or surfaces that light meets. true: also for roughness and index
+    of refraction, whose derivatives are detached otherwise."""
     filter_normalization: Literal["attached", "detached"] = "attached"
-    """Whether the sum of the reconstruction filter's weights has its derivative too, where light moves over the film:
-    `attached` is what finite differences find, `detached` what `ptracer` computes."""
+    """Whether to differentiate the sum of the weights of the reconstruction filter when light moves over the film.
+    `attached`: yes, which agrees with finite differences. `detached`: no, as `ptracer` does."""
 
 
-#: The options of `reslrb` that belong to an estimator, by its name; the others have no use for them.
+#: Options of `reslrb` that only some estimators use, by estimator.
 ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
     "auto": (),
     "reservoir": ("capacity", "weight"),
@@ -103,7 +103,7 @@ ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
     "stack": (),
 }
 
-#: Those that `auto` leaves to measurement beside any estimator, with what they are where nothing is measured.
+#: Options that a run decides by measurement if they are `auto`, and their values if nothing is measured.
 UNDECIDED: dict[str, str | float] = {
     "paths": "light",
     "light_share": 0.5,
@@ -115,68 +115,74 @@ UNDECIDED: dict[str, str | float] = {
 #: The estimator of `auto`: the only one with derivatives of camera paths and of both `follow` and `stay`.
 AUTO_ESTIMATOR = "stack"
 
-#: Every option that says which estimator, and how.
+#: All options that select or configure the estimator.
 _ANY_ESTIMATORS = {"estimator", *(option for options in ESTIMATOR_OPTIONS.values() for option in options)}
 
 
 class Reslrb(AttachingTracer):
-    """Reservoir light replay backpropagation: light tracing whose memory does not depend on path length."""
+    """Reservoir light replay backpropagation: light tracing with memory that does not depend on path length."""
 
     type: Literal["reslrb"] = "reslrb"
-    """Light tracing, derivatives by a replay of each path."""
+    """Light tracing that computes derivatives by replaying each path."""
     estimator: Literal["auto", "reservoir", "gather", "event", "stack"] = "auto"
-    """How a path's connections enter its gradient. `reservoir`: few of them, kept at random; `gather`: all, by a second
-    traversal; `event`: few scattering events, kept at random; `stack`: all, kept in thread-local memory; `auto`:
-    `stack`, which was the most efficient in every experiment that was measured."""
+    """How the connections of a path enter its gradient. `reservoir`: a few connections, selected at random. `gather`:
+    all connections, by a second traversal. `event`: a few scattering events, selected at random. `stack`: all
+    connections, stored in thread-local memory. `auto`: `stack`, the most efficient one in every experiment that was
+    measured."""
     capacity: Annotated[Count, _CAPACITY] = Field(default=1, json_schema_extra={"maximum": CAPACITY})
-    """How many connections, or events, are kept of each path. Only with estimators `reservoir` and `event`."""
+    """Number of connections (`reservoir`) or scattering events (`event`) that are stored for each path. Only with
+    estimators `reservoir` and `event`."""
     weight: Literal["luminance", "adjoint"] = "luminance"
-    """What a connection is kept in proportion to: its `luminance`, or its share in the objective (`adjoint`: less
-    variance; not with `run.adjoint: correlated`). Only with estimators `reservoir` and `event`."""
+    """Selection probability of a connection: in proportion to its `luminance`, or to its contribution to the objective
+    (`adjoint`). `adjoint` has less variance; it does not work with `run.adjoint: correlated`. Only with estimators
+    `reservoir` and `event`."""
     attached_sampling: Literal["auto", "follow", "stay"] = "auto"
-    """Where light is followed: what becomes of it behind a surface that is not specular. `follow`: its direction turns
-    with the surface, as `ptracer` has it, and sweeps over edges at rest, whose part is then missing; `stay`: it goes on
-    to the same place; `auto`: `stay` behind diffuse surfaces, `follow` behind glossy ones, where `stay` is noisy."""
+    """Where light goes after a moving surface that is not specular, in attached derivatives. `follow`: its direction
+    turns with the surface, as in `ptracer`. It then sweeps over edges of objects that do not move, and the derivative
+    lacks this effect. `stay`: light still arrives at the same point. `auto`: `stay` after diffuse surfaces, `follow`
+    after glossy ones, where `stay` is noisy."""
     paths: Literal["auto", "light", "camera", "both"] = "auto"
-    """Where paths begin. `light`: at the emitters, which finds caustics and light through glass, but shows mirrors and
-    clear glass black; `camera`: at the sensor, which finds what mirrors and glass show, and most light of rooms, but no
-    caustics of small lamps (with estimators `auto` and `stack`); `both`: each path is weighed by how likely either
-    side was to find it, so that the image has all light. `auto`: `both`, or `camera` where that finds all light and a
-    few steps of each, before the first iteration, show that it is the more efficient; `light` where nothing else can
-    render the scene, or finds any of its light. What moves light has light paths alone. Left out it is `auto` with
-    estimator `auto`, and `light` with one that is named."""
+    """Where paths start. `light`: at the emitters. Finds caustics and light through glass; mirrors and clear glass are
+    black. `camera`: at the sensor. Finds reflections in mirrors, the view through glass, and most light in rooms, but
+    no caustics of small lamps. Only with estimators `auto` and `stack`. `both`: at both, with each path weighted by how
+    likely either side was to find it, so that the image has all light. `auto`: usually `both`. It is `camera` if camera
+    paths find all light and a few steps before the first iteration show that they are more efficient. It is `light` if
+    `both` and `camera` cannot render the scene or find none of its light. Runs that move geometry or lamps always use
+    `light`. The default is `auto` with estimator `auto`, and `light` with an estimator that you name."""
     light_share: Annotated[
         Annotated[float, Field(ge=0, le=1, allow_inf_nan=False), mark("number")]
         | Annotated[Literal["auto"], mark("text")],
         Discriminator(lambda value: MARK + ("text" if isinstance(value, str) else "number")),
     ] = "auto"
-    """Which share of the samples are light paths where `paths` are `both`; with 0 or 1 nothing of the other side is
-    compiled. `auto`: the most efficient by a few steps of each before the first iteration, 0.5 where nothing is
+    """Fraction of the samples that are light paths, with `paths: both`. With 0 or 1 the code of the other side is not
+    compiled. `auto`: the most efficient fraction in a few steps before the first iteration, or 0.5 if nothing is
     measured."""
     guiding: Literal["auto", "on", "off"] = "auto"
-    """Whether light paths start where those of earlier steps had something to say about gradient and image, at least a
-    quarter of them anywhere, and end where those had little left to say; in scenes with glossy surfaces they are also
-    sent to what the sensor sees. `on`: less noise where few paths say anything (a room lit through windows, a caustic),
-    from the second step on; a few of the first, and one in sixteen later, trace as many paths again to learn where that
-    is. `auto`: where a few steps with and without it, before the first iteration, show that it pays here. Left out it
-    is `auto` with estimator `auto`, and `off` with one that is named."""
+    """Importance sampling of light paths, learned in earlier steps. `on`: paths start where earlier paths contributed
+    to the gradient and the image (at least a quarter start anywhere), and end early where earlier paths contributed
+    little. In scenes with glossy surfaces, paths are also aimed at points that the sensor sees. From the second step
+    on, this reduces noise where few paths contribute, as in a room lit through windows or in a caustic. A few of the
+    first steps, and one in sixteen later steps, trace as many paths again to learn. `auto`: `on` if a few steps with
+    and without guiding, before the first iteration, show that it is more efficient. The default is `auto` with
+    estimator `auto`, and `off` with an estimator that you name."""
     sequence: Literal["auto", "independent", "low_discrepancy"] = "auto"
-    """The random numbers that say where light paths start and how they first scatter. `low_discrepancy`: evenly spread
-    over all paths of a step, and independent from one step to the next; less noise where little but these numbers says
-    where light goes (a beam through glass), a little less elsewhere. `auto`: where a few steps with and without it,
-    before the first iteration, show that it pays here. Left out it is `auto` with estimator `auto`, and `independent`
-    with one that is named."""
+    """Random numbers that decide where light paths start and how they first scatter. `low_discrepancy`: spread evenly
+    over all paths of a step, and independent between steps. This reduces noise where little else decides where light
+    goes, as in a beam through glass, and a little elsewhere. `auto`: `low_discrepancy` if a few steps with and without
+    it, before the first iteration, show that it is more efficient. The default is `auto` with estimator `auto`, and
+    `independent` with an estimator that you name."""
     pixels: Literal["auto", "even", "measured"] = "auto"
-    """Number of camera paths in each pixel. `even`: the same in all pixels. `measured`: a quarter is spread evenly. The
-    other paths go to the pixels whose noise weighs most in the gradient, by the curvature of the loss, 0 in pixels that
-    are left out. A few paths through each pixel measure this before the first iteration, at the parameters' initial
-    values. A texture that only a mirror shows gains most; a few colours may lose. `auto`: `measured` where
-    there are camera paths, the loss is `l2`, and the measurement takes at most 2 % of the run's samples. The default is
-    `auto` with estimator `auto`, and `even` with an estimator that you name."""
+    """Number of camera paths in each pixel. `even`: the same in all pixels. `measured`: a quarter of the paths is
+    spread evenly, and the others go to the pixels whose noise adds most to the noise of the gradient, by the curvature
+    of the loss (0 in pixels that a mask leaves out). A few paths through each pixel measure this before the first
+    iteration, at the initial values of the parameters. A texture that only a mirror shows gains most; a few colours may
+    get noisier. `auto`: `measured` if there are camera paths, the loss is `l2`, and the measurement takes at most 2 %
+    of the samples of the run. The default is `auto` with estimator `auto`, and `even` with an estimator that you
+    name."""
 
     @model_validator(mode="after")
     def _leave_off(self) -> Self:
-        """Whoever names an estimator, and nothing else, has nothing measured."""
+        """Turn off the measured options that are not given if an estimator is named."""
         if self.estimator != "auto":  # not by assignment, which would count them among those that were given
             self.__dict__.update({name: off for name, off in UNDECIDED.items() if name not in self.model_fields_set})
         return self
@@ -201,52 +207,52 @@ class Reslrb(AttachingTracer):
         return {name: value for name, value in values.items() if name not in self._foreign()}
 
     def undecided_off(self) -> Reslrb:
-        """Return these options with estimator `stack` for `auto`, and with all that a run measures turned off."""
+        """Return these options with estimator `stack` instead of `auto`, and with all measured options turned off."""
         undecided = {name: off for name, off in UNDECIDED.items() if getattr(self, name) == "auto"}
         if self.estimator == "auto":
             undecided["estimator"] = AUTO_ESTIMATOR
         return self.model_copy(update=undecided) if undecided else self
 
     def _foreign(self) -> set[str]:
-        """The options of the other estimators."""
+        """Return the options of the other estimators."""
         return _ANY_ESTIMATORS - {"estimator", *ESTIMATOR_OPTIONS[self.estimator]}
 
 
 class Ptracer(LightTracerOptions, json_schema_extra=NEEDS_TYPE):
-    """Mitsuba's own light tracer under naive reverse-mode differentiation: memory grows with depth."""
+    """Mitsuba's light tracer with naive reverse-mode differentiation. Its memory grows with depth."""
 
     type: Literal["ptracer"] = Field(default="ptracer", description="Mitsuba's light tracer, naively differentiated.")
 
 
 class Prb(Integrator, json_schema_extra=NEEDS_TYPE):
-    """Mitsuba's path replay backpropagation: paths from the sensor; it cannot see caustics of small lights."""
+    """Mitsuba's path replay backpropagation. It traces paths from the sensor, and misses caustics of small lamps."""
 
     type: Literal["prb"] = Field(default="prb", description="Mitsuba's path replay backpropagation, from the sensor.")
 
 
 class PrbProjective(Integrator, json_schema_extra=NEEDS_TYPE):
-    """Mitsuba's path replay backpropagation with the derivatives of outlines and shadow edges. A derivative has three
+    """Mitsuba's path replay backpropagation, with the derivatives of outlines and shadow edges. A derivative has three
     parts, each with its own samples."""
 
     type: Literal["prb_projective"] = "prb_projective"
     """Mitsuba's projective path replay, from the sensor."""
     sppc: Samples | None = None
-    """Samples per pixel of what changes smoothly. 0 leaves that part out. null: those of the step."""
+    """Samples per pixel of the part that changes smoothly. 0 leaves this part out. null: as many as the step has."""
     sppp: Samples | None = None
-    """Samples per pixel of outlines that the sensor sees. 0 leaves them out. null: those of the step."""
+    """Samples per pixel of the outlines that the sensor sees. 0 leaves this part out. null: as many as the step has."""
     sppi: Samples | None = None
-    """Samples per pixel of shadow edges and of all else behind the first surface. 0 leaves them out. null: those of the
-    step."""
+    """Samples per pixel of shadow edges and of everything else behind the first surface. 0 leaves this part out. null:
+    as many as the step has."""
 
 
 class WalkAd(AttachingTracer, json_schema_extra=NEEDS_TYPE):
-    """The light-path walk of `reslrb` under naive reverse-mode differentiation, for comparisons at equal seeds."""
+    """The paths of `reslrb` with naive reverse-mode differentiation, for comparisons at equal seeds."""
 
     type: Literal["walk_ad"] = Field(default="walk_ad", description="The walk of `reslrb`, naively differentiated.")
     paths: Literal["light", "camera", "both"] = "light"
-    """Where paths begin, as with `reslrb`."""
+    """Where paths start, as for `reslrb`."""
     light_share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = 0.5
-    """Which share of the samples are light paths where `paths` are `both`."""
+    """Fraction of the samples that are light paths, with `paths: both`."""
 
     @model_validator(mode="after")
     def _check_options(self) -> Self:
@@ -255,27 +261,29 @@ class WalkAd(AttachingTracer, json_schema_extra=NEEDS_TYPE):
 
 
 class Trajectory(LightTracerOptions, json_schema_extra=NEEDS_TYPE):
-    """The same walk, reversed by Dr.Jit itself: it records each path's loop state in thread-local memory."""
+    """The light paths of `reslrb`, reversed by Dr.Jit, which records the loop state of each path in thread-local
+    memory."""
 
     type: Literal["trajectory"] = Field(default="trajectory", description="The walk of `reslrb`, reversed by Dr.Jit.")
     max_depth: Annotated[int, _RECORD] = Field(default=8, ge=0, json_schema_extra={"exclusiveMaximum": LOCAL_ENTRIES})
-    """Longest path in segments, as above; the record has room for as many vertices, so that there must be a limit."""
+    """Length of the longest path in segments, as above. The record has room for this many vertices, so a limit is
+    required."""
 
 
 class Own(Integrator, json_schema_extra=NEEDS_TYPE):
-    """A Mitsuba integrator of one's own, a class in a file of Python code; only where the command line has
-    `--allow-code` ([your_integrator.md](your_integrator.md))."""
+    """Your own Mitsuba integrator, a class in a Python file. Needs `--allow-code` on the command line
+    ([your_integrator.md](your_integrator.md))."""
 
-    type: Literal["custom"] = Field(default="custom", description="A Mitsuba integrator of one's own.")
+    type: Literal["custom"] = Field(default="custom", description="Your own Mitsuba integrator.")
     file: CodePlace
-    """`FILE.py:CLASS`: a file of Python code, relative to the config file, and the class in it, which is made of a
-    `mi.Properties` with `max_depth`, `rr_depth`, `hide_emitters` and `arguments`. A run keeps a digest of the file's
-    bytes, not of what it imports, and goes on with no other."""
+    """`FILE.py:CLASS`: a Python file, relative to the config file, and a class in it. The class is constructed from a
+    `mi.Properties` with `max_depth`, `rr_depth`, `hide_emitters` and `arguments`. A run stores a digest of the file,
+    without the modules that it imports, and resumes only with the same file."""
     paths: Literal["camera", "light"] = "camera"
-    """Where its paths begin: what it can see, and whether its images are darker along the film's border, as those of
-    light paths are."""
+    """Where its paths start. This tells which light they can find, and whether images are darker along the film's
+    border, as with light paths."""
     arguments: dict[str, bool | int | float | str] = Field(default_factory=dict)
-    """What else it is made of."""
+    """Further properties of the integrator, by name."""
 
     @property
     def path(self) -> Path:
@@ -292,10 +300,10 @@ def _check_share(paths: str, light_share: float | str) -> None:
 
 
 def passes_obstacle(spp: int, per_pass: int | None, pixels: int, splits: bool = True) -> str | None:
-    """Why `spp` samples per pixel of a film of so many `pixels` cannot be traced, and what would be right; or None.
+    """Return why `spp` samples per pixel of a film with `pixels` pixels cannot be traced, and what to change; or None.
 
-    `per_pass` is the integrator's `samples_per_pass`; it divides `spp`, or is larger. An integrator that does not
-    split its samples by itself (`splits`) has none.
+    `per_pass` is the integrator's `samples_per_pass`. It divides `spp`, or is larger. `splits` tells whether the
+    integrator splits its samples by itself; integrators that do not have no `samples_per_pass`.
     """
     unit = min(per_pass or spp, spp)
     parts = -(-unit // PASS_SAMPLES) if splits else 1
@@ -312,12 +320,12 @@ def passes_obstacle(spp: int, per_pass: int | None, pixels: int, splits: bool = 
 
 
 def largest_pass(spp: int, pixels: int) -> int | None:
-    """The largest `samples_per_pass` that divides `spp` and makes no more paths than a pass can have; None without."""
+    """Return the largest `samples_per_pass` that divides `spp` and fits into a pass; None if there is none."""
     most = min(PASS_PATHS // pixels, PASS_SAMPLES, spp)
     return max((n for n in divisors(spp) if n <= most), default=None)
 
 
 def divisors(number: int) -> list[int]:
-    """All divisors of a number, the smallest first; of one of 31 bits at once."""
+    """Return all divisors of a number in ascending order. Fast for numbers of 31 bits."""
     small = [n for n in range(1, int(number**0.5) + 1) if number % n == 0]
     return sorted({*small, *(number // n for n in small)})

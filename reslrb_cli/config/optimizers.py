@@ -1,4 +1,4 @@
-"""The losses and the optimisers, each with the options that it knows, and the stages in which a run begins."""
+"""The losses, the optimisers and the stages of a run, with their options."""
 
 from __future__ import annotations
 
@@ -36,12 +36,13 @@ class Loss(Choice):
 
     type: str
     scale: Literal["none", "fitted"] = "none"
-    """`fitted`: in each step, and for each view by itself, the image is multiplied by s = <I, T> / <I, I> before it is
-    compared, sums over the pixels inside the mask and all channels: how bright the image is does not matter, and the
-    gradient goes through s. <I, I> is taken between two halves of the samples, since noise would make s too small."""
+    """`fitted`: multiply the image by s = <I, T> / <I, I> before it is compared, so that its brightness does not
+    matter. The sums run over all channels and the pixels inside the mask; s is computed for each step and each view.
+    The gradient includes the derivative of s. <I, I> is computed between two halves of the samples, because noise would
+    make s too small. `none`: compare the image as it is."""
     weight: Positive = 1.0
-    """What an entry of a list of losses (`loss: [{type: l2, weight: 1}, {type: ssim, weight: 0.1}]`) is multiplied by
-    before they are added up; only there. In a list, `scale` is the same in all entries."""
+    """Factor of an entry in a list of losses, such as `loss: [{type: l2, weight: 1}, {type: ssim, weight: 0.1}]`. Only
+    in a list. All entries of a list must have the same `scale`."""
 
     @model_serializer(mode="wrap")
     def _without_unasked(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -52,12 +53,12 @@ class Loss(Choice):
         return values
 
     def own_options(self) -> dict[str, Any]:
-        """Options of the function itself (epsilon, ...): those that not all types share."""
+        """Return the options of the function itself (epsilon, ...), without those that all losses share."""
         return {name: value for name, value in self.options().items() if name not in Loss.model_fields}
 
 
 class L2(Loss):
-    """Mean of (I - T)², I the image, T the target, over pixels and channels; so are the others."""
+    """Mean of (I - T)² over pixels and channels. I is the image, T the target. The other losses are means, too."""
 
     type: Literal["l2"] = Field(default="l2", description="Mean of (I - T)².")
 
@@ -73,28 +74,28 @@ class RelativeL2(Loss, json_schema_extra=NEEDS_TYPE):
 
     type: Literal["relative_l2"] = Field(default="relative_l2", description="Mean of (I - T)² / (T² + epsilon).")
     epsilon: Positive = 1e-2
-    """Added to the denominator, in squared units of radiance; keeps dark pixels from dominating."""
+    """Added to the denominator, in squared units of radiance. Keeps dark pixels from dominating the loss."""
 
 
 class SSIM(Loss, json_schema_extra=NEEDS_TYPE):
-    """1 - mean SSIM (Wang et al. 2004) of windows of 11x11 pixels, Gaussian with a standard deviation of 1.5, each
-    channel by itself, of linear radiance. L, the data range of SSIM's constants, is the target's largest value. Windows
-    lie within the image, which has 11x11 pixels or more. Pixels that are left out are in a window as if they were the
-    target's, and windows about them do not count."""
+    """1 - mean SSIM (Wang et al. 2004) of linear radiance, computed for each channel. Windows have 11x11 pixels and
+    Gaussian weights with a standard deviation of 1.5. They lie within the image, so the image needs at least 11x11
+    pixels. The data range L in SSIM's constants is the largest value of the target. In a window, pixels that the mask
+    leaves out count as equal to the target. Windows centred at such pixels are left out."""
 
     type: Literal["ssim"] = Field(default="ssim", description="1 - mean SSIM (Wang et al. 2004).")
 
 
 class Custom(Loss, json_schema_extra=NEEDS_TYPE):
-    """What a function of one's own returns, `file`; only where the command line has `--allow-code`
+    """Your own loss, a Python function. Needs `--allow-code` on the command line
     ([method.md](method.md#a-loss-of-ones-own))."""
 
-    type: Literal["custom"] = Field(default="custom", description="What a function of one's own returns.")
+    type: Literal["custom"] = Field(default="custom", description="Your own loss, a Python function.")
     file: CodePlace | None = None
-    """`FILE.py:NAME`: a file of Python code, relative to the config file, and the function in it:
-    `NAME(image: mi.TensorXf, target: mi.TensorXf) -> mi.Float`, or with a third argument, `weights`. A run keeps a
-    digest of the file's bytes, not of what it imports, and goes on with no other. null: the function that a caller in
-    Python hands over."""
+    """`FILE.py:NAME`: a Python file, relative to the config file, and a function in it:
+    `NAME(image: mi.TensorXf, target: mi.TensorXf) -> mi.Float`. The function may take a third argument, `weights`. A
+    run stores a digest of the file, without the modules that it imports, and resumes only with the same file. null: the
+    function that was passed in Python."""
 
     @property
     def path(self) -> Path | None:
@@ -103,7 +104,7 @@ class Custom(Loss, json_schema_extra=NEEDS_TYPE):
 
     @property
     def name(self) -> str:
-        """The function's name in it."""
+        """The name of the function in the file."""
         return "" if self.file is None else self.file.rpartition(":")[2]
 
 
@@ -127,7 +128,7 @@ def _check_single(loss: Loss) -> Loss:
     return loss
 
 
-#: One loss, or the list of those whose sum is the loss.
+#: One loss, or a list of losses that are added up.
 Losses = Annotated[
     Annotated[AnyLoss, AfterValidator(_check_single), mark("mapping")]
     | Annotated[list[AnyLoss], Field(min_length=1, max_length=16), AfterValidator(_check_list), mark("list")],
@@ -136,7 +137,7 @@ Losses = Annotated[
 
 
 def losses_of(given: Loss | Sequence[Loss]) -> list[Loss]:
-    """Return the entries of `loss`, a single one as a list of it."""
+    """Return the entries of `loss` as a list, also if it is a single loss."""
     return [given] if isinstance(given, Loss) else list(given)
 
 
@@ -148,7 +149,7 @@ def loss_keys(name: str, given: Loss | Sequence[Loss]) -> list[tuple[str, Loss]]
 
 
 def loss_words(given: Loss | Sequence[Loss]) -> str:
-    """Of what a loss is made, in short: `l2`, or `l2 + 0.1 ssim`."""
+    """Return the loss in short: `l2`, or `l2 + 0.1 ssim`."""
     parts = [f"{loss.type}" if loss.weight == 1 else f"{loss.weight:g} {loss.type}" for loss in losses_of(given)]
     return " + ".join(parts)
 
@@ -157,39 +158,40 @@ _Decay = Annotated[float, Field(ge=0, lt=1)]
 
 
 class StopRule(Section):
-    """When a loss is taken to stand."""
+    """The test for a loss that has stopped falling."""
 
     patience: Annotated[int, Field(ge=5, lt=2**31)] = 20
-    """Iterations of a window. The loss is tested at the end of each, from the third on. At least 20 where views are
-    held out, whose loss is known every 10 iterations."""
+    """Length of a window in iterations. The loss is tested at the end of each window, from the third on. Must be at
+    least 20 with held-out views, whose loss is computed every 10 iterations."""
     relative: Annotated[float, Field(ge=0, lt=1)] = 0.01
-    """The loss stands where it is shown to fall by less than this share of itself from one window to the next. The
-    smaller this is, and the more noise losses have, the more windows the test needs."""
+    """Smallest decrease that counts, as a fraction of the loss per window. The loss has stopped falling when the test
+    shows that it falls by less. Smaller values and noisier losses need more windows."""
 
 
 class Optimizer(Choice):
-    """Options that all optimisers share: the learning rate and its schedule."""
+    """Options of all optimisers: the learning rate and its schedule."""
 
     type: str
     learning_rate: Positive = 0.02
-    """Step size at the first iteration, in the parameter's units; in those of its `transform`, where it has one; with
-    `scale: auto`, as a share of the measured length."""
+    """Step size at the first iteration, in the units of the parameter, or of its transformed variable if it has a
+    `transform`. With `scale: auto`, a fraction of the measured length."""
     scale: Literal["none", "auto", "curvature"] = "none"
-    """`auto`: before the first iteration, measure for each parameter the length by which it would have to change to
-    make up the image where it has an effect, and how large its gradient is, and let the optimizer move each in units of
-    its own: one learning rate serves parameters that differ by orders of magnitude, and `epsilon` does not matter.
-    Learning rates are then shares of that length: 0.02 is 2 % a step.
-    `curvature`, for `sgd`: measure the largest curvature of the loss by each parameter, and divide gradients by it. A
-    learning rate of 1 is then the step that ends at the bottom in the steepest direction; the default is 0.5."""
+    """Units in which the optimizer moves each parameter. `none`: its own. `auto`: units that a run measures before its
+    first iteration, so that one learning rate suits parameters that differ by orders of magnitude, and `epsilon` does
+    not matter. The run measures the size of the gradient, and a length: the change of the parameter that would make up
+    the image in the pixels that it affects. Learning rates are fractions of this length: 0.02 is 2 % per step.
+    `curvature`, only for `sgd`: divide the gradient of each parameter by the largest curvature of the loss, which a run
+    measures. A learning rate of 1 is then the step that reaches the minimum along the steepest direction; the default
+    is 0.5."""
     schedule: Literal["constant", "cosine", "exponential", "plateau"] = "constant"
-    """How the learning rate runs from its first value to its last. `plateau`: the rate is halved each time that the
-    loss stands, as `run.stop` defines it."""
+    """How the learning rate changes from its first to its last value. `plateau`: it is halved each time the loss has
+    stopped falling, by the test in `run.stop`."""
     final_fraction: float = Field(default=0.01, gt=0, le=1)
-    """Last learning rate over the first; only with a schedule other than `constant`."""
+    """Last learning rate divided by the first. Only with a schedule other than `constant`."""
     clamp_gradient: Annotated[float, Field(ge=1)] | None = None
-    """Clamp each entry of a gradient at so many times its usual size: the larger of the running means of its own
-    absolute value and of those of all entries of the parameter. Takes the noise of rare bright paths, and is biased by
-    what it takes, which the run reports. null: no clamp."""
+    """Limit on each entry of a gradient, as a multiple of its usual size. The usual size is the larger of two running
+    means of absolute values: that of the entry, and that of all entries of the parameter. The limit removes the noise
+    of rare bright paths. It biases the gradient by what it removes, and the run reports how much. null: no limit."""
 
     @model_validator(mode="after")
     def _check_schedule(self) -> Self:
@@ -218,7 +220,7 @@ class Optimizer(Choice):
         return values
 
     def own_options(self) -> dict[str, Any]:
-        """Options of the update rule itself (beta_1, momentum, ...): those that not all types share."""
+        """Return the options of the update rule itself (beta_1, ...), without those that all optimisers share."""
         return {name: value for name, value in self.options().items() if name not in Optimizer.model_fields}
 
 
@@ -229,9 +231,9 @@ class Adam(Optimizer):
     beta_1: _Decay = Field(default=0.9, description="Decay of the running mean of the gradient.")
     beta_2: _Decay = Field(
         default=0.9,
-        description="Decay of the running mean of the squared gradient. A larger decay suits textures whose gradients "
-        "are noisy. It also remembers the large gradients of a bad start for longer, and steps stay short meanwhile: "
-        "0.999 for a thousand iterations.",
+        description="Decay of the running mean of the squared gradient. A larger decay suits textures with noisy "
+        "gradients. It also remembers the large gradients of a bad start for longer, and steps are short until then: "
+        "with 0.999, for a thousand iterations.",
     )
     epsilon: Positive = Field(default=1e-8, description="Added to the root of the mean squared gradient.")
 
@@ -239,8 +241,8 @@ class Adam(Optimizer):
 class SGD(Optimizer, json_schema_extra=NEEDS_TYPE):
     """Gradient descent with momentum."""
 
-    type: Literal["sgd"] = Field(default="sgd", description="Gradient descent, with momentum if that is above 0.")
-    momentum: _Decay = Field(default=0.0, description="Decay of the running sum of gradients; 0: none.")
+    type: Literal["sgd"] = Field(default="sgd", description="Gradient descent, with momentum if it is above 0.")
+    momentum: _Decay = Field(default=0.0, description="Decay of the running sum of gradients. 0: no momentum.")
 
 
 AnyOptimizer = Annotated[Adam | SGD, ByType("adam")]
@@ -250,31 +252,31 @@ _Share = Annotated[float, Field(gt=0, le=1)]
 
 
 class Stage(Section):
-    """A part of a run, until a share of its iterations is done; what it leaves out is as the run has it."""
+    """A coarser stage at the start of a run. Settings that a stage leaves out are those of the run."""
 
     until: Annotated[float, Field(gt=0, lt=1)]
-    """Share of the run's iterations after which the next stage begins, or, after the last one, the run as it is
-    configured."""
+    """Fraction of the run's iterations at which the stage ends. The next stage follows; after the last stage, the run
+    continues as configured."""
     resolution: _Share = 1.0
-    """Of heightmaps and textures, width and height, and of a heightmap's mesh that is a flat grid with a vertex for
-    each texel. What several keys share, and textures that only a mesh's file has, keep theirs."""
+    """Factor for the width and height of heightmaps and textures. It also applies to a heightmap's mesh if the mesh is
+    a flat grid with one vertex for each texel. Tied textures (a list of keys), and textures that only a mesh
+    file contains, keep their resolution."""
     film: _Share = 1.0
-    """Width and height of the films: one over a whole number that divides them. The target's pixels are means of as
-    many, by their weights."""
+    """Factor for the width and height of the film: 1/n, with a whole number n that divides both. The pixels of the
+    target become weighted means of n x n pixels."""
 
     @property
     def grain(self) -> tuple[float, float]:
-        """What makes it another problem than the run's: the resolution and the film."""
+        """The settings that change the problem: resolution and film."""
         return self.resolution, self.film
 
 
-#: What a run is when its stages are over.
+#: The stage after the last one: the run as configured.
 AS_CONFIGURED = Stage.model_construct(until=1.0)
 
 
 def check_stages(stages: list[Stage]) -> None:
-    """Raise an error, located, where stages are not in their order, or one is coarser than another before
-    it."""
+    """Raise a located error if stages are out of order, or one is coarser than the stage before it."""
     for place, (before, stage) in enumerate(pairwise(stages), 1):
         if stage.until <= before.until:
             raise located(f"run.stages[{place}].until", f"must be above {before.until:g}, that of the stage before it")

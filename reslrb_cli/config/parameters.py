@@ -1,6 +1,6 @@
-"""The parameters that are recovered: those of the scene by key, heightmaps on meshes, motions of shapes and emitters.
+"""The parameters to recover: scene parameters by key, heightmaps on meshes, and motions of shapes and emitters.
 
-Settings of a motion are said by word (translation, rotation, scale), or for all of it at once.
+Settings of a motion are given for each part (translation, rotation, scale), or for all parts at once.
 """
 
 from __future__ import annotations
@@ -36,30 +36,30 @@ from reslrb_cli.config.files import PIXELS
 
 Numbers = Annotated[list[float], Field(min_length=1)]
 
-#: The parts of a motion, applied in the opposite order. An axis is that part of a translation alone.
+#: The parts of a motion, applied in reverse order. An axis is that part of a translation.
 Word = Literal["translation", "x", "y", "z", "rotation", "scale"]
 WORDS: tuple[Word, ...] = ("translation", "x", "y", "z", "rotation", "scale")
 AXES: tuple[Word, ...] = ("x", "y", "z")
 
-#: The name, below its mesh's, of what a heightmap recovers.
+#: Name of a heightmap's parameter, below the name of its mesh.
 HEIGHTMAP = "heightmap"
 
 
-# --- settings of a motion, by what of it is free ----------------------------------------------------------------------
+# --- settings of a motion, by part ------------------------------------------------------------------------------------
 
 
 class ByWord(Section):
-    """Settings of a motion, each by its word."""
+    """Settings of a motion for each of its parts."""
 
     TAG: ClassVar[str] = "words"
 
     def words(self) -> dict[str, Any]:
-        """What is set, by word."""
+        """Return the settings that are given, by part."""
         return {word: value for word in WORDS if (value := getattr(self, word)) is not None}
 
 
 def or_words(plain: str) -> Discriminator:
-    """Tells a mapping by the words of a motion (`words`) from what is tagged `plain`, which is anything else."""
+    """Return a discriminator that tags mappings by the parts of a motion as `words`, and anything else as `plain`."""
     return Discriminator(lambda value: MARK + (ByWord.TAG if isinstance(value, (dict, ByWord)) else plain))
 
 
@@ -75,12 +75,12 @@ TransformName = Literal["none", "sigmoid", "log", "softplus"]
 class MotionInitial(ByWord):
     """Initial values of a motion."""
 
-    translation: _NumberOrList | None = Field(default=None, description="In scene units.")
-    x: float | None = Field(default=None, description="In scene units.")
-    y: float | None = Field(default=None, description="In scene units.")
-    z: float | None = Field(default=None, description="In scene units.")
-    rotation: _NumberOrList | None = Field(default=None, description="In degrees.")
-    scale: _NumberOrList | None = Field(default=None, description="A factor.")
+    translation: _NumberOrList | None = Field(default=None, description="Initial translation, in scene units.")
+    x: float | None = Field(default=None, description="Initial translation along x, in scene units.")
+    y: float | None = Field(default=None, description="Initial translation along y, in scene units.")
+    z: float | None = Field(default=None, description="Initial translation along z, in scene units.")
+    rotation: _NumberOrList | None = Field(default=None, description="Initial angles, in degrees.")
+    scale: _NumberOrList | None = Field(default=None, description="Initial scale factor.")
 
 
 class MotionBounds(ByWord):
@@ -90,8 +90,8 @@ class MotionBounds(ByWord):
     x: Bounds | None = Field(default=None, description="[low, high], in scene units.")
     y: Bounds | None = Field(default=None, description="[low, high], in scene units.")
     z: Bounds | None = Field(default=None, description="[low, high], in scene units.")
-    rotation: Bounds | None = Field(default=None, description="[low, high] of each number, in degrees.")
-    scale: Bounds | None = Field(default=None, description="[low, high] of the factor.")
+    rotation: Bounds | None = Field(default=None, description="[low, high] of each angle, in degrees.")
+    scale: Bounds | None = Field(default=None, description="[low, high] of the scale factor.")
 
 
 class MotionTransform(ByWord):
@@ -108,12 +108,12 @@ class MotionTransform(ByWord):
 class MotionRates(ByWord):
     """Learning rates of a motion."""
 
-    translation: Positive | None = Field(default=None, description="In scene units.")
-    x: Positive | None = Field(default=None, description="In scene units.")
-    y: Positive | None = Field(default=None, description="In scene units.")
-    z: Positive | None = Field(default=None, description="In scene units.")
-    rotation: Positive | None = Field(default=None, description="In degrees.")
-    scale: Positive | None = Field(default=None, description="Of the factor.")
+    translation: Positive | None = Field(default=None, description="Learning rate, in scene units.")
+    x: Positive | None = Field(default=None, description="Learning rate, in scene units.")
+    y: Positive | None = Field(default=None, description="Learning rate, in scene units.")
+    z: Positive | None = Field(default=None, description="Learning rate, in scene units.")
+    rotation: Positive | None = Field(default=None, description="Learning rate, in degrees.")
+    scale: Positive | None = Field(default=None, description="Learning rate of the scale factor.")
 
 
 # --- what moves -------------------------------------------------------------------------------------------------------
@@ -123,7 +123,7 @@ _NAME = {"type": "string", "minLength": 1}
 _NAMES = WithJsonSchema({"anyOf": [_NAME, {"type": "array", "items": _NAME, "minItems": 1}]})
 _EACH_ONCE = must(each_once, lambda _: "must name each once")
 
-#: One name or several.
+#: One name, or a list of names.
 Names = Annotated[list[Name], Field(min_length=1), BeforeValidator(list_of_one), _EACH_ONCE, _NAMES]
 
 _TEXELS = must(
@@ -139,7 +139,7 @@ _GRID = must(
 
 
 def size_of(grid: int | tuple[int, int]) -> tuple[int, int]:
-    """[width, height] of what may be one number for both."""
+    """Return [width, height] of a grid that may be given as one number for both."""
     return (grid, grid) if isinstance(grid, int) else grid
 
 
@@ -149,17 +149,19 @@ _Grid = Annotated[
 
 
 class HeightmapSpec(Section):
-    """Displacement of a mesh along its initial normals, in scene units: a texture over its texture coordinates."""
+    """Displacement of a mesh along its initial normals, in scene units. The map is a texture over the mesh's texture
+    coordinates."""
 
     mesh: Names
-    """Id of a mesh with texture coordinates, or a list: one map for all, named by the first."""
+    """Id of a mesh with texture coordinates, or a list of ids. Meshes in a list share one map, which is named after the
+    first mesh."""
     resolution: Annotated[Size, _TEXELS]
-    """[width, height] in texels, at least 2 each, looked up bilinearly; beyond the centres of the outermost texels it
-    goes on as they are."""
+    """[width, height] of the map in texels, at least 2 each. Lookups are bilinear, and constant beyond the centres of
+    the outermost texels."""
     grid: _Grid | None = None
-    """Vertices along each edge, a number or [width, height]: makes a mesh of this size of a `rectangle`, or of a mesh
-    that is one, of four vertices. They reach from edge to edge, and their texture coordinates are the centres of as
-    many texels. null: the mesh stays as it is."""
+    """Number of vertices along each edge, or [width, height]. Replaces a `rectangle`, or a mesh of four vertices that
+    is a rectangle, by a mesh of this size. The vertices reach from edge to edge. Their texture coordinates are the
+    centres of as many texels. null: the mesh stays as it is."""
 
 
 _POINT = must(
@@ -170,13 +172,13 @@ _POINT = must(
 class MotionSpec(Section):
     """Motion of shapes and emitters together: scaled, then rotated, then translated."""
 
-    of: Names = Field(description="Ids of the shapes and emitters that move together; they are named by the first.")
+    of: Names = Field(description="Ids of the shapes and emitters that move together. The first id names the motion.")
     pivot: Annotated[list[float], _POINT] | None = None
-    """The point about which they are scaled and rotated; null: the centre of their bounding box."""
+    """Centre of the scale and the rotation, [x, y, z]. null: the centre of the bounding box of these objects."""
     free: Annotated[list[Word], Field(min_length=1), _EACH_ONCE] = Field(default=["translation", "rotation"])
-    """What is recovered. `translation`: three numbers, in scene units; `x`, `y`, `z`: a translation along this axis
-    alone, such as `free: [x, y]`; `rotation`: three angles in degrees, about the x, then the y, then the z axis of the
-    scene; `scale`: one factor for all axes."""
+    """Parts of the motion to recover. `translation`: three numbers, in scene units. `x`, `y`, `z`: a translation along
+    one axis, as in `free: [x, y]`. `rotation`: three angles in degrees, about the x axis, then the y axis, then the z
+    axis of the scene. `scale`: one factor for all axes."""
 
     @model_validator(mode="after")
     def _check_axes(self) -> Self:
@@ -186,7 +188,7 @@ class MotionSpec(Section):
 
 
 ColorSpace = Literal["auto", "linear", "srgb"]
-COLOR_SPACE = "How values are encoded: `linear`, `srgb`, or `auto` (8-bit files srgb, float files linear)."
+COLOR_SPACE = "Encoding of the values: `linear`, `srgb`, or `auto` (srgb for 8-bit files, linear for float files)."
 
 
 class ImageFile(Section):
@@ -197,12 +199,12 @@ class ImageFile(Section):
 
 
 class RunValue(Section):
-    """Values to which a run brought parameters."""
+    """A value that another run recovered."""
 
     TAG: ClassVar[str] = "run"
 
     run: ConfigPath
-    """Folder of a run, finished or interrupted, that recovered a parameter of the same key; relative to the config
+    """Folder of a finished or interrupted run that recovered a parameter with the same key, relative to the config
     file."""
 
 
@@ -221,7 +223,7 @@ def _initial_tag(value: Any) -> str | None:
     return kind_tag(value, "scene")
 
 
-#: A value to start from; "scene" is the one that the scene file gives.
+#: An initial value. "scene" is the value in the scene file.
 Initial = Annotated[
     Annotated[float, mark("number")]
     | Annotated[Numbers, mark("list")]
@@ -243,85 +245,90 @@ _AnyTransform = Annotated[
     Annotated[TransformName, mark("text")] | Annotated[MotionTransform, mark(ByWord.TAG)], or_words("text")
 ]
 
-#: One key, or several that are tied.
+#: One key, or several keys that are tied.
 _Key = Annotated[
     Annotated[Name, mark("text")] | Annotated[list[Name], Field(min_length=1), mark("list")],
     Discriminator(lambda value: MARK + ("list" if isinstance(value, list) else "text")),
 ]
 
 
-# --- what its value costs besides -------------------------------------------------------------------------------------
+# --- regularizers -----------------------------------------------------------------------------------------------------
 
 
 class Regularizer(Choice):
-    """An integral over the parameter's surface, in scene units, that is added to the loss once a step."""
+    """An integral over the parameter's surface, in scene units, that is added to the loss once per step."""
 
     type: str
     weight: Positive = 1.0
-    """Factor of the integral in what is minimised."""
+    """Factor of the integral in the objective."""
 
 
 class Curvature(Regularizer, json_schema_extra={"required": ["type", "radius"]}):
-    """The concave curvature k of a heightmap, seen from outside, beyond a tool's: integral of max(0, k - 1/radius)²."""
+    """Hollows of a heightmap that are too narrow for a tool: integral of max(0, k - 1/radius)². k is the larger
+    principal curvature, positive in hollows as seen from outside."""
 
     type: Literal["curvature"] = "curvature"
-    """Of a heightmap: integral of max(0, k - 1/radius)², k the larger principal curvature, positive in hollows."""
-    radius: Positive = Field(description="Radius of the tool's ball, in scene units.")
+    """For a heightmap: integral of max(0, k - 1/radius)². k is the larger principal curvature, positive in hollows."""
+    radius: Positive = Field(description="Radius of the ball of the tool, in scene units.")
 
 
 class Slope(Regularizer, json_schema_extra={"required": ["type", "degrees"]}):
-    """The slope of a heightmap beyond an angle: integral of max(0, slope - tan(degrees))²."""
+    """Slopes of a heightmap that are too steep: integral of max(0, slope - tan(degrees))²."""
 
-    type: Literal["slope"] = Field(default="slope", description="Of a heightmap: integral of max(0, slope - tan)².")
-    degrees: float = Field(ge=0, lt=90, description="Angle up to which slopes cost nothing.")
+    type: Literal["slope"] = Field(default="slope", description="For a heightmap: integral of max(0, slope - tan)².")
+    degrees: float = Field(ge=0, lt=90, description="Largest angle of a slope without a cost, in degrees.")
 
 
 class Thickness(Regularizer, json_schema_extra={"required": ["type", "thickness", "least"]}):
-    """A plate that is too thin: integral of max(0, least - (thickness + h))²."""
+    """A plate that is too thin: integral of max(0, least - (thickness + h))², with the heightmap h. After each step,
+    heights are clamped so that the plate keeps a tenth of `least`, and its faces never cross. The run records how many
+    heights are clamped."""
 
     type: Literal["thickness"] = "thickness"
-    """Of a heightmap h: integral of max(0, least - (thickness + h))². After each step heights are held where the plate
-    has a tenth of `least`, so that its faces never cross; how many were is recorded."""
-    thickness: Positive = Field(description="Of the plate where the heightmap is 0, in scene units.")
-    least: Positive = Field(description="Below this it costs, in scene units.")
+    """For a heightmap h: integral of max(0, least - (thickness + h))². After each step, heights are clamped so that the
+    plate keeps a tenth of `least`."""
+    thickness: Positive = Field(description="Thickness of the plate where the heightmap is 0, in scene units.")
+    least: Positive = Field(description="Smallest thickness without a cost, in scene units.")
     opposite: Annotated[str, Field(min_length=1)] | None = None
-    """Id of the mesh on the other side, where that has a heightmap as well: its heights, outwards where each texel
-    stands, are part of the thickness, and it is pushed and held back as this one is. null: the other side is flat."""
+    """Id of the mesh on the other side, if it has a heightmap as well. Its heights (positive outwards) at the place of
+    each texel are added to the thickness, and both heightmaps are penalised and clamped. null: the other side is
+    flat."""
 
     @property
     def thinnest(self) -> float:
-        """The thickness at which it is held."""
+        """The thickness at which the plate is clamped."""
         return _HELD * self.least
 
     @property
     def lowest(self) -> float:
-        """The height at which it is held, over a flat back."""
+        """The height at which the plate is clamped, over a flat back."""
         return self.thinnest - self.thickness
 
 
-#: Share of `least` that a plate always keeps.
+#: Fraction of `least` that a plate always keeps.
 _HELD = 0.1
 
 
 class TotalVariation(Regularizer, json_schema_extra=NEEDS_TYPE):
-    """Integral of sqrt(|gradient|² + epsilon²) - epsilon, channels together."""
+    """Total variation of a heightmap or a bitmap: integral of sqrt(|gradient|² + epsilon²) - epsilon. The gradient is
+    that of all channels together."""
 
     type: Literal["total_variation"] = "total_variation"
-    """Of a heightmap or a bitmap: integral of sqrt(g² + epsilon²) - epsilon, g the gradient of all channels."""
-    epsilon: Positive = Field(default=1e-3, description="Gradients well below this cost as their square.")
+    """For a heightmap or a bitmap: integral of sqrt(g² + epsilon²) - epsilon, with the gradient g of all channels."""
+    epsilon: Positive = Field(default=1e-3, description="Gradients well below this value have a quadratic cost.")
 
 
 class Laplacian(Regularizer, json_schema_extra=NEEDS_TYPE):
-    """Integral of the square of the Laplacian."""
+    """Roughness of a heightmap, a bitmap or the vertex positions of a mesh: integral of the squared Laplacian. For
+    vertex positions, it is the cotangent Laplacian of the initial mesh, without the vertices on the mesh's boundary."""
 
     type: Literal["laplacian"] = "laplacian"
-    """Of a heightmap, a bitmap or a mesh's vertex positions: integral of the square of the Laplacian; of a mesh over
-    its surface as it begins, by cotangents, vertices at its rim left out."""
+    """For a heightmap, a bitmap or the vertex positions of a mesh: integral of the squared Laplacian."""
 
 
 AnyRegularizer = Annotated[Curvature | Slope | Thickness | TotalVariation | Laplacian, ByType("")]
 
-#: What has a meaning for each kind of parameter.
+#: The regularizers of each kind of parameter.
 REGULARIZERS = {
     "heightmap": ("curvature", "slope", "thickness", "total_variation", "laplacian"),
     "bitmap": ("total_variation", "laplacian"),
@@ -329,12 +336,12 @@ REGULARIZERS = {
 }
 
 
-# --- what is recovered ------------------------------------------------------------------------------------------------
+# --- parameters -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What is said of one array that is recovered; `word` is that of a motion, "" otherwise."""
+    """The settings of one recovered array. `word` is the part of a motion, or ""."""
 
     initial: Any = "scene"
     bounds: tuple[float, float] | None = None
@@ -347,54 +354,54 @@ class Settings:
 
 
 class Precondition(Section):
-    """Smooth steps ("large steps", Nicolet, Jacobson and Jakob 2021): the optimizer moves v, the parameter is
+    """Smooth steps ("large steps", Nicolet, Jacobson and Jakob 2021). The optimizer moves v; the parameter is
     (1 - l² Δ)⁻¹ v."""
 
     laplacian: Annotated[float, Field(gt=0, le=10)]
-    """l, as a share of the longer side of a map, a texture or a mesh: the same on a finer one. What is finer than l
-    goes less far in a step; of gradient descent, by the fourth power of its size over l."""
+    """Length l, as a fraction of the longer side of a map, a texture or a mesh. Its effect does not depend on the
+    resolution. Details smaller than l move less in a step. With gradient descent, their steps shrink with the fourth
+    power of their size divided by l."""
 
 
 class ParameterSpec(Section):
-    """What is recovered, by exactly one of `key`, `heightmap` and `motion`."""
+    """A parameter to recover, given by exactly one of `key`, `heightmap` and `motion`."""
 
     key: _Key | None = None
-    """Key as `reslrb inspect` lists it: the names of `mi.traverse`, in which an object without an id goes by its kind
-    and number in the scene file, such as `Sphere_3`. Or a glob such as `*.reflectance.data`. A list of keys ties them
-    to one value, which is recorded by the first."""
+    """Key as `reslrb inspect` lists it. Keys are the names of `mi.traverse`. An object without an id is named after its
+    kind and its number in the scene file, as in `Sphere_3`. A glob such as `*.reflectance.data` selects several
+    parameters. A list of keys ties them to one value, which is recorded under the first key."""
     heightmap: HeightmapSpec | None = None
-    """A displacement of a mesh, recorded as `MESH.heightmap`."""
+    """Displacement of a mesh, recorded as `MESH.heightmap`."""
     motion: MotionSpec | None = None
-    """A motion of shapes and emitters, recorded as `ID.translation`, `ID.x`, `ID.rotation` and so on. With several
-    `free`, `initial`, `bounds`, `transform` and `learning_rate` are mappings by these words, such as `bounds:
-    {rotation: [-10, 10]}`; `transform` and `learning_rate` may also be one for all."""
+    """Motion of shapes and emitters, recorded as `ID.translation`, `ID.x`, `ID.rotation` and so on. If several parts
+    are `free`, then `initial`, `bounds`, `transform` and `learning_rate` are mappings by part, as in `bounds:
+    {rotation: [-10, 10]}`. `transform` and `learning_rate` may also be one value for all parts."""
     initial: Initial = "scene"
-    """Value to start from: a number (all entries), a list of numbers (one per channel), an image file, the value to
-    which a run brought the same key, or `scene` (the scene's own value; a heightmap is flat there, and nothing is
-    moved). `transport` makes a heightmap that throws the view's target onto the plane shape `receiver`, nothing darker
-    than `floor` (a share of its maximum, or `auto`, the least with which light is not torn apart); `lamp` names the
-    lamp where several have light: docs/lens.md."""
+    """Value at the start. A number (for all entries), a list of numbers (one per channel), an image file, `{run: RUN}`
+    (the value that this run recovered for the same key), or `scene` (the value in the scene file; a heightmap is then
+    flat, and a motion at rest)."""
     bounds: _AnyBounds | None = None
-    """[low, high], in the parameter's units; values are clamped to them after each step. `-.inf` and `.inf` leave a
-    side open."""
+    """[low, high], in the units of the parameter. Values are clamped to the bounds after each step. `-.inf` and `.inf`
+    leave a side open."""
     transform: _AnyTransform = "none"
-    """What the optimizer moves in place of the value x: `sigmoid`: the logit of x between its `bounds`, which it never
-    reaches; `log`: log(x), for positive values known to an order of magnitude at best; `softplus`: log(exp(x) - 1), for
-    positive values; as `log` well below 1, as `none` well above. Learning rates are in units of that variable."""
+    """Variable that the optimizer moves instead of the value x. `sigmoid`: the logit of x between its `bounds`, which x
+    never reaches. `log`: log(x), for positive values that are known to an order of magnitude at best. `softplus`:
+    log(exp(x) - 1), for positive values; acts like `log` well below 1, and like `none` well above. Learning rates are
+    in units of this variable."""
     learning_rate: _AnyRate | None = None
-    """Step size of this parameter, in the optimizer's units; null: the optimizer's."""
+    """Step size of this parameter, in the units of `optimizer.learning_rate`. null: `optimizer.learning_rate`."""
     resolution: Annotated[Size, few("texels")] | None = None
-    """[width, height] in texels to which a texture is resampled before the start."""
+    """[width, height] in texels. The texture is resampled to this size before the start. null: it keeps its size."""
     precondition: Precondition | None = None
-    """Smooth steps, for textures, heightmaps and the vertices of meshes; null: none."""
+    """Smooth steps, for textures, heightmaps and mesh vertices. null: off."""
     regularizers: list[AnyRegularizer] = Field(default=[], max_length=16)
-    """What the value itself costs: integrals over its surface, added to the loss once a step, and recorded beside it.
-    Lengths are the scene's; of a bitmap they are those of its texture coordinates. The value hardly depends on the
-    resolution."""
+    """Costs of the value itself. They are integrals over its surface, added to the loss once per step and recorded
+    separately. Lengths are in scene units, and for a bitmap in units of its texture coordinates. The integrals hardly
+    depend on the resolution."""
 
     @property
     def names(self) -> list[str]:
-        """Keys and globs, or the names by which a heightmap or a motion is recorded."""
+        """The keys and globs, or the names under which a heightmap or a motion is recorded."""
         if self.heightmap is not None:
             return [f"{self.heightmap.mesh[0]}.{HEIGHTMAP}"]
         if self.motion is not None:
@@ -407,7 +414,7 @@ class ParameterSpec(Section):
         return [self.key] if isinstance(self.key, str) else list(self.key or ())
 
     def objects(self) -> list[tuple[str, int | None, str]]:
-        """What it names, each with its option and, in a list, its place there."""
+        """Return the keys and ids that are named, each with its option and, in a list, its index."""
         lists: list[tuple[str, Any]] = [("key", self.key)]
         lists += [] if self.heightmap is None else [("heightmap.mesh", self.heightmap.mesh)]
         lists += [] if self.motion is None else [("motion.of", self.motion.of)]
@@ -421,15 +428,15 @@ class ParameterSpec(Section):
 
     @property
     def _plates(self) -> list[Thickness]:
-        """The plates whose other side is flat: their thickness bounds the heights."""
+        """The plates with a flat back: their thickness bounds the heights."""
         return [each for each in self.regularizers if isinstance(each, Thickness) and each.opposite is None]
 
     def at(self, option: str, word: str) -> str:
-        """Where in this section `option` is set for what `word` names."""
+        """Return the key, within this section, that sets `option` for the part `word`."""
         return f"{option}.{word}" if isinstance(getattr(self, option, None), ByWord) else option
 
     def settings(self, word: str = "") -> Settings:
-        """What is said of the array of a motion that `word` names; "": of what is no motion."""
+        """Return the settings of the part `word` of a motion, or with "" those of any other parameter."""
 
         def of(option: str, default: Any = None) -> Any:
             value = getattr(self, option)

@@ -1,4 +1,4 @@
-"""How long a run is, with how many samples, in which parts, where to, and what it keeps (`run`)."""
+"""The section `run`: length, samples, output and checkpoints of a run."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from reslrb_cli.config.files import NAME_BYTES
 from reslrb_cli.config.optimizers import Stage, StopRule
 from reslrb_cli.config.views import SensorName
 
-#: Names that Windows takes for devices, whatever suffix they have: a folder that is called so cannot be copied there.
+#: Names of devices on Windows, with any suffix. A folder with such a name cannot be copied there.
 _RESERVED = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9])(\..*)?", re.IGNORECASE)
 
-#: What begins at a root or at a home, or has `.` or `..` for a part. A slash between words is none of that.
+#: Paths: text that starts at a root or a home, or has `.` or `..` as a part. A slash between words is no path.
 _PATH = re.compile(r"^([/\\~]|[A-Za-z]:[/\\])|(^|[/\\])\.\.?($|[/\\])")
 
 
 def folder_name(name: str) -> str:
-    """A run's name as the name of a folder: what is no letter, digit, `.`, `_`, `+`, `=` becomes `-`."""
+    """Return the folder name for a run's name: all but letters, digits, `.`, `_`, `+` and `=` becomes `-`."""
     return re.sub(r"[^\w.+=]+", "-", name).strip("-.")
 
 
 def check_name(name: str) -> str:
-    """`name`, where it can name a run; else raises an error that says what is wrong with it."""
+    """Return `name` if it can name a run. Raises an error that says what is wrong otherwise."""
     folder = folder_name(name)
     if _PATH.search(name.strip()):
         raise wrong("must be a name and not a path; run.output says where the run's folder is")
@@ -54,9 +54,9 @@ _SIZE = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]+)")
 
 
 def memory_bytes(value: int | float | str) -> int:
-    """Bytes of a number of MiB, or of text such as "512 MiB", "2GiB", "500 MB".
+    """Return the bytes of a number of MiB, or of text such as "512 MiB", "2GiB" or "500 MB".
 
-    Raises ValueError where it is neither, or less than one byte.
+    Raises ValueError if it is neither, or less than one byte.
     """
     number, unit = float("nan"), "mib"
     if isinstance(value, str):
@@ -64,7 +64,7 @@ def memory_bytes(value: int | float | str) -> int:
         if match:
             number, unit = float(match[1]), match[2].lower()
     elif not isinstance(value, bool):
-        number = float(value) if abs(value) < 2**63 else float("inf")  # longer integers fit into no float
+        number = float(value) if abs(value) < 2**63 else float("inf")  # larger integers overflow a float
     if unit not in _UNITS or not 1 <= number * _UNITS[unit] < 2**63:
         raise ValueError(f"{value!r} is no amount of memory")
     return int(number * _UNITS[unit])
@@ -78,7 +78,7 @@ def _check_memory(value: Any) -> Any:
     return value
 
 
-#: A number of MiB, or text with a unit (B, kB, KiB, MB, MiB, GB, GiB); kept as it was written.
+#: A number of MiB, or text with a unit (B, kB, KiB, MB, MiB, GB, GiB), stored as it was written.
 Memory = Annotated[
     int | float | str,
     BeforeValidator(_check_memory),
@@ -87,10 +87,10 @@ Memory = Annotated[
 
 
 class CheckpointEvery(Section):
-    """Exactly one of `iterations` and `seconds`."""
+    """Time between two checkpoints: exactly one of `iterations` and `seconds`."""
 
     iterations: Count | None = Field(default=None, description="Iterations between two checkpoints.")
-    seconds: Positive | None = Field(default=None, description="Seconds between two checkpoints, at least.")
+    seconds: Positive | None = Field(default=None, description="Smallest number of seconds between two checkpoints.")
 
     @model_validator(mode="after")
     def _check_one(self) -> Self:
@@ -104,16 +104,16 @@ class CheckpointEvery(Section):
         return {key: value for key, value in handler(self).items() if value is not None}
 
     def is_due(self, iterations: int, seconds: float) -> bool:
-        """Whether it is time for one, so many iterations and seconds after the last."""
+        """Return whether a checkpoint is due this many iterations and seconds after the last one."""
         return iterations >= self.iterations if self.iterations is not None else seconds > (self.seconds or 0.0)
 
 
 def _without_default(schema: dict[str, Any]) -> None:
-    """For a default that the loader fills in, from what the schema does not know."""
+    """Remove a default that the loader fills in from outside of the schema."""
     del schema["default"]
 
 
-#: Shards of `auto`, at most.
+#: Largest number of shards of `auto`.
 AUTO_SHARDS = 16
 
 _Shards = Annotated[
@@ -123,93 +123,95 @@ _Shards = Annotated[
 
 
 class RunConfig(Section):
-    """How long, with how many samples, and where to."""
+    """Length, samples and output of a run."""
 
     name: Annotated[str, AfterValidator(check_name)] = Field(
         default="run", min_length=1, json_schema_extra=_without_default
     )
-    """Name of the run and of its folder, not a path, of at most 200 bytes; left out: the config file's name without its
-    suffix."""
+    """Name of the run and of its folder, at most 200 bytes. It is not a path. Default: the name of the config file
+    without its suffix."""
     output: WorkPath = Field(default=Path("runs"), validate_default=True)
-    """Folder of the run folders, relative to the working directory."""
-    iterations: Count = Field(default=200, description="Optimisation steps.")
+    """Folder for run folders, relative to the working directory."""
+    iterations: Count = Field(default=200, description="Number of optimisation steps.")
     max_seconds: Positive | None = None
-    """End the run before its last iteration, as finished, when these seconds are over. They count measuring what is
-    `auto`, compiling, steps and updates; they do not count loading, targets and saved images. The last iteration is the
-    one after which the mean iteration would take too long; the first one is always completed. `optimizer.schedule` ends
-    with the time or with the iterations, whichever comes first. Not with `stages`. null: no
-    limit."""
-    spp: Count = Field(default=16, description="Samples per pixel and step.")
-    seed: Seed = Field(default=0, description="Seed of the run; every other seed is made from it.")
+    """Time limit in seconds. The run ends, as finished, before the iteration that would exceed the limit if it took the
+    mean time of an iteration. The first iteration is always completed. The limit includes the measurement of automatic
+    settings, compiling, steps and updates, but not loading, targets and saved images. `optimizer.schedule` ends with
+    the time or with the iterations, whichever comes first. Not with `stages`. null: no limit."""
+    spp: Count = Field(default=16, description="Samples per pixel in each step.")
+    seed: Seed = Field(default=0, description="Seed of the run. All other seeds are derived from it.")
     adjoint: Literal["auto", "correlated", "independent", "batched", "others"] = "auto"
-    """Samples that the adjoint image dL/dI comes from: the batches before the one that is differentiated (`batched`), a
-    second set (`independent`, twice the paths), those of the gradient (`correlated`), or, where the samples of a view
-    are in `shards`, the other shards (`others`, each path traced twice; as `auto` where shards are whole views).
-    Gradients of `l2` and `relative_l2` are unbiased with all but `correlated`, with which the noise that both share
-    pulls parameters, mostly towards darker: a run says by how much, where a measurement before its first iteration can
-    see it. `l1` and `ssim` are biased with any of them, since noise in the image does not average out of their
-    derivatives; more samples help. A list of losses is as its entries are, and one of one's own as its
-    formula is. `auto`: `others` where it can be; else `batched` where `batches` divides `spp`, else `independent`."""
+    """Samples from which the adjoint image dL/dI is computed. `correlated`: the samples of the gradient itself.
+    `independent`: a second set of samples, which doubles the number of paths. `batched`: the batches before the one
+    that is differentiated. `others`: the other shards, if `shards` splits the samples of a view; each path is traced
+    twice. If shards are whole views, `others` acts like `auto`. Gradients of `l2` and `relative_l2` are unbiased with
+    all settings except `correlated`. With `correlated`, the noise that image and gradient share pulls parameters,
+    mostly towards darker values; a run reports by how much if its measurement before the first iteration can see it.
+    Gradients of `l1` and `ssim` are biased with all settings, because noise in the image does not average out of their
+    derivatives; more samples help. A list of losses has the bias of its entries, and your own loss that of its formula.
+    `auto`: `others` if it is possible, otherwise `batched` if `batches` divides `spp`, otherwise `independent`."""
     batches: Annotated[int, Field(ge=2)] = 4
-    """Batches of a step's samples, or of a shard's; with `adjoint: batched` it must divide them. Not with `correlated`
-    and `independent`."""
+    """Number of batches that the samples of a step, or of a shard, are split into. With `adjoint: batched` it must
+    divide them. Not with `correlated` and `independent`."""
     shards: _Shards = 1
-    """Parts that the samples of an iteration are split into, each with a seed of its own, whatever computes them: at
-    most as many as it has views, each is some of these; a multiple of that, each is a share of one view's samples
-    (`adjoint` and `batches` are then of a shard). Their gradients are added up in their order, in double precision.
-    `auto`: 16, or the most below that which these settings allow; whole views where only `scene.cameras` says how many
-    there are. 1: none.
-    Not in what measures single steps (`bench`, `gradcheck`, `convergence`, `inspect`, what is `auto`, `certainty`)."""
+    """Number of parts that the samples of an iteration are split into. Each part has its own seed, so that results do
+    not depend on the process that computes it. Up to the number of views, each shard has some of the views. A multiple
+    of the number of views gives each shard a part of the samples of one view; `adjoint` and `batches` then apply to
+    each shard. Gradients of shards are summed in order, in double precision. `auto`: 16, or the largest number below 16
+    that the settings allow; whole views if only `scene.cameras` tells their number. 1: no shards. Not used for single
+    steps (`bench`, `gradcheck`, `convergence`, `inspect`, the measurement of automatic settings, `certainty`)."""
     memory_budget: Memory | None = None
-    """Memory that the iterations may take, with what stands before them: a number of MiB, or text such as 512 MiB or
-    2GiB. The samples of a step are split into passes that fit. It covers what the backend's allocator gives out (the
-    scene's textures and buffers, targets, images of a step, parameters and what the optimiser keeps of them, what is
-    kept of paths; `peak_mib` in `metrics.jsonl` is that) and thread-local memory; not Python, libraries, the code of
-    kernels, the structure that rays are traced in, nor what targets and saved images take while they are rendered.
-    null: no limit but what is free. Only with integrator `reslrb`."""
+    """Memory limit of the iterations: a number of MiB, or text such as 512 MiB or 2GiB. The samples of a step are split
+    into passes that fit. The limit covers thread-local memory and all memory from the backend's allocator
+    (`peak_mib` in `metrics.jsonl`): the scene's textures and buffers, targets, images of a step, parameters and the
+    state of the optimiser, and stored paths. It does not cover Python, libraries, kernel code, the acceleration
+    structure, and the rendering of targets and saved images. null: the free memory. Only with integrator `reslrb`."""
     on_nonfinite: Literal["stop", "skip", "zero"] = "skip"
-    """What to do where a loss, its derivative, or a gradient is not finite. `stop`: end the run (exit code 5); `skip`:
-    leave the parameter as it is in this iteration, or all of them; `zero`: take such entries of a gradient or of the
-    loss's derivative for 0, and go on. No such value ever reaches a parameter; a run that comes to a standstill for 10
-    iterations ends."""
+    """Action if a loss, its derivative, or a gradient is not finite. `stop`: end the run (exit code 5). `skip`: leave
+    the parameter, or all parameters, unchanged in this iteration. `zero`: replace such entries of a gradient or of the
+    loss's derivative by 0 and continue. Values that are not finite never reach a parameter. A run without progress for
+    10 iterations ends."""
     images_every: Annotated[int, Field(ge=0)] = 0
-    """Iterations between two saved images; 0: only the initial and the final one."""
+    """Iterations between two saved images. 0: save only the initial and the final image."""
     final_spp: Count = 256
-    """Samples per pixel of the saved initial and final image, rounded up to whole passes of `samples_per_pass`."""
+    """Samples per pixel of the initial and the final image, rounded up to whole passes of `samples_per_pass`."""
     views_per_iteration: Count | None = None
-    """Views that an iteration renders, drawn anew each time by the run's seed; their loss is scaled so that its mean is
-    that of all. null: all of them."""
+    """Number of views that an iteration renders. Each iteration draws them at random by the run's seed, and scales
+    their loss so that its mean is the loss of all views. null: all views."""
     held_out: list[SensorName] = Field(default=[])
-    """Sensors whose views are not trained on, by index or id, which for those of `scene.cameras` is the image's name
-    without its suffix; their loss is recorded every 10 iterations (`held_out`), and of the first and the last image."""
+    """Sensors whose views are not used for training, by index or id. The id of a sensor in `scene.cameras` is the name
+    of its image without the suffix. The loss of these views is recorded every 10 iterations (`held_out`), and for the
+    first and the last image."""
     measuring: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.1
-    """What is `auto` in the integrator is measured before the first iteration. This is what all of that may take,
-    kernels that are compiled for it included, as a share of what the run itself is expected to take; first steps of
-    camera paths, which most runs need anyway, may take more. What there is no time for is decided by the scene's
-    features; 0: all of it, and nothing is measured."""
+    """Time limit for the measurement of automatic integrator settings (`auto`) before the first iteration, as a
+    fraction of the expected time of the run. It includes the compilation of kernels for the measurement. First steps of
+    camera paths, which most runs need anyway, may take longer. Settings that there is no time for are chosen by
+    features of the scene. 0: measure nothing."""
     accept_incomplete: bool = False
-    """Run although more than half of the loss's derivative is missing for a parameter that moves light. The derivative
-    lacks silhouettes and edges of shadows. A run measures their share before its first iteration, for `measuring` of
-    its samples, and refuses to begin if they are more than half of it; the steps could lead the other way. A parameter
-    that lacks a significant share gets the verdict `derivative incomplete`, and never `settled`."""
+    """Run even if more than half of the derivative of the loss is missing for a parameter that moves light. The
+    derivative lacks silhouettes and shadow edges. A run measures their share before its first iteration, with a
+    fraction `measuring` of its samples. By default it refuses to start if the share is more than half, because the
+    steps could go the wrong way. A parameter that lacks a significant share gets the verdict `derivative incomplete`,
+    and never `settled`."""
     certainty: bool = True
-    """After the last iteration, measure how certain the values are: their spread, and a verdict on each parameter.
-    Takes as long as some iterations, ten or so where parameters are few; runs of fewer than 20 iterations, and
-    interrupted ones, go without."""
+    """Whether to measure, after the last iteration, how certain the values are: their spread, and a verdict for each
+    parameter. This takes as long as some iterations, about ten if there are few parameters. Runs of fewer than 20
+    iterations and interrupted runs skip it."""
     checkpoint_every: CheckpointEvery = CheckpointEvery(seconds=30.0)
-    """When the state of the run is kept, for `reslrb optimize --resume`: `iterations` or `seconds` between two
-    checkpoints. Besides, before the first iteration and at the end, whatever ends it but a kill."""
+    """`iterations` or `seconds` between two checkpoints, for `reslrb optimize --resume`. A run also writes a checkpoint
+    before the first iteration and at its end, unless it is killed."""
     stages: list[Stage] = Field(default=[], max_length=16)
-    """How the run begins, in parts, from coarse to fine: resolution and film until a share of the iterations is done.
-    After the last of them it is as configured. Where resolution or film change, the optimizer begins anew, and so does
-    what `optimizer.scale` measures."""
+    """Coarser stages at the start of the run, from coarse to fine. Each reduces the resolution or the film until a
+    fraction of the iterations is done. After the last stage the run continues as configured. When resolution or film
+    change, the optimizer restarts, and the units of `optimizer.scale` are measured again."""
 
     stop: StopRule | None = None
-    """End the run before its last iteration, as finished, once its loss stands: that of held-out views where there are
-    any, else that of the iterations; with `schedule: plateau` not before the rate is at its least. At most 5 % of runs
-    are stopped whose loss still falls by more than `relative` a window. With the defaults, a run goes on for about 300
-    iterations after its loss stands where losses have 10 % noise, and for 500 at 30 %
-    ([method.md](method.md#when-a-loss-stands)). `{}`: the defaults. null: never."""
+    """End the run, as finished, before its last iteration if the loss has stopped falling. The test uses the loss of
+    held-out views if there are any, otherwise the loss of the iterations. With `schedule: plateau` the run ends only at
+    the smallest learning rate. At most 5 % of the runs end while the loss still falls by more than `relative` per
+    window. With the defaults, a run continues for about 300 iterations after its loss has stopped falling if losses
+    have 10 % noise, and for about 500 at 30 % ([method.md](method.md#when-a-loss-stands)). `{}`: the defaults. null:
+    never."""
 
     @model_serializer(mode="wrap")
     def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -229,5 +231,5 @@ class RunConfig(Section):
 
     @property
     def folder_name(self) -> str:
-        """The run's name as the name of a folder: what is no letter, digit, `.`, `_`, `+`, `=` becomes `-`."""
+        """The folder name for the run's name."""
         return folder_name(self.name)

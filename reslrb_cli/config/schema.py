@@ -1,6 +1,7 @@
-"""The configuration: one file is one experiment.
+"""The configuration. One file is one experiment.
 
-Units, defaults and meanings stand in the fields' descriptions; `scripts/make_reference.py` writes docs/config.md.
+The descriptions of the fields give units, defaults and meanings. `scripts/make_reference.py` writes docs/config.md from
+them.
 """
 
 from __future__ import annotations
@@ -56,69 +57,71 @@ def _scalar(value: Any) -> Any:
 
 
 class SceneConfig(Section):
-    """The scene and what it is seen through."""
+    """The scene and its cameras."""
 
     file: ConfigPath = Field(description="Mitsuba scene (XML, versions 0.5 to 3), relative to the config file.")
     options: dict[str, Annotated[bool | int | float | str, BeforeValidator(_scalar)]] = Field(default={})
     """Values of the scene file's `$name` variables."""
     size: Annotated[Size, few("pixels", ": each image of a step takes 12 bytes or more of every one")] | None = None
-    """[width, height] of the film of every sensor in pixels, without crop window; null: as the scene file has it. What
-    is seen stays the same where the ratio does."""
+    """[width, height] of the film of every sensor in pixels, without a crop window. The view stays the same if the
+    ratio does. null: the size in the scene file."""
     cameras: ConfigPath | None = None
-    """Cameras in place of the scene's own sensors: NeRF's `transforms.json`, or COLMAP's `images.txt` with
-    `cameras.txt` beside it; relative to the config file. Each is a view, unless `views` names some. Their images,
-    relative to that file, are the targets of views for which no other is named."""
+    """Cameras that replace the scene's sensors: NeRF's `transforms.json`, or COLMAP's `images.txt` with `cameras.txt`
+    beside it. The path is relative to the config file. Every camera is a view, unless `views` selects some. The images
+    that the file names, relative to it, are the targets of views without another target."""
 
 
 # --- solids -----------------------------------------------------------------------------------------------------------
 
 
 class Fabrication(Section):
-    """The solid behind a face of heights, in millimetres: what `reslrb export` makes of a run, and what it checks."""
+    """Solid of a lens or a mirror with a face of heights, in millimetres. `reslrb export` writes and checks it."""
 
-    kind: Literal["lens", "mirror"] = Field(default="lens", description="What the face does with light.")
+    kind: Literal["lens", "mirror"] = Field(default="lens", description="Whether the face refracts or reflects light.")
     faces: Annotated[
         list[Annotated[str, Field(min_length=1)]],
         Field(min_length=1, max_length=2),
         must(each_once, lambda _: "must name each mesh once"),
     ] = Field(default=["face"])
-    """Ids of the meshes that are its faces: the front, a grid about z = 0 with its outside towards +z, and where that
-    is free as well the back, a grid about z = -thickness with its outside towards -z. One alone: the back is flat."""
-    thickness: Positive = Field(description="From z = 0 down to the back, in mm.")
+    """Ids of the meshes of the faces. The first is the front: a grid about z = 0 that faces +z. The second is the back,
+    if it is free as well: a grid about z = -thickness that faces -z. With one id the back is flat."""
+    thickness: Positive = Field(description="Distance from z = 0 down to the back, in mm.")
     outline: Literal["rectangle", "round"] = "rectangle"
-    """`round`: the ellipse of this size; of the face what is outside is cut off."""
+    """Outline of the solid. `round`: the ellipse of the given size; the face outside of it is cut off."""
     size: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = None
-    """Width and height of the face in mm, about x = y = 0; null: as large as its mesh."""
-    rim: Annotated[float, Field(ge=0)] = Field(default=0.0, description="Width of a flat rim about the face, in mm.")
+    """Width and height of the face in mm, centred at x = y = 0. null: the size of its mesh."""
+    rim: Annotated[float, Field(ge=0)] = Field(default=0.0, description="Width of a flat rim around the face, in mm.")
     ior: Annotated[float, Field(gt=1, le=5)] = Field(default=1.49, description="Index of refraction of a lens.")
     tool_radius: Positive | None = None
-    """Radius of the ball that cuts the faces, in mm; it does not get into hollows that are narrower."""
-    min_thickness: Positive | None = Field(default=None, description="Least thickness that the material bears, in mm.")
-    sun: Annotated[float, Field(ge=0, lt=90)] = Field(default=0.53, description="Diameter of the light, in degrees.")
+    """Radius of the ball that cuts the faces, in mm. It does not reach into narrower hollows."""
+    min_thickness: Positive | None = Field(default=None, description="Smallest thickness for the material, in mm.")
+    sun: Annotated[float, Field(ge=0, lt=90)] = Field(
+        default=0.53, description="Angular diameter of the light source, in degrees."
+    )
     receiver: Annotated[str, Field(min_length=1)] = Field(
-        default="screen", description="Id of what the light falls on."
+        default="screen", description="Id of the shape that the light falls on."
     )
     picture: ConfigPath | None = None
-    """The picture as it was before its dark parts were lifted, as the film sees it: what is thrown is compared with
-    that, too. null: with the target alone."""
+    """The picture before its dark parts were lifted, as the film sees it. The result is compared with it as well as
+    with the target. null: only with the target."""
 
 
 class Config(Section):
-    """One experiment, checked; its paths are absolute."""
+    """One checked experiment. Its paths are absolute."""
 
     variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "llvm_ad_mono", "cuda_ad_mono"] = "auto"
-    """Mitsuba variant; `auto`: cuda_ad_rgb where Mitsuba can trace rays on it, else llvm_ad_rgb."""
+    """Mitsuba variant. `auto`: cuda_ad_rgb if Mitsuba can trace rays with it, otherwise llvm_ad_rgb."""
     scene: SceneConfig = Field(description="The scene and its sensors.")
-    target: TargetConfig = Field(description="What the image is compared with.")
+    target: TargetConfig = Field(description="The image to match.")
     views: Annotated[list[ViewSpec], Field(min_length=1)] | None = None
-    """Sensors, each with its target; what a view does not say is as `target` has it. null: the scene's first sensor,
-    with `scene.cameras` all of them."""
-    parameters: Annotated[list[ParameterSpec], Field(min_length=1)] = Field(description="What is recovered.")
-    integrator: AnyIntegrator = Field(default=ReslrbConfig(), description="How image and gradient are computed.")
-    loss: Losses = Field(default=L2(), description="How image and target are compared.")
-    optimizer: AnyOptimizer = Field(default=Adam(), description="How parameters follow their gradient.")
+    """Sensors, each with its target. Settings that a view leaves out are those of `target`. null: the first sensor of
+    the scene, or all of `scene.cameras`."""
+    parameters: Annotated[list[ParameterSpec], Field(min_length=1)] = Field(description="Parameters to recover.")
+    integrator: AnyIntegrator = Field(default=ReslrbConfig(), description="Method for image and gradient.")
+    loss: Losses = Field(default=L2(), description="Difference between image and target to minimise.")
+    optimizer: AnyOptimizer = Field(default=Adam(), description="Update rule of the parameters.")
     run: RunConfig = Field(default_factory=lambda: RunConfig(), description="Iterations, samples, seed and output.")
-    fabrication: Fabrication | None = Field(default=None, description="The solid that a lens or a mirror is made as.")
+    fabrication: Fabrication | None = Field(default=None, description="The solid of a lens or a mirror, to export.")
 
     _source: Path = PrivateAttr(default=Path("config.yaml"))
     _allows_code: bool = PrivateAttr(default=False)
@@ -126,8 +129,8 @@ class Config(Section):
 
     @property
     def adjoint(self) -> Literal["correlated", "independent", "batched"]:
-        """`run.adjoint` of a step, or a shard, by itself, with `auto` settled: batches where they divide the samples,
-        and the passes divide them. `others` is `independent` to who looks at one alone."""
+        """`run.adjoint` of a single step or shard, with `auto` resolved: `batched` if the batches divide the samples
+        and the passes divide the batches. `others` is `independent` for a single shard."""
         if self.in_rounds:
             return "independent"
         if self.run.adjoint != "auto" and self.run.adjoint != "others":
@@ -135,13 +138,13 @@ class Config(Section):
         return "batched" if self._splits(self.run.spp, self.run.batches) else "independent"
 
     def _splits(self, spp: int, sets: int) -> bool:
-        """Whether `spp` samples per pixel can be split into so many sets, their halves, and the passes of these."""
+        """Return whether `spp` samples per pixel can be split into this many sets, their halves, and their passes."""
         parts = sets * self.halves
         return spp % parts == 0 and _passes_divide(self.integrator, spp // parts)
 
     @property
     def drawn_views(self) -> int | None:
-        """How many views an iteration has; None where the scene alone says."""
+        """Number of views in an iteration; None if only the scene determines it."""
         if self.views is None and self.scene.cameras is not None:
             trained = None
         else:
@@ -151,7 +154,7 @@ class Config(Section):
 
     @property
     def shards(self) -> int:
-        """`run.shards`, with `auto` settled; of whole views the most that there are."""
+        """`run.shards` with `auto` resolved. For shards of whole views, the largest possible number."""
         asked = self.run.shards
         if asked != "auto":
             return asked
@@ -160,7 +163,7 @@ class Config(Section):
 
     @property
     def shares(self) -> int:
-        """How many shards the samples of each view are in; 1 where shards are whole views."""
+        """Number of shards of each view's samples; 1 if shards are whole views."""
         views, asked, spp = self.drawn_views, self.run.shards, self.run.spp
         if views is None:
             return 1
@@ -172,46 +175,46 @@ class Config(Section):
 
     @property
     def share_spp(self) -> int:
-        """Samples per pixel of a view that one shard has."""
+        """Samples per pixel of a view in one shard."""
         return self.run.spp // self.shares
 
     @property
     def in_rounds(self) -> bool:
-        """Whether a step is two rounds: the images of all shards, then their gradients."""
+        """Whether a step has two rounds: the images of all shards, then their gradients."""
         return self.run.adjoint in ("auto", "others") and self.shares > 1
 
     @property
     def losses(self) -> list[Loss]:
-        """The entries of `loss`, a single one as a list of it."""
+        """The entries of `loss` as a list, also if it is a single loss."""
         return losses_of(self.loss)
 
     @property
     def allows_code(self) -> bool:
-        """Whether files of the user's own code are run; no YAML can say so."""
+        """Whether Python files of the user may run. No setting in YAML changes it."""
         return self._allows_code
 
     @property
     def own_loss(self) -> Callable[..., Any] | None:
-        """The function that was handed over in place of a file (`loss.type: custom` without one)."""
+        """The function that was passed instead of a file (`loss.type: custom` without `file`)."""
         return self._own_loss
 
     def with_code(self, allowed: bool = True) -> Config:
-        """The same experiment, with the files of code that it names run, or not."""
+        """Return the same experiment, with or without permission to run the Python files that it names."""
         config = self.model_copy()
         config._allows_code = allowed
         return config
 
     def with_code_as(self, other: Config) -> Config:
-        """The same experiment, with what another is handed and allowed."""
+        """Return the same experiment, with the loss function and the permission of `other`."""
         config = self.with_code(other._allows_code)
         config._own_loss = other._own_loss
         return config
 
     def with_loss(self, loss: Callable[..., Any]) -> Config:
-        """The same experiment with a function for its loss.
+        """Return the same experiment with a function as its loss.
 
-        It is called as `loss(image, target)` of two `mi.TensorXf` (H, W, C), with `weights` third where it has room for
-        them, and returns a `mi.Float` of width 1 that Dr.Jit differentiates.
+        The function is called as `loss(image, target)` with two `mi.TensorXf` (H, W, C), and with `weights` as the
+        third argument if it takes three. It returns a `mi.Float` of width 1 that Dr.Jit differentiates.
         """
         config = self.model_copy(update={"loss": Custom(type="custom")})
         config._own_loss = loss
@@ -219,7 +222,7 @@ class Config(Section):
 
     @property
     def codes(self) -> dict[str, Custom | Own]:
-        """The losses and integrators that users have written, each with the key that names its file."""
+        """The user's own losses and integrators, by the key that names their file."""
         integrators: dict[str, Integrator | None] = {"integrator": self.integrator}
         if self.target.render is not None:
             integrators["target.render.integrator"] = self.target.render.integrator
@@ -228,30 +231,30 @@ class Config(Section):
 
     @property
     def halves(self) -> Literal[1, 2]:
-        """How many sets each set of a step's samples is made of: 2 where a loss needs two images (`scale: fitted`)."""
+        """Number of halves of each set of samples: 2 if a loss needs two images (`scale: fitted`)."""
         return 2 if any(loss.scale == "fitted" for loss in self.losses) else 1
 
     @property
     def by_pixel(self) -> bool:
-        """Whether every loss looks at each pixel by itself."""
+        """Whether every loss is a sum of functions of single pixels."""
         return all(loss.scale == "none" and loss.type not in ("ssim", "custom") for loss in self.losses)
 
     @property
     def set_spp(self) -> int:
-        """Samples per pixel of each set of a step's samples."""
+        """Samples per pixel of each set of samples in a step."""
         return self.share_spp // ((self.run.batches if self.adjoint == "batched" else 1) * self.halves)
 
     def samples_obstacle(self, pixels: int) -> str | None:
-        """Why the samples of a step cannot be traced with films of so many `pixels`, and what would be right."""
+        """Return why the samples of a step cannot be traced with films of `pixels` pixels, and what to change."""
         run, own = self.run, self.integrator.options().get("samples_per_pass")
         spp = self.set_spp
         if run.memory_budget is not None:
-            own = largest_pass(spp, pixels)  # passes are chosen
+            own = largest_pass(spp, pixels)  # a run chooses the passes
         obstacle = passes_obstacle(spp, own, pixels, splits=self.integrator.type in ("reslrb", "walk_ad", "trajectory"))
         return None if obstacle is None else f"{run.spp} {obstacle}"
 
     def with_exposures_fixed(self) -> Config:
-        """The experiment with exposures of 1 in place of recovered ones, for what looks at the scene alone."""
+        """Return the experiment with exposures of 1 instead of recovered ones, for uses of the scene alone."""
         target = self.target
         if isinstance(target.exposure, str):
             target = target.model_copy(update={"exposure": 1.0})
@@ -261,20 +264,19 @@ class Config(Section):
         return self.model_copy(update={"target": target, "views": views})
 
     def stage(self, number: int) -> Stage:
-        """The stage of that number; after the last one, the run as it is configured."""
+        """Return the stage of this number. After the last stage, return the run as configured."""
         return self.run.stages[number] if number < len(self.run.stages) else AS_CONFIGURED
 
     def stage_number(self, progress: float) -> int:
-        """The number of the stage that a run is in when this share (0 to 1) of it is done; of one whose stages are
-        over, or that has none, how many it has."""
+        """Return the number of the stage at `progress` (0 to 1) of the run; the number of stages after the last one."""
         return sum(progress >= stage.until for stage in self.run.stages)
 
     def without_stages(self) -> Config:
-        """Return the experiment as if one stage were all of its run."""
+        """Return the experiment without stages."""
         return self.model_copy(update={"run": self.run.model_copy(update={"stages": []})})
 
     def step_options(self, shard: bool = False) -> dict[str, Any]:
-        """What a gradient step is told of its samples, those of an iteration or of a `shard`."""
+        """Return the options of a gradient step about its samples, those of an iteration or of a `shard`."""
         options: dict[str, Any] = {"spp": self.share_spp if shard else self.run.spp, "adjoint": self.adjoint}
         if self.adjoint == "batched":
             options["batches"] = self.run.batches
@@ -284,11 +286,11 @@ class Config(Section):
 
     @property
     def source(self) -> Path:
-        """The file that this was loaded from, as the user named it."""
+        """The file of this configuration, as the user named it."""
         return self._source
 
     def __eq__(self, other: object) -> bool:
-        """Whether all settings agree, wherever they were loaded from."""
+        """Return whether all settings are equal. The files that they come from do not matter."""
         return isinstance(other, Config) and self.model_dump() == other.model_dump()
 
     __hash__ = None  # type: ignore[assignment]
@@ -296,7 +298,7 @@ class Config(Section):
     @model_validator(mode="before")
     @classmethod
     def _target_of_views(cls, data: Any) -> Any:
-        """Views, and cameras of a file, may have all that there is to say of targets."""
+        """Fill in an empty `target` if views or cameras may supply all targets."""
         if isinstance(data, dict) and data.get("target") is None:
             scene = data.get("scene")
             if data.get("views") is not None or (isinstance(scene, dict) and scene.get("cameras") is not None):
@@ -340,7 +342,7 @@ class Config(Section):
         return self
 
     def _check_standing(self) -> None:
-        """Raise an error, located, where windows of losses hold too few."""
+        """Raise a located error if the settings of `run.stop` or `run.max_seconds` contradict others."""
         stop = self.run.stop
         if stop is not None and self.run.held_out and stop.patience < 20:
             reason = f"must be at least 20, not {stop.patience}: held-out views are looked at every 10 iterations"
@@ -350,7 +352,7 @@ class Config(Section):
             raise located("run.max_seconds", reason)
 
     def _check_samples(self) -> None:
-        """Raise an error, located, where a step's samples cannot be split as the run's settings have it."""
+        """Raise a located error if the samples of a step cannot be split as configured."""
         _check_passes(self.integrator, self.run.spp, "integrator", "run.spp")
         self._check_shards()
         if self.scene.size is not None:
@@ -369,7 +371,7 @@ class Config(Section):
             self._check_halves()
 
     def _check_shards(self) -> None:
-        """Raise an error, located, where shards are neither whole views nor equal shares of one."""
+        """Raise a located error if shards are neither whole views nor equal parts of one view."""
         asked, views, spp = self.run.shards, self.drawn_views, self.run.spp
         if asked == "auto" or views is None:
             return
@@ -383,7 +385,7 @@ class Config(Section):
         _check_passes(self.integrator, self.share_spp, "integrator", "the samples of a shard")
 
     def _check_halves(self) -> None:
-        """Raise an error, located, where samples have no two halves, or a view has its brightness from two places."""
+        """Raise a located error if samples cannot be halved, or two settings scale the brightness of a view."""
         sets = (self.run.batches if self.adjoint == "batched" else 1) * self.shares
         if self.run.spp % (2 * sets):
             reason = f"must be a multiple of {2 * sets}, not {self.run.spp}: loss.scale: fitted takes samples in halves"
@@ -397,7 +399,7 @@ class Config(Section):
 
 
 def _passes_divide(integrator: Integrator, spp: int) -> bool:
-    """Whether `spp` samples per pixel can be split into the integrator's passes."""
+    """Return whether `spp` samples per pixel can be split into the integrator's passes."""
     per_pass = getattr(integrator, "samples_per_pass", None)
     return per_pass is None or spp % min(per_pass, spp) == 0
 

@@ -1,4 +1,4 @@
-"""What images are compared with: targets, the masks that leave pixels out of them, their exposures; and views."""
+"""The targets that images are compared with, their masks and exposures, and the views."""
 
 from __future__ import annotations
 
@@ -26,26 +26,27 @@ _KINDS = ("specular", "border", "clipped", "alpha")
 
 
 class Mask(Section):
-    """Which pixels of a target are left out, and what the others weigh.
+    """Pixels of a target that the loss leaves out, and weights of the others.
 
-    Kinds act on a target that is read from a file. `specular` and `border` are what light tracing lacks: they act where
-    one of the run's integrator and the target's traces from the light and the other does not, also on a rendered one.
+    `specular`, `border`, `clipped` and `alpha` apply to targets that are read from files. `specular` and `border` leave
+    out pixels that light tracing cannot render. They apply only if one of the run's integrator and the target's
+    integrator traces from the lights and the other one does not. In this case they also apply to rendered targets.
     Pixels of a file that are not finite are always left out.
     """
 
     file: ConfigPath | None = None
-    """Image of weights, of the target's size, relative to the config file: 0 leaves a pixel out. Values are taken as
-    they stand in it, of 8 and 16 bits as shares of the greatest; of several channels the mean."""
+    """Image of weights, with the size of the target, relative to the config file. 0 leaves a pixel out. Values are used
+    as stored; those of 8 and 16 bits are divided by the largest possible value. Several channels are averaged."""
     specular: bool = True
-    """Leave out pixels that see smooth glass or mirrors directly, which light tracing cannot render. Where shapes move,
+    """Leave out pixels that see smooth glass or mirrors directly. Light tracing cannot render them. If shapes move,
     each iteration finds these pixels anew."""
     border: bool = True
-    """Leave out pixels within the reconstruction filter's radius of the film's border, where light tracing is
+    """Leave out pixels within the radius of the reconstruction filter from the film's border, where light tracing is
     darker."""
     clipped: bool = True
-    """Leave out pixels of 8 and 16 bit files that are at the greatest value in any channel, and those that the film's
-    reconstruction filter mixes with them."""
-    alpha: bool = Field(default=True, description="Leave out pixels whose alpha is 0.")
+    """Leave out pixels of 8- and 16-bit files with the largest possible value in any channel, and the pixels that the
+    film's reconstruction filter mixes with them."""
+    alpha: bool = Field(default=True, description="Leave out pixels with an alpha of 0.")
 
 
 def _mask(value: Any) -> Any:
@@ -61,19 +62,19 @@ def _mask(value: Any) -> Any:
 
 
 class _OrText:
-    """For JSON Schema: a section, or text that stands for one."""
+    """For JSON Schema: a section, or text as its short form."""
 
     def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         return {"anyOf": [handler(core), {"type": "string"}]}
 
 
-#: `auto`, `none`, an image of weights, or a section that says what is left out.
+#: `auto`, `none`, an image of weights, or a section.
 AnyMask = Annotated[Mask, BeforeValidator(_mask), _OrText()]
 
 
 def _view_mask(value: Any) -> Any:
     if isinstance(value, dict) and {**value, "file": None} == {**dict.fromkeys(_KINDS, False), "file": None}:
-        return value  # as a run's own configuration has it
+        return value  # as in the config.yaml of a run
     if not isinstance(value, (str, Path, Mask)) or value == "auto":
         raise wrong("must be `none` or the path of an image of weights; which kinds are left out is in `target.mask`")
     return _mask(value)
@@ -92,7 +93,7 @@ def _exposure(value: Any) -> Any:
 
 _EXPOSURE = [{"type": "number", "exclusiveMinimum": 0}, {"enum": ["auto", "per_channel"]}]
 
-#: An exposure: a number, `auto` (recovered, one factor), or `per_channel` (recovered, one factor a channel).
+#: An exposure: a number, `auto` (one recovered factor), or `per_channel` (one recovered factor per channel).
 Exposure = Annotated[
     float | Literal["auto", "per_channel"],
     BeforeValidator(_exposure),
@@ -115,37 +116,39 @@ SensorName = Annotated[
 
 
 class Rendering(Section):
-    """A target that is rendered from the scene itself, with other parameter values."""
+    """A target that is rendered from the scene itself, with other values of its parameters."""
 
     parameters: Annotated[
         dict[str, Value],
         must(lambda values: all(values), lambda _: "must have keys that are not empty"),
     ] = Field(default={})
-    """True values by key, as in `parameters`: a number, a list of numbers, or an image file. Empty: the scene as it
-    stands."""
+    """True values by key, as in `parameters`. A value is a number, a list of numbers, or an image file. Empty: the
+    values in the scene file."""
     spp: Count = Field(default=1024, description="Samples per pixel of the target.")
     integrator: AnyIntegrator | None = None
-    """Integrator of the target; null: that of the run."""
+    """Integrator of the target. null: the integrator of the run."""
 
 
 class TargetConfig(Section):
-    """What the image is compared with: exactly one of `file` and `render`; views with own targets need none."""
+    """Target that the image is compared with: exactly one of `file` and `render`. If all views have their own targets,
+    neither is needed."""
 
     file: ConfigPath | None = None
-    """Target image (EXR, PNG, JPG, HDR), relative to the config file. It is turned as its EXIF orientation says, unless
-    `scene.cameras` is given. Several views have theirs in `views`."""
+    """Target image (EXR, PNG, JPG, HDR), relative to the config file. The image is turned by its EXIF orientation,
+    unless `scene.cameras` is given. With several views, set the `target` of each view instead."""
     color_space: ColorSpace = Field(default="auto", description=f"{COLOR_SPACE} Only with `file`.")
     truth: bool = False
-    """Whether files show the scene with its own values, as pictures of another renderer do: the error of each parameter
-    is then known and told. Only with files."""
+    """Whether the target files show the scene with the values in its scene file, as images of another renderer do. The
+    run then reports the error of each parameter. Only with files."""
     render: Rendering | None = Field(default=None, description="Render the target from the scene.")
     mask: AnyMask = Mask()
-    """Pixels that are left out of the loss, and what the others weigh: `auto` (all kinds are left out), `none`, the
-    path of an image of weights, alone, or a section that switches kinds off and may add weights."""
+    """Pixels that the loss leaves out, and weights of the others. `auto`: leave out all kinds of pixels below. `none`:
+    leave out none. The path of an image of weights: use only these weights. A section turns kinds off, and may add
+    weights."""
     exposure: Exposure = 1.0
-    """What the image is multiplied by before it is compared, target = exposure * image: a number, `auto` (recovered
-    with the parameters, one factor), or `per_channel` (recovered, one for each channel, which is white balance). All
-    views have the same; `views` may give each its own."""
+    """Factor of the image before it is compared: target = exposure * image. A number, `auto` (one factor, recovered
+    with the parameters), or `per_channel` (one recovered factor per channel, for the white balance). All views share
+    it, unless `views` gives a view its own."""
 
     @model_validator(mode="before")
     @classmethod
@@ -175,20 +178,21 @@ class TargetConfig(Section):
 
 
 class ViewSpec(Section):
-    """One view: a sensor of the scene, and what it is to see."""
+    """A view: a sensor of the scene, and its target."""
 
-    sensor: Annotated[int, Field(ge=0)] = Field(description="Index of the scene's sensor.")
+    sensor: Annotated[int, Field(ge=0)] = Field(description="Index of the sensor in the scene.")
     target: ConfigPath | None = None
-    """Target image, relative to the config file; null: rendered, as `target.render` says."""
+    """Target image, relative to the config file. null: rendered, as `target.render` describes."""
     mask: ViewMask | None = None
-    """What stands in place of `target.mask`: `none`, or the path of an image of weights, alone."""
-    weight: Positive = Field(default=1.0, description="The view's part of the loss, relative to the other views'.")
+    """Mask that replaces `target.mask`: `none`, or the path of an image of weights. null: `target.mask`."""
+    weight: Positive = Field(default=1.0, description="Weight of the view in the loss, relative to the other views.")
     exposure: Exposure | None = None
-    """As `target.exposure`, but recovered for this view alone where it is not a number."""
+    """As `target.exposure`, for this view. `auto` and `per_channel` recover an exposure for this view alone. null:
+    `target.exposure`."""
 
 
 def check_views(views: list[ViewSpec], scene: Any, target: TargetConfig) -> None:
-    """Raise an error, located, where views contradict each other or `target`."""
+    """Raise a located error if views contradict each other or `target`."""
     places: dict[int, int] = {}
     for number, view in enumerate(views):
         if places.setdefault(view.sensor, number) < number:

@@ -200,7 +200,7 @@ REFUSED = {
     ),
     "capacity": (
         ["integrator={estimator: reservoir, capacity: 1000000}"],
-        "integrator.capacity: must be at most 1024, not 1000000: each connection that is kept is code of its own",
+        "integrator.capacity: must be at most 1024, not 1000000: each stored connection adds code to the kernel",
     ),
     "depth": (
         ["integrator.max_depth=1000000"],
