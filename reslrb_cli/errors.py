@@ -103,13 +103,13 @@ class NonFinite(ReslrbError):
 
 
 class MachineError(ReslrbError):
-    """The machine failed, whatever the user asked for: a full disk, a folder that has gone, a driver."""
+    """Failure of the machine that no setting causes: a full disk, a removed folder, a driver error."""
 
     exit_code = ExitCode.MACHINE
 
 
-#: What backends, the C++ library, the loader and NumPy write where memory is out. The last is what Dr.Jit says of the
-#: address that stands for a mapping that failed, when it tidies up.
+#: Phrases in out-of-memory messages of the backends, the C++ library, the loader and NumPy. Dr.Jit writes the last one
+#: during cleanup, for the address of a failed mapping.
 _MEMORY_WORDS = (
     "out of memory", "bad alloc", "cannot allocate memory", "could not allocate", "unable to allocate",
     "failed to map segment", "unknown address <0xffffffffffffffff>",
