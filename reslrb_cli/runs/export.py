@@ -376,7 +376,7 @@ def choose_integrator(
     if paths != "light":
         return {"type": "path", **options}, ""
     sensor = scene.sensors()[choose_sensors(config, scene)[0]]
-    # DEEPEST as the roulette depth, because roulette does not change the mean image.
+    # DEEPEST passes the depth check, which is about roulette: roulette does not change the mean image.
     why = ptracer_image(Situation.of(scene, sensor, params, DEEPEST, config.integrator.hide_emitters))
     if why is None or config.integrator.type == "ptracer":
         return {"type": "ptracer", **options}, ""

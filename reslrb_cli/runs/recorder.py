@@ -226,7 +226,7 @@ class Recording:
                 failure = failure or error
         if failure is not None:
             status = Status.FAILED
-        elif status is Status.FINISHED:  # a user who interrupts does not want to wait
+        elif status is Status.FINISHED:  # an interrupt must not wait; `reslrb report` finds the image errors, too
             self._add("how certain the values are was", self._measure_certainty)
             self._add("errors as people see them were", self._measure_seen_errors)
             if self.problem.config.fabrication is not None:
