@@ -223,7 +223,7 @@ class SweepRowRecord(Line):
 
 @dataclass(frozen=True)
 class SweepBestRecord(Line):
-    """Combination with the lowest median of `of` (`loss` or `error`), over the `seeds` seeds that all combinations have.
+    """Combination with the lowest median of `of` (`loss` or `error`), over the `seeds` seeds common to all.
 
     Combinations that differ only in learning rates are compared at their best rate. Wilcoxon's signed-rank test on
     pairs of the same seed finds a difference from those in `beats`, and none from those in `tied`. `second` has the
