@@ -207,7 +207,7 @@ def _about(results: Mapping[str, Any], key: str) -> dict[str, Any]:
 IMPROVED = 0.9
 
 #: In a run too short to know the noise of its loss, the loss of the saved images rose if it grew by more than the first
-#: factor. A target is noisy if it has fewer samples than this number of steps.
+#: factor. A target is noisy if it has fewer samples than the second number of steps together.
 ROSE_IF_SHORT, FEW_STEPS = 1.1, 16
 
 #: Losses of runs with fewer iterations are not judged.
@@ -330,7 +330,7 @@ def terminal_width() -> int:
 
 
 def parameter_lines(results: Mapping[str, Any], width: int) -> list[str]:
-    """Return values at start and end, true values, errors, spreads and verdicts, in lines of at most `width` characters.
+    """Return values at start and end, true values, errors, spreads and verdicts, in lines of `width` characters or less.
 
     Textures are shown as mean and range. The lines form a table if it fits, otherwise one block per parameter.
     `results` is the result of `Results.to_json`.
