@@ -1,10 +1,16 @@
 """Gradients through light paths: reservoir light replay backpropagation on Mitsuba 3.
 
-`import reslrb_cli` needs no variant and loads no Mitsuba. Import it before Mitsuba: it chooses the libLLVM that Dr.Jit
-will load. `optimize(...)` recovers parameters in a loop of one's own, `render`, `gradient`, `gradcheck`, `convergence`
-and `export` are what the commands do, of an experiment that `load` reads. `register()` makes the plugins known to
-Mitsuba, `load_scene(...)` gives a scene whose parameters are named as on the command line, `step(...)` is one gradient
-step. All that is public stands in `__all__`.
+`import reslrb_cli` needs no variant and does not load Mitsuba. Import it before Mitsuba: it chooses the libLLVM that
+Dr.Jit loads.
+
+- `load` reads an experiment.
+- `optimize` recovers parameters in your own loop.
+- `render`, `gradient`, `gradcheck`, `convergence` and `export` run the commands of the same name on an experiment.
+- `register` registers the plugins with Mitsuba.
+- `load_scene` loads a scene whose parameters have the same names as on the command line.
+- `step` computes one gradient step.
+
+`__all__` lists the public names.
 """
 
 from __future__ import annotations
@@ -15,7 +21,7 @@ import sys
 
 _is_program = bool(sys.argv) and os.path.basename(sys.argv[0]) == "reslrb"
 if _is_program and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    # Until its command line can answer, Ctrl-C ends the program without a traceback: also during the imports below.
+    # Ctrl-C during the imports below must end the program without a traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import importlib  # noqa: E402
@@ -53,7 +59,7 @@ __all__ = [
     "step",
 ]
 
-# Dr.Jit loads libLLVM on a thread of its own while it is being imported: later is too late.
+# Dr.Jit loads libLLVM on another thread during its import, so the choice must be made before.
 _llvm.prepare()
 
 _LAZY = {
@@ -72,7 +78,7 @@ _LAZY = {
 
 
 def __getattr__(name: str) -> Any:
-    """Loads a public name that needs Mitsuba when it is first asked for."""
+    """Import a public name on first access, because most of them need Mitsuba."""
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, its_name = _LAZY[name]

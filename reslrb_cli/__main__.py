@@ -1,4 +1,4 @@
-"""`python -m reslrb_cli` does what `reslrb` does."""
+"""Entry point of `python -m reslrb_cli`, which is the same as `reslrb`."""
 
 from reslrb_cli.cli import run
 

@@ -1,30 +1,29 @@
-"""The errors that reach a user: one located line and an exit code each, never a traceback."""
+"""The errors that users see. Each has an exit code and one line that names its location, never a traceback."""
 
 from __future__ import annotations
 
 import enum
 import errno
 
-#: Characters of a message, and of the file or key that it names: a few lines of a terminal. What a message quotes may
-#: be as long as a file; of longer text the two ends are shown.
+#: Maximum length of a message, and of the file or key that it names. Quoted text can be as long as a file, so longer
+#: text is shortened in the middle.
 MESSAGE_LENGTH = 600
 PLACE_LENGTH = 300
 LINE_LENGTH = MESSAGE_LENGTH + 2 * PLACE_LENGTH
 
 
 def printable(text: object) -> str:
-    """`text` with every character that a terminal or a page would obey, and not show, as an escape such as `\\x1b`.
+    """Return `text` with every unprintable character replaced by an escape such as `\\x1b`.
 
-    These are control characters (a file's name may hold them, and with them commands to the terminal), marks that turn
-    the direction of writing, line breaks, and halves of surrogate pairs, by which Python holds bytes that are no UTF-8.
-    Letters of every script stay.
+    This covers control characters (a file name may contain terminal commands), marks that change the writing direction,
+    line breaks, and the surrogates that Python uses for bytes that are not UTF-8. Letters of all scripts are unchanged.
     """
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
 
 
 def one_line(text: object, most: int = MESSAGE_LENGTH) -> str:
-    """`text` as one printable line of at most `most` characters; of a longer one both ends, with `...` between."""
-    line = " ".join(_shorten(str(text), 8 * most).split())  # first, so that a long text takes no time
+    """Return `text` as one printable line of at most `most` characters; `...` replaces the middle of a longer line."""
+    line = " ".join(_shorten(str(text), 8 * most).split())  # shortened first, because splitting a long text is slow
     return _shorten(printable(_shorten(line, most)), most)
 
 
@@ -49,7 +48,7 @@ class ExitCode(enum.IntEnum):
 
 
 class ReslrbError(Exception):
-    """Base of all errors that `reslrb` reports itself; `str()` of one is the line that the user sees."""
+    """Base class of all errors that `reslrb` reports itself; `str(error)` is the line that the user sees."""
 
     exit_code: ExitCode = ExitCode.USAGE
 
@@ -58,10 +57,10 @@ class ReslrbError(Exception):
 
 
 class ConfigError(ReslrbError):
-    """Wrong configuration or input, located by file and key.
+    """Error in the configuration or the input, located by file and key.
 
-    `source` is the file as the user named it, `key` the place in it (`parameters[0].bounds`; empty for the file as a
-    whole), `message` says what is wrong and what would be right.
+    `source` is the file as the user named it. `key` is the place in the file, such as `parameters[0].bounds`, or empty
+    for the whole file. `message` says what is wrong and how to correct it.
     """
 
     exit_code = ExitCode.USAGE
@@ -73,9 +72,9 @@ class ConfigError(ReslrbError):
 
 
 class UnsupportedScene(ReslrbError):
-    """A scene that light tracing cannot render, or differentiate; the message gives the reason.
+    """Scene that light tracing cannot render or differentiate; the message gives the reason.
 
-    `option` is the setting that is to blame, where one is (`estimator`).
+    `option` is the setting that causes the error, such as `estimator`, or empty.
     """
 
     exit_code = ExitCode.USAGE
@@ -86,31 +85,31 @@ class UnsupportedScene(ReslrbError):
 
 
 class BackendError(ReslrbError):
-    """No usable CUDA device or libLLVM; the message says what to install."""
+    """Missing CUDA device or libLLVM; the message says what to install."""
 
     exit_code = ExitCode.BACKEND
 
 
 class OutOfMemory(ReslrbError):
-    """The device or the host ran out of memory."""
+    """Exhausted memory of the device or the host."""
 
     exit_code = ExitCode.OUT_OF_MEMORY
 
 
 class NonFinite(ReslrbError):
-    """A value that must be finite is not; raised before it reaches a parameter."""
+    """Value that must be finite but is not; raised before it reaches a parameter."""
 
     exit_code = ExitCode.NON_FINITE
 
 
 class MachineError(ReslrbError):
-    """The machine failed, whatever the user asked for: a full disk, a folder that has gone, a driver."""
+    """Failure of the machine that no setting causes: a full disk, a removed folder, a driver error."""
 
     exit_code = ExitCode.MACHINE
 
 
-#: What backends, the C++ library, the loader and NumPy write where memory is out. The last is what Dr.Jit says of the
-#: address that stands for a mapping that failed, when it tidies up.
+#: Phrases in out-of-memory messages of the backends, the C++ library, the loader and NumPy. Dr.Jit writes the last one
+#: during cleanup, for the address of a failed mapping.
 _MEMORY_WORDS = (
     "out of memory", "bad alloc", "cannot allocate memory", "could not allocate", "unable to allocate",
     "failed to map segment", "unknown address <0xffffffffffffffff>",
@@ -118,19 +117,19 @@ _MEMORY_WORDS = (
 
 
 def mentions_memory(text: str) -> bool:
-    """Whether a message, known by its text alone, says that an allocation failed."""
+    """Whether the text of a message says that an allocation failed."""
     text = text.lower().replace("_", " ")
     return any(words in text for words in _MEMORY_WORDS)
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether an exception, ours or a backend's, says that an allocation failed."""
+    """Whether an exception of `reslrb` or of a backend says that an allocation failed."""
     if isinstance(error, MemoryError | OutOfMemory) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return True
     return isinstance(error, RuntimeError | ImportError) and mentions_memory(str(error))
 
 
-#: Errors of files that say nothing about what the user chose: no room, a device or a server that does not answer.
+#: File errors that no choice of the user causes: a full disk, a device or a server that does not answer.
 _MACHINE_ERRNOS = {
     number
     for name in (
@@ -140,7 +139,7 @@ _MACHINE_ERRNOS = {
     if (number := getattr(errno, name, None)) is not None
 }  # fmt: skip
 
-#: How Dr.Jit's messages about a driver or a compiler begin, and what CUDA and OptiX call their errors.
+#: Beginnings of Dr.Jit's messages about a driver or a compiler, and prefixes of CUDA and OptiX error names.
 _DRIVER_WORDS = (
     "cuda_check()", "jit_optix_check()", "jit_cuda_compile()", "jit_optix_compile()", "jit_llvm_compile()",
     "CUDA_ERROR_", "OPTIX_ERROR_",
@@ -148,7 +147,7 @@ _DRIVER_WORDS = (
 
 
 def is_machine_fault(error: BaseException) -> bool:
-    """Whether an exception, ours or another's, says that the machine failed; one about memory does not."""
+    """Whether an exception says that the machine failed; out-of-memory errors do not count."""
     if isinstance(error, MachineError):
         return True
     if isinstance(error, OSError):
@@ -156,12 +155,12 @@ def is_machine_fault(error: BaseException) -> bool:
     return isinstance(error, RuntimeError) and any(word in str(error) for word in _DRIVER_WORDS)
 
 
-#: Characters that are shown of what a library says.
+#: Maximum length of a quoted library message.
 QUOTED_LENGTH = 200
 
 
 def tell(error: BaseException) -> tuple[str, int] | None:
-    """The line and the exit code for `error`; None for a fault of ours, whose traceback is wanted."""
+    """Return the line and the exit code for `error`, or None for a bug, which needs its traceback."""
     if isinstance(error, ReslrbError):
         return str(error), error.exit_code
     if isinstance(error, KeyboardInterrupt):
@@ -178,7 +177,7 @@ def tell(error: BaseException) -> tuple[str, int] | None:
 
 
 def describe(error: BaseException) -> str:
-    """One printable line for `error`, whatever it is."""
+    """Return one printable line for any exception."""
     told = tell(error)
     if told is None:
         return f"{type(error).__name__}: {one_line(error, QUOTED_LENGTH)}".rstrip(": ")

@@ -1,4 +1,4 @@
-"""Statistics that several rows have need of."""
+"""Statistics that several modules share."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ Array = np.ndarray[Any, Any]
 
 
 def jackknife_variance(without: Array) -> Array:
-    """The variance (...) of an estimate, by its values (N, ...) with each of N independent samples left out in turn.
+    """Return the jackknife variance (...) of an estimate; its square root is the standard error.
 
-    Efron, The Jackknife, the Bootstrap and Other Resampling Plans, 1982: its root is the standard error.
+    `without` (N, ...) holds the estimates with each of N independent samples left out in turn.
+    Source: Efron, The Jackknife, the Bootstrap and Other Resampling Plans, 1982.
     """
     count = len(without)
     return np.asarray((count - 1) / count * np.sum(np.square(without - without.mean(axis=0)), axis=0))
 
 
 def rms(values: Array) -> float:
-    """The root mean square of all entries, in double precision."""
+    """Return the root mean square of all entries, in double precision."""
     return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))
 
 
 def sum_of_squares(values: Array) -> float:
-    """The sum of the squares of all entries, in double precision."""
+    """Return the sum of the squares of all entries, in double precision."""
     return float(np.sum(np.square(values, dtype=np.float64)))

@@ -1,3 +1,3 @@
-"""The version of the package: a file of its own, which everything may know."""
+"""The version of the package, in a module that every other module can import."""
 
 __version__ = "0.1.0"

@@ -1,4 +1,4 @@
-"""What a script or a notebook calls: the commands as functions, with arrays and records for files and lines.
+"""Python interface for scripts and notebooks: the commands as functions that return arrays and records.
 
-`reslrb_cli.__all__` names what of it is public; docs/python.md is written of its docstrings.
+`reslrb_cli.__all__` lists the public names. The reference in docs/python.md is generated from their docstrings.
 """

@@ -1,8 +1,8 @@
-"""Experiments of a script: loaded from wherever they are described, and looked at in single calls.
+"""Functions of the Python interface that take an experiment and return a result in one call.
 
-- `load`: a configuration, of a file, a mapping or a run's folder.
-- `render`, `gradient`, `gradcheck`, `convergence`, `export`: the commands, or what they are made of, as functions.
-- `held`: an interrupt that waits until it is safe to stop.
+- `load`: read a configuration from a file, a mapping or a run folder.
+- `render`, `gradient`, `gradcheck`, `convergence`, `export`: the commands, or parts of them, as functions.
+- `held`: delay an interrupt until it is safe to stop.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from reslrb_cli.records.measurements import GradcheckRecord
 from reslrb_cli.records.run_folder import recovered
 
 Array: TypeAlias = "np.ndarray[Any, np.dtype[np.float32]]"
-#: Whatever describes an experiment: a configuration's file, a run's folder, what YAML would have been, or a `Config`.
+#: Description of an experiment: a configuration file, a run folder, a mapping with the content of YAML, or a `Config`.
 Experiment: TypeAlias = "Config | str | os.PathLike[str] | Mapping[str, Any]"
 
-#: What errors say of an experiment that was no file.
+#: Name in error messages of an experiment that is not a file.
 NAMELESS = "<dict>"
 
-#: What errors advise on the command line, and what that is in a script.
+#: Advice in error messages on the command line, and its replacement in a script.
 ARGUMENTS = {
     "add --set run.output=FOLDER": "give folder=FOLDER",
     "--allow-code has it run": "allow_code=True has it run, or the experiment `load(...).with_code()`",
@@ -51,11 +51,10 @@ logger = logging.getLogger(__name__)
 
 @contextlib.contextmanager
 def held() -> Iterator[Callable[[], bool]]:
-    """Have Ctrl-C, and a notebook's interrupt, wait until the block is done, which then raises KeyboardInterrupt.
+    """Delay Ctrl-C and a notebook's interrupt until the end of the block, then raise KeyboardInterrupt.
 
-    In the midst of what Mitsuba and Dr.Jit are doing it would end in a crash, or in an error that names something else.
-    Yields what says whether one waits, for blocks that take long. In another thread than the main one, and within
-    another such block, nothing is done.
+    An interrupt inside Mitsuba or Dr.Jit would cause a crash or an unrelated error. Yields a function that says whether
+    an interrupt is waiting, for long blocks. Does nothing outside of the main thread and inside another such block.
     """
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or before is not signal.default_int_handler:
@@ -78,7 +77,7 @@ def held() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def called() -> Iterator[Callable[[], bool]]:
-    """The same, with errors of what is a command's option located by the argument, which has its name."""
+    """Do the same as `held`, and rename command-line options in a ConfigError to the arguments of the function."""
     with held() as stop:
         try:
             yield stop
@@ -97,23 +96,27 @@ def load(
     overrides: Mapping[str, object] | None = None,
     base: str | os.PathLike[str] | None = None,
 ) -> Config:
-    """The experiment that a file, a mapping or a run describes, checked, with every default.
+    """Load and check an experiment, and fill in the defaults.
 
-    `experiment` is a YAML file; a mapping that is what YAML would have been (paths, tuples, and NumPy's numbers and
-    arrays may stand in it); the folder of a run, whose parameters then begin where the run has brought them; or a
-    `Config`. `overrides` are values by key, as `--set` names them: `{"run.iterations": 5, "parameters[0].bounds": [0,
-    1]}`. Paths are relative to the file, those of a mapping to `base`, the working directory unless it is given.
+    `experiment` is one of:
 
-    Nothing that the experiment names is opened yet, and no Mitsuba variant is set.
+    - a YAML file;
+    - a mapping with the same content as a YAML file (paths, tuples and NumPy numbers and arrays are allowed);
+    - a run folder: the parameters then start from the values that the run has reached;
+    - a `Config`.
 
-    Raises ConfigError, located by file and key, for what is unknown, missing or of a wrong kind; an override that is at
-    fault is located by `overrides`.
+    `overrides` maps keys to values, with the keys of `--set`: `{"run.iterations": 5, "parameters[0].bounds": [0, 1]}`.
+    Paths in a file are relative to the file. Paths in a mapping are relative to `base`, by default the working
+    directory. The files that the experiment names are not opened, and no Mitsuba variant is set.
+
+    Raises ConfigError, located by file and key, if a key is unknown or missing or a value has a wrong type. Errors in
+    an override are located by `overrides`.
     """
     return load_with(experiment, loader.overrides_of(overrides), base)
 
 
 def load_with(experiment: Experiment, put_in: Sequence[Override], base: str | os.PathLike[str] | None = None) -> Config:
-    """The same with overrides that were read already."""
+    """Do the same as `load`, with overrides that are already parsed."""
     if isinstance(experiment, Config):
         return loader.changed(experiment, put_in)
     if isinstance(experiment, Mapping):
@@ -134,14 +137,16 @@ def render(
     values: Mapping[str, Any] | None = None,
     initial: bool = True,
 ) -> dict[int, Array]:
-    """The image of each view's sensor, by its index: (height, width, channels) float32, in linear units of radiance.
+    """Render every view of an experiment and return the images by sensor index.
 
-    The scene is rendered by the experiment's integrator with `spp` samples per pixel (`run.spp` unless it is given);
-    its parameters have their initial values, of a run those that it recovered. `values` are taken in their place, by
-    key: arrays of the parameter's shape, or what NumPy makes such of, as a number; what is not named stays. With
-    `initial=False` the scene is as it stands in its file.
+    Images are (height, width, channels) float32, in linear radiance. The experiment's integrator renders them with
+    `spp` samples per pixel (default: `run.spp`).
 
-    Sets the Mitsuba variant of the experiment where none is set. Raises ConfigError, also where another one is set, and
+    The parameters have their initial values, or for a run folder the recovered values. `values` replaces them by key:
+    each value is an array of the parameter's shape, or a number or list that NumPy converts to one. Parameters that
+    `values` does not name are unchanged. With `initial=False` the scene is rendered as it is in its file.
+
+    Sets the experiment's Mitsuba variant if none is set. Raises ConfigError (also if another variant is set) and
     UnsupportedScene.
     """
     with called():
@@ -167,14 +172,17 @@ def gradient(
     spp: int | None = None,
     seed: int | None = None,
 ) -> tuple[float, dict[str, Array]]:
-    """The loss of an experiment and its gradient by key, each in its parameter's shape and per its unit, float32.
+    """Return the loss of an experiment and its gradients by key.
 
-    It is that of the first iteration of a run: of the images that `run.adjoint` takes, at the parameters' initial
-    values, or at `values`, as for `render`. `spp` stands in for `run.spp`, and `seed` for the `run.seed` of the
-    samples; the target, and what is measured before (`guiding: auto`, ...), stay those of the experiment.
-    Regularizers are in the gradient, and not in the loss. Entries that are not finite are left as they are.
+    Each gradient is float32 and has the shape of its parameter, per unit of the parameter. The result equals that of
+    the first iteration of a run, including the images that `run.adjoint` selects. The parameters have their initial
+    values, or `values` as for `render`.
 
-    Sets the Mitsuba variant of the experiment where none is set. Raises ConfigError, UnsupportedScene.
+    `spp` replaces `run.spp`. `seed` replaces `run.seed` for the samples only: the target and the measurements before
+    the first iteration (`guiding: auto`, ...) still use the experiment's seed. Regularizers contribute to the gradient
+    but not to the loss. Entries that are not finite are returned unchanged.
+
+    Sets the experiment's Mitsuba variant if none is set. Raises ConfigError and UnsupportedScene.
     """
     with called():
         config = load(experiment, None if spp is None else {"run.spp": spp})
@@ -203,16 +211,22 @@ def gradcheck(
     integrators: str | None = None,
     allow_code: bool = False,
 ) -> list[GradcheckRecord]:
-    """The comparisons of `reslrb gradcheck`, one record each, as `--json` writes them (docs/gradcheck.md).
+    """Compare gradients with independent references, as `reslrb gradcheck` does (docs/gradcheck.md).
 
-    `estimators` is the list that `--estimators` takes (all four, unless it is given), `budget` the seconds for the
-    whole, `seeds` their number whatever time they take, at least 3, `spp` the samples per pixel of one gradient.
-    `record.holds` is False where a comparison fails. `integrators` are Mitsuba integrators of your own,
-    `FILE.py:CLASS[(OPTION=VALUE,...)]`, in place of ours; `allow_code` has their files run (docs/your_integrator.md).
-    How noisy and dear they are, and where to look in one that is wrong, is logged (`logging.INFO`). An interrupt ends
-    it after the gradient that is at work, in KeyboardInterrupt.
+    Returns one record per comparison, with the fields that `--json` writes. `record.holds` is False if the comparison
+    fails.
 
-    Sets the Mitsuba variant of the experiment where none is set. Raises ConfigError, UnsupportedScene.
+    - `estimators`: a list as for `--estimators` (default: all four).
+    - `budget`: total time in seconds.
+    - `seeds`: number of seeds, at least 3, regardless of `budget`.
+    - `spp`: samples per pixel of one gradient.
+    - `integrators`: your own Mitsuba integrators, `FILE.py:CLASS[(OPTION=VALUE,...)]`, which are checked instead of
+      those of `reslrb` (docs/your_integrator.md). The log (`logging.INFO`) reports their noise and cost, and hints for
+      an integrator that is wrong.
+    - `allow_code`: permit running the code of these files.
+
+    An interrupt stops the check after the current gradient and raises KeyboardInterrupt. Sets the experiment's Mitsuba
+    variant if none is set. Raises ConfigError and UnsupportedScene.
     """
     began = time.monotonic()
     with called() as stop:
@@ -225,7 +239,7 @@ def gradcheck(
         from reslrb_cli.measure.gradcheck import Gradcheck
         from reslrb_cli.measure.participants import settings_of
 
-        gc.collect()  # scenes that are done with would take part, and their parameters' gradients be in the way
+        gc.collect()  # earlier scenes and the gradients of their parameters would otherwise take part in the check
         checked = settings_of(config, estimators, budget, seeds, spp, time.monotonic() - began, integrators)
         check = Gradcheck(checked)
         records = [result.record for result in check.run(stop, logger.info)]
@@ -247,15 +261,19 @@ def convergence(
     reference: str | None = None,
     allow_code: bool = False,
 ) -> list[Line]:
-    """What `reslrb convergence --json` writes: points, methods, references, and a sentence (docs/convergence.md).
+    """Measure how fast the error of each method falls, as `reslrb convergence` does (docs/convergence.md).
 
-    The arguments are the command's options: `integrators` and `reference` as `--integrators` and `--reference` take
-    them, `budget` the seconds for the whole, `rounds` the number of turns whatever time they take, `spps` samples per
-    pixel that are compared; `allow_code` has the files of integrators of your own run. Each method computes in a
-    process of its own, under the experiment's variant; none is set in this one. An interrupt ends it soon, in
-    KeyboardInterrupt.
+    Returns the records that `--json` writes: points, methods, references and a summary sentence. The arguments are the
+    options of the command:
 
-    Raises ConfigError.
+    - `integrators`, `reference`: as for `--integrators` and `--reference`.
+    - `budget`: total time in seconds.
+    - `rounds`: number of rounds, regardless of `budget`.
+    - `spps`: sample counts per pixel to compare.
+    - `allow_code`: permit running the files of your own integrators.
+
+    Each method runs in its own process with the experiment's variant; this process sets none. An interrupt stops the
+    measurement soon and raises KeyboardInterrupt. Raises ConfigError.
     """
     began = time.monotonic()
     with called() as stop:
@@ -287,13 +305,14 @@ def convergence(
 
 
 def export(run: str | os.PathLike[str], folder: str | os.PathLike[str], tolerances: bool = False) -> Path:
-    """Write the scene of a run with the values that it recovered, for Mitsuba alone; returns the path of `scene.xml`.
+    """Write the scene of a run with the recovered values for plain Mitsuba, and return the path of `scene.xml`.
 
-    `run` is the run's folder, `folder` one that does not exist yet, or is empty. Of a lens or a mirror it also holds
-    the solid, in millimetres, and with `tolerances` what the scene throws where something is not as planned, as
-    `reslrb export` has it. `mi.load_file` reads what is returned.
+    `run` is the run folder. `folder` must not exist or must be empty. `mi.load_file` loads the returned file.
 
-    Sets the Mitsuba variant of the run's experiment where none is set. Raises ConfigError, UnsupportedScene.
+    For a lens or a mirror, the folder also holds the solid in millimetres. `tolerances` adds the effect of deviations
+    from the plan on the image, as `reslrb export` does.
+
+    Sets the experiment's Mitsuba variant if none is set. Raises ConfigError and UnsupportedScene.
     """
     with called():
         begun = "the folder of a run, which `optimize(..., folder=...)` makes as its loop begins"

@@ -1,4 +1,4 @@
-"""A run that is watched: a progress bar, and in a notebook a figure that is kept current."""
+"""Live view of a run: a progress bar and, in a notebook, a figure that is updated."""
 
 from __future__ import annotations
 
@@ -25,8 +25,11 @@ Array: TypeAlias = "np.ndarray[Any, Any]"
 def watched(
     records: Generator[Record, None, None], total: int, done: int, meter: ErrorMeter, draw: Callable[[], bytes] | None
 ) -> Iterator[Record]:
-    """The `records`, each shown in a bar of `total` iterations, of which some are `done`; and in a notebook, now and
-    then, the PNG that `draw` makes. Both are as of the last iteration when the loop ends, however it does."""
+    """Yield `records` and show the progress.
+
+    A bar counts from `done` to `total` iterations. In a notebook, the PNG that `draw` returns is updated now and then.
+    When the loop ends, for whatever reason, both show the last iteration.
+    """
     show = None if draw is None else _notebook()
 
     def refresh() -> None:
@@ -44,12 +47,12 @@ def watched(
                 yield record
         finally:
             if seen:
-                with contextlib.suppress(Exception):  # the run is what counts
+                with contextlib.suppress(Exception):  # a figure that cannot be drawn must not end the run
                     refresh()
 
 
 def _notebook() -> Callable[[bytes], None] | None:
-    """What shows a PNG in the notebook's cell, in the place of the one before; None outside of a notebook."""
+    """Return a function that shows a PNG in the notebook cell, replacing the previous one; None without a notebook."""
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     if shell is None or getattr(shell, "kernel", None) is None:
@@ -68,8 +71,10 @@ def _notebook() -> Callable[[bytes], None] | None:
 
 
 def drawn(records: Sequence[Record], known: Iterable[str], image: Array, target: Array) -> bytes:
-    """A PNG of how far a run is: its loss, the errors of the parameters whose true values are `known`, and an image
-    (H, W, C) beside its target."""
+    """Return a PNG with the loss, the errors of the `known` parameters, and an image (H, W, C) beside its target.
+
+    `known` names the parameters whose true values are known.
+    """
     figure = Figure(figsize=(10, 3), layout="constrained")
     curves, *pictures = figure.subplots(1, 3, width_ratios=(1.4, 1, 1))
     iterations = [record.iteration for record in records]

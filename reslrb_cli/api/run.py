@@ -1,4 +1,4 @@
-"""A run of a script: its iterations in the script's own loop, with or without a folder."""
+"""Optimisation in the loop of a script, with or without a run folder."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 Array: TypeAlias = "np.ndarray[Any, np.dtype[np.float32]]"
 Folder: TypeAlias = "str | os.PathLike[str]"
-#: `loss(image, target)`, or with `weights` third.
+#: `loss(image, target)` or `loss(image, target, weights)`.
 Loss: TypeAlias = (
     "Callable[[mi.TensorXf, mi.TensorXf], mi.Float | mi.TensorXf]"
     " | Callable[[mi.TensorXf, mi.TensorXf, mi.TensorXf | None], mi.Float | mi.TensorXf]"
@@ -45,15 +45,17 @@ logger = logging.getLogger(__name__)
 
 
 class Run:
-    """An optimisation whose iterations are made as they are asked for; `optimize` makes it.
+    """Optimisation that computes one iteration at a time; `optimize` returns it.
 
-    Iterating over it makes one iteration after the other and yields the `Record` of each, as `metrics.jsonl` has it.
-    Whoever leaves the loop, by `break` or an error, stops the run; so do the end of a `with` block and `close`. A run
-    folder is then complete, as after Ctrl-C on the command line: manifest, checkpoint, parameters, final images and
-    report, the lock released. A loop that is begun again goes on where the one before was left. What an interrupt
-    (Ctrl-C, a notebook's stop button) cuts short is the loop, after the iteration that is at work.
+    Iterate over a run to compute its iterations. Each iteration yields its `Record`, which is also a line of
+    `metrics.jsonl`.
 
-    Runs of one process share nothing but the device, and may take turns: `zip(run_a, run_b)`.
+    A run stops when you leave the loop (`break` or an error), at the end of a `with` block, and on `close`. Its folder
+    is then complete, as after Ctrl-C on the command line: manifest, checkpoint, parameters, final images and report,
+    with the lock released. A second loop continues where the first one stopped. An interrupt (Ctrl-C, a notebook's stop
+    button) ends the loop after the current iteration.
+
+    Runs in one process share only the device. You can alternate between them: `zip(run_a, run_b)`.
     """
 
     def __init__(self, stack: contextlib.ExitStack, begun: PreparedRun, writes: bool) -> None:
@@ -72,7 +74,7 @@ class Run:
         loop = None if self._loop is None else self._loop()
         if (
             loop is not None and getgeneratorstate(loop) != GEN_CLOSED
-        ):  # one that has ended may still stand in a traceback
+        ):  # a traceback can keep a closed loop alive
             raise RuntimeError("this run is in a loop already; leave that first")
         loop = self._iterations()
         self._loop = weakref.ref(loop)
@@ -89,7 +91,7 @@ class Run:
                 self._records.append(record)
                 yield record
         except GeneratorExit:
-            # Python drops what is raised while the loop is left: `close` raises it.
+            # Python discards an exception raised while the loop is left, so `close` raises it.
             try:
                 with held():
                     made.close()
@@ -101,7 +103,7 @@ class Run:
                 made.close()
 
     def _made(self) -> Generator[Record, None, None]:
-        """The records of what is left to do, written down where the run has a folder."""
+        """Yield the records of the remaining iterations, and write them if the run has a folder."""
         if self._stopped and self._writes and self._folder is not None:
             with called():
                 self._stack, self._begun, self._writes = _reopened(
@@ -137,12 +139,12 @@ class Run:
                 self._status = Status.FINISHED
 
     def live(self, figure: bool = True) -> Iterator[Record]:
-        """Iterate, with a progress bar, and in a notebook a live `figure`: loss, errors, and a view beside its target.
+        """Iterate with a progress bar and, in a notebook, a live `figure` of loss, errors, and a view and its target.
 
-        The bar is that of `tqdm.auto`, in a notebook with the extra `reslrb[notebook]` a widget. The figure is drawn
-        anew now and then, in a small share of the time.
+        The bar comes from `tqdm.auto`. In a notebook it is a widget if the extra `reslrb[notebook]` is installed. The
+        figure is redrawn now and then, in a small share of the time.
         """
-        from reslrb_cli.api.live import drawn, watched  # brings matplotlib along
+        from reslrb_cli.api.live import drawn, watched  # imports matplotlib
 
         def draw() -> bytes:
             (sensor, target), *_ = self.targets.items()
@@ -153,10 +155,10 @@ class Run:
         return watched(iter(self), total, self.iteration, problem.meter, draw if figure else None)
 
     def close(self) -> None:
-        """Stop the run where it is, and complete its folder; nothing is done where it is not in a loop.
+        """Stop the run and complete its folder; do nothing if no loop is active.
 
-        Raises what could not be done, as MachineError where the folder could not be written to; of a loop that was
-        left before, too.
+        Raises the error if the folder could not be completed, now or when an earlier loop was left. It is a
+        MachineError if the folder could not be written to.
         """
         loop = None if self._loop is None else self._loop()
         if loop is not None:
@@ -175,56 +177,62 @@ class Run:
         try:
             self.close()
         except Exception:
-            if error is None:  # else it was logged, and what the block failed of is the better news
+            if error is None:  # otherwise it is logged already, and the error of the block says more
                 raise
 
     # --- looking ------------------------------------------------------------------------------------------------------
 
     @property
     def config(self) -> Config:
-        """The experiment, with every default."""
+        """The experiment, with all defaults filled in."""
         return self._begun.course.problem.config
 
     @property
     def folder(self) -> Path | None:
-        """The run's folder, which is made as the first loop begins; None before, and of a run that writes nothing."""
+        """The run folder. It is None before the first loop, which creates it, and for a run that writes nothing."""
         return self._folder
 
     @property
     def status(self) -> str:
-        """`running` until a loop has ended, then `finished`, `interrupted` or `failed`."""
+        """`running` until a loop ends, then `finished`, `interrupted` or `failed`."""
         return self._status.value
 
     @property
     def iteration(self) -> int:
-        """The number of iterations that are done, those before a `resume` included."""
+        """The number of completed iterations, including those before a `resume`."""
         return self._begun.course.done
 
     @property
     def records(self) -> list[Record]:
-        """The records of the iterations that this process has made, oldest first."""
+        """The records of the iterations that this process has computed, oldest first."""
         return list(self._records)
 
     @property
     def parameters(self) -> dict[str, Array]:
-        """The parameters' values after the last whole iteration, by key, float32 and in the parameters' own units:
-        a texture (height, width, channels), a colour (channels,), a number (), vertices (count, 3)."""
+        """The parameter values after the last complete iteration, by key.
+
+        Values are float32, in the units of the parameters. Shapes: texture (height, width, channels), colour
+        (channels,), number (), vertices (count, 3).
+        """
         return self._begun.course.values()
 
     @property
     def gradients(self) -> dict[str, Array]:
-        """The gradient of the last iteration's step by key, of its parameter's shape, regularizers included: before
-        clamping, and as it came, finite or not; in a stage of `run.stages`, of that stage's shapes. Empty before the
-        first iteration."""
+        """The gradients of the last iteration, by key; empty before the first iteration.
+
+        Each has the shape of its parameter; in a stage of `run.stages`, the shape in that stage. Gradients include
+        regularizers and are not clamped. They may contain values that are not finite.
+        """
         course = self._begun.course
         return course.shown(course.state.gradients)
 
     @property
     def images(self) -> dict[int, Array]:
-        """What each view shows now, by its sensor's index: (height, width, channels) float32, exposed as its target.
+        """The current image of each view, by sensor index: (height, width, channels) float32, exposed as its target.
 
-        Rendered when it is asked for, with as many samples as images between iterations have (at least 64 per pixel),
-        whose seeds are no iteration's: to look changes nothing. Raises ConfigError and the like as a run does.
+        Each access renders the images, with the sample count of the images saved between iterations (at least 64 per
+        pixel) and with separate seeds, so it does not change the run. Raises the same errors as a run, such as
+        ConfigError.
         """
         course = self._begun.course
         problem = course.problem
@@ -238,12 +246,12 @@ class Run:
 
     @property
     def targets(self) -> dict[int, Array]:
-        """The target of each view, by its sensor's index: (height, width, channels) float32, without alpha."""
+        """The target of each view, by sensor index: (height, width, channels) float32, without alpha."""
         return {view.sensor: np.array(view.target) for view in self._begun.course.problem.views}
 
     @property
     def truth(self) -> dict[str, Array]:
-        """The true values by key, of the parameters of which they are known: where the target is rendered."""
+        """The true parameter values, by key. They are known only if the target is rendered."""
         return dict(self._begun.course.problem.truth)
 
     def __repr__(self) -> str:
@@ -259,30 +267,31 @@ def optimize(
     loss: Loss | None = None,
     allow_code: bool = False,
 ) -> Run:
-    """Recover the parameters of an experiment: a `Run`, to be iterated over, which makes one iteration after the other.
+    """Recover the parameters of an experiment; returns a `Run`, which computes one iteration at a time.
 
         with rl.optimize("configs/cornell_floor.yaml", folder="runs/carpet") as run:
             for record in run:
                 print(record.iteration, record.loss)
         texture = run.parameters["floor.reflectance.data"]
 
-    `experiment` is what `load` takes, or what it returned, and `overrides` are as there. With `folder` the run is
-    written there as `reslrb optimize` does, or where that name is taken to `folder-2` and so on (`Run.folder`); what
-    `run.output` says is not used, which is told; without one nothing is written but the caches of kernels and of what
-    was measured.
+    `experiment` and `overrides` are the arguments of `load`; `experiment` may also be its result.
 
-    `resume` goes on with the run in that folder exactly where it was, in that folder, or with `folder` in a new one.
-    `experiment` may then be left out, else it has to be that of the run; `overrides` may change iterations and learning
-    rates. A finished run has nothing to iterate over, which a warning says.
+    `folder` is the run folder, with the same content as from `reslrb optimize`. If it exists, the run is written to
+    `folder-2` and so on (see `Run.folder`). The setting `run.output` is then ignored, with a warning. Without `folder`,
+    only the caches of kernels and measurements are written.
 
-    `loss` is a function of your own in place of the experiment's: `loss(image, target)` of two `mi.TensorXf` (height,
-    width, channels), the image attached, or `loss(image, target, weights)`; it returns a `mi.Float` of width 1, or a
-    tensor of one entry. A `resume` asks for it again. `allow_code` has the files of code run that the experiment names
+    `resume` is the folder of a run, which continues exactly where it stopped: in that folder, or in a new one if you
+    give `folder`. `experiment` is then optional; if given, it must be that of the run. `overrides` may change
+    iterations and learning rates. A finished run has no iterations left and logs a warning.
+
+    `loss` is your own loss function, `loss(image, target)` or `loss(image, target, weights)`. The arguments are
+    `mi.TensorXf` (height, width, channels), and the image is attached. It returns a `mi.Float` of width 1 or a tensor
+    with one entry. Pass it again with `resume`. `allow_code` permits running the code files that the experiment names
     (`loss.file`, `integrator.file`).
 
-    Sets the Mitsuba variant of the experiment where none is set. Loads and checks all that the experiment names, makes
-    the target, and measures what is left to measurement, before it returns. Raises ConfigError, located by file and
-    key, UnsupportedScene, BackendError, MachineError; iterating raises NonFinite, OutOfMemory and MachineError too.
+    Before it returns, `optimize` sets the experiment's Mitsuba variant if none is set, loads and checks all files,
+    makes the target, and measures the settings left to measurement. Raises ConfigError (located by file and key),
+    UnsupportedScene, BackendError and MachineError. Iterating can also raise NonFinite and OutOfMemory.
     """
     put_in, named = overrides_of(overrides), list[Override]()
     if folder is not None:
@@ -318,7 +327,7 @@ def optimize(
 
 
 def _with_own(config: Config, loss: Loss | None, allow_code: bool) -> Config:
-    """Return the experiment with a loss of the caller, and with its code allowed if it was not already."""
+    """Return the experiment with the caller's loss, and with its code allowed if `allow_code` is set."""
     config = config.with_code(allow_code or config.allows_code)
     if loss is not None and not callable(loss):
         reason = "is no function; a file's is named by the setting `loss: {type: custom, file: FILE.py:NAME}`"
@@ -333,7 +342,7 @@ def _reopened(
     loss: Loss | None,
     allow_code: bool,
 ) -> tuple[contextlib.ExitStack, PreparedRun, bool]:
-    """What holds the folder of a run that goes on, that run, and whether there is anything left to be written."""
+    """Return the stack that holds the lock of a resumed run's folder, the run, and whether iterations are left."""
     with contextlib.ExitStack() as stack:
         earlier = stack.enter_context(open_earlier(folder, wanted, put_in))
         earlier.config = _with_own(earlier.config, loss, allow_code)

@@ -1,4 +1,4 @@
-"""What a run writes down: its folder, manifest, metrics, checkpoints, images and parameters, and its clock readings.
+"""Files and records of a run: folder, manifest, metrics, checkpoints, images, parameters and timings.
 
-`clock` needs Dr.Jit and `images` Mitsuba, the other modules neither; so nothing is imported here.
+Nothing is imported here, because `clock` needs Dr.Jit and `images` needs Mitsuba.
 """

@@ -1,7 +1,7 @@
-"""Files that are either whole or absent, however the process ends.
+"""Files that are either complete or absent, however the process ends.
 
-What is under way has a name of its own (`.NAME.PID.part`, `.reslrb-*` for folders). A process that fails removes it,
-one that is ended at once does so by `remove_unfinished`, and what a killed process leaves is found by its name.
+Unfinished files are named `.NAME.PID.part`, unfinished folders `.reslrb-*`. A process that fails removes its own. A
+process that exits at once calls `remove_unfinished`. The rest of a killed process is recognised by its name.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from reslrb_cli.records.lock import FolderLock, is_alive
 
 _PART = re.compile(r"\..+\.\d+\.part")
 
-#: How the names of folders that are not finished begin.
+#: Prefix of the names of unfinished folders.
 FOLDER_PREFIX = ".reslrb-"
 
-#: Files and folders that this process is about to finish.
+#: Unfinished files and folders of this process.
 unfinished: set[Path] = set()
 
 
 def write_atomically(path: Path, write: Callable[[IO[bytes]], object], durable: bool = False) -> None:
-    """Let `write` fill a neighbour of `path` and rename it into place, so that no reader sees half a file.
+    """Let `write` fill a temporary file beside `path`, then rename it, so that no reader sees a partial file.
 
-    With `durable` a machine that loses its power does not lose the file either. Raises OSError, which names `path`.
+    With `durable`, the file also survives a loss of power. Raises OSError, which names `path`.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     unfinished.add(part)
@@ -46,7 +46,7 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object], durable: 
         if durable:
             _sync_folder(path.parent)
     except OSError as error:
-        # An error of writing names no file, one of renaming names two.
+        # Write errors name no file, and rename errors name two.
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         with contextlib.suppress(OSError):
@@ -56,10 +56,10 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object], durable: 
 
 @contextmanager
 def unfinished_folder(parent: Path, lock: bool = True) -> Iterator[Path]:
-    """Yield a new folder in `parent`, which the block may rename; else remove it at the end, with its content.
+    """Yield a new folder in `parent`; unless the block renames it, remove it with its content at the end.
 
-    The folder is locked meanwhile: other processes remove an old folder without a lock. With `lock=False` the block
-    locks it.
+    The folder is locked, because other processes remove old unlocked folders. With `lock=False`, the block must lock
+    it.
     """
     path = parent / f"{FOLDER_PREFIX}{secrets.token_hex(8)}"
     unfinished.add(path)
@@ -73,7 +73,7 @@ def unfinished_folder(parent: Path, lock: bool = True) -> Iterator[Path]:
 
 
 def remove_unfinished() -> None:
-    """Remove what this process has not finished; to be called when it is about to end in the midst of it."""
+    """Remove the unfinished files and folders of this process; call it before an immediate exit."""
     for path in list(unfinished):
         with contextlib.suppress(OSError):
             if path.is_dir():
@@ -83,8 +83,8 @@ def remove_unfinished() -> None:
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove the files in `folder` and in the folders below it that a process began and never finished."""
-    for parent, _, names in os.walk(folder):  # which follows no links
+    """Remove unfinished files in `folder` and its subfolders."""
+    for parent, _, names in os.walk(folder):  # does not follow links
         for name in names:
             if _PART.fullmatch(name):
                 with contextlib.suppress(OSError):
@@ -92,7 +92,7 @@ def remove_parts(folder: Path) -> None:
 
 
 def remove_parts_of(path: Path) -> None:
-    """Remove what processes that are no more began to write in place of the file `path`, and never finished."""
+    """Remove unfinished versions of the file `path` whose processes have ended."""
     for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
         if _PART.fullmatch(part.name) and not is_alive(int(part.name.split(".")[-2])):
             with contextlib.suppress(OSError):
@@ -100,7 +100,7 @@ def remove_parts_of(path: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Have a renamed file's name on the disk too, where the system can do that for a folder."""
+    """Flush the names in a folder to the disk, if the system supports that."""
     with contextlib.suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -111,7 +111,7 @@ def _sync_folder(folder: Path) -> None:
 
 @contextmanager
 def writing(option: str, path: Path) -> Iterator[None]:
-    """Have an error of writing `path` located by the option (ConfigError); one of the machine stays what it is."""
+    """Turn errors of writing `path` into a ConfigError located by `option`; machine faults are unchanged."""
     try:
         yield
     except (OSError, RuntimeError) as error:

@@ -1,4 +1,4 @@
-"""The cache of what runs measured before their first iteration, for the next run of the same scene and parameters."""
+"""Cache of the measurements before the first iteration, for later runs of the same scene and parameters."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from reslrb_cli.records.atomic import write_atomically
 
 PILOT_FILE = "pilot.json"
 
-#: Entries kept, the newest.
+#: Maximum number of entries; the oldest are dropped.
 MOST = 200
 
 
 def cache_folder() -> Path:
-    """$RESLRB_CACHE, or `reslrb` in the user's cache folder."""
+    """Return $RESLRB_CACHE, or `reslrb` in the user's cache folder."""
     if own := os.environ.get("RESLRB_CACHE"):
         return Path(own)
     base = os.environ.get("XDG_CACHE_HOME")
@@ -25,25 +25,27 @@ def cache_folder() -> Path:
 
 
 def key_of(what: dict[str, Any]) -> str:
-    """The key of an entry from all that it depends on, of plain values."""
+    """Return the key of an entry, a hash of all plain values that the entry depends on."""
     return hashlib.blake2b(json.dumps(what, sort_keys=True, default=str).encode(), digest_size=16).hexdigest()
 
 
 class PilotCache:
-    """A JSON file of entries by key. One that cannot be read is empty, one that cannot be written stays as it is, and
-    `keeps` is False from then on."""
+    """JSON file of entries by key.
+
+    An unreadable file counts as empty. If the file cannot be written, it is unchanged and `keeps` becomes False.
+    """
 
     def __init__(self, folder: Path | None = None) -> None:
         self._given = folder
         self.keeps = True
 
     def get(self, key: str) -> dict[str, Any] | None:
-        """The entry of `key`, if there is one."""
+        """Return the entry of `key`, or None."""
         entry = self._read().get(key)
         return entry if isinstance(entry, dict) else None
 
     def put(self, key: str, entry: dict[str, Any]) -> None:
-        """Keep an entry, as the newest."""
+        """Store an entry as the newest one."""
         entries = {name: value for name, value in self._read().items() if name != key}
         entries = {**dict(list(entries.items())[1 - MOST :]), key: entry}
         text = json.dumps(entries, indent=1)
@@ -51,7 +53,7 @@ class PilotCache:
             path = self._path()
             path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(path, lambda file: file.write(text.encode() + b"\n"))
-        except (OSError, RuntimeError):  # RuntimeError: there is no home
+        except (OSError, RuntimeError):  # RuntimeError: no home folder
             self.keeps = False
 
     def _path(self) -> Path:

@@ -1,11 +1,11 @@
-"""Archives of arrays (`.npz`), and `checkpoint/`, a run's folder of them.
+"""Archives of arrays (`.npz`), and the checkpoints of a run.
 
-`checkpoint/` holds the state of a run after some iteration, and what it met that was not finite:
+The folder `checkpoint/` of a run holds:
 
-`state.npz`      the newest state; `iteration`, `parameter/<key>`, what else the iterations carry on as arrays, and
-                 `state`, the rest of it as JSON
-`previous.npz`   the state before that
-`nonfinite.npz`  the state with which the first iteration began that met a value that was not finite
+`state.npz`      the newest state: `iteration`, `parameter/<key>`, the other arrays of the optimisation, and `state`,
+                 the remaining values as JSON
+`previous.npz`   the state saved before that
+`nonfinite.npz`  the state before the first iteration with a value that was not finite
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ Array = np.ndarray[Any, Any]
 
 
 def write_archive(path: Path, arrays: Mapping[str, Array], durable: bool = False) -> None:
-    """Write arrays to `path`, in place of what is there, atomically. Raises OSError, with what was there as it was."""
+    """Write arrays to `path` atomically, replacing the file. Raises OSError, and then the old file is unchanged."""
     entries: dict[str, Any] = dict(arrays)
     write_atomically(path, lambda file: np.savez(file, **entries), durable)
 
 
 @contextmanager
 def open_archive(path: Path) -> Iterator[Mapping[str, Array]]:
-    """Open an archive; each of its arrays is read, and its checksum compared, when the block asks for it.
+    """Open an archive. An array is read, and its checksum verified, when the block accesses it.
 
-    Raises ConfigError, located in the file, if reading fails in the block.
+    Raises ConfigError, located in the file, if reading fails inside the block.
     """
     try:
         with open_file(path) as file, np.load(file, allow_pickle=False) as arrays:
             yield arrays
     except ConfigError:
         raise
-    except Exception as error:  # NumPy and zipfile raise many kinds
+    except Exception as error:  # NumPy and zipfile raise many types of exceptions
         if is_out_of_memory(error) or is_machine_fault(error):
             raise
         reason = str(error) or type(error).__name__
@@ -54,7 +54,7 @@ def open_archive(path: Path) -> Iterator[Mapping[str, Array]]:
 STATE_FILE, PREVIOUS_FILE_NAME, _NEXT_FILE = "state.npz", "previous.npz", "next.npz"
 NONFINITE_FILE_NAME = "nonfinite.npz"
 
-#: What the JSON of a state says that it is. Another number where the same words mean something else.
+#: Format version in the JSON of a state. It changes when the meaning of an entry changes.
 FORMAT = 2
 
 
@@ -68,9 +68,8 @@ def save_checkpoint(
 ) -> None:
     """Write the state after `iteration` updates into `folder`, atomically and durably.
 
-    Its entries are `iteration`, `parameter/<key>`, `others` by their names, and, as JSON, `values`, what there is
-    besides. The state before is kept as `previous.npz`. A file of another `name` is written beside both. Raises
-    OSError, and then both earlier states are still there.
+    The entries are `iteration`, `parameter/<key>`, `others` by name, and `values` as JSON. The earlier state becomes
+    `previous.npz`, unless `name` is another file name. Raises OSError, and then both earlier states still exist.
     """
     entries: dict[str, Array] = {"iteration": np.array(iteration)}
     entries |= {f"parameter/{key}": value for key, value in parameters.items()}
@@ -82,7 +81,7 @@ def save_checkpoint(
     try:
         write_archive(new, entries, durable=True)
         if name == STATE_FILE:
-            with contextlib.suppress(FileNotFoundError):  # of the first one
+            with contextlib.suppress(FileNotFoundError):  # there is no earlier state yet
                 os.replace(path, folder / PREVIOUS_FILE_NAME)
         os.replace(new, path)
     except OSError as error:
@@ -90,7 +89,7 @@ def save_checkpoint(
 
 
 def read_state(path: Path) -> tuple[dict[str, Array], dict[str, Any]]:
-    """Read the arrays of a state and its other values. Raises ConfigError, located in the file."""
+    """Read the arrays and the other values of a state. Raises ConfigError, located in the file."""
     with open_archive(path) as archive:
         arrays = dict(archive)
     if "state" not in arrays:
@@ -105,10 +104,10 @@ def read_state(path: Path) -> tuple[dict[str, Array], dict[str, Any]]:
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
-    """The newest state in `folder`, which may be damaged; None where there is none."""
+    """Return the file of the newest state in `folder`, which may be damaged; None if there is no state."""
     return next((path for name in (STATE_FILE, PREVIOUS_FILE_NAME) if (path := folder / name).exists()), None)
 
 
 def entries_below(arrays: Mapping[str, Array], prefix: str) -> dict[str, Array]:
-    """Return the arrays whose names begin with `prefix`, by the rest of their names."""
+    """Return the arrays whose names start with `prefix`, by the rest of their names."""
     return {name.removeprefix(prefix): arrays[name] for name in arrays if name.startswith(prefix)}

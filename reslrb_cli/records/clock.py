@@ -1,4 +1,4 @@
-"""Readings of time and memory around a step."""
+"""Measurement of the time and memory of steps."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ MIB = 2.0**20
 
 @dataclass
 class StepTimes:
-    """Times of one step in milliseconds; filled in when the step has ended.
+    """Times of one step in milliseconds, filled in at the end of the step.
 
-    `wall_ms` is what a user waits; `kernel_ms` the execution of kernels and `codegen_ms` their generation and
-    compilation, both from `dr.kernel_history`; `new_kernels` the number of kernels that no earlier step of the same
-    clock has launched (`cache_hit` does not tell: a kernel from the disk cache is a hit).
+    `wall_ms` is the wall time. `kernel_ms` is the execution time of kernels and `codegen_ms` the time of their
+    generation and compilation, both from `dr.kernel_history`. `new_kernels` counts kernels that no earlier step of the
+    same clock launched; `cache_hit` is also true for kernels from the disk cache, so it cannot serve for that.
     """
 
     wall_ms: float = 0.0
@@ -30,7 +30,7 @@ class StepTimes:
 
 
 class StepClock:
-    """Times steps, and adds up the time that an optimisation takes without what is written in between."""
+    """Clock for steps; it also sums up the time of an optimisation, without the time for writing files."""
 
     def __init__(self, elapsed_s: float = 0.0) -> None:
         self.elapsed_s = elapsed_s
@@ -40,7 +40,7 @@ class StepClock:
 
     @contextmanager
     def step(self) -> Iterator[StepTimes]:
-        """Time the block as one step, under kernel history; what it launches is waited for."""
+        """Time the block as one step, with the kernel history enabled, and wait for its kernels."""
         times = StepTimes()
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.sync_thread()
@@ -58,7 +58,7 @@ class StepClock:
 
     @contextmanager
     def counted(self) -> Iterator[None]:
-        """Count the block's time into `elapsed_s`."""
+        """Add the time of the block to `elapsed_s`."""
         start = time.perf_counter()
         yield
         dr.sync_thread()
@@ -67,8 +67,10 @@ class StepClock:
 
 @dataclass(frozen=True)
 class WorkerTime:
-    """What one worker did: calls that it answered, seconds of computing them, and how many of what it had were asked of
-    others too, since it said nothing for long."""
+    """Work of one worker: the calls that it answered and the seconds that it computed.
+
+    `again` counts its calls that other workers received, too, because it did not answer for a long time.
+    """
 
     calls: int = 0
     computing_s: float = 0.0
@@ -80,11 +82,11 @@ class WorkerTime:
 
 @dataclass(frozen=True)
 class SharedTime:
-    """Seconds for which workers were asked to compute, by part, and what each of them did, by name.
+    """Seconds of the computation shared by workers, by part, and the work of each worker, by name.
 
-    `wall_s` goes from the first question of a round to its last answer. Of that the mean worker computed for
-    `computing_s`, and waited for `waiting_s` for the one that had most; the rest is `sending_s`, the handing out
-    included. `places` are those of the workers, as `--cluster` had them.
+    `wall_s` is the time from the first call of a round to its last answer. The mean worker computes for `computing_s`
+    and waits for `waiting_s` for the slowest one. The rest is `sending_s`, which includes distributing the calls.
+    `places` are the places of the workers, as given to `--cluster`.
     """
 
     places: tuple[str, ...] = ()
@@ -95,11 +97,11 @@ class SharedTime:
 
     @property
     def sending_s(self) -> float:
-        """What is neither computing nor waiting."""
+        """The time that is neither computing nor waiting."""
         return max(self.wall_s - self.computing_s - self.waiting_s, 0.0)
 
     def __add__(self, other: SharedTime) -> SharedTime:
-        """Both, one after the other."""
+        """Add the times of another part of the run."""
         workers = dict(self.workers)
         for name, spent in other.workers.items():
             workers[name] = workers.get(name, WorkerTime()) + spent
@@ -116,7 +118,7 @@ class SharedTime:
 def summarise(history: list[dict[str, Any]]) -> tuple[float, float]:
     """Sum a kernel history: milliseconds of execution, and of code generation and compilation.
 
-    Copies and reductions count as execution: they are kernels of the step like any other.
+    Copies and reductions count as execution.
     """
     execution = sum(entry.get("execution_time", 0.0) for entry in history)
     codegen = sum(entry.get("codegen_time", 0.0) + entry.get("backend_time", 0.0) for entry in history)
@@ -124,10 +126,10 @@ def summarise(history: list[dict[str, Any]]) -> tuple[float, float]:
 
 
 def reset_peak() -> None:
-    """Start a new memory peak from what is alive now.
+    """Reset the memory peak to the memory in use now.
 
-    The allocator's statistics count blocks that it holds back for reuse as allocated: without the flush a peak
-    would include whatever ran before; and scenes that are done with die by the garbage collector alone.
+    The flush is needed because the allocator's statistics count blocks held for reuse as allocated. The garbage
+    collection is needed because nothing else frees unused scenes.
     """
     gc.collect()
     dr.sync_thread()
@@ -137,8 +139,8 @@ def reset_peak() -> None:
 
 
 def peak_mib(backend: Any) -> float:
-    """The most memory allocated at once since `reset_peak`, in MiB, on `backend` (a `dr.JitBackend`).
+    """Return the peak of allocated memory since `reset_peak`, in MiB, on `backend` (a `dr.JitBackend`).
 
-    Thread-local memory (`dr.Local`) is not in it.
+    Thread-local memory (`dr.Local`) is not included.
     """
     return float(dr.detail.malloc_watermark(backend)) / MIB

@@ -1,8 +1,9 @@
-"""The findings of a run: what it measured before its first iteration, as manifest, checkpoints and the cache have it.
+"""Records of the settings that a run chose by measurement, in the manifest, the checkpoints and the cache.
 
-PathsRecord                    from which side paths are traced
-GuidedRecord, SequenceRecord   ways of drawing samples that were left to measurement: whether they pay
-PixelsRecord                   whether camera paths are shared out over the pixels
+PathsRecord     light paths, camera paths or both
+GuidedRecord    guided or unguided emission
+SequenceRecord  low-discrepancy or independent numbers
+PixelsRecord    camera paths distributed over the pixels by measurement or evenly
 """
 
 from __future__ import annotations
@@ -14,25 +15,25 @@ from typing import Any
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from typing_extensions import Self
 
-#: What an image's efficiency may be with the other samples over that without, where they serve image and gradient.
+#: Minimum relative efficiency of the image for a sampling method that serves both image and gradient.
 LEAST_IMAGE = 0.95
 
 
 class Jsonable:
-    """Base of dataclasses that are written as JSON and read back."""
+    """Base class of dataclasses that are written as JSON and read back."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
     def to_json(self) -> dict[str, Any]:
-        """As a mapping for JSON."""
+        """Return the record as a mapping for JSON."""
         found: dict[str, Any] = asdict(self)  # type: ignore[call-overload]  # each is a dataclass
         return found
 
     @classmethod
     def from_json(cls, data: Any) -> Self:
-        """The same again. Raises TypeError where `data` is nothing that `to_json` made."""
+        """Return the record from the result of `to_json`. Raises TypeError for any other data."""
         try:
-            # As JSON: strict of Python's values, it would take no mapping for a dataclass.
+            # Validated as JSON, because strict validation of Python values rejects a mapping for a dataclass.
             return TypeAdapter(cls).validate_json(json.dumps(data), strict=True)
         except ValidationError as error:
             raise TypeError(f"no {cls.__name__}: {error}") from None
@@ -40,11 +41,11 @@ class Jsonable:
 
 @dataclass(frozen=True, kw_only=True)
 class Finding(Jsonable):
-    """What is alike of all decisions by measurement.
+    """Base class of all decisions by measurement.
 
-    Steps of `spp` samples per pixel took `measure_s` seconds, with what was learned for them, and first steps, which
-    compile, `compile_s`. `note` says why nothing was measured, or what the figures do not. `cached`: an earlier run
-    measured it.
+    The measured steps have `spp` samples per pixel and took `measure_s` seconds, including training. The first steps,
+    which compile, took `compile_s` seconds. `note` says why nothing was measured, or adds to the figures. `cached` is
+    true if an earlier run made the measurement.
     """
 
     spp: int = 0
@@ -54,15 +55,15 @@ class Finding(Jsonable):
     cached: bool = False
 
     def decision(self) -> str:
-        """What was decided on, and how, in words."""
+        """Return the decision in words."""
         raise NotImplementedError
 
     def why(self) -> str:
-        """What was measured, in words."""
+        """Return the measurement in words."""
         raise NotImplementedError
 
     def line(self, cost: bool = False) -> str:
-        """What the user is told; with what it took to measure that, if `cost`."""
+        """Return the line for the user, with the time of the measurement if `cost` is set."""
         line = f"{self.decision()}: {self.why()}"
         if not cost or not (self.cached or self.measure_s or self.compile_s):
             return line
@@ -71,7 +72,7 @@ class Finding(Jsonable):
 
 
 def _times(gain: float | None, low: float | None, high: float | None, note: str) -> str:
-    """An efficiency over another's with its interval; the note alone where it was not measured."""
+    """Return a ratio of efficiencies with its interval in words, or only the note if it was not measured."""
     if gain is None or low is None or high is None:
         return note
     found = f"{gain:.2g} times the efficiency here ({low:.2g} to {high:.2g})"
@@ -80,12 +81,12 @@ def _times(gain: float | None, low: float | None, high: float | None, note: str)
 
 @dataclass(frozen=True, kw_only=True)
 class PaidRecord(Finding):
-    """Of another way of drawing samples.
+    """Measured gain of an alternative sampling method.
 
-    `gain` is the efficiency 1 / (variance * time) of the gradient with the other samples over that without, between
-    `low` and `high` with 95 % confidence; `image_gain` and so on are the same of the image, of the gradient's samples
-    where these serve both. None where that was not measured. `note` says why it is off where the gain does not.
-    `rounds` steps of each kind took `share` of 200 iterations.
+    `gain` is the ratio of the gradient's efficiency 1 / (variance * time) with and without the method; its 95 %
+    interval is `low` to `high`. `image_gain`, `image_low` and `image_high` are the same for the image, if the
+    gradient's samples serve both. Values that were not measured are None. `note` gives the reason if the method is off
+    despite its gain. `rounds` steps of each kind took `share` of the time of 200 iterations.
     """
 
     gain: float | None = None
@@ -99,7 +100,7 @@ class PaidRecord(Finding):
 
     @property
     def setting(self) -> str:
-        """What the option is by this."""
+        """The chosen value of the option."""
         raise NotImplementedError
 
     def why(self) -> str:
@@ -108,9 +109,10 @@ class PaidRecord(Finding):
 
 @dataclass(frozen=True, kw_only=True)
 class PathsRecord(PaidRecord):
-    """Of where paths begin: `paths` (light, camera, both), of which `light_share` are light paths where both are.
+    """Choice of `paths` (light, camera, both); with both, `light_share` is the share of light paths.
 
-    The gain is that over the best share that was tried before, or of the next that was found no better, as `note` says.
+    The gain is relative to the best share tried before, or it is that of the next share, which was no better; `note`
+    says which.
     """
 
     paths: str
@@ -127,7 +129,7 @@ class PathsRecord(PaidRecord):
 
 @dataclass(frozen=True, kw_only=True)
 class GuidedRecord(PaidRecord):
-    """Of guided emission. `guided`: gradients are; `images`: and samples that serve an image alone."""
+    """Choice of guided emission, for gradients (`guided`) and for samples that serve only an image (`images`)."""
 
     guided: bool
     images: bool = False
@@ -143,9 +145,10 @@ class GuidedRecord(PaidRecord):
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceRecord(PaidRecord):
-    """Of low-discrepancy numbers, which gradients and images have, or neither: `low_discrepancy`.
+    """Choice of low-discrepancy numbers, for both gradients and images.
 
-    `alone`: they were tried in place of guided emission, which had been found to pay, and is over that what it gains.
+    `alone` is true if they were measured as a replacement for guided emission, which had been chosen before. The gain
+    is then relative to guided emission.
     """
 
     low_discrepancy: bool
@@ -162,14 +165,16 @@ class SequenceRecord(PaidRecord):
 
 @dataclass(frozen=True, kw_only=True)
 class PixelsRecord(Finding):
-    """Of how camera paths are shared out over the pixels: as was `measured` that these need them, or evenly; `note`
-    says why."""
+    """Choice of the distribution of camera paths over the pixels: by measured need (`measured`) or evenly.
+
+    `note` gives the reason.
+    """
 
     measured: bool
 
     @property
     def setting(self) -> str:
-        """What the option is by this."""
+        """The chosen value of the option."""
         return "measured" if self.measured else "even"
 
     def decision(self) -> str:

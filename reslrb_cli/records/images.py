@@ -1,8 +1,8 @@
-"""Images and recovered parameters on the disk, in formats that other tools read.
+"""Files of images and parameters, in formats that other tools read.
 
-Names of files are made from the keys of parameters, which are as long as a scene's author likes. Images are written as
-EXR (linear, 32-bit) and PNG (8-bit sRGB, to look at). OpenEXR files of named layers hold several arrays of one size, so
-that a viewer flips between them. `parameters/` holds what was optimised.
+Images are written as EXR (linear, 32-bit) and PNG (8-bit sRGB, for viewing). EXR files with named layers hold several
+arrays of one size, so that a viewer can flip between them. The folder `parameters/` holds the recovered parameters;
+file names are made from parameter keys, which can be of any length.
 """
 
 from __future__ import annotations
@@ -26,50 +26,50 @@ Array = np.ndarray[Any, Any]
 
 
 def luminance(image: Array) -> Array:
-    """Return the luminance (H, W) of linear values (H, W, C), by Mitsuba's weights; of one channel, that channel."""
+    """Return the luminance (H, W) of linear values (H, W, C), with Mitsuba's weights; one channel is unchanged."""
     wide = image.astype(np.float64)
     return wide[:, :, :3] @ [0.212671, 0.715160, 0.072169] if image.shape[2] >= 3 else wide[:, :, 0]
 
 
-#: Bytes of such a name. File systems take 255, of which some are for suffixes and for files that are being written.
+#: Maximum length of a file stem in bytes. File systems allow 255; the rest is for suffixes and temporary names.
 MOST_BYTES = 180
 
 
 def file_stem(key: str) -> str:
-    """A file name for the parameter `key`, not too long, and another for every key.
+    """Return a unique file name of limited length for the parameter `key`.
 
-    Where file systems mind something of it that is `_` in its place, and a number tells it from others like it.
+    Characters that file systems do not accept become `_`, and a hash is then added to keep the name unique.
     """
     stem = re.sub(r"[^\w.\-]", "_", key)
     return bounded(stem) if stem == key else _numbered(stem, key)
 
 
 def bounded(stem: str) -> str:
-    """`stem`, or where it is too long for a file's name its beginning, and a number that tells it from others."""
+    """Return `stem`, or its beginning and a hash if it is too long for a file name."""
     return stem if len(stem.encode()) <= MOST_BYTES else _numbered(stem, stem)
 
 
 def _numbered(stem: str, whole: str) -> str:
-    """`stem`, or its beginning, and a number made from `whole`."""
+    """Return `stem`, shortened if necessary, with a hash of `whole`."""
     digest = hashlib.blake2b(whole.encode(errors="surrogatepass"), digest_size=6).hexdigest()
     return f"{stem.encode(errors='replace')[: MOST_BYTES - 13].decode(errors='ignore')}-{digest}"
 
 
-#: Mitsuba's name of the format of each suffix.
+#: Mitsuba's format name for each suffix.
 FORMATS = {".exr": "OpenEXR", ".hdr": "RGBE", ".pfm": "PFM", ".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
 
 
 def write_image(stem: Path, image: Array, shown: Array | None = None) -> None:
-    """Write an (H, W, C) image of linear values as `<stem>.exr`, and it or what is `shown` of it as `<stem>.png`.
+    """Write an (H, W, C) image of linear values as `<stem>.exr`, and it or `shown` as `<stem>.png`.
 
-    `stem` is appended to rather than given a new suffix: keys of parameters have dots of their own.
+    The suffix is appended to `stem` and replaces nothing, because parameter keys contain dots.
     """
     write_file(Path(f"{stem}.exr"), image, linear=True)
     write_file(Path(f"{stem}.png"), image if shown is None else shown, linear=False)
 
 
 def finite_range(arrays: Iterable[Array]) -> tuple[float, float]:
-    """The least and the greatest finite value in any of the arrays; 0 and 0 where there is none."""
+    """Return the minimum and maximum finite value of all arrays; 0 and 0 if there is none."""
     known = [values for array in arrays if (values := array[np.isfinite(array)]).size]
     if not known:
         return 0.0, 0.0
@@ -77,10 +77,11 @@ def finite_range(arrays: Iterable[Array]) -> tuple[float, float]:
 
 
 def write_file(path: Path, image: Array, linear: bool) -> None:
-    """Write an (H, W, C) image of linear values in the format that the suffix of `path` names, atomically.
+    """Write an (H, W, C) image of linear values atomically, in the format given by the suffix of `path`.
 
-    `linear` writes it as it is; else it becomes 8-bit sRGB, clipped to [0, 1], and of four channels or more, and of
-    two, only the first are shown: three and one. Raises OSError, and RuntimeError for channels that a format lacks.
+    With `linear`, values are written unchanged. Otherwise they are clipped to [0, 1] and converted to 8-bit sRGB, using
+    the first three channels, or the first one of fewer than three. Raises OSError, and RuntimeError if the format does
+    not support the channels.
     """
     if linear:
         write_bitmap(path, mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32)))
@@ -92,9 +93,9 @@ def write_file(path: Path, image: Array, linear: bool) -> None:
 
 
 def write_bitmap(path: Path, bitmap: mi.Bitmap) -> None:
-    """Write a bitmap as it is, atomically, in the format that the suffix of `path` names; raises as `write_file`.
+    """Write a bitmap unchanged and atomically, in the format given by the suffix of `path`; raises as `write_file`.
 
-    By way of memory: Mitsuba would open the file itself, and leave it empty or cut short where the process ends.
+    The bitmap is encoded in memory, because Mitsuba would leave a partial file if the process ends.
     """
     stream = mi.MemoryStream()
     bitmap.write(stream, getattr(mi.Bitmap.FileFormat, FORMATS[path.suffix.lower()]))
@@ -102,7 +103,7 @@ def write_bitmap(path: Path, bitmap: mi.Bitmap) -> None:
 
 
 def load_image(path: Path) -> Array | None:
-    """An image of linear values that `write_image` wrote, (H, W, C) float32; None where none is, or it is damaged."""
+    """Return an image written by `write_image`, (H, W, C) float32, linear; None if it is missing or damaged."""
     if not path.is_file():
         return None
     try:
@@ -112,14 +113,14 @@ def load_image(path: Path) -> Array | None:
     return array if array.ndim == 3 else array[:, :, None]
 
 
-#: Names of the channels of a layer, by their number. A layer of another number has them counted.
+#: Channel names of a layer by channel count. For other counts, the channels are numbered.
 _CHANNELS = {1: "Y", 3: "RGB", 4: "RGBA"}
 
 
 def write_layers(path: Path, layers: Mapping[str, Array]) -> None:
-    """Write arrays (H, W) or (H, W, C) of linear values as one EXR at `path`, atomically, 32 bits a channel.
+    """Write arrays (H, W) or (H, W, C) of linear values atomically as one EXR with 32 bits per channel.
 
-    Each is a layer of its name, with channels such as `image.R`; all have one height and width. Raises OSError.
+    Each array becomes a layer with channels such as `image.R`. All have the same height and width. Raises OSError.
     """
     import OpenEXR
 
@@ -130,15 +131,15 @@ def write_layers(path: Path, layers: Mapping[str, Array]) -> None:
         for place, letter in enumerate(letters):
             channels[f"{name}.{letter}"] = np.ascontiguousarray(planes[:, :, place], dtype=np.float32)
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    stream = io.BytesIO()  # by way of memory: OpenEXR would leave half a file where the process ends
+    stream = io.BytesIO()  # in memory, because OpenEXR would leave a partial file if the process ends
     OpenEXR.File(header, channels).write(stream)
     write_atomically(path, lambda file: file.write(stream.getbuffer()))
 
 
 def read_layers(path: Path) -> dict[str, Array]:
-    """The layers of an EXR by name, each (H, W, C) float32; what has no layer's name is the layer "".
+    """Return the layers of an EXR by name, each (H, W, C) float32; channels without a layer form the layer "".
 
-    Raises OSError where there is no file, ValueError where it is no EXR, or damaged.
+    Raises OSError if there is no file, and ValueError if it is damaged or not an EXR.
     """
     import OpenEXR
 
@@ -147,7 +148,7 @@ def read_layers(path: Path) -> dict[str, Array]:
         planes = {
             name: channel.pixels for name, channel in OpenEXR.File(content, separate_channels=True).channels().items()
         }
-    except Exception as error:  # of many kinds, for files that are damaged
+    except Exception as error:  # damaged files raise many types
         raise ValueError(f"{path}: {error}") from None
     groups: dict[str, dict[str, Array]] = {}
     for full, pixels in planes.items():
@@ -159,33 +160,34 @@ def read_layers(path: Path) -> dict[str, Array]:
 
 
 def _place(letter: str) -> tuple[int, int, str]:
-    """Where a channel stands in its layer: colours as R, G, B, A, numbers by their value, the rest by name."""
+    """Return a sort key for channels: colours as R, G, B, A, then numbers by value, the rest by name."""
     if letter in "RGBA":
         return 0, "RGBA".index(letter), ""
     return 1, int(letter) if letter.isdecimal() else 0, letter
 
 
 def read_layer_names(path: Path) -> set[str]:
-    """The names of the layers of an EXR, from its head alone; none where there is no file, or it is no EXR."""
+    """Return the layer names of an EXR, reading only its header; empty if there is no file or it is not an EXR."""
     import OpenEXR
 
     try:
         head = OpenEXR.File(str(path), header_only=True).header()
         return {channel.name.rpartition(".")[0] for channel in head["channels"]}
-    except Exception:  # of many kinds, for files that are damaged
+    except Exception:  # damaged files raise many types
         return set()
 
 
-#: Of all values as they are.
+#: File with the unchanged values of all parameters.
 PARAMETERS_FILE = "parameters.npz"
 
 
 def write_parameters(folder: Path, values: Mapping[str, Array]) -> None:
     """Write parameter values into `folder`.
 
-    Textures (H, W, C) as `<key>.exr`, which can stand in the scene file in place of the texture that it began with,
-    and `<key>.png` to look at (a heightmap from its lowest point in black to its highest in white); the shape of every
-    parameter, and the values of those that are no textures, in `parameters.json`; everything in `parameters.npz`.
+    - `<key>.exr` and `<key>.png` of each texture (H, W, C). The EXR can replace the original texture in the scene file.
+      The PNG is for viewing; for a heightmap, black is the lowest point and white the highest.
+    - `parameters.json`: the shape of every parameter, and the values of small parameters that are not textures.
+    - `parameters.npz`: the values of all parameters.
     """
     folder.mkdir(exist_ok=True)
     summary: dict[str, Any] = {}
@@ -207,7 +209,7 @@ def write_parameters(folder: Path, values: Mapping[str, Array]) -> None:
 def write_mask(folder: Path, key: str, mask: Array) -> None:
     """Write the mask of the entries that light and sensor reach: `<key>.mask.npy`, and for textures `<key>.mask.png`.
 
-    `mask` is boolean, (H, W) for a texture and of the parameter's own shape otherwise.
+    `mask` is boolean, (H, W) for a texture and otherwise of the parameter's shape.
     """
     stem = file_stem(key) + ".mask"
     write_atomically(folder / f"{stem}.npy", lambda file: np.save(file, mask))
@@ -217,7 +219,7 @@ def write_mask(folder: Path, key: str, mask: Array) -> None:
 
 
 def read_parameters(folder: Path) -> dict[str, Array]:
-    """The values that `write_parameters` wrote into `folder`, by key; nothing where they are missing or damaged."""
+    """Return the values that `write_parameters` wrote into `folder`, by key; empty if they are missing or damaged."""
     try:
         with np.load(folder / PARAMETERS_FILE) as arrays:
             return {key: arrays[key] for key in arrays.files}
@@ -226,7 +228,7 @@ def read_parameters(folder: Path) -> dict[str, Array]:
 
 
 def read_mask(folder: Path, key: str) -> Array | None:
-    """The mask that `write_mask` wrote for the parameter `key`; None where there is none, or it is damaged."""
+    """Return the mask that `write_mask` wrote for the parameter `key`; None if it is missing or damaged."""
     try:
         mask: Array = np.load(folder / f"{file_stem(key)}.mask.npy")
     except (OSError, ValueError, EOFError):
@@ -235,5 +237,5 @@ def read_mask(folder: Path, key: str) -> Array | None:
 
 
 def in_range(heights: Array, low: float, high: float) -> Array:
-    """Heights, which may be negative and far below 1, from 0 at `low` to 1 at `high`."""
+    """Map heights linearly, so that `low` becomes 0 and `high` becomes 1."""
     return (heights - low) / ((high - low) or 1.0)

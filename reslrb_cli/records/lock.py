@@ -1,7 +1,7 @@
-"""Who works in a run folder: a lock on the folder, and the name of the process that has it.
+"""Locks on run folders, and the identity of the process that uses a folder.
 
-The lock is the kernel's (`flock` on the folder itself). It leaves no file, and it ends with its process, whatever ends
-that. Some network file systems have no locks, or none that other machines see: there the process's name decides.
+The lock is a kernel lock (`flock`) on the folder itself. It leaves no file and ends with its process in any case. Some
+network file systems have no locks, or none that other machines see. There, the recorded process decides.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-#: Who reads a folder, or puts its manifest right, has the lock for an instant: no run is refused over that, and no
-#: other reader takes it for a run.
+#: Seconds to wait for a lock, for writers and for readers. Readers hold it for an instant; neither a run nor another
+#: reader must mistake them for a run.
 WAIT_SECONDS, READER_WAIT_SECONDS = 1.0, 0.25
 _POLL_SECONDS = 0.01
 _HELD = {errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES}
 
-#: The folders that this process has locked for itself, by device and inode: who reads its own need not wait for them.
+#: Folders that this process has locked exclusively, by device and inode. Reading them needs no wait.
 _own: set[tuple[int, int]] = set()
 
 
 class InUse(Exception):
-    """Another process, or another part of this one, has the lock."""
+    """Lock held by another process or by another part of this one."""
 
 
 class FolderLock:
-    """The lock on a folder, from its construction until `release` or the end of the process.
+    """Lock on a folder, from its construction until `release` or the end of the process.
 
-    The folder keeps it when it is renamed. Several may have a `shared` one, as long as nobody has it alone. `real` is
-    False where the file system has no locks, and nothing is locked. Raises InUse, and OSError where there is no such
-    folder (a link to one is none).
+    The lock stays on the folder when it is renamed. Several holders can have a `shared` lock if nobody has an exclusive
+    one. `real` is False if the file system has no locks; nothing is locked then. Raises InUse, and OSError if there is
+    no such folder (a link does not count).
     """
 
     def __init__(self, folder: Path, wait_s: float = WAIT_SECONDS, shared: bool = False) -> None:
@@ -66,14 +66,14 @@ class FolderLock:
                 return True
 
     def is_of(self, folder: Path) -> bool:
-        """Whether the folder at that path is the one that is locked, which may have been moved or removed since."""
+        """Whether `folder` is the locked folder, which may have been moved or removed since."""
         try:
             return self._descriptor is not None and os.path.samestat(os.fstat(self._descriptor), os.lstat(folder))
         except OSError:
             return False
 
     def release(self) -> None:
-        """Let others have it."""
+        """Release the lock."""
         if self._place is not None:
             _own.discard(self._place)
             self._place = None
@@ -90,10 +90,10 @@ class FolderLock:
 
 @dataclass(frozen=True)
 class Holder:
-    """A process that works in a run folder, as its manifest names it.
+    """Process that uses a run folder, as recorded in the manifest.
 
-    `boot` tells one start of a machine from the next (None: the system does not say), and so two machines, or two
-    containers on one machine, of which the latter share it. `locked` says whether the process has a lock.
+    `boot` identifies one boot of a machine, or is None if the system does not provide it. It differs between machines,
+    and containers on one machine share it. `locked` says whether the process has a lock.
     """
 
     host: str
@@ -103,21 +103,21 @@ class Holder:
 
     @staticmethod
     def here(locked: bool) -> Holder:
-        """This process."""
+        """Return the holder for this process."""
         return Holder(platform.node(), os.getpid(), _boot(), locked)
 
     @staticmethod
     def from_json(data: Mapping[str, Any] | None) -> Holder | None:
-        """What a manifest says; None where it says nothing."""
+        """Return the holder recorded in a manifest; None if there is none."""
         try:
             return Holder(**data) if data is not None else None
         except TypeError:
             return None
 
     def is_gone(self, folder: Path) -> bool:
-        """Whether this process, which worked in `folder`, has surely ended.
+        """Whether this process, which used `folder`, has certainly ended.
 
-        Where that cannot be known, as of a process on another machine without common locks, it has not.
+        False if that is unknown, such as for a process on another machine without common locks.
         """
         here = Holder.here(locked=False)
         same_kernel = self.host == here.host or (self.boot is not None and self.boot == here.boot)
@@ -127,12 +127,12 @@ class Holder:
                     return False
                 with FolderLock(folder, READER_WAIT_SECONDS, shared=True) as lock:
                     if lock.real:
-                        # Not everywhere do machines share locks of network disks, which have no block device.
+                        # Network disks (no block device, major number 0) may not share locks between machines.
                         return same_kernel or os.major(os.stat(folder).st_dev) != 0
             except InUse:
                 return False
             except OSError:
-                pass  # the folder cannot be opened: no lock to ask
+                pass  # the folder cannot be opened, so there is no lock to test
         return self.host == here.host and (self.boot != here.boot or not is_alive(self.pid))
 
     def __str__(self) -> str:
@@ -140,12 +140,12 @@ class Holder:
 
 
 def is_alive(process: int) -> bool:
-    """Whether there is a process of this number."""
+    """Whether a process with this number exists."""
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
         return False
-    except OSError:  # somebody else's
+    except OSError:  # a process of another user
         return True
     return True
 

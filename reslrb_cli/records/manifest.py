@@ -1,7 +1,7 @@
-"""The manifest of a run, `manifest.json`: what ran, on what, and how it ended.
+"""The manifest of a run, `manifest.json`: what ran, on which machine, and how it ended.
 
-Where the process has gone without ending the run (killed, out of memory, the machine switched off), `read_manifest`
-puts right what it left.
+If the process ended without completing the manifest (killed, out of memory, machine switched off), `read_manifest`
+corrects it.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ from reslrb_cli.version import __version__
 
 PACKAGES = ("mitsuba", "drjit", "numpy")
 
-#: Held while a manifest is written; a process that is about to end takes it for good, after so many seconds at most.
+#: Lock for writing a manifest. A process about to exit waits at most LAST_WAIT_SECONDS for it and never releases it.
 _WRITING, LAST_WAIT_SECONDS = threading.Lock(), 5.0
 
 
 def now() -> str:
-    """The time as ISO 8601, in UTC, to the second."""
+    """Return the current UTC time as ISO 8601, to the second."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that a result depends on."""
+    """Return the versions of Python and of the packages that a result depends on."""
     found = {name: package_version(name) or "not installed as a package" for name in PACKAGES}
     return {"reslrb": __version__, "python": platform.python_version()} | found
 
 
 class Status(str, enum.Enum):
-    """How far a run has come."""
+    """Status of a run."""
 
     RUNNING = "running"
     FINISHED = "finished"
@@ -60,17 +60,19 @@ class Status(str, enum.Enum):
 class Manifest:
     """Provenance and outcome of one run.
 
-    `process` is who works in the folder. `plan` is what a step consists of, `paths` which paths paid, `guided` whether
-    guided emission did, `sequence` whether low-discrepancy numbers did, `pixels` whether camera paths are shared out
-    over the pixels, `incomplete` what the derivative of each parameter that moves light lacks (`MissingRecord`),
-    `memory` how a memory budget is kept, `scaling` what was measured of each parameter for `scale: auto`, `shared` the
-    time that workers took (`SharedTime`); each is None, or empty, where that was not asked for. `views` has, of each
-    view, its share of the loss, how many of its pixels are left out, by kind, and what its images are multiplied by to
-    be looked at (`shown`).
-    `results` is what the run found (`iterations`, values and errors by key,
-    `certainty`, `warnings`, and `seen`, errors as people see them, ...); `error` is the line that the user saw where
-    the run failed. `resumed` says of each time that the run was gone on with after how many iterations, when, by what
-    command, from which state, and what had changed: settings, from and to, and versions.
+    - `process`: the process that uses the folder.
+    - `plan`: the parts of a step.
+    - `paths`, `guided`, `sequence`, `pixels`: settings chosen by measurement (`records/decisions.py`).
+    - `incomplete`: the missing share of the derivative of each parameter that moves light (`MissingRecord`).
+    - `memory`: how the run keeps its memory budget.
+    - `scaling`: the measurements of each parameter for `scale: auto`.
+    - `shared`: the time of workers (`SharedTime`).
+    - `views`: per view the share of the loss, the pixels left out by kind, and the factor for viewing (`shown`).
+    - `results`: `iterations`, values and errors by key, `certainty`, `warnings`, perceptual errors (`seen`), ...
+    - `error`: the line that the user saw if the run failed.
+    - `resumed`: per resumption the iteration, the time, the command, the state, and the changed settings and versions.
+
+    Entries that do not apply are None or empty.
     """
 
     variant: str
@@ -109,28 +111,27 @@ class Manifest:
         self.write(folder)
 
     def end_for_good(self, folder: Path, status: Status) -> None:
-        """The same in a process that is about to end, by a thread beside the one that works: that writes no more."""
+        """Do the same as `end` from another thread of a process about to exit, and block all later writes."""
         _WRITING.acquire(timeout=LAST_WAIT_SECONDS)  # and never released
         self.status, self.error, self.ended = status, None, now()
         _write(folder, self.content())
 
     def content(self) -> dict[str, Any]:
-        """What the file says once it is written."""
+        """Return the content of the file."""
         return {"program": PROGRAM, **asdict(self), "status": self.status.value}
 
 
 MANIFEST_FILE = "manifest.json"
 PROGRAM = "reslrb"
 
-#: Checks the types of the fields, and of what they hold as far as `Manifest` says.
+#: Checks the types that `Manifest` declares.
 _CHECK = TypeAdapter(Manifest)
 
 
 def read_content(folder: Path) -> dict[str, Any] | None:
-    """Return the content of the manifest in `folder`, or None where there is none that `reslrb` wrote.
+    """Return the content of the manifest in `folder`, or None if there is none written by `reslrb`.
 
-    Fields of earlier versions may be missing; those that are there have the types of `Manifest`. Raises ConfigError,
-    located by the first field of another type.
+    Manifests of earlier versions may lack fields. Raises ConfigError, located by the first field of a wrong type.
     """
     try:
         text = read_file(folder / MANIFEST_FILE)
@@ -154,16 +155,15 @@ def _write(folder: Path, content: Mapping[str, Any]) -> None:
     write_atomically(folder / MANIFEST_FILE, lambda file: file.write(text), durable=True)
 
 
-#: What the manifest of a run gives as its error whose process has gone.
+#: Error in the manifest of a run whose process has ended unexpectedly.
 REASON = "its process ended before the run did"
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """Return the manifest in `folder`, or None where there is none that `reslrb` wrote. Raises ConfigError as
-    `read_content` does.
+    """Return the manifest in `folder`, or None if there is none written by `reslrb`.
 
-    One that was left saying `running` by a process that has surely gone says `interrupted`, on the disk too from then
-    on, if that can be written to; what the run never finished is removed then.
+    If the status is `running` but the process has certainly ended, the status becomes `interrupted`. If the folder is
+    writable, the correction is saved and unfinished files are removed. Raises ConfigError as `read_content`.
     """
     content = read_content(folder)
     if content is None or content.get("status") != Status.RUNNING:
@@ -174,7 +174,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     ended = _last_sign(folder) or content.get("ended")
     right = content | {"status": Status.INTERRUPTED.value, "ended": ended, "error": REASON}
     with contextlib.suppress(InUse, OSError), FolderLock(folder, READER_WAIT_SECONDS):
-        if read_content(folder) == content:  # nobody was faster
+        if read_content(folder) == content:  # unchanged by any other process
             metrics.mend(folder)
             remove_parts(folder)
             _write(folder, right)
@@ -182,7 +182,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
 
 
 def _last_sign(folder: Path) -> str | None:
-    """When the run last wrote something, as far as that can be told."""
+    """Return the time at which the run last wrote a file, if known."""
     times = []
     for name in (MANIFEST_FILE, metrics.METRICS_FILE, "checkpoint", "images", "parameters"):
         with contextlib.suppress(OSError):

@@ -1,8 +1,8 @@
-"""Files of measurements, JSON with one object a line: written as they come, and read as far as they are whole.
+"""Files of measurements, JSON with one object per line.
 
-`LineFile` is current while measurements are made, and whole at every moment, however the process ends. Its first line,
-before what was measured, is an `Origin`: where the file comes from. `read_lines` reads any such file that someone
-names. `NAME.samples.npz` beside it is what its figures were made of, to go on from.
+`LineFile` writes a file that is current and complete at every moment, however the process ends. The first line is an
+`Origin`, which says where the file comes from. `read_lines` reads such files. The file `NAME.samples.npz` holds the
+samples behind the figures, so that a measurement can be continued.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-#: Lines after which it is told how far reading has come.
+#: Lines between two reports of reading progress.
 _LINES = 4096
 
-#: What is told of a file that is being read: it, the bytes that are done, and those that it has.
+#: Called with the progress of reading: the file, the bytes read, and the size in bytes.
 Tell = Callable[[Path, int, int], None]
 
 
 @dataclass(frozen=True)
 class Lines:
-    """The objects in a file, oldest first, and the numbers of the lines, from 1, that are none.
+    """Objects in a file, oldest first, and the numbers (from 1) of the damaged lines.
 
-    What is not finite, which JSON does not have and Python writes all the same, is None.
+    Numbers that are not finite, which Python writes although JSON does not have them, are None.
     """
 
     objects: list[dict[str, Any]] = field(default_factory=list)
@@ -51,13 +51,13 @@ class Lines:
 
 
 def read_lines(path: Path, tell: Tell | None = None) -> Lines:
-    """Read a file of JSON lines. Raises ConfigError, located in it, where it cannot be read at all.
+    """Read a file of JSON lines. Raises ConfigError, located in the file, if it cannot be read.
 
-    A last line that lacks its end is one that a process did not come to finish, or is about to: it is left out, and not
-    counted as damaged.
+    A last line without a line end is still being written or was interrupted. If it is incomplete, it is left out and
+    does not count as damaged.
     """
     found, done = Lines(), 0
-    # Numbers that are not finite are found as they are parsed: to go through all that was parsed takes twice as long.
+    # Numbers that are not finite are replaced during parsing, because a second pass takes twice as long.
     decoder = json.JSONDecoder(parse_float=_finite, parse_constant=lambda name: None)
     with open_file(path) as file, _without_collecting():
         size = os.fstat(file.fileno()).st_size
@@ -88,7 +88,7 @@ def _finite(text: str) -> float | None:
 
 @contextmanager
 def _without_collecting() -> Iterator[None]:
-    """Python's search for cycles left out: it would go through millions of objects that have none, again and again."""
+    """Disable garbage collection in the block: it would scan millions of objects without cycles repeatedly."""
     was_on = gc.isenabled()
     gc.disable()
     try:
@@ -99,13 +99,13 @@ def _without_collecting() -> Iterator[None]:
 
 
 class LineFile:
-    """JSON with one object a line, written anew as a whole each time; what another process wrote stays until then.
+    """JSON file with one object per line, rewritten as a whole each time; an existing file stays until the first write.
 
-    A pipe, or whatever else is no regular file, has each line once: those that are final, as they come.
+    A pipe or any other file that is not regular receives each final line once, when it is known.
     """
 
     def __init__(self, path: Path) -> None:
-        # What a link points to is replaced, not the link.
+        # Replaces the target of a link, not the link.
         self._path = Path(os.path.realpath(path))
         self.is_stream = os.path.lexists(path) and not self._path.is_file()
         self._stream: IO[str] | None = None
@@ -114,9 +114,9 @@ class LineFile:
             remove_parts_of(self._path)
 
     def write(self, final: Sequence[Line], provisional: Sequence[Line] = ()) -> None:
-        """Write all lines so far: those that are final, which a later call has too, and the others.
+        """Write all lines so far: the final ones, which later calls must repeat, and the provisional ones.
 
-        Raises OSError, and then the file is as it was.
+        Raises OSError, and then the file is unchanged.
         """
         if not self.is_stream:
             text = "".join(line.to_json() + "\n" for line in [*final, *provisional])
@@ -131,22 +131,22 @@ class LineFile:
         self._stream.flush()
 
     def close(self) -> None:
-        """Close what is open."""
+        """Close the stream, if there is one."""
         if self._stream is not None:
             self._stream.close()
 
 
 def _command() -> list[str]:
-    """The command line of this process, as it can be typed anywhere: the program without its folder."""
+    """Return the command line of this process, with the program's name instead of its path."""
     return ["reslrb", *(printable(word) for word in sys.argv[1:])]
 
 
 @dataclass(frozen=True)
 class Origin(Line):
-    """What measured, on what, and the command that does it again.
+    """Origin of a file of measurements: the machine, the software, and the command that repeats the measurement.
 
-    `command` are its words, `versions` those of `manifest.json`; `written` is when the file was begun. What a damaged
-    or foreign line does not tell is empty.
+    `command` is a list of words, `versions` is as in `manifest.json`, and `written` is the time when the file was
+    started. Missing entries are empty.
     """
 
     KIND: ClassVar[str] = "origin"
@@ -160,7 +160,7 @@ class Origin(Line):
 
 
 def read_origin(entry: Mapping[str, Any]) -> Origin | None:
-    """The record that a line holds; None where it holds another one. Members of other types than theirs are empty."""
+    """Return the origin in a line, or None if the line holds another record. Values of a wrong type become empty."""
     if entry.get("kind") != Origin.KIND:
         return None
     words, named = entry.get("command"), entry.get("versions")
@@ -172,34 +172,34 @@ def read_origin(entry: Mapping[str, Any]) -> Origin | None:
     )
 
 
-#: Bytes of samples that are kept; more are not.
+#: Maximum size of saved samples in bytes; larger ones are not saved.
 MOST_SAMPLES_BYTES = 2**28
 
-#: A head, which JSON can hold, and arrays by name.
+#: A header of JSON values, and arrays by name.
 Kept = tuple[dict[str, Any], dict[str, "np.ndarray"]]
 _HEAD = "head"
 
 
 def samples_file(json_file: Path) -> Path:
-    """Where the samples behind a JSON file are."""
+    """Return the path of the samples behind a JSON file."""
     return json_file.with_suffix(".samples.npz")
 
 
 def are_kept(arrays: Mapping[str, np.ndarray]) -> bool:
-    """Whether samples are few enough to be kept."""
+    """Whether samples are small enough to be saved."""
     return sum(array.nbytes for array in arrays.values()) <= MOST_SAMPLES_BYTES
 
 
 def write_samples(path: Path, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write the file atomically: `head`, which JSON can hold, and the arrays. Raises OSError."""
-    import numpy as np  # whoever asks for help of a command has no need of it
+    """Write `head`, JSON values, and the arrays atomically. Raises OSError."""
+    import numpy as np  # imported late, because the help of a command does not need it
 
     content: dict[str, Any] = {_HEAD: np.array(json.dumps(head)), **arrays}
     write_atomically(path, lambda file: np.savez(file, **content))
 
 
 def read_samples(path: Path) -> Kept:
-    """What `write_samples` wrote. Raises ConfigError, located in the file, where it is none of that."""
+    """Read the result of `write_samples`. Raises ConfigError, located in the file, if it is anything else."""
     from reslrb_cli.records.checkpoint import open_archive
 
     with open_archive(path) as archive:
@@ -208,15 +208,15 @@ def read_samples(path: Path) -> Kept:
         return head, arrays
 
 
-#: Seconds between two pages, at least; and the times as long as the last page took: pages take a twentieth of a run,
-#: where nothing else is said.
+#: Minimum seconds between two pages, and minimum interval as a multiple of the time of the last page. By default, pages
+#: take at most a twentieth of a run.
 PAGE_SECONDS, PAGE_SHARE = 5.0, 20.0
 
 
 class LivePage:
-    """Has `write` write the page, or `what` else, anew, at once and then now and then; called outside of iterations.
+    """Page, or another file named by `what`, that `write` rewrites at once and then now and then, between iterations.
 
-    A page that cannot be written ends no run, and is not tried again: the last one, at the run's end, says why.
+    If the page cannot be written, the run continues without it; writing the last page at the end reports the reason.
     """
 
     def __init__(

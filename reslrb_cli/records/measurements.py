@@ -1,6 +1,6 @@
-"""The records that measuring commands write with `--json`, one object a line.
+"""Records that the measuring commands write with `--json`, one object per line.
 
-Lines of `gradcheck` are read back as the records that they were, where they are whole.
+`record_of` turns a line of `gradcheck` back into a record.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from reslrb_cli.records.metrics import Line, finite
 
 
 class BenchStatus(str, enum.Enum):
-    """How a case ended."""
+    """Outcome of a case."""
 
     OK = "ok"
     OUT_OF_MEMORY = "out_of_memory"
@@ -27,7 +27,7 @@ class BenchStatus(str, enum.Enum):
 
 @dataclass(frozen=True)
 class Spread:
-    """Median, least and greatest of repeated measurements."""
+    """Median, minimum and maximum of repeated measurements."""
 
     median: float
     min: float
@@ -35,22 +35,26 @@ class Spread:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Spread:
-        """The spread of at least one value."""
+        """Return the spread of at least one value."""
         return cls(statistics.median(values), min(values), max(values))
 
 
 @dataclass(frozen=True)
 class BenchRecord(Line):
-    """Cost of a step of one integrator at one depth, number of samples, size of film, and size of textures.
+    """Cost of a step of one integrator at one depth, sample count, film size and texture size.
 
-    `estimator` is None where the integrator has none; what makes it another than by default, but for `capacity`, stands
-    behind its name, `reservoir(weight=adjoint)`. `step_ms` is wall time, `kernel_ms` what kernels took of it,
-    `codegen_ms` their generation (and the look into the cache of kernels), `tracing_ms` the rest: Python and what it
-    calls; all of warm steps. `cold_ms` is the wall time of the first step in a new process with an empty kernel cache,
-    `cold_codegen_ms` its part in which kernels were generated and compiled. `peak_mib` is the most that the allocator
-    held in that step, the scene included. `scratch_bytes` is thread-local memory of a path. `texels` are those of all
-    textures that are parameters. `paths` are those of the integrator (`light`, `camera`, `both`), `light_share` is the
-    share of light paths where there are both. What was not measured is None: everything, where `status` is not ok.
+    - `estimator`: None if the integrator has none. Options other than the defaults follow the name, except `capacity`:
+      `reservoir(weight=adjoint)`.
+    - `step_ms`, `kernel_ms`, `codegen_ms`, `tracing_ms`: wall time of warm steps, and its parts: execution of kernels,
+      their generation (with the lookup in the kernel cache), and the rest (Python and the functions that it calls).
+    - `cold_ms`, `cold_codegen_ms`: wall time of the first step in a new process with an empty kernel cache, and the
+      part for generating and compiling kernels.
+    - `peak_mib`: peak memory of the allocator in that step, including the scene.
+    - `scratch_bytes`: thread-local memory of a path.
+    - `texels`: texel count of all textures that are parameters.
+    - `paths`, `light_share`: paths of the integrator (`light`, `camera`, `both`); with both, the share of light paths.
+
+    Values that were not measured are None. If `status` is not ok, this holds for all of them.
     """
 
     integrator: str
@@ -76,13 +80,13 @@ class BenchRecord(Line):
     light_share: float | None = None
 
 
-#: Relative errors whose time is told.
+#: Relative errors for which the required time is reported.
 TARGETS = (0.1, 0.03, 0.01)
 
 
 @dataclass(frozen=True)
 class Range:
-    """An estimate and the ends of its 95 % interval."""
+    """Estimate with its 95 % interval."""
 
     value: float
     low: float
@@ -91,11 +95,11 @@ class Range:
 
 @dataclass(frozen=True)
 class Method:
-    """What was measured: an integrator, and how its steps take their samples.
+    """Measured method: an integrator and the sampling of its steps.
 
-    `estimator` is None where the integrator has none, `capacity` where the estimator has none; `adjoint` is
-    `run.adjoint`, None where dL/dI is held or nothing is differentiated. `label` is how the user wrote it, `spp` are
-    samples per pixel of a step. `paths` and `light_share` are as in a `BenchRecord`; `auto` and None: the run decides.
+    `estimator` and `capacity` are None if they do not apply. `adjoint` is `run.adjoint`, or None if dL/dI is fixed or
+    nothing is differentiated. `label` is the method as the user wrote it, and `spp` the samples per pixel of a step.
+    `paths` and `light_share` are as in a `BenchRecord`; with `auto` and None, the run decides.
     """
 
     label: str
@@ -110,11 +114,11 @@ class Method:
 
 @dataclass(frozen=True)
 class PointRecord(Line):
-    """The error of the average of `steps` steps, which take `elapsed_s` seconds.
+    """Error of the average of `steps` steps, which take `elapsed_s` seconds.
 
-    `parameter` is a parameter's key, `all` (of them together) or `image`. Errors are relative to the size of what is
-    estimated, in L2 over all its entries. `relative_rmse` has the reference's own error, `reference_rmse`, subtracted,
-    and is the root of the mean square over `repeats` such averages; None where it drowns in the reference's.
+    `parameter` is a parameter key, `all` (all parameters together) or `image`. Errors are in L2 over all entries,
+    relative to the norm of the estimated quantity. `relative_rmse` is the root mean square over `repeats` such
+    averages, with the error of the reference, `reference_rmse`, subtracted; None if the latter dominates.
     """
 
     KIND: ClassVar[str] = "point"
@@ -130,16 +134,20 @@ class PointRecord(Line):
 
 @dataclass(frozen=True)
 class MethodRecord(Line):
-    """What the points of one method and parameter come to; `repeats` is the number of steps.
+    """Summary of the points of one method and parameter; `repeats` is the number of steps.
 
-    `relative_rmse` is that of one step, from their variance, which takes `step_s` seconds; `cold_s` is the first step
-    in a new process, which compiles. `slope` is d log error / d log seconds. `efficiency` is 1 / (relative variance *
-    seconds), of a `biased` method with squared bias + variance. `bias_z` is the largest deviation from
-    `bias_reference`, in standard errors, `bias_z_limit` what it exceeds by chance with probability 1e-4 anywhere in the
-    table; `bias` its relative size, where there is one; `biased` is None where the question is open, as `message`
-    says. `independent` says whether that reference shares no code with what it judges. `seconds_to` has for each error
-    (`0.1`, `0.03`, `0.01`) the time until averages are as good, None where a bias keeps them from it; those in
-    `extrapolated` lie beyond the steps that were taken, or below the reference's error. What was not measured is None.
+    - `relative_rmse`, `step_s`: error of one step, from the variance of the steps, and seconds per step.
+    - `cold_s`: seconds of the first step in a new process, including compilation.
+    - `slope`: d log error / d log seconds.
+    - `efficiency`: 1 / (relative variance * seconds); for a `biased` method with squared bias + variance.
+    - `bias_z`, `bias_z_limit`: largest deviation from `bias_reference` in standard errors, and the limit that it
+      exceeds by chance anywhere in the table with probability 1e-4.
+    - `bias`, `biased`: relative bias, if there is one; `biased` is None if undecided, with the reason in `message`.
+    - `independent`: whether the reference shares no code with the method.
+    - `seconds_to`: time until averages reach each error (`0.1`, `0.03`, `0.01`); None if a bias prevents it.
+    - `extrapolated`: the errors whose time lies beyond the measured steps or below the reference's error.
+
+    Values that were not measured are None.
     """
 
     KIND: ClassVar[str] = "method"
@@ -167,10 +175,9 @@ class MethodRecord(Line):
 
 @dataclass(frozen=True)
 class ReferenceRecord(Line):
-    """What errors are taken from: the mean of `repeats` steps, with the relative standard error `reference_rmse`.
+    """Reference for the errors: the mean of `repeats` steps, with the relative standard error `reference_rmse`.
 
-    `bias_z` is its own largest deviation from an independent reference, as of a `MethodRecord`; None where there is
-    none.
+    `bias_z` is its largest deviation from an independent reference, as in a `MethodRecord`; None without one.
     """
 
     KIND: ClassVar[str] = "reference"
@@ -188,7 +195,7 @@ class ReferenceRecord(Line):
 
 @dataclass(frozen=True)
 class SummaryRecord(Line):
-    """Which method is the best, in words."""
+    """Sentence about the best method."""
 
     KIND: ClassVar[str] = "summary"
 
@@ -196,9 +203,10 @@ class SummaryRecord(Line):
 
 
 class Reference(str, enum.Enum):
-    """What a gradient is compared with; `forward_mode` by the dot product <w, J v> = <J^T w, v>.
+    """Reference for a gradient.
 
-    `unguided`: guided steps are compared with unguided steps of the same estimator.
+    `forward_mode` uses the dot product <w, J v> = <J^T w, v>. `unguided` compares guided steps with unguided steps of
+    the same estimator.
     """
 
     PTRACER = "ptracer"
@@ -212,10 +220,10 @@ class Reference(str, enum.Enum):
 
 
 class Kind(str, enum.Enum):
-    """How it is compared.
+    """Kind of comparison.
 
-    `equal_seeds`: by relative L2, where both compute the same numbers but for rounding. `expectation`: by z scores over
-    many seeds. `image`: so too, but not the gradient, the image it belongs to.
+    `equal_seeds`: by relative L2, if both sides compute the same numbers except for rounding. `expectation`: by z
+    scores over many seeds. `image`: by z scores of the image instead of the gradient.
     """
 
     EQUAL_SEEDS = "equal_seeds"
@@ -224,11 +232,13 @@ class Kind(str, enum.Enum):
 
 
 class Verdict(str, enum.Enum):
-    """What came of it. All but `holds` and `fails` leave the question open, and `message` says why.
+    """Result of a comparison. All values except `holds` and `fails` are undecided, with the reason in `message`.
 
-    `heavy_tailed`: single seeds carry the variance, so that z scores prove nothing. `unresolved`: noise hides
-    deviations as large as the gradient itself. `unreached`: gradient and reference are exactly zero.
-    `no_reference`: nothing here counts as one. `not_measured`: time was up before there were samples.
+    - `heavy_tailed`: single seeds dominate the variance, so z scores prove nothing.
+    - `unresolved`: noise hides deviations as large as the gradient itself.
+    - `unreached`: gradient and reference are exactly zero.
+    - `no_reference`: no reference is available.
+    - `not_measured`: the time ran out before the first samples.
     """
 
     HOLDS = "holds"
@@ -242,10 +252,10 @@ class Verdict(str, enum.Enum):
 
 @dataclass(frozen=True)
 class Compared:
-    """The two sides of a comparison: the gradient of a parameter by an integrator, and a reference.
+    """Two sides of a comparison: the gradient of a parameter by an integrator, and a reference.
 
-    `case` names the scene: the configuration, or a case of a suite. `parameter` is None where all are compared
-    together, or the image; `estimator` where the integrator has none. `seeds` is how many gradients each side has.
+    `case` is the configuration, or a case of a suite. `parameter` is None if all parameters together or the image are
+    compared. `estimator` is None if the integrator has none. `seeds` is the number of gradients on each side.
     """
 
     case: str
@@ -259,13 +269,17 @@ class Compared:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The outcome of a comparison of estimates with a reference.
+    """Outcome of a comparison of estimates with a reference.
 
-    `relative_l2` is the distance from the reference over its norm: at equal seeds of the samples, else of the
-    means. `z_rms` and `z_max` are in standard errors; each has its limit, corrected for the number of comparisons.
-    `cosine` is that of the angle between the means, `variance_ratio` the variance over that of the reference.
-    `detectable` is the least deviation, as a fraction of the reference, that would have been seen. `message` says what
-    the figures do not. What does not apply is None.
+    - `relative_l2`: distance from the reference divided by its norm, of the samples at equal seeds, otherwise of the
+      means.
+    - `z_rms`, `z_max`: in standard errors, with limits corrected for the number of comparisons.
+    - `cosine`: cosine of the angle between the means.
+    - `variance_ratio`: variance divided by that of the reference.
+    - `detectable`: smallest detectable deviation, as a fraction of the reference.
+    - `message`: remarks.
+
+    Values that do not apply are None.
     """
 
     verdict: Verdict
@@ -282,25 +296,25 @@ class Comparison:
 
     @property
     def holds(self) -> bool | None:
-        """True or False where the comparison decides; None where it does not."""
+        """Whether the comparison holds; None if it is undecided."""
         return {Verdict.HOLDS: True, Verdict.FAILS: False}.get(self.verdict)
 
 
 @dataclass(frozen=True)
 class GradcheckRecord(Comparison, Compared, Line):
-    """One comparison: what was compared, by which paths (as in a `BenchRecord`), and what was found."""
+    """One comparison: its two sides, the paths (as in a `BenchRecord`) and the outcome."""
 
     paths: str = "light"
     light_share: float | None = None
 
     def to_json(self) -> str:
-        """The record as one line of JSON; figures that are not finite become null."""
+        """Return the record as one line of JSON; numbers that are not finite become null."""
         return json.dumps(finite(asdict(self)) | {"holds": self.holds}, allow_nan=False)
 
 
 @dataclass(frozen=True)
 class Band:
-    """The median of several runs, and the least and the greatest of them."""
+    """Median, minimum and maximum of several runs."""
 
     median: float
     low: float
@@ -308,32 +322,32 @@ class Band:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Band | None:
-        """The band of some values; None where there are none."""
+        """Return the band of some values; None if there are none."""
         return cls(statistics.median(values), min(values), max(values)) if values else None
 
 
-#: Standard errors within which a share counts as none.
+#: A missing share within this many standard errors counts as zero.
 NOTHING = 3
 
-#: A share that single precision may have made.
+#: Missing share that rounding in single precision can cause.
 LEAST = 1e-4
 
-#: A share that turns a run's steps, where it is told from 0; and one with which they may lead the other way.
+#: Missing share that changes the direction of a run's steps, and one that may reverse it.
 NOTICED, HALF = 0.05, 0.5
 
-#: A standard error of a share that is small enough.
+#: Standard error of the share that is small enough.
 KNOWN = 0.03
 
-#: The verdict on a parameter whose derivative lacks that much.
+#: Verdict on a parameter with an incomplete derivative.
 INCOMPLETE = "derivative incomplete"
 
 
 @dataclass(frozen=True)
 class MissingRecord(Line):
-    """The share of a parameter's derivative that is not in the attached gradient, relative to finite differences.
+    """Share of a parameter's derivative that the attached gradient lacks, relative to finite differences.
 
-    `share` and `standard_error` are None where the derivative itself is lost in its noise, and where there was no time
-    to measure them (no `seeds`).
+    `share` and `standard_error` are None if noise hides the derivative, or if there was no time to measure them
+    (`seeds` is 0).
     """
 
     case: str
@@ -346,7 +360,7 @@ class MissingRecord(Line):
 
     @property
     def is_unknown(self) -> bool:
-        """Whether more than half may be missing, without being told from 0."""
+        """Whether the interval of the missing share includes both 0 and more than half."""
         if self.share is None or self.standard_error is None:
             return True
         margin = NOTHING * self.standard_error
@@ -354,7 +368,7 @@ class MissingRecord(Line):
 
     @property
     def is_incomplete(self) -> bool:
-        """Whether the values that the derivative leads to cannot be relied on."""
+        """Whether so much is missing that the recovered values are unreliable."""
         return self.is_unknown or (self.share or 0) > max(NOTHING * (self.standard_error or 0), NOTICED)
 
     @property
@@ -364,17 +378,17 @@ class MissingRecord(Line):
 
     @property
     def is_known(self) -> bool:
-        """Whether more seeds would hardly change what is made of it."""
+        """Whether the share is known well enough, so that more seeds would hardly change the verdict."""
         return self.standard_error is not None and (self.standard_error < KNOWN or self.is_for_the_most_part)
 
     def percent(self) -> str:
-        """The share in words."""
+        """Return the share in words."""
         if self.share is None or self.standard_error is None:
             return "an unknown share"
         return f"{_percent(self.share)} +- {_percent(self.standard_error)}"
 
     def line(self) -> str:
-        """What it says, in one line."""
+        """Return the record as one line of text."""
         if not self.seeds:
             return (
                 f"{self.parameter}: silhouettes and edges of shadows are not in the derivative; there was no time to "
@@ -405,7 +419,7 @@ R = TypeVar("R", bound=Line)
 
 
 def record_of(kind: type[R], entry: Mapping[str, Any]) -> R | None:
-    """The record of that class which a line, read back, holds; None where it holds none."""
+    """Return the record of class `kind` in a line that was read back; None if it holds no such record."""
     try:
         found: R = _READERS[kind].validate_python(entry)
     except ValidationError:
@@ -414,6 +428,6 @@ def record_of(kind: type[R], entry: Mapping[str, Any]) -> R | None:
 
 
 def incomplete_records(entries: Sequence[Mapping[str, Any]]) -> list[MissingRecord]:
-    """The records among `entries`, of a manifest, that say that a derivative is incomplete."""
+    """Return the records of incomplete derivatives among the `entries` of a manifest."""
     found = (record_of(MissingRecord, entry) for entry in entries)
     return [record for record in found if record is not None and record.is_incomplete]

@@ -1,7 +1,7 @@
-"""The metrics of a run, `metrics.jsonl`: one object a line, one line an iteration.
+"""The metrics of a run, `metrics.jsonl`: one JSON object per line, one line per iteration.
 
-A run that is resumed goes on from a part of the file: the iterations that its checkpoint contains, and no others. The
-tallies add up from the records what of a whole run was not finite, or clamped.
+A resumed run keeps the lines of the iterations in its checkpoint and drops the others. The tallies sum up, over a whole
+run, values that were not finite, clamped gradients and regularizers.
 """
 
 from __future__ import annotations
@@ -26,23 +26,26 @@ METRICS_FILE = "metrics.jsonl"
 
 
 class Line:
-    """A line of JSON: a dataclass's fields in their order, behind `kind` where the class has a `KIND`.
+    """Base class of dataclasses that become a line of JSON.
 
-    Those of a `method` stand beside the others, in front. Figures that are not finite become null: JSON has none.
+    The line has `kind` first if the class has a `KIND`, then the fields of `method`, then the other fields in their
+    order. Numbers that are not finite become null.
     """
 
     KIND: ClassVar[str] = ""
 
     def to_json(self) -> str:
-        """The record as one line of JSON."""
+        """Return the record as one line of JSON."""
         values = asdict(self)  # type: ignore[call-overload]  # of a dataclass derived from this
         head = {"kind": self.KIND} if self.KIND else {}
         return json.dumps(head | values.pop("method", {}) | finite(values), allow_nan=False)
 
 
 def finite(value: Any, instead: Callable[[float], object] = lambda number: None) -> Any:
-    """The same of mappings, lists and numbers, with None, or what is to stand `instead`, for numbers that are not
-    finite: JSON has none."""
+    """Return `value` with numbers that are not finite replaced by None, or by the result of `instead`, for JSON.
+
+    `value` can be a number or nested mappings and lists of numbers.
+    """
     if isinstance(value, dict):
         return {key: finite(entry, instead) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -54,15 +57,17 @@ def _nan_for_null(value: object, handler: ValidatorFunctionWrapHandler) -> float
     return math.nan if value is None else handler(value)
 
 
-#: A number that may be not finite, which JSON does not have.
+#: Number that may not be finite; null in JSON is read as NaN.
 Figure = Annotated[float, WrapValidator(_nan_for_null)]
 
 
 @dataclass(frozen=True)
 class Clamped:
-    """What a clamp did to the gradients of an iteration: how many entries it changed; by parameter, the share that it
-    took of the gradient (the sum of absolute values), and the bias that this made of the iterations so far: the share
-    that it took of their sum."""
+    """Effect of clamping on the gradients of an iteration: the number of changed entries, and two shares by parameter.
+
+    `share` is the share of the gradient that was removed (sum of absolute values). `bias` is the share removed from the
+    sum of the gradients of all iterations so far.
+    """
 
     entries: int
     share: dict[str, Figure]
@@ -71,8 +76,10 @@ class Clamped:
 
 @dataclass(frozen=True)
 class Regularized:
-    """What regularizers cost in an iteration, by parameter and type, weights included; no part of the loss. And by
-    parameter how many heights the update left at the least thickness."""
+    """Weighted regularizer costs of an iteration, by parameter and type; they are not part of the loss.
+
+    `held` is the number of heights at the minimum thickness after the update, by parameter.
+    """
 
     costs: dict[str, dict[str, Figure]]
     held: dict[str, int]
@@ -80,19 +87,22 @@ class Regularized:
 
 @dataclass(frozen=True)
 class Record(Line):
-    """What one iteration was: its step, and the parameters before its update.
+    """Record of one iteration: its step, and the parameters before its update.
 
-    `step_ms` is the wall time of the step (image, loss and gradient of every sensor, evaluated; the optimiser's update
-    left out), `codegen_ms` the part of it in which kernels were generated and compiled. `primal_ms` and `adjoint_ms`
-    are None where one kernel does both. `elapsed_s` is the time since the start in steps and updates; files and
-    the reading of `parameter_errors` are not in it. `peak_mib` is the allocator's high-water mark since the start.
-    `nonfinite` counts the entries of loss, of its derivative by the image and of gradients that were not finite;
-    `grad_norm` leaves them out. `nonfinite_by_parameter` holds those of gradients and updates, of parameters with any.
-    `clamped` is None where gradients are not clamped; `grad_norm` is that before. `held_out` is the loss of views that
-    are held out, None without any, and of iterations that did not look. `regularized` is None without regularizers.
-    `parameter_errors` are root mean square errors by key, each in its parameter's unit, over the entries that light and
-    sensor reach, of the parameters whose true value is known; `parameter_rmse` is that over the entries of all of them,
-    None where they have no common unit, or no true value is known.
+    - `step_ms`: wall time of the step (image, loss and gradient of every sensor, without the optimiser's update).
+    - `codegen_ms`: the part of `step_ms` for generating and compiling kernels.
+    - `primal_ms`, `adjoint_ms`: times of image and gradient; None if one kernel computes both.
+    - `elapsed_s`: time in steps and updates since the start, without writing files and computing `parameter_errors`.
+    - `peak_mib`: peak memory of the allocator since the start.
+    - `nonfinite`: number of entries that are not finite in the loss, its derivative by the image, and the gradients.
+    - `nonfinite_by_parameter`: the same in gradients and updates, for parameters that have any.
+    - `grad_norm`: norm of the gradient before clamping, without entries that are not finite.
+    - `clamped`: None if gradients are not clamped.
+    - `held_out`: loss of the views that are held out; None if there are none or the iteration did not compute it.
+    - `regularized`: None without regularizers.
+    - `parameter_errors`: root mean square error of each parameter whose true value is known, by key, in the unit of the
+      parameter, over the entries that light and sensor reach.
+    - `parameter_rmse`: the same over all these parameters; None if they have no common unit or no true value is known.
     """
 
     __pydantic_config__ = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
@@ -118,7 +128,7 @@ class Record(Line):
 
 
 class MetricsWriter:
-    """Appends records to `metrics.jsonl`; each line is in the file once `write` returns, and whole whatever happens."""
+    """Writer that appends records to `metrics.jsonl`; when `write` returns, the file contains the complete line."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / METRICS_FILE
@@ -126,11 +136,11 @@ class MetricsWriter:
         mend(folder)
 
     def write(self, record: Record) -> None:
-        """Append one record. Raises OSError, with the file as it was, where there is no room or no file any more."""
+        """Append one record. Raises OSError if the disk is full or the file was removed; the file is then unchanged."""
         line = record.to_json().encode() + b"\n"
         if self._descriptor is None:
             if not self._path.exists():
-                write_atomically(self._path, lambda file: file.write(line))  # it is never seen empty
+                write_atomically(self._path, lambda file: file.write(line))  # readers never see an empty file
                 line = b""
             self._descriptor = os.open(self._path, os.O_WRONLY | os.O_APPEND)
         state = os.fstat(self._descriptor)
@@ -144,9 +154,9 @@ class MetricsWriter:
             raise OSError(error.errno, error.strerror, str(self._path)) from error
 
     def sync(self) -> None:
-        """Have all that was written on the disk, so that no loss of power takes lines that a checkpoint counts on."""
+        """Flush the lines to the disk, so that a loss of power cannot remove lines that a checkpoint needs."""
         if self._descriptor is not None:
-            with contextlib.suppress(OSError):  # of a disk that cannot: the lines are written all the same
+            with contextlib.suppress(OSError):  # not all file systems support it; the lines are written anyway
                 os.fsync(self._descriptor)
 
     def __enter__(self) -> MetricsWriter:
@@ -158,7 +168,7 @@ class MetricsWriter:
 
 
 def mend(folder: Path) -> None:
-    """Cut off a last line that a process did not come to finish. Raises OSError where that cannot be done."""
+    """Remove an incomplete last line. Raises OSError if that is impossible."""
     try:
         with (folder / METRICS_FILE).open("r+b") as file:
             text = file.read()
@@ -170,10 +180,10 @@ def mend(folder: Path) -> None:
 
 
 def read_records(folder: Path, count: int, last: Record | None) -> tuple[list[Record], int]:
-    """The first `count` records in `folder`, and the bytes that they take; the rest was not kept by a checkpoint.
+    """Return the first `count` records in `folder`, which are those of a checkpoint, and their size in bytes.
 
-    A full disk may have taken the line of the last one, which the checkpoint has too: `last`. Raises ConfigError,
-    located in the file and the line, where others are missing or are not what a run writes.
+    `last` is the last of them, stored in the checkpoint; it replaces a line lost to a full disk. Raises ConfigError,
+    located by file and line, if other records are missing or damaged.
     """
     path = folder / METRICS_FILE
     content = read_file(path) if count and os.path.lexists(path) else b""
@@ -188,7 +198,7 @@ def read_records(folder: Path, count: int, last: Record | None) -> tuple[list[Re
 
 
 def cut_back(folder: Path, records: list[Record], size: int) -> None:
-    """Leave `records` alone in `folder`, of which the first `size` bytes hold all but the last one or none."""
+    """Cut the file in `folder` back to `records`; its first `size` bytes hold all of them, or all except the last."""
     path = folder / METRICS_FILE
     if not records:
         path.unlink(missing_ok=True)
@@ -203,7 +213,7 @@ _RECORD: TypeAdapter[Record] = TypeAdapter(Record)
 
 
 def _record(line: bytes, number: int, path: Path) -> Record:
-    """The record of iteration `number`. Raises ConfigError."""
+    """Return the record of iteration `number` in `line`. Raises ConfigError."""
     try:
         record = _RECORD.validate_json(line)
         if record.iteration == number:
@@ -216,17 +226,17 @@ def _record(line: bytes, number: int, path: Path) -> Record:
 
 
 class _Tally:
-    """What of a whole run is added up from its records."""
+    """Sum over the records of a run."""
 
     def to_json(self) -> dict[str, Any]:
-        """For the manifest."""
+        """Return the tally for the manifest."""
         found: dict[str, Any] = finite(asdict(self))  # type: ignore[call-overload]  # of a dataclass derived from this
         return found
 
 
 @dataclass
 class NonFiniteTally(_Tally):
-    """Iterations with values that were not finite, the number of these values, and those of each parameter."""
+    """Number of iterations with values that were not finite, and of these values, in total and by parameter."""
 
     iterations: int = 0
     values: int = 0
@@ -240,7 +250,7 @@ class NonFiniteTally(_Tally):
             self.by_parameter[key] = self.by_parameter.get(key, 0) + count
 
     def __str__(self) -> str:
-        """For the last line of a run; empty where all was finite."""
+        """Return the words for the last line of a run; empty if all values were finite."""
         if not self.iterations:
             return ""
         parameters = ", ".join(f"{key} {count}" for key, count in self.by_parameter.items())
@@ -250,7 +260,7 @@ class NonFiniteTally(_Tally):
 
 @dataclass
 class ClampTally(_Tally):
-    """Iterations in which gradients were clamped, the number of entries, and the bias over the run by parameter."""
+    """Number of iterations with clamped gradients, of clamped entries, and the bias over the run by parameter."""
 
     iterations: int = 0
     entries: int = 0
@@ -264,7 +274,7 @@ class ClampTally(_Tally):
             self.bias |= record.clamped.bias
 
     def __str__(self) -> str:
-        """For the last line of a run; empty where nothing was clamped."""
+        """Return the words for the last line of a run; empty if nothing was clamped."""
         if not self.iterations:
             return ""
         shares = ", ".join(f"{100 * value:.2g} % of that of {key}" for key, value in self.bias.items())
@@ -273,8 +283,10 @@ class ClampTally(_Tally):
 
 @dataclass
 class RegularizedTally(_Tally):
-    """What regularizers cost in the last iteration, by parameter and type, and the iterations after which heights were
-    held at the least thickness, and how many heights after the last."""
+    """Regularizer costs of the last iteration, by parameter and type, and heights held at the minimum thickness.
+
+    `held_iterations` counts the iterations that held heights; `held` is the number of heights after the last one.
+    """
 
     iterations: int = 0
     costs: dict[str, dict[str, float]] = field(default_factory=dict)
@@ -289,7 +301,7 @@ class RegularizedTally(_Tally):
             self.held_iterations += any(self.held.values())
 
     def __str__(self) -> str:
-        """For the last line of a run; empty where nothing is regularized."""
+        """Return the words for the last line of a run; empty if nothing is regularized."""
         told = [f"{name} of {key} {value:.3g}" for key, costs in self.costs.items() for name, value in costs.items()
                 if value]  # fmt: skip
         if self.held_iterations:

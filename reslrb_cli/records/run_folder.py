@@ -1,8 +1,9 @@
-"""The folder of one run: where it is made, what may be replaced, who works in it, and how a run goes on in it.
+"""The folder of a run: creating, replacing, locking, resuming and reading it.
 
-`read_value` reads the values to which a run brought its parameters, whether it is finished, interrupted or still at
-work, and `recovered` makes the experiment that begins with them. `RunFolder` makes and replaces folders. Those that are
-gone on with are opened under their lock (`opened`), or copied into a new one (`copy_into`).
+- `read_value`: read a recovered parameter value of a run that is finished, interrupted or in progress.
+- `recovered`: make the experiment that starts from the recovered values.
+- `RunFolder`: create and replace folders.
+- `opened`, `copy_into`: lock the folder of a run to resume it, or copy its content into a new folder.
 """
 
 from __future__ import annotations
@@ -35,19 +36,19 @@ from reslrb_cli.records.manifest import Manifest, Status, read_manifest
 
 Array = np.ndarray[Any, Any]
 
-#: Keys that an error names.
+#: Maximum number of keys that an error names.
 _SHOWN = 3
 
-#: What a maker wants to know of the solid that a run shapes, and below `images` a picture of it.
+#: Fabrication data of the solid of a run, and the name of its picture in `images`.
 FABRICATION_FILE, SOLID_PICTURE = "fabrication.json", "solid"
 
 
 def read_value(run: Path, key: str) -> Array:
     """Return the value of `key` in the newest checkpoint of the run folder `run`.
 
-    Shapes as in `parameters.npz`: a texture (H, W, C), a colour (C,), a buffer (N,), a number (). It may hold
-    values that are not finite: who uses it says where. Raises ConfigError, located in the folder or a file of it, where
-    it is no run's, damaged, or the run did not recover `key`.
+    Shapes are as in `parameters.npz`: texture (H, W, C), colour (C,), buffer (N,), number (). The caller must check for
+    values that are not finite. Raises ConfigError, located in the folder or one of its files, if the folder is not a
+    run folder or is damaged, or if the run did not recover `key`.
     """
     path = checkpoint_of(run)
     with open_archive(path) as archive:
@@ -61,9 +62,9 @@ def read_value(run: Path, key: str) -> Array:
 
 
 def recovered(run: Path, overrides: Sequence[str | Override]) -> Config:
-    """The configuration of the run in the folder `run`, its parameters beginning where that run has brought them.
+    """Return the configuration of the run in the folder `run`, with its recovered values as initial values.
 
-    Raises ConfigError, located in the folder, where it is no run's or holds no values.
+    Raises ConfigError, located in the folder, if it is not a run folder or holds no values.
     """
     checkpoint_of(run)
     config = load(run / "config.yaml", overrides)
@@ -73,7 +74,7 @@ def recovered(run: Path, overrides: Sequence[str | Override]) -> Config:
 
 
 def exposures(run: Path) -> dict[int, Array]:
-    """Return the exposure of each sensor that a run compares, recovered or given: one number, or one for each channel.
+    """Return the recovered or given exposure of each sensor of a run: one number, or one per channel.
 
     Raises ConfigError as `read_value`.
     """
@@ -85,7 +86,7 @@ def exposures(run: Path) -> dict[int, Array]:
 
 
 def checkpoint_of(run: Path) -> Path:
-    """The file of the newest checkpoint of the run folder `run`. Raises ConfigError where there is none."""
+    """Return the file of the newest checkpoint of the run folder `run`. Raises ConfigError if there is none."""
     _manifest_of(run)
     path = newest_checkpoint(run / "checkpoint")
     if path is None:
@@ -94,7 +95,7 @@ def checkpoint_of(run: Path) -> Path:
 
 
 def _manifest_of(run: Path) -> dict[str, Any]:
-    """What the manifest of the run folder `run` says, that of a killed run put right. Raises ConfigError."""
+    """Return the manifest of the run folder `run`, corrected if the run was killed. Raises ConfigError."""
     if not run.is_dir():
         what = "is a file, not the folder of a run" if os.path.lexists(run) else "no such folder"
         raise ConfigError(run, "", what)
@@ -109,14 +110,14 @@ OWN_ENTRIES = (
     "config.yaml", manifests.MANIFEST_FILE, metrics.METRICS_FILE, "report.html", FABRICATION_FILE, *SUBFOLDERS
 )  # fmt: skip
 
-#: An unfinished folder without a process is removed when it is so old: nobody is just about to lock it.
+#: Minimum age in seconds of an unlocked unfinished folder to be removed; a newer one may be about to be locked.
 LEFT_SECONDS = 60.0
 
 
 def check_output(source: object, output: Path, name: str, force: bool) -> None:
-    """Raise a ConfigError (key `run.output` or `run.name`) where a run folder cannot be made in `output`.
+    """Raise a ConfigError (key `run.output` or `run.name`) if a run folder cannot be made in `output`.
 
-    Tried, not asked: for root, permissions say nothing. Leaves nothing behind. Raises MachineError for a full disk.
+    Makes a folder and removes it, because permissions do not apply to root. Raises MachineError for a full disk.
     """
     ancestor = next(path for path in (output, *output.absolute().parents) if os.path.lexists(path))
     if not ancestor.is_dir():
@@ -129,7 +130,7 @@ def check_output(source: object, output: Path, name: str, force: bool) -> None:
         raise _output_error(source, ancestor, error) from None
     if force:
         _check_replaceable(source, output / name)
-        with contextlib.suppress(OSError):  # such as: there is none
+        with contextlib.suppress(OSError):  # such as a missing folder
             try:
                 FolderLock(output / name, READER_WAIT_SECONDS, shared=True).release()
             except InUse:
@@ -138,9 +139,9 @@ def check_output(source: object, output: Path, name: str, force: bool) -> None:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A run folder on disk: the paths of what it holds, and the lock of who works in it.
+    """Run folder on the disk: the paths of its content, and its lock.
 
-    As a context manager it lets go of the lock at the end.
+    As a context manager, it releases the lock at the end.
     """
 
     path: Path
@@ -148,11 +149,12 @@ class RunFolder:
 
     @classmethod
     def create(cls, source: object, output: Path, name: str, force: bool, config: str, manifest: Manifest) -> RunFolder:
-        """Make `<output>/<name>/` with its configuration, manifest and empty subfolders, and lock it.
+        """Create `<output>/<name>/` with its configuration, manifest and empty subfolders, and lock it.
 
-        Where the name is taken, `<name>-2/` and so on. With `force` the run of that name is replaced: of its folder
-        only what a run writes is removed, and a folder that is no run's, or in which one is at work, is refused
-        (ConfigError). The folder appears under its name only once it is whole. Raises MachineError for a full disk.
+        If the name is taken, the folder is `<name>-2/` and so on. With `force`, it replaces the run of that name, but
+        removes only files that a run writes. The folder appears under its name only when it is complete. Raises
+        ConfigError if `force` would replace a folder that is not a run folder or is in use, and MachineError for a full
+        disk.
         """
         try:
             output.mkdir(parents=True, exist_ok=True)
@@ -173,37 +175,37 @@ class RunFolder:
             raise _output_error(source, output, error) from None
 
     def _place(self, wanted: Path) -> RunFolder:
-        """Rename the folder to the first free of `wanted`, `wanted-2`, ..."""
+        """Rename the folder to the first free name of `wanted`, `wanted-2`, ..."""
         names = itertools.chain([wanted], (wanted.with_name(f"{wanted.name}-{n}") for n in itertools.count(2)))
         return replace(self, path=next(path for path in names if self._take_name(path)))
 
     def _take_name(self, path: Path) -> bool:
-        """Rename the folder to `path`, unless there is something already."""
+        """Rename the folder to `path` unless that exists; return whether it was renamed."""
         if os.path.lexists(path):
             return False
         try:
             os.rename(self.path, path)
         except OSError:
-            if not os.path.lexists(path):  # else another run took the name first
+            if not os.path.lexists(path):  # otherwise another run took the name first
                 raise
             return False
         return True
 
     def _replace(self, source: object, path: Path, manifest: Manifest) -> RunFolder:
-        """Move what is in the folder over the run folder at `path`, under the lock of that."""
+        """Move the content of the folder over the run folder at `path`, holding the lock of `path`."""
         while not self._take_name(path):
             _check_replaceable(source, path)
             try:
                 lock = FolderLock(path)
             except InUse:
                 raise _in_use(source, path) from None
-            except FileNotFoundError:  # it has just gone
+            except FileNotFoundError:  # removed just now
                 continue
-            if not lock.is_of(path):  # it has been moved away, or removed and made anew
+            if not lock.is_of(path):  # moved or replaced since
                 lock.release()
                 continue
             try:
-                # The manifest comes first: whatever happens from here on, the folder says whose run it is.
+                # The manifest comes first, so that it names the right run even if the process ends here.
                 os.replace(self.path / manifests.MANIFEST_FILE, path / manifests.MANIFEST_FILE)
                 self._replace_others(path, manifest)
             except BaseException:
@@ -230,20 +232,20 @@ class RunFolder:
 
     @property
     def is_there(self) -> bool:
-        """Whether the folder is still under its name, and not another one, such as that of a later run."""
+        """Whether the folder still exists under its name and is not another one, such as that of a later run."""
         if self.lock is None:
             return self.path.is_dir()
         return self.lock.is_of(Path(os.path.realpath(self.path)))
 
     @property
     def fault(self) -> OSError | None:
-        """What is wrong where it is not."""
+        """The error if the folder is no longer there (`is_there`); None otherwise."""
         if self.is_there:
             return None
         return FileNotFoundError(errno.ENOENT, "has gone while the run went on", str(self.path))
 
     def make_whole(self) -> None:
-        """Make the subfolders anew that somebody has removed. Raises OSError."""
+        """Recreate removed subfolders. Raises OSError."""
         for name in SUBFOLDERS:
             (self.path / name).mkdir(exist_ok=True)
 
@@ -269,7 +271,7 @@ class RunFolder:
 
 def _try_name(source: object, folder: Path, name: str) -> None:
     try:
-        (folder / f"{name}-2").mkdir()  # as a second run would be called
+        (folder / f"{name}-2").mkdir()  # the name of a second run
     except OSError as error:
         if is_machine_fault(error):
             raise
@@ -292,7 +294,7 @@ def _in_use(source: object, path: Path) -> ConfigError:
 
 
 def _who_works(content: Mapping[str, Any]) -> str:
-    """The process that has a folder, as its manifest's content names it."""
+    """Return the process that uses a folder, from the content of its manifest."""
     holder = Holder.from_json(content.get("process"))
     return f"{holder}, since {content.get('started')}" if holder is not None else "another process"
 
@@ -305,7 +307,7 @@ def _output_error(source: object, folder: Path, error: OSError) -> ConfigError |
 
 
 def _remove_left(output: Path) -> None:
-    """Remove folders that killed processes never came to finish."""
+    """Remove unfinished folders of killed processes."""
     for path in output.glob(f"{FOLDER_PREFIX}*"):
         with contextlib.suppress(OSError, InUse):
             if time.time() - path.stat().st_mtime > LEFT_SECONDS:
@@ -316,9 +318,9 @@ def _remove_left(output: Path) -> None:
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[tuple[RunFolder, dict[str, Any]]]:
-    """The run folder `path`, locked while the block works, and what its manifest says.
+    """Yield the run folder `path`, locked while the block runs, and its manifest.
 
-    Raises ConfigError, located in the folder, where it is no run's, or a run is at work in it.
+    Raises ConfigError, located in the folder, if it is not a run folder or is in use.
     """
     content = _manifest_of(path)
     in_use = ConfigError(path, "", f"is in use by a run ({_who_works(content)}); end that first")
@@ -335,9 +337,9 @@ def opened(path: Path) -> Iterator[tuple[RunFolder, dict[str, Any]]]:
 
 
 def check_writable(folder: RunFolder) -> None:
-    """Raise ConfigError, located in the folder, where nothing can be written to it, MachineError for a full disk.
+    """Raise ConfigError, located in the folder, if it cannot be written to, and MachineError for a full disk.
 
-    What a process that is no more never came to finish is removed.
+    Also removes unfinished files of earlier processes.
     """
     try:
         for name in SUBFOLDERS:
@@ -354,7 +356,7 @@ def check_writable(folder: RunFolder) -> None:
 
 
 def copy_into(folder: RunFolder, earlier: Path) -> None:
-    """Copy what a run has written from the folder `earlier` into a new one, but for its page and its configuration.
+    """Copy the files of a run from `earlier` into a new folder, except its report and its configuration.
 
     Raises OSError.
     """
@@ -375,7 +377,7 @@ def _copy(path: Path, target: Path) -> None:
 
 
 def write_beginning(folder: RunFolder, config: str, manifest: Manifest) -> None:
-    """Write configuration and manifest of a run that goes on in `folder`. Raises OSError."""
+    """Write the configuration and the manifest of a run resumed in `folder`. Raises OSError."""
     write_atomically(folder.path / "config.yaml", lambda file: file.write(config.encode()))
     manifest.process = Holder.here(locked=folder.lock is not None and folder.lock.real)
     manifest.write(folder.path)

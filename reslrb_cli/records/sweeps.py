@@ -1,8 +1,7 @@
-"""Sweeps, runs of one experiment at several settings and seeds: the plan in `sweep.json`, and records of what they came
-to.
+"""Sweeps, runs of one experiment with several settings and seeds: the plan in `sweep.json`, and records of the results.
 
-The folder of a sweep has, beside that file, a configuration for each combination of settings in `configs/`, and the
-folder of each run, which is named by its settings and its seed.
+The folder of a sweep holds that file, one configuration per combination of settings in `configs/`, and one folder per
+run, named by its settings and seed.
 """
 
 from __future__ import annotations
@@ -26,19 +25,19 @@ from reslrb_cli.version import __version__
 
 SWEEP_FILE, PAGE_FILE, CONFIGS = "sweep.json", "sweep.html", "configs"
 
-#: Of the file; another one is not read.
+#: Version of the file; other versions are not read.
 VERSION = 1
 
-#: What a combination may be called: the name of a folder, and no way out of it.
+#: Valid names of combinations: folder names that cannot leave the folder of the sweep.
 _NAME = re.compile(r"[\w+=-][\w.+=-]*")
 
-#: A method such as `reslrb:stack(paths=both)`: YAML would quote it in a list, though it need not.
+#: A method such as `reslrb:stack(paths=both)`, which YAML would quote in a list without need.
 _METHOD = re.compile(r"[A-Za-z][\w./-]*:\w[\w=().-]*")
 
 
 @dataclass(frozen=True)
 class Combination:
-    """One combination of settings: its name, and the value of each key that is varied, as plain data."""
+    """Combination of settings: its name and the value of each varied key, as plain data."""
 
     name: str
     settings: dict[str, Any]
@@ -46,7 +45,7 @@ class Combination:
 
 @dataclass(frozen=True)
 class Failure:
-    """How a run failed: the exit code of its process, negative for a signal, and what that said last."""
+    """Failure of a run: the exit code of its process (negative for a signal) and its last output line."""
 
     code: int
     line: str
@@ -54,10 +53,10 @@ class Failure:
 
 @dataclass(frozen=True)
 class Sweep:
-    """What a sweep consists of: every combination with every seed; and which runs failed, by name.
+    """Plan of a sweep: every combination with every seed, and the failed runs by name.
 
-    `config` is the file that it was made from, `overrides` what was given to `--set`, both as the user wrote them.
-    `codes` are the digests of the files of the user's own code that its runs call, by path, `files` of all others.
+    `config` is the configuration file and `overrides` the values of `--set`, both as the user wrote them. `codes` holds
+    the digests of the user's code files by path, `files` those of all other files.
     """
 
     config: str
@@ -72,16 +71,16 @@ class Sweep:
 
     @property
     def keys(self) -> list[str]:
-        """The settings that are varied."""
+        """The varied settings."""
         return list(self.combinations[0].settings) if self.combinations else []
 
     @property
     def runs(self) -> Iterator[tuple[Combination, int]]:
-        """Combination and seed of each run, in their order: all combinations of one seed, then those of the next."""
+        """Combination and seed of each run, in order: all combinations with the first seed, then with the next."""
         return ((combination, seed) for seed in self.seeds for combination in self.combinations)
 
     def with_failure(self, name: str, failure: Failure | None) -> Sweep:
-        """The same where the run `name` failed, or None, did not."""
+        """Return the sweep with the failure of the run `name` set, or removed if it is None."""
         others = {other: each for other, each in self.failures.items() if other != name}
         return replace(self, failures=others if failure is None else {**others, name: failure})
 
@@ -95,7 +94,7 @@ _READER = TypeAdapter(Sweep)
 
 
 def in_words(value: Any) -> str:
-    """A value as it is written on the command line: YAML on one line."""
+    """Return a value as written on the command line: YAML on one line."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{key}: {in_words(each)}" for key, each in value.items()) + "}"
     if isinstance(value, list):
@@ -109,7 +108,7 @@ def in_words(value: Any) -> str:
 
 
 def short_keys(keys: Sequence[str]) -> dict[str, str]:
-    """By key the end of it that tells it from the others: `spp` of `run.spp`, if no other ends so."""
+    """Return the shortest unique ending of each key, such as `spp` for `run.spp`."""
     found = {}
     for key in keys:
         parts = key.split(".")
@@ -120,28 +119,28 @@ def short_keys(keys: Sequence[str]) -> dict[str, str]:
 
 
 def label(settings: Mapping[str, Any]) -> str:
-    """A combination in words, `learning_rate=0.1, spp=16`; of settings that are not varied, `as it is`."""
+    """Return a combination in words, `learning_rate=0.1, spp=16`, or `as it is` if nothing is varied."""
     short = short_keys(list(settings))
     return ", ".join(f"{short[key]}={in_words(value)}" for key, value in settings.items()) or "as it is"
 
 
 def run_name(combination: Combination, seed: int) -> str:
-    """The name of a run, and of its folder."""
+    """Return the name of a run and of its folder."""
     return f"{combination.name}-seed={seed}" if combination.name else f"seed={seed}"
 
 
 def config_file(folder: Path, combination: Combination) -> Path:
-    """The configuration of a combination, as resolved, in the sweep's `folder`."""
+    """Return the path of the resolved configuration of a combination in the sweep's `folder`."""
     return folder / CONFIGS / f"{combination.name or 'config'}.yaml"
 
 
 def is_sweep(folder: Path) -> bool:
-    """Whether `folder` is one of a sweep."""
+    """Whether `folder` is the folder of a sweep."""
     return (folder / SWEEP_FILE).is_file()
 
 
 def read_sweep(folder: Path) -> Sweep:
-    """The sweep in `folder`. Raises ConfigError, located in its file, where it is none, or damaged."""
+    """Read the sweep in `folder`. Raises ConfigError, located in its file, if it is missing or damaged."""
     path = folder / SWEEP_FILE
     if folder.is_dir() and not path.exists():
         raise ConfigError(folder, "", f"is no sweep's folder: it has no {SWEEP_FILE}")
@@ -159,16 +158,21 @@ def read_sweep(folder: Path) -> Sweep:
     return sweep
 
 
-# --- what they came to ------------------------------------------------------------------------------------------------
+# --- results ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class SweepRunRecord(Line):
-    """What one run came to: `status` as in a manifest, or `waiting`; `message` says what it failed of.
+    """Result of one run.
 
-    `loss` is that of its final image, `error` the root mean square error over all parameters whose true value is known,
-    or, where these have no common unit (`relative`), the root mean square of their relative errors. `elapsed_s` are
-    seconds in steps and updates, `peak_mib` what the allocator held at the most. What is not known is None.
+    - `status`: as in a manifest, or `waiting`; `message` is the error if the run failed.
+    - `loss`: loss of the final image.
+    - `error`: root mean square error over all parameters whose true value is known; if they have no common unit
+      (`relative`), the root mean square of their relative errors.
+    - `elapsed_s`: seconds in steps and updates.
+    - `peak_mib`: peak memory of the allocator.
+
+    Unknown values are None.
     """
 
     KIND: ClassVar[str] = "sweep_run"
@@ -187,17 +191,17 @@ class SweepRunRecord(Line):
 
     @property
     def is_done(self) -> bool:
-        """Whether it came to its end."""
+        """Whether the run is finished."""
         return self.status == "finished"
 
 
 @dataclass(frozen=True)
 class SweepRowRecord(Line):
-    """What the finished runs of one combination came to, `runs` of `of`: medians, the least and the greatest.
+    """Result of one combination: median, minimum and maximum over its finished runs, `runs` of `of`.
 
-    `loss_ratio` and `error_ratio` are the median over that of the first combination that can be compared, with the 95 %
-    interval of a bootstrap over the seeds. Combinations that differ in learning rates alone are compared at their best
-    rate, which alone has a ratio. None of fewer than 5 seeds.
+    `loss_ratio` and `error_ratio` are the median divided by that of the first comparable combination, with the 95 %
+    interval of a bootstrap over the seeds. Combinations that differ only in learning rates are compared at their best
+    rate, and only that one has a ratio. Ratios are None for fewer than 5 seeds.
     """
 
     KIND: ClassVar[str] = "sweep_row"
@@ -219,12 +223,12 @@ class SweepRowRecord(Line):
 
 @dataclass(frozen=True)
 class SweepBestRecord(Line):
-    """Which combination has the lowest median `of` what (`loss` or `error`), over `seeds` seeds that all have.
+    """Combination with the lowest median of `of` (`loss` or `error`), over the `seeds` seeds common to all.
 
-    Combinations that differ in learning rates alone are compared at their best rate. From those `tied` it is not told,
-    those it `beats` it is, by Wilcoxon's test of signed ranks, in pairs of the same seed. `second` has the next median,
-    `ratio` is that of the best over it, with the 95 % interval of a bootstrap over the seeds, None of fewer than 5 of
-    them. `line` is the record in words.
+    Combinations that differ only in learning rates are compared at their best rate. Wilcoxon's signed-rank test on
+    pairs of the same seed finds a difference from those in `beats`, and none from those in `tied`. `second` has the
+    next median. `ratio` is the best median divided by that of `second`, with the 95 % interval of a bootstrap over the
+    seeds; None for fewer than 5 seeds. `line` is the record in words.
     """
 
     KIND: ClassVar[str] = "sweep_best"

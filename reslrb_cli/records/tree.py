@@ -1,7 +1,7 @@
-"""Trees of plain dataclasses, kept as arrays by name with JSON beside them, and read back.
+"""Serialisation of dataclass trees as named arrays and JSON.
 
-A tree's fields are plain values, checked by their types, or, by the metadata `entry`, mappings of names to arrays. Its
-`entries` are those of an archive; `Stored` reads them back, as what a tree of the same kind expects.
+The fields of a tree are plain values, checked by their types, or, with the metadata `entry`, mappings of names to
+arrays. `entries` converts a tree to the entries of an archive, and `Stored` reads them back.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from reslrb_cli.records.checkpoint import read_state
 from reslrb_cli.records.metrics import finite
 
 Array = np.ndarray[Any, Any]
-#: The type of a field whose metadata is `entry`.
+#: Type of a field with the metadata `entry`.
 Arrays = dict[str, Any]
 T = TypeVar("T")
 
 _ENTRY = "entry"
 
-#: Metadata of a field that no file has.
+#: Metadata of a field that is not saved.
 PASSING = {_ENTRY: None}
 
 
 def entry(name: str) -> dict[str, Any]:
-    """Return the metadata of a field that maps names to arrays, or to more such mappings: the entries `<name>/...`."""
+    """Return the metadata of a field that maps names to arrays or nested mappings, saved as `<name>/...`."""
     return {_ENTRY: name}
 
 
 def to_array(value: Any) -> Array:
-    """A Dr.Jit value, of any type, without derivatives; a number for one that is one."""
+    """Convert a Dr.Jit value of any type, or a number, to an array without derivatives."""
     return np.array(dr.detach(value) if dr.is_array_v(value) else value)
 
 
 def like(value: Any, array: Array) -> Any:
-    """`array` as a value of the type of `value`, in Dr.Jit's own memory.
+    """Convert `array` to the type of `value`, in Dr.Jit's own memory.
 
-    `value` and `array` have one shape (`to_array`). A number that was part of a kernel's code (a literal, as Adam's
-    count of steps) is so again, so that the same kernel results.
+    Both must have the same shape (`to_array`). If `value` is a literal, which is part of the kernel code (such as
+    Adam's step count), the result is a literal, too, so that the kernel does not change.
     """
     kind = type(value)
     if not dr.is_array_v(value):
@@ -62,12 +62,12 @@ def like(value: Any, array: Array) -> Any:
 
 
 def expected(shape: tuple[int, ...]) -> Array:
-    """An array of zeros that takes no memory, for one of a file that is to have its shape."""
+    """Return an array of zeros that takes no memory, to state the expected shape of an array in a file."""
     return np.broadcast_to(np.zeros(()), shape)
 
 
 def entries(*trees: Any) -> tuple[dict[str, Array], dict[str, Any]]:
-    """The arrays of all of them by their names, and all else of them as one mapping for JSON."""
+    """Return the arrays of all trees by name, and all other fields as one mapping for JSON."""
     found: dict[str, Array] = {}
     values: dict[str, Any] = {}
     for tree in trees:
@@ -92,9 +92,9 @@ def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 class Stored:
-    """The arrays of a state's file and the JSON beside them.
+    """Arrays and JSON values of a state file.
 
-    Raises ConfigError, located in the file and by the name of the value, for a value that is missing or does not fit.
+    Methods raise ConfigError, located by the file and the value, if a value is missing or does not fit.
     """
 
     def __init__(self, path: Path) -> None:
@@ -102,23 +102,23 @@ class Stored:
         self.arrays, self._values = read_state(path)
 
     def wrong(self, name: str, message: str) -> ConfigError:
-        """The error for a value."""
+        """Return the error for a wrong value."""
         return ConfigError(self.path, name, f"{message}: not as a run writes it")
 
     def read(self, kind: type[T]) -> T:
-        """A tree of this kind, by the types of its fields; its mappings of arrays are empty still."""
+        """Read a tree of this class, checked by the types of its fields; its mappings of arrays are still empty."""
         names = [each.name for each in fields(kind) if _ENTRY not in each.metadata]  # type: ignore[arg-type]
         plain = {name: self._values[name] for name in names if name in self._values}
-        try:  # as JSON: strict of Python's values, it would take no mapping for a dataclass
+        try:  # as JSON, because strict validation of Python values rejects a mapping for a dataclass
             return TypeAdapter(kind).validate_json(json.dumps(plain), strict=True)
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             raise self.wrong(".".join(map(str, first["loc"])), first["msg"]) from None
 
     def fill(self, tree: T) -> T:
-        """The same tree with each of its arrays as the file has it, of the type and shape of the one before.
+        """Return the tree with its arrays read from the file.
 
-        In place of None stands an array of any shape.
+        Each array must have the type and shape of the one that it replaces; None accepts any shape.
         """
 
         def filled(name: str, other: Any) -> Any:
@@ -130,7 +130,7 @@ class Stored:
         return replace(tree, **found)  # type: ignore[type-var]  # a dataclass
 
     def take(self, name: str, other: Any) -> Any:
-        """Return the array of a name, as a value of the type of `other`, whose shape it must have; None for any."""
+        """Return the array `name`, converted to the type of `other` and of the same shape; None accepts any."""
         array = self.arrays.get(name)
         if array is None:
             raise self.wrong(name, "is missing")

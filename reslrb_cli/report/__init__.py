@@ -1,1 +1,1 @@
-"""Reads records, draws plots, writes the HTML page of a run."""
+"""Reports: reading records, drawing plots, and writing the HTML page of a run."""

@@ -1,4 +1,4 @@
-"""A convergence as an aligned table, and the sentence that it comes to."""
+"""Results of `reslrb convergence` as an aligned table and a closing sentence."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from reslrb_cli.records.measurements import (
 )
 from reslrb_cli.report.format import Columns, interval, number, shorten
 
-#: Characters that a parameter's key may take.
+#: Maximum width of a parameter key.
 KEY_WIDTH = 28
 
 
 def method_columns(labels: Sequence[str], parameters: Sequence[str]) -> Columns:
-    """The columns of a convergence, whose first two fit `labels` and `parameters`."""
+    """Return the columns of the table; the first two fit `labels` and `parameters`."""
     figures = ("step s", "steps", "error", "slope", "efficiency", "max |z| (limit)")
     titles = ("", "parameter", *figures, *(f"s to {target:.0%}" for target in TARGETS))
     names = max(len(shorten(key, KEY_WIDTH)) for key in ("parameter", *parameters))
@@ -31,7 +31,7 @@ def method_columns(labels: Sequence[str], parameters: Sequence[str]) -> Columns:
 
 
 def method_cells(record: MethodRecord, parameter: str | None = None) -> tuple[str, ...]:
-    """The line of one record, `parameter` in place of its own where it is given."""
+    """Return the cells of one record; `parameter` replaces its own parameter if given."""
     named = (record.method.label, shorten(parameter or record.parameter, KEY_WIDTH))
     if record.relative_rmse is None:
         return *named, record.message if record.status is BenchStatus.OK else record.status.value
@@ -53,7 +53,7 @@ def _deviation(record: MethodRecord) -> str:
 
 
 def _seconds(record: MethodRecord, target: str) -> str:
-    """A time; `~` before one that is extrapolated, a dash where a bias keeps the error from being so small."""
+    """Return a time, with `~` if it is extrapolated, or a dash if a bias keeps the error above the target."""
     seconds = record.seconds_to[target]
     if seconds is None:
         return "-"
@@ -61,7 +61,7 @@ def _seconds(record: MethodRecord, target: str) -> str:
 
 
 def notes(records: Sequence[MethodRecord]) -> list[str]:
-    """What the table does not say, one line each: how large biases are, and why questions stay open."""
+    """Return remarks on the table, one per line: the size of biases, and why a question is undecided."""
     lines = []
     for record in records:
         where = f"{record.method.label}, {shorten(record.parameter, KEY_WIDTH)}"
@@ -74,7 +74,7 @@ def notes(records: Sequence[MethodRecord]) -> list[str]:
 
 
 def reference_line(record: ReferenceRecord) -> str:
-    """What stands behind the errors of one parameter."""
+    """Return a line about the reference for the errors of one parameter."""
     floor = record.message if record.reference_rmse is None else f"known to {record.reference_rmse:.2g}"
     words = f"{shorten(record.parameter, KEY_WIDTH)}: {floor}, {record.repeats} steps of {record.method.label}"
     if record.bias_z is not None:
@@ -85,15 +85,15 @@ def reference_line(record: ReferenceRecord) -> str:
 
 
 def result_lines(results: ConvergenceResults) -> list[Line]:
-    """All that a convergence is written as: its records, and what they come to in a sentence."""
+    """Return all records of a convergence, including the closing sentence."""
     summary = SummaryRecord(closing_sentence(results.methods))
     return [*results.points, *results.methods, *results.references, summary]
 
 
 def closing_sentence(records: Sequence[MethodRecord]) -> str:
-    """Which method is the best for this scene, of all parameters together, and by how much.
+    """Return a sentence about the best method for this scene, for all parameters together, and its lead.
 
-    A biased one is never called the best without that word, and a lead that the intervals do not show is none.
+    A biased method is always called biased. A lead within the intervals does not count.
     """
     together = [record for record in records if record.parameter in ("all", "image") and record.efficiency is not None]
     if not together:
@@ -130,7 +130,7 @@ def _efficiency(record: MethodRecord) -> float:
 
 
 def _ratio(one: MethodRecord, other: MethodRecord) -> tuple[float, float, float]:
-    """Ratio of efficiencies with its interval: logarithms of independent estimates, whose half widths add up."""
+    """Return the ratio of efficiencies and its interval; half widths of the logarithms add in quadrature."""
     a, b = one.efficiency, other.efficiency
     assert a is not None, "others are left out"
     assert b is not None, "others are left out"

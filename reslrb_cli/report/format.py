@@ -1,4 +1,4 @@
-"""Numbers, times and keys in words, as the terminal and the page have them."""
+"""Formatting of numbers, keys and tables for the terminal and the page."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from itertools import zip_longest
 
 from reslrb_cli.errors import printable
 
-#: What stands in place of the middle of a shortened key.
+#: Replaces the middle of a shortened key.
 ELLIPSIS = "..."
 
-#: What is said of a comparison of paths from the camera with paths from the lights.
+#: Remark on comparisons of camera paths with light paths.
 WITHOUT_BORDER = "without the film's border, where light paths lose what camera paths see"
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """A number with so many significant digits; empty for None."""
+    """Return a number with `digits` significant digits; empty for None."""
     return "" if value is None else f"{value:.{digits}g}"
 
 
 def with_error(value: float, error: float, sign: str = "+-") -> str:
-    """A value and its standard error, both to the error's first digit: `0.0131 +- 0.0004`."""
+    """Return a value and its standard error, both rounded to the error's first digit: `0.0131 +- 0.0004`."""
     if not (error > 0 and math.isfinite(error) and math.isfinite(value)):
         return number(value)
     exponent = math.floor(math.log10(max(abs(value), error)))
@@ -34,19 +34,18 @@ def with_error(value: float, error: float, sign: str = "+-") -> str:
 
 
 def interval(value: float, low: float, high: float, digits: int | str) -> str:
-    """A value with the ends of its interval; `digits` significant ones, or a format."""
+    """Return a value and its interval; `digits` is the number of significant digits, or a format."""
     spec = digits if isinstance(digits, str) else f".{digits}g"
     return f"{value:{spec}} [{low:{spec}}, {high:{spec}}]"
 
 
 def count(amount: int, what: str) -> str:
-    """An amount of things whose plural ends in s."""
+    """Return an amount with its noun, adding `s` for the plural."""
     return f"{amount} {what}" if amount == 1 else f"{amount} {what}s"
 
 
 def shorten(text: str, width: int) -> str:
-    """`text` in at most `width` characters, on one line: what is too long loses its middle, since keys differ at both
-    ends."""
+    """Return `text` on one line of at most `width` characters, without its middle, because keys differ at both ends."""
     text = printable(text)
     if len(text) <= width:
         return text
@@ -57,9 +56,9 @@ def shorten(text: str, width: int) -> str:
 
 
 def line(cells: Sequence[str], widths: Sequence[int], align: str = "<") -> str:
-    """Cells that stand below those of other lines, in columns of `widths`; those that are left out are the last.
+    """Return a line of cells in columns of `widths`; the last cells may be missing.
 
-    `align` has a letter for each column, `<` for flush left, `>` for flush right; its last goes for all that follow.
+    `align` has one letter per column, `<` for left and `>` for right; the last letter applies to all further columns.
     """
     sides = align.ljust(len(cells), align[-1])
     return "  ".join(f"{cell:{side}{width}}" for cell, side, width in zip(cells, sides, widths, strict=False)).rstrip()
@@ -67,22 +66,22 @@ def line(cells: Sequence[str], widths: Sequence[int], align: str = "<") -> str:
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns of a table whose lines are told one by one: their titles and widths, and `align` as of `line`."""
+    """Columns of a table that is printed line by line: titles, widths, and `align` as in `line`."""
 
     titles: Sequence[str]
     widths: Sequence[int]
     align: str
 
     def head(self) -> str:
-        """The first line."""
+        """Return the line of titles."""
         return self.line(self.titles)
 
     def line(self, cells: Sequence[str]) -> str:
-        """The line of these cells; those that are left out are the last."""
+        """Return a line of cells; the last cells may be missing."""
         return line(cells, self.widths, self.align)
 
 
 def table(rows: Sequence[Sequence[str]], align: str = "<") -> list[str]:
-    """The lines of a table, whose columns are as wide as what stands in them; `align` is as in `line`."""
+    """Return the lines of a table with columns as wide as their content; `align` is as in `line`."""
     widths = [max(map(len, column)) for column in zip_longest(*rows, fillvalue="")]
     return [line(row, widths, align) for row in rows]

@@ -1,4 +1,4 @@
-"""Errors as people see them: PSNR, SSIM and CIEDE2000 of images against their targets, CIEDE2000 of recovered colours.
+"""Perceptual errors: PSNR, SSIM and CIEDE2000 between images and targets, and CIEDE2000 of recovered colours.
 
 Colours are linear sRGB (BT.709 primaries, D65), as in Mitsuba's RGB variants. Arrays are (..., 3).
 """
@@ -23,16 +23,16 @@ Array = np.ndarray[Any, Any]
 
 
 def ciede2000(first: Array, second: Array) -> Array:
-    """CIEDE2000 between colours of surfaces, or of a picture as a screen shows it: clipped to [0, 1].
+    """Return the CIEDE2000 differences between two arrays of colours, clipped to [0, 1] as on a screen.
 
-    Some 1 is just noticeable side by side, some 10 at a glance.
+    A difference of about 1 is just noticeable side by side, about 10 at a glance.
     """
     labs = [to_lab(np.clip(values, 0.0, 1.0)) for values in (first, second)]
     return np.asarray(_colour().delta_E(*labs, method="CIE 2000"))
 
 
 def to_lab(values: Array) -> Array:
-    """CIE L*a*b* under D65, the white of linear sRGB."""
+    """Convert linear sRGB to CIE L*a*b* under D65."""
     colour = _colour()
     space = colour.RGB_COLOURSPACES["sRGB"]
     xyz = values.astype(np.float64) @ space.matrix_RGB_to_XYZ.T
@@ -45,27 +45,27 @@ def _mean_and_max(differences: Array) -> dict[str, float]:
 
 
 def _colour() -> Any:
-    """The package, which takes a second to be imported, and warns then of packages that nothing here needs."""
+    """Import the package `colour` late, because that takes a second, and hide its warnings about optional packages."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import colour
     return colour
 
 
-#: Parameters of three numbers that are no colours to look at.
+#: Parameters of three numbers that are not visible colours.
 NO_COLORS = ("eta", "k")
 
-#: What is no light and no colour, but where something is.
+#: Quantities of geometry, which are neither light nor colour.
 PLACES = ("length", "degrees", "scale")
 
 
 def is_color(key: str, quantity: str) -> bool:
-    """Whether three channels of a parameter are those of a colour."""
+    """Whether the three channels of a parameter are a colour."""
     return quantity not in PLACES and not any(part in NO_COLORS for part in key.split(".")[-2:])
 
 
 def color_errors(moments: Mapping[str, Array], true: Array, mask: Array | None) -> dict[str, Any]:
-    """Return the CIEDE2000 between a surface's colours and the true ones at each of `moments`, for entries in `mask`.
+    """Return CIEDE2000 between the colours of a surface and the true ones at each of `moments`, for entries in `mask`.
 
     Arrays are colours (3,) or textures (H, W, 3). If the resolutions differ, the finer grid is used. The result is
     empty if the arrays hold no colours or the mask is empty.
@@ -84,13 +84,13 @@ def color_errors(moments: Mapping[str, Array], true: Array, mask: Array | None) 
 
 
 def _texture(array: Array) -> Array | None:
-    """Colours (3,) or (H, W, 3) as (H, W, 3); None for anything else."""
+    """Return colours (3,) or (H, W, 3) as (H, W, 3); None for other shapes."""
     array = array.reshape(1, 1, 3) if array.shape == (3,) else array
     return array if array.ndim == 3 and array.shape[2] == 3 else None
 
 
 def _entries(value: Array, true: Array, mask: Array | None) -> tuple[Array, Array]:
-    """The colours (N, 3) to be compared, of both."""
+    """Return the colours (N, 3) of both arrays that are compared."""
     grid = comparison_grid(value.shape, true.shape)
     if mask is None or mask.shape != value.shape[:2]:
         mask = np.ones(value.shape[:2], dtype=bool)
@@ -99,16 +99,16 @@ def _entries(value: Array, true: Array, mask: Array | None) -> tuple[Array, Arra
     return np.nan_to_num(value[mask]), np.nan_to_num(true[mask])
 
 
-#: Standard deviation of SSIM's window in pixels, and the sides of it, as Wang et al. have them.
+#: Standard deviation and side length of the SSIM window in pixels, as in Wang et al. 2004.
 SIGMA, WINDOW = 1.5, 11
 
 
 def image_errors(image: Array, target: Array, exposure: float) -> dict[str, Any]:
-    """Return the errors of an image (H, W, C) of linear values, for the channels that `target` has too, without alpha.
+    """Return the errors of an image (H, W, C) of linear values, for the channels shared with `target`, without alpha.
 
-    Both are multiplied by `exposure`, clipped to [0, 1] and encoded in sRGB, as a screen shows them. `psnr_db` is None
-    if both look the same, `ssim` is None for images smaller than its window, and `ciede2000` has the mean and the
-    maximum over the pixels. `not_finite` counts the pixels of the image that are not finite; they count as black.
+    Both are multiplied by `exposure`, clipped to [0, 1] and encoded in sRGB, as on a screen. `psnr_db` is None if both
+    look the same. `ssim` is None for images smaller than its window. `ciede2000` holds the mean and the maximum over
+    the pixels. `not_finite` is the number of pixels of the image that are not finite; they are treated as black.
     """
     colors = 3 if min(image.shape[2], target.shape[2]) >= 3 else 1
     bad = int(np.sum(~np.isfinite(image[:, :, :colors]).all(axis=2)))
@@ -116,20 +116,20 @@ def image_errors(image: Array, target: Array, exposure: float) -> dict[str, Any]
     found: dict[str, Any] = {"not_finite": bad} if bad else {}
     shown = [encode(np.clip(array * exposure, 0.0, 1.0)) for array in pair]
     found |= {"psnr_db": psnr(*shown), "ssim": ssim(*shown)}
-    # Grey is a colour, too: three channels alike.
+    # CIEDE2000 needs three channels, so grey is repeated.
     rgb = [np.broadcast_to(array * exposure, (*array.shape[:2], 3)) for array in pair]
     return found | {"ciede2000": _mean_and_max(ciede2000(*rgb))}
 
 
 def psnr(first: Array, second: Array) -> float | None:
-    """The peak signal-to-noise ratio in dB of values from 0 to 1; None where they are the same, and it is infinite."""
+    """Return the peak signal-to-noise ratio in dB of values in [0, 1]; None if it is infinite (equal values)."""
     from skimage.metrics import peak_signal_noise_ratio
 
     return None if np.array_equal(first, second) else float(peak_signal_noise_ratio(first, second, data_range=1.0))
 
 
 def ssim(first: Array, second: Array) -> float | None:
-    """The structural similarity (Wang et al. 2004) of values (H, W, C) from 0 to 1; None for less than a window."""
+    """Return the structural similarity (Wang et al. 2004) of values (H, W, C) in [0, 1]; None below the window size."""
     from skimage.metrics import structural_similarity
 
     if min(first.shape[:2]) < WINDOW:
@@ -147,9 +147,9 @@ def seen_errors(
 ) -> dict[str, Any]:
     """Return `results.seen` of the manifest of the run in `folder`; empty if nothing can be compared.
 
-    `images` has, by sensor (`""`, `"-0"`, ...), the `exposure` that the target is shown with, and `image_errors` of the
-    `initial` and the `final` image. `colors` has, by key, `color_errors` of the surface colours whose true value is
-    known. `results` are those of the manifest, and `views` its views. Missing and damaged files are left out.
+    `images` holds, by sensor (`""`, `"-0"`, ...), the `exposure` for viewing the target and the `image_errors` of the
+    `initial` and the `final` image. `colors` holds the `color_errors` of surface colours with known true values, by
+    key. `results` and `views` are those of the manifest. Missing and damaged files are left out.
     """
     images, exposures = {}, shown_exposures(views)
     for path in sorted((folder / "images").glob("target*.exr")):
@@ -182,12 +182,12 @@ def _colors(folder: Path, results: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def with_seen_errors(source: Source) -> Source:
-    """The same, with those errors among its results where it is a run that can have them and does not."""
+    """Return `source` with the perceptual errors added to its results if it is a run that lacks them."""
     if not isinstance(source, Run) or "seen" in source.results:
         return source
     try:
         found = seen_errors(source.path, source.results, source.manifest.get("views"))
-    except Exception:  # what lies in the folder is damaged, in a way that nobody thought of; the page goes on without
+    except Exception:  # damaged files must not prevent the page
         return source
     results = {**source.results, "seen": found}
     return replace(source, manifest={**source.manifest, "results": results}) if found else source

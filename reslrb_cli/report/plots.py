@@ -1,4 +1,4 @@
-"""Curves of the pages' diagrams, and maps of gradients."""
+"""Curves in the diagrams of pages, and maps of gradients."""
 
 from __future__ import annotations
 
@@ -21,21 +21,22 @@ if TYPE_CHECKING:
 
 Array = np.ndarray[Any, Any]
 
-#: Colours that can be told apart, on light and on dark. Further curves have them again, in dashes.
+#: Colours that are easy to distinguish on light and dark pages. Further curves repeat them with dashes.
 COLORS = ("#3b7ddd", "#e07b39", "#2f9e62", "#d0517e", "#8b6fd6", "#b08900", "#1f9eb3", "#9c6b4f")
 
-#: Points of a curve, at most; of a longer one each is the mean of some.
+#: Maximum number of points of a curve. In a longer curve, each point is the mean of several.
 MOST_POINTS = 600
 
-#: An axis is logarithmic where its values span more than this factor, and has ticks between its decades up to that one.
+#: An axis is logarithmic if its values span more than the first factor, and has minor tick labels up to the second.
 LEAST_LOG, MOST_LABELLED = 5.0, 300.0
 
 
 @dataclass(frozen=True)
 class Curve:
-    """One curve: points (x, y), those that are None or not finite left out. `place` chooses its colour and its dashes.
+    """Curve of points (x, y); points that are None or not finite are left out.
 
-    `band` has the ends of each point's interval, where there are such. `points`: each point has a mark.
+    `place` selects the colour and the dashes. `band` holds the ends of each point's interval, if any. `points` adds
+    markers.
     """
 
     name: str
@@ -46,16 +47,16 @@ class Curve:
     points: bool = False
 
     def known(self) -> Array:
-        """Its points as (N, 2)."""
+        """Return the points as (N, 2)."""
         array = np.array([self.xs, self.ys], dtype=np.float64).T  # None is NaN
         return array[np.isfinite(array).all(axis=1)]
 
 
 def draw(axis: Any, curves: Sequence[Curve], log_x: float | None = None) -> None:
-    """Draw curves, each of which has a point.
+    """Draw curves, each with at least one point.
 
-    The y axis is logarithmic where values differ much, the x axis, to the base `log_x`, where that is given and all are
-    above 0.
+    The y axis is logarithmic if positive values span a large factor. The x axis is logarithmic with base `log_x` if
+    that is given and all values are positive.
     """
     for curve in curves:
         _draw(axis, curve)
@@ -74,7 +75,7 @@ def draw(axis: Any, curves: Sequence[Curve], log_x: float | None = None) -> None
 
 
 def points_together(count: int) -> int:
-    """How many of `count` points make one that is drawn."""
+    """Return how many of `count` points are averaged into one drawn point."""
     return -(-count // MOST_POINTS)
 
 
@@ -92,7 +93,7 @@ def _draw(axis: Any, curve: Curve) -> None:
 
 
 def _mark_decades(axis: Any, span: float) -> None:
-    """Mark a logarithmic axis in plain text, which takes a fraction of the time of formulas."""
+    """Label a logarithmic axis with plain text, which is much faster than formulas."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     plain = FuncFormatter(lambda value, _: f"{value:g}")
@@ -102,7 +103,7 @@ def _mark_decades(axis: Any, span: float) -> None:
 
 
 def _thinned(points: Array, together: int) -> tuple[Any, Any]:
-    """Means of so many points each; the last is of what is left."""
+    """Return the means of `together` points each; the last mean is over the rest."""
     starts = np.arange(0, len(points), together)
     sums = np.add.reduceat(points, starts, axis=0)
     counts = np.diff([*starts, len(points)])
@@ -111,7 +112,7 @@ def _thinned(points: Array, together: int) -> tuple[Any, Any]:
 
 
 def _figure(inches: tuple[float, float]) -> Figure:
-    """A figure with a canvas of its own: pyplot would pick a backend for the whole process."""
+    """Return a figure with its own canvas, because pyplot would choose a backend for the whole process."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -128,8 +129,8 @@ def plot_maps(record: GradcheckRecord, gradient: np.ndarray, reference: np.ndarr
               ) -> Path:  # fmt: skip
     """Write a PNG of `gradient` and `reference` (H, W, C), summed over channels, and `z` (H, W); return its path.
 
-    Both gradients have one scale, whose ends 1 % of the texels go beyond. An EXR of the same name has them as they
-    are: the layers `gradient`, `reference`, `difference` (of the two) and `z`.
+    Both gradients share one scale, which 1 % of the texels exceed. An EXR of the same name holds the unchanged values
+    as the layers `gradient`, `reference`, `difference` and `z`.
     """
     colors = color_map(signed=True)
     sums = gradient.sum(-1), reference.sum(-1)
@@ -143,7 +144,7 @@ def plot_maps(record: GradcheckRecord, gradient: np.ndarray, reference: np.ndarr
         axis.tick_params(labelsize=7)
         figure.colorbar(shown, ax=axis, extend="both").ax.tick_params(labelsize=7)
     title = f"{record.parameter}, sum over channels, {record.seeds} seeds: {record.verdict.value}"
-    figure.suptitle(one_line(title, 150), fontsize=10, parse_math=False)  # a key may hold a $
+    figure.suptitle(one_line(title, 150), fontsize=10, parse_math=False)  # keys may contain $
     path = folder / f"{map_name(record)}.png"
     figure.savefig(path, dpi=110)
     layers = {"gradient": gradient, "reference": reference, "difference": gradient - reference, "z": z}
@@ -152,7 +153,7 @@ def plot_maps(record: GradcheckRecord, gradient: np.ndarray, reference: np.ndarr
 
 
 def map_name(record: GradcheckRecord) -> str:
-    """Name of a record's file, without its suffix."""
+    """Return the file name for a record, without the suffix."""
     what = (record.integrator, record.estimator, record.reference.value)
     parts = [file_stem(record.parameter)] if record.parameter else []
     return bounded("-".join(parts + [re.sub(r"[^\w.=]+", "_", part).strip("_") for part in what if part]))

@@ -1,6 +1,6 @@
-"""A finished run in a few lines, for a terminal: how it ended, and its parameters.
+"""Summary of a run in a few lines for the terminal: how it ended, its parameters, and their certainty.
 
-How certain its values are is said in words, of the manifest's `results`, whose `certainty` may be missing.
+The functions take the `results` of the manifest, which may lack `certainty`.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from reslrb_cli.records.measurements import INCOMPLETE, incomplete_records
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.report.format import count, line, number, shorten, with_error
 
-#: The verdict on a value that can be relied on, as recorded; all others say what keeps it from that.
+#: Recorded verdicts on a value: SETTLED is reliable, and the others give the reason why a value is not.
 SETTLED, MOVING, UNDETERMINED = "settled", "still moving", "not determined"
 NOISE, UNSEEN = "below the noise", "not seen"
 
-#: What of a spread the target's noise makes, at least, where that is what hides a value.
+#: Minimum share of the target's noise in a spread for it to be the cause that hides a value.
 OF_TARGET = 0.7
 
-#: Where a value has gone and has to go farther than this share of what its steps allow, they are too short.
+#: Steps are too short if the distance that a value has moved and must still move exceeds this share of their reach.
 REACHED = 0.5
 
-#: More iterations than this many times those of a run are not proposed, nor fewer.
+#: Bounds of a proposed number of iterations, as multiples of those of the run.
 LEAST_LONGER, MOST_LONGER = 2, 5
 
-#: What a rate is divided by where the loss rose, and the samples of a noisy target are multiplied by.
+#: Divisor of the learning rate if the loss rose, and factor for the samples of a noisy target.
 LOWER, MORE_SAMPLES = 3, 16
 
-#: What is proposed, that which makes the others of no use first.
+#: Proposals in the order of priority: the first ones make the later ones useless.
 ORDER = (
     "a lower rate",
     "scale: auto",
@@ -44,23 +44,23 @@ ORDER = (
     "more samples for it",
 )
 
-#: Quantities of what emits, which may be of any size.
+#: Quantities of emitters, which can have any magnitude.
 EMITTED = ("radiance", "irradiance", "intensity")
 
-#: Parameters with one verdict that are named.
+#: Maximum number of parameters named for one verdict.
 MOST_NAMED = 3
 
-#: A key in a line of text has at most so many characters, and beside a verdict.
+#: Maximum width of a key beside a verdict.
 PARTNER_WIDTH = 40
 
-#: The same beside a bar.
+#: Maximum width of a key beside a progress bar.
 BESIDE_A_BAR = 32
 
 
 def descriptions(record: Record, meter: ErrorMeter) -> list[str]:
-    """The record's loss, and its parameters' error where that is known, in ever fewer words.
+    """Return the loss and, if known, the parameter error of a record, as texts of decreasing length.
 
-    Where the parameters' units differ, the error is the largest relative one.
+    If the units of the parameters differ, the error is the largest relative one.
     """
     loss = f"loss {record.loss:.4g}"
     if record.parameter_rmse is not None:
@@ -75,20 +75,22 @@ def descriptions(record: Record, meter: ErrorMeter) -> list[str]:
 
 
 def is_settled(results: Mapping[str, Any], key: str) -> bool:
-    """Whether the value of a parameter can be relied on, as far as was measured."""
+    """Whether the value of a parameter was found to be reliable."""
     return bool(_about(results, key).get("verdict") == SETTLED)
 
 
 class Remedy(NamedTuple):
-    """What would help, in a word or two, and the setting for it."""
+    """Proposal in a few words, and the setting for it."""
 
     words: str
     setting: str
 
 
 def verdict_words(results: Mapping[str, Any], key: str) -> str:
-    """The verdict on a parameter, with the share of its entries that have it and of those that no view shows, and what
-    would help; empty where nothing was measured."""
+    """Return the verdict on a parameter and a proposal; empty if nothing was measured.
+
+    Includes the share of entries with this verdict and the share of entries that no view shows.
+    """
     about = _about(results, key)
     verdict, shares = about.get("verdict", ""), about.get("shares") or {}
     words = str(verdict)
@@ -105,8 +107,10 @@ def verdict_words(results: Mapping[str, Any], key: str) -> str:
 
 
 def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
-    """What the run shows to be wrong with its steps, of a value that is still moving, or with its target, of one that
-    the noise of that hides; None of any other, and where too little was recorded."""
+    """Return a proposal for a value that is still moving or that the noise of the target hides.
+
+    None for all other values, and if the records are insufficient.
+    """
     about, measured = _about(results, key), results.get("certainty") or {}
     if about.get("verdict") == NOISE and _is_of_target(about) and measured.get("target_spp"):
         return Remedy("more samples for it", f"--set target.render.spp={MORE_SAMPLES * measured['target_spp']}")
@@ -124,14 +128,14 @@ def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
         if emits in EMITTED and measured.get("scale") == "none":
             return Remedy("scale: auto", "--set optimizer.scale=auto")
         return Remedy("a higher rate", _rate_setting(measured, rate, max(2 * way / reach, 2.0)))
-    if (results.get("loss_trend") or {}).get("late") == "flat":  # more of the same steps gain nothing
+    if (results.get("loss_trend") or {}).get("late") == "flat":  # more of the same steps would not help
         return Remedy("a new run from here", "initial: {run: RUN} for each parameter")
     longer = min(max(way / moved if moved else MOST_LONGER, LEAST_LONGER), MOST_LONGER)
     return Remedy("more iterations", f"--set run.iterations={int(float(f'{longer * iterations:.2g}'))}")
 
 
 def spread_words(results: Mapping[str, Any], key: str, sign: str = "+-") -> str:
-    """One standard deviation of each entry of a small parameter, or of a typical entry; empty where none is known."""
+    """Return one standard deviation of each entry of a small parameter, or of a typical entry; empty if unknown."""
     spread = _about(results, key).get("spread")
     if not spread:
         return ""
@@ -141,7 +145,7 @@ def spread_words(results: Mapping[str, Any], key: str, sign: str = "+-") -> str:
 
 
 def certainty_lines(results: Mapping[str, Any]) -> list[str]:
-    """For each verdict but the good one a line that names the parameters that have it."""
+    """Return one line for each verdict except `settled`, with the parameters that have it."""
     verdicts = {key: about.get("verdict", SETTLED) for key, about in _parameters(results).items()}
     lines = []
     for verdict in dict.fromkeys(verdict for verdict in verdicts.values() if verdict != SETTLED):
@@ -154,7 +158,7 @@ def certainty_lines(results: Mapping[str, Any]) -> list[str]:
         shares = [record.percent() for record in incomplete_records(results.get("incomplete") or ())
                   if record.parameter in keys and verdict == INCOMPLETE]  # fmt: skip
         line += f" ({', '.join(shares)} of it is missing)" if shares else ""
-        if remedies:  # that of the steps first, if there is one: more of the wrong ones do not help
+        if remedies:  # proposals about steps come first, because more of the wrong steps do not help
             remedy = min(remedies, key=lambda each: ORDER.index(each.words))
             line += f" ({remedy.words}: {remedy.setting})"
         lines.append(line)
@@ -162,7 +166,7 @@ def certainty_lines(results: Mapping[str, Any]) -> list[str]:
 
 
 def noise_line(results: Mapping[str, Any]) -> str:
-    """What a reader of spreads has to know of a target whose noise they do not have; empty where they have it."""
+    """Return a line that says that spreads exclude the noise of the target; empty if they include it."""
     measured = results.get("certainty") or {}
     if measured.get("target_noise") not in ("left out", "in part"):
         return ""
@@ -171,22 +175,21 @@ def noise_line(results: Mapping[str, Any]) -> str:
 
 
 def measured_line(kind: type[Finding], measured: Mapping[str, Any] | None) -> str:
-    """What a measurement before the run came to, of another way of drawing samples or of another integrator; empty
-    where there was none."""
+    """Return a line about a setting chosen by measurement before the run; empty if there is none."""
     try:
         return kind.from_json(dict(measured or {})).line(cost=True)
-    except TypeError:  # there was none, or another version's
+    except TypeError:  # missing, or of another version
         return ""
 
 
 def _is_of_target(about: Mapping[str, Any]) -> bool:
-    """Whether the noise of the target makes most of a spread."""
+    """Whether most of a spread comes from the noise of the target."""
     pairs = zip(about.get("of_target") or (), about.get("spread") or (), strict=False)
     return any(part is not None and whole and part > OF_TARGET * whole for part, whole in pairs)
 
 
 def _rate_setting(measured: Mapping[str, Any], rate: float, factor: float) -> str:
-    """Another learning rate, of all parameters or of one that has its own."""
+    """Return the setting for another learning rate, of all parameters or of one that has its own."""
     value = f"{float(f'{factor * rate:.1g}'):g}"
     common = rate == measured.get("learning_rate")
     return f"--set optimizer.learning_rate={value}" if common else f"its own learning_rate: {value}"
@@ -200,24 +203,24 @@ def _about(results: Mapping[str, Any], key: str) -> dict[str, Any]:
     return dict(_parameters(results).get(key) or {})
 
 
-#: What of its loss an image that came closer has left, at most.
+#: An image has improved if its loss ratio, end over start, is below this value.
 IMPROVED = 0.9
 
-#: In a run that is too short to know the noise of its loss, by how much that of the saved images has to rise; and a
-#: target that has fewer samples than so many steps is noisy itself.
+#: In a run too short to know the noise of its loss, the loss of the saved images rose if it grew by more than the first
+#: factor. A target is noisy if it has fewer samples than the second number of steps together.
 ROSE_IF_SHORT, FEW_STEPS = 1.1, 16
 
-#: In a run of fewer iterations losses tell nothing.
+#: Losses of runs with fewer iterations are not judged.
 LEAST_JUDGED = 20
 
-#: A key in a line of text has at most so many characters.
+#: Maximum width of a key in a line of text.
 KEY_WIDTH = 60
 
 
 def last_line(status: str, results: Mapping[str, Any], tallies: Sequence[str], report: str) -> str:
-    """What the terminal says last: how the run ended, what it came to, what went wrong, and where its page is.
+    """Return the last line on the terminal: how the run ended, its results, warnings, and the path of its page.
 
-    `results` is the manifest's.
+    `results` is that of the manifest.
     """
     parts = [f"{status} after {count(results['iterations'], 'iteration')}"]
     parts += [] if results["loss"] is None else [f"loss {number(results['loss'])}"]
@@ -226,9 +229,9 @@ def last_line(status: str, results: Mapping[str, Any], tallies: Sequence[str], r
 
 
 def error_line(results: Mapping[str, Any]) -> str | None:
-    """The error of all parameters at start and end; where their units differ, that of the worst, as a share of it.
+    """Return the error of all parameters at start and end; if their units differ, the largest relative error.
 
-    `results` is what `Results.to_json` made. None where no true value is known.
+    `results` is the result of `Results.to_json`. None if no true value is known.
     """
     total = results.get("rmse") or {}
     if total.get("final") is not None:
@@ -240,15 +243,14 @@ def error_line(results: Mapping[str, Any]) -> str | None:
 
 
 def worst(results: Mapping[str, Any]) -> str | None:
-    """The key with the largest relative error at the end."""
+    """Return the key with the largest relative error at the end, or None."""
     errors = {key: pair.get("final") for key, pair in (results.get("relative_error") or {}).items()}
     known = {key: error for key, error in errors.items() if error is not None}
     return max(known, key=lambda key: known[key]) if known else None
 
 
 def warnings(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
-    """What went wrong in a run that did not fail, plainly: a loss that did not fall, errors that rose, and values that
-    cannot be relied on."""
+    """Return warnings about a run that did not fail: a loss that did not fall, errors that rose, unreliable values."""
     lines = []
     trend, ratio = results.get("loss_trend") or {}, _image_ratio(results)
     if trend.get("change") in ("rose", "flat") and not (ratio is not None and ratio < IMPROVED):
@@ -273,7 +275,7 @@ def warnings(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
 
 
 def _reasons(results: Mapping[str, Any]) -> list[str]:
-    """What may have kept a run from getting better, as far as its settings tell."""
+    """Return possible reasons why a run did not improve, as far as its records show."""
     samples = results.get("samples") or {}
     found = [f"its steps followed derivatives without silhouettes and edges of shadows ({record.percent()} of that of "
              f"{shorten(record.parameter, KEY_WIDTH)} is missing), and a lower rate does not help"
@@ -290,8 +292,10 @@ def _reasons(results: Mapping[str, Any]) -> list[str]:
 
 
 def _image_ratio(results: Mapping[str, Any]) -> float | None:
-    """The loss of the saved images, which have less noise than those of the iterations, at the end over that at the
-    start; None where one is not known."""
+    """Return the loss of the saved images at the end divided by that at the start; None if one is unknown.
+
+    Saved images have less noise than those of the iterations.
+    """
     losses = results.get("image_loss") or {}
     initial, final = losses.get("initial"), losses.get("final")
     if initial is None or final is None:
@@ -304,32 +308,32 @@ def _from_to(pair: Mapping[str, float | None]) -> str:
     return f"{start} to {end}" if start else end
 
 
-#: Parameters that are listed; a run with more says so, and its page has them all.
+#: Maximum number of listed parameters. The page of a run lists all of them.
 MOST_LISTED = 12
 
-#: A key in the table has at most so many characters, and at least.
+#: Maximum and minimum width of a key in the table.
 WIDEST_KEY, NARROWEST_KEY = 48, 24
 
-#: Columns where there is no terminal.
+#: Width if there is no terminal.
 NO_TERMINAL = 200
 
-#: What stands over the keys, and between two columns.
+#: Title of the column of keys, and gap between two columns.
 HEAD, GAP = "parameter", "  "
 
-#: Columns of values: what stands above each, and its name in the results.
+#: Columns of values: title and name in the results.
 MOMENTS = (("start", "initial"), ("end", "final"), ("true", "true"))
 
 
 def terminal_width() -> int:
-    """Columns of standard output; what stands in a file or a pipe may be wider than most terminals."""
+    """Return the width of standard output; files and pipes may be wider than most terminals."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else NO_TERMINAL
 
 
 def parameter_lines(results: Mapping[str, Any], width: int) -> list[str]:
-    """Values at start and end, true values, errors, spreads and verdicts, in lines of at most `width` characters.
+    """Return values at start and end, true values, errors, spreads and verdicts, in lines of `width` characters or less.
 
-    Textures are told by mean and range. A table where that fits, else a block for each parameter. `results` is what
-    `Results.to_json` made.
+    Textures are shown as mean and range. The lines form a table if it fits, otherwise one block per parameter.
+    `results` is the result of `Results.to_json`.
     """
     parameters = results.get("parameters") or {}
     shown = [key for key, about in parameters.items() if about.get("initial")]
@@ -351,12 +355,12 @@ def parameter_lines(results: Mapping[str, Any], width: int) -> list[str]:
 
 
 def units_differ(results: Mapping[str, Any]) -> bool:
-    """Whether the errors of a run have no common unit, so that they compare as shares of the truth alone."""
+    """Whether the errors of a run have no common unit, so that only relative errors can be compared."""
     return bool(results.get("parameter_rmse")) and (results.get("rmse") or {}).get("initial") is None
 
 
 def error_words(results: Mapping[str, Any], key: str, relative: bool) -> str:
-    """The error of one parameter at start and end, `0.189 to 0.222`; empty where it is not known."""
+    """Return the error of one parameter at start and end, `0.189 to 0.222`; empty if unknown."""
     pair = (results.get("relative_error" if relative else "parameter_rmse") or {}).get(key) or {}
     if pair.get("initial") is None:
         return ""
@@ -364,7 +368,7 @@ def error_words(results: Mapping[str, Any], key: str, relative: bool) -> str:
 
 
 def _value(about: Mapping[str, Any] | None) -> str:
-    """All numbers of a small parameter; mean and range of a large one."""
+    """Return all numbers of a small parameter, or the mean and range of a large one."""
     if not about:
         return ""
     if "value" in about:
@@ -377,7 +381,7 @@ def _value(about: Mapping[str, Any] | None) -> str:
 
 
 def _table(keys: Sequence[str], titles: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[str]:
-    """One line a parameter; nothing where that does not fit."""
+    """Return one line per parameter; empty if they do not fit."""
     widths = [max(len(title), *(len(row[column]) for row in rows)) for column, title in enumerate(titles)]
     left = width - sum(widths) - len(GAP) * len(widths)
     first = min(max(map(len, (HEAD, *keys))), WIDEST_KEY, left)
@@ -388,7 +392,7 @@ def _table(keys: Sequence[str], titles: Sequence[str], rows: Sequence[Sequence[s
 
 
 def _blocks(keys: Sequence[str], titles: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[str]:
-    """A line for the key, and one for each value; long ones go on below their beginning."""
+    """Return one line per key and one per value; long values are wrapped with indentation."""
     lines, indent = [], max(map(len, titles)) + 2 * len(GAP)
     for key, row in zip(keys, rows, strict=True):
         lines.append(shorten(key, width))

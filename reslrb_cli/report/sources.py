@@ -1,4 +1,4 @@
-"""What a page is made of: folders of runs and sweeps, files of measuring commands, told apart by what is in them."""
+"""Sources of a page: folders of runs, sweeps and maps, and files of measuring commands, recognised by content."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from reslrb_cli.records.sweeps import Sweep, is_sweep, read_sweep, run_name
 
 Array = np.ndarray[Any, Any]
 
-#: Figures that a record of a run has, or it is none.
+#: Numbers that every record of a run has.
 _FIGURES = ("iteration", "elapsed_s", "step_ms", "codegen_ms", "peak_mib", "spp")
 
-#: All that a record may have.
+#: All numbers that a record can have.
 _ALL_FIGURES = [field.name for field in fields(metrics.Record) if field.type in ("int", "float", "float | None")]
 
-#: Layers of a map of a gradient, as `gradcheck --images` writes them.
+#: Layers of a gradient map written by `gradcheck --images`.
 MAP_LAYERS = ("gradient", "reference", "z")
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run: its folder, its name on the page, what its manifest says, and its metrics, an iteration each.
+    """Run: its folder, its name on the page, its manifest, and one record per iteration.
 
-    `current` are the parameters' values by key while it is at work, else None. `damaged` are lines that could not be
-    read.
+    `current` holds the parameter values by key while the run is in progress, otherwise None. `damaged` holds the
+    numbers of unreadable lines.
     """
 
     path: Path
@@ -44,32 +44,32 @@ class Run:
 
     @property
     def at_work(self) -> bool:
-        """Whether it had no end when this was taken down."""
+        """Whether the run was in progress when it was read."""
         return self.manifest.get("status") == "running"
 
     @property
     def results(self) -> Mapping[str, Any]:
-        """What it came to, so far."""
+        """The results so far."""
         results = self.manifest.get("results")
         return results if isinstance(results, dict) else {}
 
     def last(self, name: str) -> float | None:
-        """The last figure of that name that is known."""
+        """Return the last known value of the metric `name`."""
         return next((record[name] for record in reversed(self.records) if record[name] is not None), None)
 
     @property
     def codegen_s(self) -> float:
-        """Seconds of these in which kernels were generated and compiled."""
+        """Seconds spent on generating and compiling kernels."""
         return sum(record["codegen_ms"] for record in self.records) / 1e3
 
     @property
     def peak(self) -> str:
-        """The most memory that it took, in words."""
+        """The peak memory in words."""
         return f"{max(record['peak_mib'] for record in self.records):.4g} MiB" if self.records else ""
 
     @property
     def scales(self) -> dict[str, float | None]:
-        """The root mean square of each parameter's true value, by key; None where it is not known."""
+        """The root mean square of each parameter's true value, by key; None if unknown."""
         about = self.results.get("parameters")
         if not isinstance(about, dict):
             return {}
@@ -78,9 +78,9 @@ class Run:
 
 @dataclass(frozen=True)
 class Measurements:
-    """The objects in a file of `bench`, `gradcheck` or `convergence`, which `kind` is the name of.
+    """Objects in a file of the command `kind`: `bench`, `gradcheck` or `convergence`.
 
-    `origins` are those that the file names, one where a single command wrote it: none in files of older versions.
+    `origins` has one entry if a single command wrote the file, and none in files of older versions.
     """
 
     path: Path
@@ -93,7 +93,7 @@ class Measurements:
 
 @dataclass(frozen=True)
 class Maps:
-    """A folder of maps of gradients, and the files in it that are such."""
+    """Folder of gradient maps, and the map files in it."""
 
     path: Path
     name: str
@@ -103,7 +103,7 @@ class Maps:
 
 @dataclass(frozen=True)
 class SweepRuns:
-    """A sweep, and those of its runs that have a folder, by their names."""
+    """Sweep, and its runs that have a folder, by name."""
 
     path: Path
     name: str
@@ -116,9 +116,9 @@ Source = Run | Measurements | Maps | SweepRuns
 
 
 def read_sources(paths: Sequence[Path], tell: Tell | None = None) -> list[Source]:
-    """What lies at each path; `tell` hears how far reading has come.
+    """Read the source at each path; `tell` is called with the reading progress.
 
-    Raises ConfigError, located in the first that is nothing of what a page can show.
+    Raises ConfigError, located by the first path that a page cannot show.
     """
     found: list[Source] = []
     for path, name in zip(paths, _names(paths), strict=True):
@@ -131,7 +131,7 @@ def read_sources(paths: Sequence[Path], tell: Tell | None = None) -> list[Source
 
 
 def read_run(folder: Path, name: str | None = None, tell: Tell | None = None) -> Run:
-    """The run in `folder`, as far as it can be read; of another folder, one that says nothing."""
+    """Read the run in `folder` as far as possible; for any other folder, return an empty run."""
     try:
         lines = read_lines(folder / metrics.METRICS_FILE, tell)
         damaged = lines.damaged
@@ -142,7 +142,7 @@ def read_run(folder: Path, name: str | None = None, tell: Tell | None = None) ->
 
 
 def read_sweep_runs(folder: Path, name: str | None = None, tell: Tell | None = None) -> SweepRuns:
-    """The sweep in `folder`, and its runs as far as they can be read. Raises ConfigError, located in its plan."""
+    """Read the sweep in `folder`, and its runs as far as possible. Raises ConfigError, located in its plan."""
     sweep = read_sweep(folder)
     names = [run_name(*run) for run in sweep.runs]
     runs = {name: read_run(folder / name, name, tell) for name in names if read_manifest(folder / name) is not None}
@@ -181,7 +181,7 @@ def _read_file(path: Path, name: str, tell: Tell | None) -> Measurements:
 
 
 def _kind(entry: Mapping[str, Any]) -> str | None:
-    """Which command wrote a line; None where that cannot be told."""
+    """Return the command that wrote a line; None if unknown."""
     if entry.get("kind") in ("point", "method"):
         return "convergence"
     if entry.get("kind") == "missing" or {"reference", "verdict"} <= set(entry):
@@ -190,7 +190,7 @@ def _kind(entry: Mapping[str, Any]) -> str | None:
 
 
 def _record(entry: dict[str, Any]) -> dict[str, Any] | None:
-    """A line of `metrics.jsonl`, changed so that its figures are figures; None where what each has is missing."""
+    """Return a line of `metrics.jsonl` with invalid numbers replaced by None; None if a required number is missing."""
     if not all(is_number(entry.get(key)) for key in _FIGURES):
         return None
     errors = entry.get("parameter_errors")
@@ -203,11 +203,11 @@ def _figures(values: Mapping[str, Any]) -> dict[str, float | None]:
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Whether it is a finite number."""
+    """Whether a value is a finite number."""
     return isinstance(value, float | int) and not isinstance(value, bool) and -1e300 < value < 1e300
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """A name of each, without its folders where that tells them apart."""
+    """Return a name for each path, without its folders if that is unique."""
     short = [path.absolute().name for path in paths]
     return [name if short.count(name) == 1 else one_line(path, 200) for name, path in zip(short, paths, strict=True)]

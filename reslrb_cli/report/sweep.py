@@ -1,6 +1,6 @@
-"""What a sweep came to: a record of each run and of each combination, which is the best, and the table of them.
+"""Results of a sweep: a record of each run and of each combination, the best combination, and the table.
 
-Losses are those of the runs' final images: of `run.final_spp` samples and, of one seed, the same random numbers.
+Losses are those of the final images, with `run.final_spp` samples. Runs with the same seed use the same random numbers.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ from reslrb_cli.report.format import count, interval, number, shorten, table
 from reslrb_cli.report.run_summary import units_differ
 from reslrb_cli.report.sources import Run, SweepRuns, is_number
 
-#: Settings by which losses become those of something else, so that they are not compared, and such for errors.
+#: Settings that make losses, or errors, incomparable if they vary.
 OTHER_LOSS = ("loss", "views", "target", "scene", "parameters", "run.final_spp", "run.held_out")
 OTHER_ERROR = ("scene", "parameters")
-#: Settings by which images get other noise and lack other paths: errors are compared where they are known, not losses.
+#: Settings that change the noise and the paths of images. If they vary, losses are compared only if errors are unknown.
 OTHER_IMAGE = ("integrator",)
 OTHERS = {"loss": OTHER_LOSS, "error": OTHER_ERROR}
 
-#: Characters of a setting's value in the table, and of a combination in a line.
+#: Maximum width of a setting's value in the table, and of a combination in a line.
 VALUE_WIDTH, LABEL_WIDTH = 32, 60
 
-#: Combinations that a line names, at most.
+#: Maximum number of combinations named in a line.
 MOST_NAMED = 4
 
-#: What the columns of figures are called.
+#: Titles of the columns of results.
 FIGURES = {"loss": "final loss", "error": "parameter RMSE", "elapsed_s": "time", "peak_mib": "peak memory"}
 
 
 def run_records(source: SweepRuns) -> list[SweepRunRecord]:
-    """What each run came to, in the order of the runs; `waiting` are those that have not begun."""
+    """Return the result of each run, in order; runs that have not started are `waiting`."""
     return [_run_record(source, combination, seed) for combination, seed in source.sweep.runs]
 
 
@@ -74,7 +74,7 @@ def _number(value: Any) -> float | None:
 
 
 def _error(run: Run, relative: bool) -> float | None:
-    """The error of all parameters at the end; where their units differ, the root mean square of the relative ones."""
+    """Return the final error of all parameters; if `relative`, the root mean square of their relative errors."""
     if not relative:
         return _number((run.results.get("rmse") or {}).get("final"))
     pairs = (run.results.get("relative_error") or {}).values()
@@ -83,7 +83,7 @@ def _error(run: Run, relative: bool) -> float | None:
 
 
 def row_records(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[SweepRowRecord]:
-    """What the finished runs of each combination came to."""
+    """Return the results of the finished runs of each combination."""
     ratios = {of: _ratios(sweep, runs, of) for of in OTHERS}
     return [
         _row(each, [run for run in runs if run.settings == each.settings],
@@ -107,13 +107,13 @@ def _row(
     )  # fmt: skip
 
 
-# --- which is the best ------------------------------------------------------------------------------------------------
+# --- the best combination ---------------------------------------------------------------------------------------------
 
 
 def best_records(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[SweepBestRecord]:
-    """Which combination is the best by loss and by error, as far as they can be compared; none of one combination.
+    """Return the best combination by loss and by error, if they can be compared; empty for a single combination.
 
-    Combinations with a run that failed, or has no such figure, are left out: what is left of them are the lucky ones.
+    Combinations with a run that failed or lacks the value are left out, because their other runs are a biased sample.
     """
     found = []
     for of in OTHERS:
@@ -125,14 +125,16 @@ def best_records(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[SweepBest
 
 
 def incomparable(sweep: Sweep, others: Sequence[str]) -> str:
-    """Return the first setting that is varied and one of `others`, or below one, but no learning rate; "" for none."""
+    """Return the first varied setting that is in `others` or below one of them, except learning rates; "" if none."""
     keys = [key for key in sweep.keys if not is_rate(key)]
     return next((key for key in keys if any(f"{key}.".startswith((f"{o}.", f"{o}[")) for o in others)), "")
 
 
 def _paired(sweep: Sweep, runs: Sequence[SweepRunRecord], of: str) -> dict[str, list[float]]:
-    """The values of each combination by its name, one a seed, over the seeds that all have; without those that failed,
-    or that have none. Nothing where they cannot be compared."""
+    """Return the values of each combination by name, one per seed, over the seeds that all combinations have.
+
+    Combinations that failed or lack values are left out. Empty if the combinations cannot be compared.
+    """
     errors_known = any(run.error is not None for run in runs)
     if incomparable(sweep, OTHERS[of]) or (of == "loss" and errors_known and incomparable(sweep, OTHER_IMAGE)):
         return {}
@@ -147,9 +149,9 @@ def _paired(sweep: Sweep, runs: Sequence[SweepRunRecord], of: str) -> dict[str, 
 
 
 def _groups(sweep: Sweep, values: Mapping[str, list[float]]) -> dict[str, list[list[float]]]:
-    """Group combinations that differ in learning rates alone: the values of each, by the name of the best, that first.
+    """Group combinations that differ only in learning rates; return the values of each group by its best combination.
 
-    Where nothing but learning rates is varied, each combination is a group.
+    The best combination of a group comes first. If only learning rates are varied, each combination is a group.
     """
     others = [key for key in sweep.keys if not is_rate(key)] or sweep.keys
     found: dict[str, list[str]] = {}
@@ -198,22 +200,22 @@ def _best(
     return SweepBestRecord(of, verdict.best, second, verdict.tied, verdict.beats, seeds, apart, f"{what}; {says}")
 
 
-#: Fewer seeds than these say nothing of how far a median of theirs may be off.
+#: Minimum number of seeds for an interval of a median.
 LEAST_SEEDS = 5
 
-#: Times that seeds are drawn anew, and what they are drawn by: the same runs have the same interval.
+#: Number of bootstrap resamples, and their random seed, which is fixed so that the interval is reproducible.
 RESAMPLES, RESAMPLED_BY = 4000, 15
 
-#: What share of the resamples an interval holds.
+#: Confidence level of an interval.
 CONFIDENCE = 0.95
 
 
 def ratio(own: Sequence[Sequence[float]], base: Sequence[Sequence[float]]) -> Range | None:
-    """Return the least median over the seeds among some rows of values, over that of others, and its 95 % interval.
+    """Return the minimum over the rows of `own` of the median over seeds, divided by that of `base`, with its interval.
 
-    Rows are learning rates, columns seeds, the same seeds for all. The interval is the bootstrap's: seeds are drawn
-    anew for all rows together, and the best rates are chosen anew each time, so that it includes the luck of choosing
-    the best of several. None of fewer than LEAST_SEEDS, and where a median is not finite, or 0.
+    Rows are learning rates, and columns are seeds, the same for all rows. The 95 % interval comes from a bootstrap that
+    resamples the seeds for all rows together and selects the best rates each time, so that it includes the selection
+    effect. None for fewer than LEAST_SEEDS seeds, and if a median is 0 or not finite.
     """
     seeds = min((len(values) for values in (*own, *base)), default=0)
     if seeds < LEAST_SEEDS or not (own and base):
@@ -232,15 +234,15 @@ def ratio(own: Sequence[Sequence[float]], base: Sequence[Sequence[float]]) -> Ra
     return Range(found[0] / found[1], float(low), float(high))
 
 
-#: The probability that among equal combinations any is told apart from the best.
+#: Probability that, among equal combinations, the test finds any difference from the best.
 ALPHA = 0.05
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The combination of the lowest median, those `tied` with it, and those that it `beats`, the lowest first.
+    """Combination with the lowest median, those `tied` with it, and those that it `beats`, in order of their medians.
 
-    `too_few`: there are so few seeds that the test could not have told any apart; `enough` seeds could.
+    `too_few` is true if the number of seeds is too small for the test to find any difference; `enough` seeds suffice.
     """
 
     best: str
@@ -251,10 +253,10 @@ class Verdict:
 
 
 def find_best(values: Mapping[str, Sequence[float]]) -> Verdict | None:
-    """Find which has the lowest median, and which are tied with it; None where there is nothing to compare.
+    """Find the combination with the lowest median and those tied with it; None if there are no values.
 
-    Values at the same place are of the same seed. Those are tied whose values Wilcoxon's test of the signed ranks of
-    the differences does not tell from the best's: two-sided, at ALPHA over the number of the others.
+    Values at the same index have the same seed. A combination is tied if Wilcoxon's signed-rank test of the differences
+    from the best finds no difference: two-sided, at level ALPHA divided by the number of other combinations.
     """
     if not values:
         return None
@@ -269,7 +271,7 @@ def find_best(values: Mapping[str, Sequence[float]]) -> Verdict | None:
 
 
 def _signed_ranks(one: Sequence[float], other: Sequence[float]) -> float:
-    """Two-sided, but where the pairs have the other one lower, whatever the medians: then 1."""
+    """Return the two-sided p-value of Wilcoxon's signed-rank test, or 1 if the pairs favour `other`."""
     differences = np.subtract(one, other, dtype=np.float64)
     if not differences.any():
         return 1.0
@@ -277,12 +279,12 @@ def _signed_ranks(one: Sequence[float], other: Sequence[float]) -> float:
 
 
 def _least_p(pairs: int) -> float:
-    """The least probability that the test can find with so many pairs."""
+    """Return the smallest p-value that the test can reach with this number of pairs."""
     return 2.0 ** (1 - pairs)
 
 
 def notes(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
-    """What a reader of the table has to know: what is not compared, and what failed."""
+    """Return remarks on the table: what is not compared, and what failed."""
     lines = []
     if key := incomparable(sweep, OTHER_LOSS):
         lines.append(f"losses of different `{key}` are not of the same, and not compared")
@@ -299,7 +301,7 @@ def notes(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
 
 
 def _outermost(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
-    """Return a line for each best learning rate beyond which no other one was tried: a better one may lie there."""
+    """Return a line for each best learning rate at the end of the tried range, because a better one may lie beyond."""
     found: dict[str, None] = {}
     rates = [key for key in sweep.keys if is_rate(key)]
     for of in OTHERS if rates else ():
@@ -318,7 +320,7 @@ def _outermost(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
 
 
 def figures_of(runs: Sequence[SweepRunRecord]) -> dict[str, str]:
-    """What columns of figures are called, by their names in the records; without errors where none is known."""
+    """Return the titles of the columns of results, by field name; without errors if none is known."""
     found = {
         name: title for name, title in FIGURES.items() if name != "error" or any(run.error is not None for run in runs)
     }
@@ -327,20 +329,20 @@ def figures_of(runs: Sequence[SweepRunRecord]) -> dict[str, str]:
     return found
 
 
-#: What the columns of ratios are called.
+#: Titles of the columns of ratios.
 RATIOS = {"loss_ratio": "loss ratio", "error_ratio": "error ratio"}
 RATIOS_LINE = "ratios: medians over that of the first line that can be compared, with 95 % intervals (bootstrap)"
 
 
 def row_figures(records: Sequence[SweepRowRecord], runs: Sequence[SweepRunRecord]) -> dict[str, str]:
-    """What columns of the figures of combinations are called: also iterations where they differ, and known ratios."""
+    """Return the titles of the columns for combinations, with iterations if they differ, and with known ratios."""
     found = {"iterations": "iterations"} if len({run.iterations for run in runs if run.is_done}) > 1 else {}
     ratios = {name: title for name, title in RATIOS.items() if any(getattr(record, name) for record in records)}
     return found | figures_of(runs) | ratios
 
 
 def lines(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
-    """The table, a line for each combination, which is the best, and what else is to be known."""
+    """Return the table with one line per combination, the best combinations, and remarks."""
     records = row_records(sweep, runs)
     keys, figures, short = sweep.keys, row_figures(records, runs), short_keys(sweep.keys)
     rows: list[tuple[str, ...]] = [(*(short[key] for key in keys), "runs", *figures.values())]
@@ -355,7 +357,7 @@ def lines(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
 
 
 def cell(name: str, band: Band | Range | None) -> str:
-    """The median of a figure, or a ratio, and the ends of its band or interval, where these differ."""
+    """Return a median or a ratio, with the ends of its band or interval if they differ."""
     if band is None:
         return ""
     write = {"elapsed_s": duration, "peak_mib": lambda size: f"{number(size)} MiB"}.get(name, lambda v: number(v, 4))

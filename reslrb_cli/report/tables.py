@@ -1,4 +1,4 @@
-"""Measurements as aligned tables: bench, conditioning and gradcheck; and what a gradcheck comes to."""
+"""Measurements as aligned tables: bench, conditioning and gradcheck, and the summary of a gradcheck."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from reslrb_cli.report.format import Columns, interval, number, table
 
 
 def bench_columns(labels: Sequence[str], swept: str = "depth") -> Columns:
-    """The columns of a bench; `labels` are all that will stand in the second one, what is `swept` in the first."""
+    """Return the columns of a bench: the first shows the `swept` quantity, the second fits all `labels`."""
     titles = (swept, "", "step ms", "over baseline", "kernel ms", "over baseline", "codegen", "tracing", "cold ms",
               "peak MiB", "scratch B", "n")  # fmt: skip
     return Columns(titles, (7, max(map(len, labels)), 9, 19, 9, 19, 7, 7, 8, 9, 9, 3), "><>")
 
 
 def bench_cells(row: BenchResult) -> tuple[str, ...]:
-    """Medians of one result, and ratios with their least and greatest."""
+    """Return the cells of one result: medians, and ratios with minimum and maximum."""
     record, named = row.record, (str(row.value), row.case.label)
     if record.step_ms is None or record.kernel_ms is None:
         return *named, record.status.value
@@ -38,7 +38,7 @@ def _ratio(ratio: Spread | None) -> str:
 
 
 def conditioning_lines(measured: Conditioning) -> list[str]:
-    """One line a parameter, in its units, and the spread of what differs between them; `-` where nothing was seen."""
+    """Return one line per parameter, in its units, and the spread between parameters; `-` for unknown values."""
     rows: list[tuple[str, ...]] = [
         ("parameter", "entries", "value", "gradient", "noise", "image / unit", "curvature", "length")
     ]
@@ -62,7 +62,7 @@ _KINDS = {Kind.EQUAL_SEEDS: ", equal seeds"}
 
 
 def cells(record: GradcheckRecord) -> tuple[str, ...]:
-    """What stands in the columns of HEAD; limits follow the figures that have one."""
+    """Return the cells for the columns of HEAD; numbers that have a limit are followed by it."""
     return (
         parameter_name(record),
         integrator_name(record),
@@ -80,24 +80,24 @@ def cells(record: GradcheckRecord) -> tuple[str, ...]:
 
 
 def parameter_name(record: GradcheckRecord) -> str:
-    """The parameter; `image` or `all` where there is none."""
+    """Return the parameter, or `image` or `all` if there is none."""
     return record.parameter or ("image" if record.kind is Kind.IMAGE else "all")
 
 
 def integrator_name(record: GradcheckRecord) -> str:
-    """`reslrb:stack`, or the type alone, with its paths, where these are not those from the light."""
+    """Return `reslrb:stack`, or only the type, with its paths if they are not light paths."""
     if record.estimator is None and record.paths != "light":
         return f"{record.integrator}(paths={record.paths})"
     return record.integrator if record.estimator is None else f"{record.integrator}:{record.estimator}"
 
 
 def reference_name(record: GradcheckRecord) -> str:
-    """The reference, and how it is compared with, where that is not by expectation."""
+    """Return the reference, and the kind of comparison if it uses equal seeds."""
     return _REFERENCES.get(record.reference, record.reference.value) + _KINDS.get(record.kind, "")
 
 
 def failure_line(record: GradcheckRecord) -> str:
-    """One line about a comparison that does not hold: which, and by how much."""
+    """Return a line about a failed comparison: its sides and the size of the deviation."""
     parts = []
     for name, value, limit in (
         ("relative L2", record.relative_l2, record.relative_l2_limit),
@@ -114,7 +114,7 @@ def failure_line(record: GradcheckRecord) -> str:
 
 
 def summary_lines(records: Sequence[GradcheckRecord]) -> list[str]:
-    """What it comes to: how many comparisons hold, what failed and by how much, and what was left open, and why."""
+    """Return a summary: the number of comparisons that hold, the undecided ones with reasons, and the failed ones."""
     count = {verdict: sum(record.verdict is verdict for record in records) for verdict in Verdict}
     open_ = [record for record in records if record.holds is None]
     held = f"{count[Verdict.HOLDS]} of {len(records)} comparisons hold, {count[Verdict.FAILS]} fail"
@@ -133,7 +133,7 @@ def summary_lines(records: Sequence[GradcheckRecord]) -> list[str]:
 
 
 def gradcheck_columns(records: Iterable[GradcheckRecord]) -> Columns:
-    """The columns of a table of these records; those of text are as wide as theirs."""
+    """Return the columns of a table of these records; text columns are as wide as their content."""
     texts = zip(*(cells(record)[:3] for record in records), strict=True)
     widths = [max(map(len, (title, *column))) for title, column in zip(HEAD, texts, strict=False)]
     return Columns(HEAD, (*widths, 5, 17, 11, 11, 8, 8, 10, 0), "<<<>")

@@ -1,8 +1,7 @@
-"""Linear values and errors as a screen shows them.
+"""Linear values and errors as pictures for a screen.
 
-Linear values have an exposure that suits them, and are encoded in sRGB (`exposure_for`, `encode`). Where an image
-differs from its target is shown as layers of a file, and as a picture whose colours have a scale (`write_error_map`,
-`colored`).
+Linear values get a suitable exposure and are encoded in sRGB (`exposure_for`, `encode`). The difference between an
+image and its target is written as layers of a file and as a picture with a colour scale (`write_error_map`, `colored`).
 """
 
 from __future__ import annotations
@@ -20,30 +19,29 @@ from reslrb_cli.records.images import read_layers, write_layers
 
 Array = np.ndarray[Any, Any]
 
-#: The level of an image is shown as it is where it lies in this range, else brought to `BRIGHT`.
+#: If the level of an image is in this range, the exposure is 1; otherwise the level is scaled to `BRIGHT`.
 LEAST_BRIGHT, MOST_BRIGHT, BRIGHT = 0.25, 1.6, 0.8
 
-#: The level is that below which so many of the pixels are, and so much of their light but for that of FIREFLIES.
+#: The level is the value below which these shares of the pixels and of their light lie, not counting FIREFLIES' light.
 MOST_PIXELS, MOST_LIGHT = 0.99, 0.9
 
-#: The share of the pixels, the brightest, whose light does not count.
+#: Share of the brightest pixels whose light does not count.
 FIREFLIES = 1e-3
 
-#: Pixels that see a lamp count where they raise the level by no more than this factor, or where the others are too few.
+#: Pixels that see a lamp count if they raise the level by at most this factor, or if the share of others is too small.
 LAMPS, LEAST_OTHERS = 3.0, 0.05
 
-#: What is clipped of an image is said where it is a larger share of it.
+#: Clipped pixels are mentioned if their share exceeds this value.
 LEAST_CLIPPED = 0.005
 
 
 def exposure_for(image: Array | None, lamps: Array | None = None) -> float:
-    """The factor, of two digits, that makes the linear values of an image (H, W, C) visible; 1 where they are, or there
-    is none.
+    """Return the exposure, rounded to two digits, that makes an image (H, W, C) visible; 1 if none is needed.
 
-    `lamps` (H, W), boolean, are the pixels that see a lamp, which may be thousands of times as bright as all that it
-    lights: they are clipped, rather than that the others are shown nearly black. Two levels are looked at, since a
-    caustic that takes few pixels holds much of the light: it would be clipped by the first alone. And an image of few
-    samples has pixels that hold much of the light, and are wrong: they would darken it by the second alone.
+    `lamps` (H, W), boolean, marks the pixels that see a lamp. They can be thousands of times brighter than the rest and
+    are clipped, because the rest would otherwise be nearly black. The level has two criteria: the share of pixels alone
+    would clip a caustic, which holds much of the light in few pixels; the share of light alone, if it included
+    fireflies, would darken a noisy image.
     """
     level = 0.0 if image is None else _level(image)
     if image is not None and lamps is not None and lamps.shape == image.shape[:2] and (~lamps).mean() >= LEAST_OTHERS:
@@ -55,7 +53,7 @@ def exposure_for(image: Array | None, lamps: Array | None = None) -> float:
 
 
 def _level(image: Array) -> float:
-    """What is to be shown of an image: the value below which most of its pixels, and most of their light, are."""
+    """Return the level of an image: the value below which most of its pixels and most of their light lie."""
     values = _brightest(image).astype(np.float64)
     values = np.sort(np.maximum(values[np.isfinite(values)], 0))
     if not values.size:
@@ -66,12 +64,12 @@ def _level(image: Array) -> float:
 
 
 def _brightest(image: Array) -> Array:
-    """The greatest of a pixel's colours (H, W), alpha left out."""
+    """Return the maximum over the channels of each pixel (H, W), without alpha."""
     return np.asarray(image[:, :, : 3 if image.shape[2] >= 3 else 1].max(axis=2))
 
 
 def shown_exposures(views: Sequence[Mapping[str, Any]] | None) -> dict[str, float]:
-    """The exposures that a manifest has of its `views`, by what their images' names end in; none of older runs."""
+    """Return the exposures of a manifest's `views`, by the suffix of their image names; empty for older runs."""
     found = {}
     for view in views or ():
         exposure = view.get("shown")
@@ -81,7 +79,7 @@ def shown_exposures(views: Sequence[Mapping[str, Any]] | None) -> dict[str, floa
 
 
 def exposure_words(exposure: float, target: Array | None = None) -> str:
-    """What has to be said of an exposure: nothing of 1, unless much of `target` is brighter than white with it."""
+    """Return a remark on an exposure; empty for 1, unless it clips many pixels of `target`."""
     words = []
     if exposure != 1:
         times = f"{exposure:.2g} times brighter" if exposure > 1 else f"{1 / exposure:.2g} times darker"
@@ -94,28 +92,28 @@ def exposure_words(exposure: float, target: Array | None = None) -> str:
 
 
 def encode(values: Array) -> Array:
-    """Linear values in [0, 1] as sRGB."""
+    """Convert linear values in [0, 1] to sRGB."""
     return np.where(values <= 0.0031308, 12.92 * values, 1.055 * np.maximum(values, 1e-9) ** (1 / 2.4) - 0.055)
 
 
-#: Matplotlib's map: dark where the images agree.
+#: Colour map of errors: dark where the images agree.
 COLORS = "inferno"
 
-#: Of what has a sign: blue where it is negative, grey at zero, red where it is positive.
+#: Colour map of signed values: blue for negative, grey for zero, red for positive.
 SIGNED = ("#053061", "#4393c3", "#bdbdbd", "#d6604d", "#67001f")
 
-#: So large a share of the pixels lies within the scale; beyond are fireflies.
+#: Share of the pixels within the scale; the rest are fireflies.
 WITHIN = 0.99
 
 
 def write_error_map(folder: Path, suffix: str, image: Array, target: Array, gradient: Array | None = None
                     ) -> dict[str, float]:  # fmt: skip
-    """Write an image and its target (H, W, C) as layers, and |I - T|, the mean over the channels, as a picture.
+    """Write an image and its target (H, W, C) as layers, and the channel mean of |I - T| as a picture.
 
-    `comparison<suffix>.exr` has the layers `image`, `target`, `difference` (I - T) and, where there is one, `gradient`,
-    dL/dI; `error<suffix>.png` the picture. Channels of the image that the target does not have are left out. Returns
-    where the colours' scale ends (`end`; all that is above has the last colour) and the `mean` of |I - T|; where that
-    is not finite, as the largest number.
+    `comparison<suffix>.exr` holds the layers `image`, `target`, `difference` (I - T) and, if given, `gradient` (dL/dI).
+    `error<suffix>.png` is the picture. Channels that the target lacks are left out. Returns the `end` of the colour
+    scale (larger values have the last colour) and the `mean` of |I - T|. Differences that are not finite count as the
+    largest float32 number.
     """
     image, most = image[:, :, : target.shape[2]], float(np.finfo(np.float32).max)
     difference = np.clip(np.nan_to_num(image.astype(np.float64) - target, nan=np.inf), -most, most)
@@ -130,7 +128,7 @@ def write_error_map(folder: Path, suffix: str, image: Array, target: Array, grad
 
 
 def read_comparison(folder: Path, suffix: str) -> dict[str, Array]:
-    """The layers that `write_error_map` wrote; nothing where there are none, or they are damaged."""
+    """Return the layers that `write_error_map` wrote; empty if they are missing or damaged."""
     try:
         return read_layers(folder / f"comparison{suffix}.exr")
     except (OSError, ValueError):
@@ -138,7 +136,7 @@ def read_comparison(folder: Path, suffix: str) -> dict[str, Array]:
 
 
 def scale_end(values: Array) -> float:
-    """A number with one digit that 99 % of the values are below; 1 where all are 0."""
+    """Return a number with one digit that is above 99 % of the values; 1 if all values are 0."""
     most = float(np.quantile(values, WITHIN)) or float(values.max())
     if most <= 0:
         return 1.0
@@ -147,18 +145,18 @@ def scale_end(values: Array) -> float:
 
 
 def signed_end(values: Array) -> float:
-    """Where the scale of values with a sign ends, on both sides: 99 % of them are within."""
+    """Return the end of a symmetric scale that contains 99 % of the signed values."""
     return scale_end(np.abs(np.nan_to_num(values)))
 
 
 def colored(values: Array, signed: bool = False) -> bytes:
-    """Values (H, W) from 0 to 1, or if `signed` from -1 to 1, in the colours of their scale, as a PNG."""
+    """Return a PNG of values (H, W) in [0, 1], or [-1, 1] if `signed`, in the colours of their scale."""
     places = np.nan_to_num(values)
     return as_png(color_map(signed)(np.clip((places + 1) / 2 if signed else places, 0.0, 1.0), bytes=True))
 
 
 def as_png(pixels: Array) -> bytes:
-    """A PNG of `pixels` (H, W, C), bytes."""
+    """Return a PNG of `pixels` (H, W, C), which are bytes."""
     from matplotlib.image import imsave
 
     buffer = io.BytesIO()
@@ -167,14 +165,14 @@ def as_png(pixels: Array) -> bytes:
 
 
 def color_stops(count: int, signed: bool = False) -> list[str]:
-    """Colours of the scale from its beginning to its end, as `#rrggbb`."""
+    """Return `count` colours of the scale from its start to its end, as `#rrggbb`."""
     from matplotlib.colors import to_hex
 
     return [to_hex(color_map(signed)(place)) for place in np.linspace(0.0, 1.0, count)]
 
 
 def color_map(signed: bool) -> Any:
-    """Matplotlib's map from [0, 1] to colours."""
+    """Return Matplotlib's map from [0, 1] to colours."""
     from matplotlib import colormaps
     from matplotlib.colors import LinearSegmentedColormap
 

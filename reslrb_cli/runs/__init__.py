@@ -1,4 +1,4 @@
-"""A run and its record: what a run folder is told while an optimisation works, how it ends, and how it goes on.
+"""Runs and sweeps: preparing, recording, resuming and exporting them.
 
-Knows no command line: who calls says what is shown, and when to stop.
+This package is independent of the command line: the caller decides what to show and when to stop.
 """

@@ -1,4 +1,4 @@
-"""The export of a run: its scene with the values that it recovered, for Mitsuba alone, and the solid that it shapes."""
+"""Export of a run: the scene with the recovered values for plain Mitsuba, and the solid of a lens or a mirror."""
 
 from __future__ import annotations
 
@@ -45,18 +45,18 @@ from reslrb_cli.scene.xml.read import Description
 
 Array = np.ndarray[Any, Any]
 
-#: Samples per pixel of the solid's picture.
+#: Samples per pixel of the picture of the solid.
 PICTURE_SPP = 128
 
-#: Formats of solids that are not written: a folder of that name is not what anyone wants.
+#: Unsupported formats of solids, which must not be taken for the name of a folder.
 _OTHER_SOLIDS = (".step", ".stp", ".iges", ".igs", ".dxf", ".f3d", ".sldprt", ".glb", ".gltf", ".fbx", ".amf")
 
-#: Told of what was written.
+#: Called with a line about each thing written.
 Say = Callable[[str], None]
 
 
 def check_export(config: Config, output: Path, tolerances: bool) -> None:
-    """Raise ConfigError where what was recovered cannot be written to `output`, a folder or the file of a solid."""
+    """Raise ConfigError if the export cannot be written to `output`, a folder or the file of a solid."""
     if tolerances and (config.fabrication is None or output.suffix.lower() in WRITERS):
         raise ConfigError("--tolerances", "", "goes with a folder, and a run whose configuration has a section "
                           "`fabrication`")  # fmt: skip
@@ -70,8 +70,11 @@ def check_export(config: Config, output: Path, tolerances: bool) -> None:
 
 
 def write_export(config: Config, run: Path, output: Path, tolerances: bool, say: Say) -> None:
-    """Write into the folder `output`, or the file of a solid, what `config`, the experiment of `run` with what it
-    recovered, comes to; a variant must be set. `say` is told what was written. Raises ConfigError, UnsupportedScene."""
+    """Export `config`, the experiment of `run` with its recovered values, to the folder or solid file `output`.
+
+    A variant must be set. `say` is called with a line about each thing written. Raises ConfigError and
+    UnsupportedScene.
+    """
     plan, writer, off = config.fabrication, WRITERS.get(output.suffix.lower()), dict[str, dict[str, Any]]()
     described: list[Description] = []
     scene = load_configured(config, described.append)
@@ -129,7 +132,7 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
 
 
 def exposure_line(run: Path) -> str:
-    """Say what renderings are to be multiplied by to match a run's photographs; empty where that is 1."""
+    """Return a line with the factor by which renderings match the run's photographs; empty if it is 1."""
     found = {sensor: " ".join(f"{value:.4g}" for value in np.ravel(each)) for sensor, each in exposures(run).items()}
     if set(found.values()) <= {"1"}:
         return ""
@@ -138,16 +141,16 @@ def exposure_line(run: Path) -> str:
     return f"multiply renderings by the exposure, {words[0] if same else ', '.join(words)}, to match the photographs"
 
 
-# --- what the run's own folder has of its solid -----------------------------------------------------------------------
+# --- the solid in the run folder --------------------------------------------------------------------------------------
 
 
 def keep_solid(
     config: Config, scene: mi.Scene, params: mi.SceneParameters, sensor: int, run: Path, image: Array, target: Array
 ) -> None:
-    """Write into the folder of a run what a maker wants to know of its solid (`fabrication.json`), and a picture of it.
+    """Write the fabrication data of a run's solid (`fabrication.json`) and its picture into the run folder.
 
-    `params` are those of the scene as it stands, `image` and `target` (H, W, C) what the sensor of that number sees and
-    what is wanted. Raises ConfigError where there is no solid between the faces.
+    `params` are the current scene parameters. `image` and `target` (H, W, C) are the image of sensor number `sensor`
+    and its target. Raises ConfigError if there is no solid between the faces.
     """
     assert config.fabrication is not None
     sheets, solid = read_solid(config, config.fabrication, params)
@@ -159,19 +162,19 @@ def keep_solid(
     if config.fabrication.picture is not None:
         picture = luminance(read_image(config.fabrication.picture))
         if picture.shape == wanted.shape:
-            kept = np.where(wanted > 0, np.maximum(picture, 1e-9), 0)  # its rectangle is the target's
+            kept = np.where(wanted > 0, np.maximum(picture, 1e-9), 0)  # the same rectangle as in the target
             numbers["thrown"]["ssim_of_picture"] = figures(thrown, kept)["ssim"]
     write_image(run / "images" / SOLID_PICTURE, picture_of(solid))
     _write_numbers(run, numbers)
 
 
 def is_there(scene: mi.Scene, plan: Fabrication) -> bool:
-    """Whether the scene has what the light leaves, and what it falls on."""
+    """Whether the scene contains the face that the light leaves and the receiver that it falls on."""
     return {plan.faces[0], plan.receiver} <= {shape.id() for shape in scene.shapes()}
 
 
 def keep_tolerances(config: Config, run: Path, off: dict[str, dict[str, Any]], say: Say) -> None:
-    """Add the measured tolerances to the folder of the run and draw its page anew, where no other process works."""
+    """Add the measured tolerances to the run folder and update its report, unless another process uses the folder."""
     from reslrb_cli.report.page import write_report
 
     try:
@@ -193,7 +196,7 @@ def _write_numbers(run: Path, numbers: dict[str, Any]) -> None:
 
 
 def picture_of(solid: Solid) -> Array:
-    """The solid in grazing light, (H, W, 3): its first face seen from a corner, as if it were of plaster."""
+    """Render the solid like plaster in grazing light, with the first face seen from a corner; returns (H, W, 3)."""
     with tempfile.TemporaryDirectory(prefix="reslrb-") as folder:
         file = Path(folder) / "solid.ply"
         file.write_bytes(WRITERS[".ply"](solid))
@@ -219,13 +222,13 @@ def picture_of(solid: Solid) -> Array:
 
 
 def check_folder(path: Path) -> None:
-    """Raise ConfigError where there is something at `path` already that is no empty folder."""
+    """Raise ConfigError if `path` exists and is not an empty folder."""
     if os.path.lexists(path) and not (path.is_dir() and not path.is_symlink() and not any(path.iterdir())):
         raise ConfigError("--output", "", f"{path} exists; name a folder that does not exist yet, or is empty")
 
 
 def check_file(path: Path, config: Config) -> None:
-    """Raise ConfigError where no solid can be written to the file `path`."""
+    """Raise ConfigError if no solid can be written to the file `path`."""
     if config.fabrication is None:
         raise ConfigError("--output", "", f"{path}: name a folder; of a scene a solid is made where the configuration "
                           "has a section `fabrication`, which `reslrb lens` writes; or add "
@@ -242,7 +245,7 @@ def _writes_3mf() -> bool:
 
 
 def read_solid(config: Config, plan: Fabrication, params: mi.SceneParameters) -> tuple[list[Sheet], Solid]:
-    """The faces in a scene with these `params`, and the solid between them. Raises ConfigError."""
+    """Return the faces in the scene and the solid between them. Raises ConfigError."""
 
     sheets = []
     try:
@@ -259,8 +262,10 @@ def read_solid(config: Config, plan: Fabrication, params: mi.SceneParameters) ->
 
 
 def read_target(config: Config, sensor: mi.Sensor, needed: bool) -> Array | None:
-    """Return the image (H, W, C) that a sensor is to see; None where `target.file` is no image of its film's size,
-    unless it is `needed` for tolerances. Raises ConfigError."""
+    """Return the target image (H, W, C) of a sensor; None if `target.file` does not have the size of the film.
+
+    Raises ConfigError in that case if the target is `needed` for tolerances.
+    """
     file = config.target.file
     if file is None:
         reason = "what is thrown is compared with target.file, which is missing"
@@ -278,7 +283,10 @@ def read_target(config: Config, sensor: mi.Sensor, needed: bool) -> Array | None
 def bench_of(
     config: Config, scene: mi.Scene, params: mi.SceneParameters, integrator: dict[str, object], sensor: int
 ) -> OpticalBench:
-    """What moves the scene's parts, for its tolerances (`measure/tolerance.py`). Raises ConfigError."""
+    """Return the bench that moves the scene's parts to measure tolerances (`measure/tolerance.py`).
+
+    Raises ConfigError.
+    """
     assert config.fabrication is not None
     try:
         return OpticalBench(scene, params, config.fabrication, mi.load_dict(dict(integrator)), sensor)
@@ -289,10 +297,10 @@ def bench_of(
 def measure_loss(
     config: Config, scene: mi.Scene, sensor: int, integrator: dict[str, object], target: Array
 ) -> tuple[Array, dict[str, Any]]:
-    """The scene's image, and its mean squared difference from `target`, as who has the exported scene finds it.
+    """Return the scene's image and its mean squared difference from `target`, reproducible from the exported scene.
 
-    By Mitsuba's own `integrator` and independent samples: a run's own images may be of low-discrepancy ones, which have
-    less noise, and so a lower loss of the same face.
+    The image is rendered by Mitsuba's own `integrator` with independent samples. The images of a run may use
+    low-discrepancy samples, which have less noise and therefore a lower loss for the same face.
     """
     spp, seed = config.run.final_spp, 0
     image = np.array(mi.render(scene, integrator=mi.load_dict(dict(integrator)), sensor=sensor, spp=spp, seed=seed))
@@ -309,9 +317,9 @@ def solid_files(
     loss: dict[str, Any],
     off: dict[str, dict[str, Any]],
 ) -> dict[str, Callable[[Path], object]]:
-    """Who writes what an exported folder holds of a solid, by the file's name; without 3MF where lib3mf is missing.
+    """Return a writer for each file of a solid in an exported folder, by file name; no 3MF if lib3mf is missing.
 
-    `light`: where it goes, `loss`: of `measure_loss`, `off`: what was measured of tolerances.
+    `light` says where the light goes, `loss` is the result of `measure_loss`, and `off` holds the measured tolerances.
     """
 
     files: dict[str, Callable[[Path], object]] = {}
@@ -346,7 +354,7 @@ def solid_files(
 
 
 def tell_solid(path: Path, plan: Fabrication, sheets: Sequence[Sheet], solid: Solid, say: Say) -> None:
-    """Say what a maker wants to know of the solid in the file `path`."""
+    """Report the fabrication data of the solid in the file `path`."""
 
     first, *others = summary(measured(solid, sheets, plan))
     say(f"{path}: {first}")
@@ -357,10 +365,10 @@ def tell_solid(path: Path, plan: Fabrication, sheets: Sequence[Sheet], solid: So
 def choose_integrator(
     config: Config, scene: mi.Scene, params: mi.SceneParameters, paths: str
 ) -> tuple[dict[str, object], str]:
-    """Mitsuba's integrator whose image is that of the run's `paths` (`loading.paths_of`), as far as there is one; and
-    why it is not the usual one.
+    """Choose the Mitsuba integrator that reproduces the image of the run's `paths` (`loading.paths_of`) best.
 
-    Light paths are traced by `ptracer`, and where that is wrong by `path`, which also sees glass and mirrors.
+    Also returns the reason if it is not the usual one. Light paths are traced by `ptracer`, or by `path` where
+    `ptracer` is wrong; `path` also sees glass and mirrors.
     """
 
     own = config.integrator.options()
@@ -368,7 +376,7 @@ def choose_integrator(
     if paths != "light":
         return {"type": "path", **options}, ""
     sensor = scene.sensors()[choose_sensors(config, scene)[0]]
-    # Roulette, which that asks about, changes no image.
+    # DEEPEST passes the depth check, which is about roulette: roulette does not change the mean image.
     why = ptracer_image(Situation.of(scene, sensor, params, DEEPEST, config.integrator.hide_emitters))
     if why is None or config.integrator.type == "ptracer":
         return {"type": "ptracer", **options}, ""

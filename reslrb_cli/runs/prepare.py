@@ -1,11 +1,10 @@
-"""A run as it goes on: how it is prepared, what its iterations go on from, what has been found, and how that is kept.
+"""Preparation of a run, and its progress: the state of the iterations, the results so far, and their checkpoints.
 
-- `plan_record`: what a run's manifest says of the plan of its step.
-- `changes`, `check_changes`: what of an experiment may change while its run goes on, and what may not.
-- `prepare`, `manifest_of`: from a configuration to a problem that is ready to run, and the manifest that says what was
-  settled on the way.
-- `PreparedRun`: a run that is to be made, or gone on with; `begin`: one that is new.
-- `RunProgress`: what a run has come to.
+- `plan_record`: the entry about the plan of a step in a run's manifest.
+- `changes`, `check_changes`: which settings of an experiment may change when its run is resumed.
+- `prepare`, `manifest_of`: make a problem that is ready to run from a configuration, and its manifest.
+- `PreparedRun`: a run that is ready to start or to resume; `begin` makes a new one.
+- `RunProgress`: the state and the results of a run.
 """
 
 from __future__ import annotations
@@ -50,9 +49,9 @@ from reslrb_cli.scene.visibility import sees_lamps
 
 
 def plan_record(problem: Problem) -> dict[str, Any]:
-    """The integrator, its estimator, and for the first view what its kernels contain and leave out, and why.
+    """Return the integrator, its estimator, and which features the kernels of the first view contain, with reasons.
 
-    `rows` is empty for integrators that plan nothing, and `estimator` None for those that have none.
+    `rows` is empty for integrators without a plan, and `estimator` is None for integrators without an estimator.
     """
     config, integrator = problem.config.integrator, problem.integrator
     if not isinstance(integrator, Reslrb):
@@ -73,22 +72,22 @@ def plan_record(problem: Problem) -> dict[str, Any]:
     return {"integrator": config.type, "estimator": estimator, "rows": rows}
 
 
-#: Settings that decide nothing of what the iterations until then were. All others would make it another run.
+#: Settings that do not affect the iterations done so far. A change of any other setting would make it another run.
 MAY_CHANGE = re.compile(
     r"run\.(iterations|name|output|checkpoint_every|images_every|certainty|on_nonfinite|stop|max_seconds)(\..*)?"
     r"|optimizer\.learning_rate|parameters\[\d+\]\.learning_rate(\..*)?"
 )
 
-#: Those that say where a run is written, which its folder says itself.
+#: Settings for the place of a run, which its folder shows already.
 _PLACE = ("run.name", "run.output")
 
-#: Differing settings that an error names.
+#: Maximum number of changed settings that an error names.
 _SHOWN = 3
 Change = tuple[Any, Any]
 
 
 def changes(before: Config, now: Config) -> dict[str, Change]:
-    """The settings that differ, by key, as they were and as they are; None where there was or is none."""
+    """Return the old and the new value of each setting that differs, by key; None for a missing value."""
     first, second = flat(before), flat(now)
     return {
         key: (first.get(key), second.get(key))
@@ -98,10 +97,10 @@ def changes(before: Config, now: Config) -> dict[str, Change]:
 
 
 def check_changes(found: Mapping[str, Change], blame: Callable[[str], object], run: Path) -> dict[str, Change]:
-    """Of the settings that differ those that may, where the run is written left out.
+    """Return the changed settings, without those for the place of the run.
 
-    Raises ConfigError, located by the first key that must not and by who is to `blame` for it, with the first few of
-    them.
+    Raises ConfigError if a setting must not change. The error names the first few such settings and is located by the
+    first one, in the source that `blame` returns for it.
     """
     wrong = [key for key in found if not MAY_CHANGE.fullmatch(key)]
     if wrong:
@@ -118,7 +117,7 @@ def check_changes(found: Mapping[str, Change], blame: Callable[[str], object], r
 
 
 def flat(config: Config) -> dict[str, Any]:
-    """All settings by their keys, as `--set` names them; those of None left out."""
+    """Return all settings that are not None, by their keys as in `--set`."""
     found: dict[str, Any] = {}
 
     def add(key: str, value: Any) -> None:
@@ -144,14 +143,14 @@ Say = Callable[[str], None]
 
 
 def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[RunProgress, Manifest]:
-    """Assemble a new run, and measure what is to be known before it; a variant must be set.
+    """Assemble a new run and make the measurements before its first iteration; a variant must be set.
 
-    `say` is told what takes long, `warn` what to look at. Raises ConfigError and UnsupportedScene.
+    `say` is called with lines about slow steps, `warn` with warnings. Raises ConfigError and UnsupportedScene.
     """
     problem = assemble(config, say, PilotCache(), to_run=True)
     warn_of_border(problem, warn)
     missing = check_missing(problem, warn)
-    if missing:  # what was moved for it may have reached beyond the sphere that lamps at infinity shine through
+    if missing:  # the check moves geometry, possibly beyond the bounding sphere of the lamps at infinity
         problem = problem.afresh(problem.values())
     manifest = manifest_of(problem, variant, config.source)
     manifest.incomplete = [asdict(record) for record in missing]
@@ -159,7 +158,7 @@ def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[RunProgr
 
 
 def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
-    """The manifest of a run of `problem`, as far as the problem tells."""
+    """Return the manifest of a run of `problem`, with the entries that the problem determines."""
     manifest = Manifest(
         variant=variant, device=device_name(variant), seed=problem.config.run.seed, config=printable(config_file)
     )
@@ -167,7 +166,7 @@ def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
     manifest.views = view_records(problem.views)
     for record, view in zip(manifest.views, problem.views, strict=True):
         sensor = problem.scene.sensors()[view.sensor]
-        # What no light path can deal with, primary rays may not either.
+        # Primary rays may fail, too, in a scene that light paths do not support.
         lamps = sees_lamps(problem.scene, sensor) if unsupported_part(problem.scene, sensor) is None else None
         record["shown"] = exposure_for(np.array(view.target), lamps)
     for name, decided in problem.decisions().items():
@@ -176,8 +175,10 @@ def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
 
 
 def settled_of(problem: Problem, variant: str) -> Settled:
-    """What every checkpoint says of the experiment, whose parameters stand at their initial values: by it another
-    process assembles the same problem."""
+    """Return the description of the experiment in every checkpoint, from which another process assembles the problem.
+
+    The parameters must have their initial values.
+    """
     initial, halo = on_file(problem, standing(problem).values)
     return Settled(
         dump(problem.config), variant, digests(problem.config), problem.guided, problem.sequence, problem.sides,
@@ -186,7 +187,7 @@ def settled_of(problem: Problem, variant: str) -> Settled:
 
 
 def digests(config: Config) -> dict[str, str]:
-    """Return digests of the files that a run needs to go on; its state has the values that parameters begin with."""
+    """Return digests of the files that a run needs to resume; initial values are part of its state instead."""
     return file_digests({key: path for key, path in files_of(config).items() if ".initial." not in key})
 
 
@@ -195,7 +196,7 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class SavedResults:
-    """What a run has met on its way, beside the records of its iterations, of which `last` is the newest."""
+    """Results in a checkpoint, in addition to the records of the iterations; `last` is the newest record."""
 
     images: Images
     certainty: Noted
@@ -208,9 +209,9 @@ class SavedResults:
 
 
 class RunProgress:
-    """Of one run of `problem`, whose parameters stand at their initial values when this is made.
+    """State and results of a run of `problem`, whose parameters must have their initial values at construction.
 
-    `state` is that after the last whole iteration; of the one that is at work nothing is in it.
+    `state` is the state after the last complete iteration, without any part of the current one.
     """
 
     def __init__(self, problem: Problem, variant: str) -> None:
@@ -226,23 +227,24 @@ class RunProgress:
         self._spent: Callable[[], SharedTime] | None = None
 
     def compute_with(self, engine: Callable[..., Any], spent: Callable[[], SharedTime] | None = None) -> None:
-        """Have the shards of a run without stages computed by `engine` (`shards.Engine`); `spent` says what time that
-        has taken by now."""
+        """Let `engine` (`shards.Engine`) compute the shards of a run without stages.
+
+        `spent` returns the time spent on that so far.
+        """
         self.problem = replace(self.problem, engine=engine)
         self.stages = Stages(self.problem)
         self._spent = spent
 
     @property
     def shared(self) -> SharedTime | None:
-        """What the shards of all iterations took that workers computed, those before the run was gone on with included;
-        None where there were none."""
+        """Time spent on shards that workers computed, including before the run was resumed; None without workers."""
         if self._spent is None:
             return self._shared
         return self._spent() if self._shared is None else self._shared + self._spent()
 
     @property
     def files(self) -> dict[str, str]:
-        """The digests of the files that the experiment names, by the keys that name them, when the run began."""
+        """Digests of the experiment's files when the run started, by the keys that name the files."""
         return self._settled.files
 
     @property
@@ -251,8 +253,8 @@ class RunProgress:
         return self.state.iteration
 
     def add(self, state: State, record: Record) -> None:
-        """Take one iteration, which leaves `state`."""
-        if self._counts(record.iteration):  # losses of other films are not to be compared
+        """Add one iteration, with the `state` after it."""
+        if self._counts(record.iteration):  # losses on films of another size cannot be compared
             self.best.see(record, self.state.values)
         self._take(record)
         if self.stages.is_whole(state.stage):
@@ -260,28 +262,27 @@ class RunProgress:
         self.state = state
 
     def _counts(self, iteration: int) -> bool:
-        """Whether the iteration before, which left its values, and this one, whose loss it is, worked on the run's own
-        problem."""
+        """Whether both this iteration and the previous one, which set its values, used the run's own problem."""
         config = self.problem.config
         begun = (max(iteration - 1, 0), iteration)
         return all(self.stages.is_whole(config.stage_number(each / config.run.iterations)) for each in begun)
 
     def values(self) -> dict[str, Array]:
-        """The newest values, as `Problem.values` has them."""
+        """Return the newest values, in the form of `Problem.values`."""
         return self.stages.values(self.state)
 
     def bring(self) -> Problem:
-        """The run's own problem, at the newest values."""
+        """Set the run's own problem to the newest values and return it."""
         self.stages.bring(self.state)
         return self.problem
 
     def go_on(self) -> None:
-        """Take back that the run had stopped: other settings say when."""
+        """Clear the stop of an earlier process, because the stopping criteria may have changed."""
         if self.state.stopped:
             self.state = replace(self.state, stopped="")
 
     def stand(self) -> None:
-        """Bring the problem back to `state` where an iteration was cut short."""
+        """Reset the problem to `state` if an iteration was interrupted."""
         now = self.stages.at(self.state.stage)
         if now.optimizer.stands_at is not self.state:
             put(now, self.state)
@@ -296,7 +297,7 @@ class RunProgress:
         self.regularized.add(record)
 
     def best_values(self) -> dict[str, Array]:
-        """The best parameters so far, as `problem.values()` has them; nothing where there are none yet."""
+        """Return the best parameters so far, in the form of `problem.values()`; empty if there are none yet."""
         shown = self.problem.selection.shown
         return {
             key: value if isinstance(value, np.ndarray) else shown(key, value)
@@ -304,25 +305,25 @@ class RunProgress:
         }
 
     def shown(self, values: Mapping[str, Any]) -> dict[str, Array]:
-        """Values by key as the optimiser has them, of a state or its gradients, as `problem.values()` has them."""
+        """Convert optimiser values or gradients, by key, to the form of `problem.values()`."""
         return {key: self.problem.selection.shown(key, value) for key, value in values.items()}
 
-    # --- kept and taken up again --------------------------------------------------------------------------------------
+    # --- checkpoints --------------------------------------------------------------------------------------------------
 
     def save(self, folder: Path) -> int:
-        """Keep it in `folder` as it was after its last whole iteration; return how many it had. Raises OSError."""
+        """Save the state after the last complete iteration in `folder`; return the iteration count. Raises OSError."""
         save_checkpoint(folder, self.done, {}, *self._entries(self.state.on_file(self.stages.at(self.state.stage))))
         return self.done
 
     def save_begun(self, folder: Path) -> None:
-        """Keep the state with which the iteration at work began, for `inspect --nonfinite`. Raises OSError."""
+        """Save the state at the start of the current iteration, for `inspect --nonfinite`. Raises OSError."""
         begun = self.stages.begun
         assert begun is not None, "an iteration is at work"
         found = self._entries(begun.on_file(self.stages.now))
         save_checkpoint(folder, begun.iteration, {}, *found, name=NONFINITE_FILE_NAME)
 
     def _entries(self, state: State) -> tuple[Arrays, dict[str, Any]]:
-        """Return the arrays and the other values of a checkpoint at a state, as `tree.entries` does."""
+        """Return the arrays and the other values of a checkpoint of `state`, in the form of `tree.entries`."""
         met = SavedResults(
             self.results.images["initial"], self.certainty.noted, self.best.least, self.last, self.shared,
             self.best_values(), self.certainty.squares, self.certainty.last_steps(),
@@ -330,9 +331,9 @@ class RunProgress:
         return entries(self._settled, state, met)
 
     def restore(self, stored: Stored, records: Sequence[Record]) -> None:
-        """Go on from what was stored, and from the records of all iterations until then.
+        """Restore the state from a checkpoint and the records of all iterations before it.
 
-        Raises ConfigError, located in the file, where something there is not what this run can have left.
+        Raises ConfigError, located in the file, if the content does not fit this run.
         """
         problem, met = self.problem, stored.read(SavedResults)
         self.state = load(self.stages.at(stored.read(State).stage), stored, problem)
@@ -353,8 +354,10 @@ class RunProgress:
 
 @dataclass(frozen=True)
 class PreparedRun:
-    """A run that is to be made, or gone on with: its course, its manifest, and `place`, which makes its folder or takes
-    it over, and has it locked while the block works."""
+    """Run that is ready to start or to resume.
+
+    `place` creates the run folder or takes it over, and locks it while the block runs.
+    """
 
     course: RunProgress
     manifest: Manifest
@@ -362,9 +365,9 @@ class PreparedRun:
 
 
 def begin(config: Config, variant: str, force: bool, say: Say, warn: Say) -> PreparedRun:
-    """A new run, prepared as `prepare` does, in a folder of its own; a variant must be set.
+    """Prepare a new run in its own folder; a variant must be set.
 
-    Whether there can be one is asked before (`check_output`). Raises ConfigError and UnsupportedScene.
+    Call `check_output` before, to check that the folder can be made. Raises ConfigError and UnsupportedScene.
     """
     course, manifest = prepare(config, variant, say, warn)
     run = config.run

@@ -1,4 +1,4 @@
-"""The recording of a run: its optimisation is run, and its folder written; one that is resumed goes on where it was."""
+"""Execution of a new or resumed run: computes its iterations and writes its folder."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ from reslrb_cli.runs.prepare import RunProgress
 logger = logging.getLogger(__name__)
 
 
-#: Images with more pixels take some seconds to be compared, and that is said.
+#: Comparing images with more pixels takes some seconds and is announced.
 MANY_PIXELS = 5e5
 
 
 @dataclass
 class Recording:
-    """One run being recorded: `course` is what it has come to, from where it began or was gone on with."""
+    """Recording of one run; `course` holds its progress."""
 
     course: RunProgress
     folder: RunFolder
@@ -58,7 +58,7 @@ class Recording:
     error_maps: dict[str, Any] = field(default_factory=dict)
     seen: dict[str, Any] = field(default_factory=dict)
     certainty: CertaintyRecord | None = None
-    #: How the run ended, once it has.
+    #: How the run ended, or RUNNING.
     status: Status = Status.RUNNING
     _saved_nonfinite: bool = field(init=False)
     #: Iterations that the newest checkpoint contains; None before the first one.
@@ -71,7 +71,7 @@ class Recording:
 
     @property
     def problem(self) -> Problem:
-        """What is optimised."""
+        """The optimisation problem."""
         return self.course.problem
 
     @property
@@ -80,9 +80,9 @@ class Recording:
         return self.course.done
 
     def run(self, show: Callable[[Record], None], stop: Callable[[], bool]) -> Status:
-        """Iterate until the end or until `stop()`, and complete the folder; return how it ended (`records`).
+        """Iterate until the end or until `stop()` is true, complete the folder, and return how the run ended.
 
-        What `show` fails of is what the run fails of.
+        See `records`. An exception in `show` ends the run with that exception.
         """
         records = self.records(stop)
         for record in records:
@@ -94,23 +94,23 @@ class Recording:
         return self.status
 
     def records(self, stop: Callable[[], bool] = lambda: False) -> Generator[Record, None, None]:
-        """The record of each iteration until the end, until `stop()`, or until nobody asks for more (`close`); then
-        the folder is completed, and `status` says how the run ended.
+        """Yield the record of each iteration, then complete the folder and set `status`.
 
-        Whatever ends the run, its folder has a checkpoint, the parameters, a manifest that says how it ended, and the
-        report; and final images if it did not fail. Raises the run's failure, as MachineError if the folder could not
-        be written to.
+        Stops at the last iteration, when `stop()` is true, or when the generator is closed. In all cases the folder
+        then has a checkpoint, the parameters, the report, and a manifest with the outcome; if the run did not fail, it
+        also has the final images. Raises the error that ended the run, as MachineError if the folder could not be
+        written to.
         """
         self._stop = stop
         status: Status = Status.FAILED
         failure: BaseException | None = None
         try:
             self.page.refresh()
-            if self.done:  # what `_begin` writes is there: a run has a state after an iteration only then
+            if self.done:  # a run with iterations has already written the files of `_begin`
                 self._saved = self.done
             else:
                 self._begin()
-            (self.folder.path / FABRICATION_FILE).unlink(missing_ok=True)  # of where it was before it went on
+            (self.folder.path / FABRICATION_FILE).unlink(missing_ok=True)  # outdated once the run goes on
             yield from self._iterate(stop)
             left = self.done < self.problem.config.run.iterations and not self.course.state.stopped
             status = Status.INTERRUPTED if left else Status.FINISHED
@@ -127,7 +127,7 @@ class Recording:
         self.status = self._end(status, failure)
 
     def abandon(self) -> None:
-        """Note in the manifest that the run was interrupted, in a process that is about to end in the midst of it."""
+        """Mark the run as interrupted in the manifest, in a process that is about to exit during an iteration."""
         if not self.manifest.results and self.course.last is not None:
             self.manifest.results = {"iterations": self.done, "elapsed_s": self.course.last.elapsed_s}
         self._note_shared()
@@ -162,14 +162,14 @@ class Recording:
                 metrics.write(record)
                 yield record
                 self._note_memory(record.peak_mib)
-                if (fault := self.folder.fault) is not None:  # another run's may have taken its name
+                if (fault := self.folder.fault) is not None:  # the folder may have been removed or replaced
                     raise fault
                 if stop():
                     return
                 if every and self.done % every == 0 and self.done < run.iterations:
                     self._write_images(f"iteration-{self.done:06d}")
                 if run.checkpoint_every.is_due(self.done - saved, time.monotonic() - saved_at):
-                    metrics.sync()  # first: a checkpoint counts on the lines of its iterations
+                    metrics.sync()  # first, because a checkpoint needs the lines of its iterations
                     self._save_checkpoint()
                     saved, saved_at = self.done, time.monotonic()
                 self.page.refresh()
@@ -181,7 +181,7 @@ class Recording:
             logger.info(f"stopped after {self.done} iterations: {course.state.stopped}")
 
     def _tell_scaling(self, measured: Sequence[Scaled]) -> None:
-        """Note what was measured for `scale`, and say what it makes of a step."""
+        """Record the measurements for `scale` in the manifest, and log the resulting steps."""
         self.manifest.scaling = [row.to_json() for row in measured]
         for row in measured:
             spec = self.problem.selection.spec(row.key)
@@ -192,29 +192,29 @@ class Recording:
             logger.log(level, f"scale {scale}: {line}")
 
     def _note_memory(self, peak: float) -> None:
-        """Note the memory that was used, where there is a budget; warn the first time that it is above that."""
+        """Record the memory use if there is a budget; warn the first time it exceeds the budget."""
         if (plan := self.problem.memory) is not None:
             if (warning := plan.check(peak)) is not None:
                 logger.warning(warning)
             self.manifest.memory = plan.to_json()
 
     def _on_nonfinite(self, found: Findings) -> None:
-        """Keep what the first step that met a value that is not finite began with, and say how to look into it."""
+        """Save the state before the first step with a value that is not finite, and say how to inspect it."""
         if self._saved_nonfinite:
             return
         self.course.save_begun(self.folder.checkpoint)
         self._saved_nonfinite = True
-        if self.problem.config.run.on_nonfinite != "stop":  # which says so when it ends
+        if self.problem.config.run.on_nonfinite != "stop":  # with "stop", the error says so
             logger.warning(f"{found}; {self._where()}")
 
     def _where(self) -> str:
-        """How to look into a value that is not finite."""
+        """Return a hint how to find the cause of a value that is not finite."""
         if self.problem.config.codes:
             return "look at what your own code returns, which `reslrb inspect --nonfinite` does not run"
         return f"where: reslrb inspect {shlex.quote(os.path.relpath(self.folder.path / 'config.yaml'))} --nonfinite"
 
     def _end(self, status: Status, failure: BaseException | None) -> Status:
-        """Complete the folder, the state first, and return how the run ended; raise its first failure."""
+        """Complete the folder, beginning with the state, and return how the run ended; raise the first error."""
         if (fault := self.folder.fault) is not None:
             failure = failure or fault
             raise MachineError(describe(failure)) if isinstance(failure, OSError) else failure
@@ -226,12 +226,12 @@ class Recording:
                 failure = failure or error
         if failure is not None:
             status = Status.FAILED
-        elif status is Status.FINISHED:  # who interrupts does not want to wait; `reslrb report` finds them as well
+        elif status is Status.FINISHED:  # an interrupt must not wait; `reslrb report` finds the image errors, too
             self._add("how certain the values are was", self._measure_certainty)
             self._add("errors as people see them were", self._measure_seen_errors)
             if self.problem.config.fabrication is not None:
                 self._add("what a maker has to know of the solid was", self._measure_solid)
-        # Nothing but files of the run folder is open by now, and that could be written to when the run began.
+        # Only files of the run folder are written here, and the folder was writable when the run started.
         if isinstance(failure, OSError) or (failure is not None and is_machine_fault(failure)):
             failure = MachineError(f"{describe(failure)}; {self._kept()}")
         try:
@@ -243,7 +243,7 @@ class Recording:
         except Exception as error:
             if failure is None:
                 logger.warning("the page was not written: %s; all else is in %s", describe(error), self.folder.path)
-            with contextlib.suppress(OSError):  # the last one says that the run is at work
+            with contextlib.suppress(OSError):  # the previous page shows the run as still running
                 (self.folder.path / "report.html").unlink(missing_ok=True)
         remove_parts(self.folder.path)
         if failure is not None:
@@ -251,14 +251,14 @@ class Recording:
         return status
 
     def _write_parameters(self) -> None:
-        """Write the last values, and beside them the best so far, where there are any."""
+        """Write the last values and, if there are any, the best values."""
         write_parameters(self.folder.parameters, self.course.bring().values())
         best = self.course.best_values()
         if best:
             write_parameters(self.folder.parameters / "best", best)
 
     def _write_live_page(self) -> None:
-        if self.course.last is None:  # nothing is there to be drawn, so that this takes no time
+        if self.course.last is None:  # there is nothing to draw yet
             write_report(self.folder.path, self.manifest.content(), {})
         else:
             found = self._found()
@@ -266,7 +266,7 @@ class Recording:
             write_report(self.folder.path, self.manifest.content() | {"results": found}, self.problem.values())
 
     def _add(self, failed: str, measure: Callable[[], None]) -> None:
-        """Add to the results what `measure` finds. The run is what it is without that; `failed` says so."""
+        """Add the results of `measure`. An error does not fail the run; it is logged, starting with `failed`."""
         try:
             measure()
         except Exception as error:
@@ -288,7 +288,7 @@ class Recording:
             [record.parameter for record in incomplete_records(self.manifest.incomplete)]
         )
         for key, shown in self.course.certainty.shown.items():
-            if key not in self.problem.masks:  # of which it was found out before
+            if key not in self.problem.masks:  # `_begin` has written the masks of the problem
                 write_mask(self.folder.parameters, key, shown)
 
     def _measure_seen_errors(self) -> None:
@@ -319,12 +319,12 @@ class Recording:
         self.manifest.results = self._found()
 
     def _note_shared(self) -> None:
-        """Note what workers have done by now."""
+        """Record the workers' time so far."""
         if self.course.shared is not None:
             self.manifest.shared = finite(asdict(self.course.shared))
 
     def _found(self) -> dict[str, Any]:
-        """What the run came to, or has come to by now."""
+        """Return the results of the run so far."""
         last = self.course.last
         found = self._ended()
         if self.manifest.incomplete:
@@ -346,7 +346,7 @@ class Recording:
         }
 
     def _ended(self) -> dict[str, Any]:
-        """Return the results with the values of the end."""
+        """Return the results with the final values."""
         course, results = self.course, self.course.results
         course.bring()
         results.end()
@@ -354,13 +354,13 @@ class Recording:
         return {**results.to_json(), **stopped}
 
     def _kept(self) -> str:
-        """Say which state of the run is on the disk."""
+        """Return a line about the saved state of the run."""
         if self._saved is None or newest_checkpoint(self.folder.checkpoint) is None:
             return "nothing of the run was kept"
         return f"kept: the state after {self._saved} of {self.done} iterations, in {self.folder.checkpoint}"
 
     def _save_last_checkpoint(self) -> None:
-        """Keep the state, unless it is there already: the one before it then is an earlier one."""
+        """Save the state unless it is saved already, so that `previous.npz` remains an earlier state."""
         if self._saved != self.done or not (self.folder.checkpoint / STATE_FILE).exists():
             self._save_checkpoint()
 
@@ -384,7 +384,7 @@ class Recording:
                 self.error_maps[f"error{suffix}"] = about
 
     def _write_image(self, name: str, sensor: int, image: np.ndarray[Any, Any]) -> None:
-        """Write an image of a sensor, to look at with the exposure that suits its target, whatever is in it."""
+        """Write an image of a sensor; its PNG uses the exposure that suits the target."""
         exposure = shown_exposures(self.manifest.views).get(self._image_name("", sensor), 1.0)
         write_image(self.folder.images / self._image_name(name, sensor), image, image * np.float32(exposure))
 

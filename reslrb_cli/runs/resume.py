@@ -1,4 +1,4 @@
-"""A run that goes on exactly where it was: its folder opened, its state read, its problem assembled again."""
+"""Resuming a run exactly where it stopped: open its folder, read its state, assemble its problem."""
 
 from __future__ import annotations
 
@@ -46,10 +46,11 @@ Say = Callable[[str], None]
 
 @dataclass
 class OpenedRun:
-    """A run that is to go on: its folder, which is locked, what its manifest says, its state, and what is now asked.
+    """Run to be resumed: its locked folder, its manifest, its stored state and the new configuration.
 
-    `changed` are the settings that differ from those that it began with; `elsewhere` says whether it goes on in a new
-    folder, with this one left as it is; `records` are those of its iterations, `size` the bytes that they take.
+    `changed` holds the settings that differ from those at the start of the run. If `elsewhere` is true, the run
+    continues in a new folder and this one stays unchanged. `records` are the records of the iterations, which take
+    `size` bytes. `said` collects warnings.
     """
 
     folder: RunFolder
@@ -65,23 +66,26 @@ class OpenedRun:
 
     @property
     def iteration(self) -> int:
-        """The number of iterations that are done."""
+        """The number of completed iterations."""
         return len(self.records)
 
     @property
     def is_done(self) -> bool:
-        """Whether nothing is left to do."""
+        """Whether the run is complete under the new configuration."""
         is_finished = self.manifest.get("status") == Status.FINISHED
         return is_finished and (self.config.run.iterations == self.iteration or self.has_stopped)
 
     @property
     def has_stopped(self) -> bool:
-        """Whether its loss stood (`run.stop`) or its time was up (`run.max_seconds`), and that setting is as it was."""
+        """Whether `run.stop` or `run.max_seconds` ended the run, and neither setting has changed."""
         ends = ("run.stop", "run.max_seconds")
         return bool(self.stored.read(State).stopped) and not any(key.startswith(ends) for key in self.changed)
 
     def done_line(self, option: str, equals: str) -> str:
-        """Say that nothing is left to do, and which setting goes on; `option` and `equals` are how the user sets it."""
+        """Return a line that says that the run is complete and which setting would continue it.
+
+        `option` and `equals` show how the user sets it.
+        """
         iterations = self.config.run.iterations
         stopped = iterations > self.iteration and self.stored.read(State).stopped
         more = f"run.iterations{equals}NUMBER"
@@ -91,7 +95,7 @@ class OpenedRun:
         return f"{self.folder.path}: is finished, after {done}; {option} {more} goes on"
 
     def begin(self, variant: str, say: Say, warn: Say) -> PreparedRun:
-        """Assemble the problem as it was, and bring it to where it is; a variant must be set.
+        """Assemble the problem of the run and restore its state; a variant must be set.
 
         Raises ConfigError, UnsupportedScene.
         """
@@ -131,9 +135,9 @@ class OpenedRun:
 
     @contextlib.contextmanager
     def _take_over(self, manifest: Manifest) -> Iterator[RunFolder]:
-        """The folder in which the run goes on, with its metrics as far as its state, and `manifest`; locked.
+        """Yield the locked folder in which the run continues, with `manifest` and the metrics up to its state.
 
-        Raises ConfigError and MachineError where it cannot be written to.
+        Raises ConfigError and MachineError if the folder cannot be written to.
         """
         text, run = dump(self.config), self.config.run
         if self.elsewhere:
@@ -149,7 +153,7 @@ class OpenedRun:
             yield self.folder
 
     def _put_first(self, folder: RunFolder) -> None:
-        """Leave what the state has, and that state as the newest: a damaged one is not to take its place."""
+        """Cut the metrics back to the state, and make that state the newest one in place of a damaged one."""
         cut_back(folder.path, self.records, self.size)
         if self.stored.path.name == PREVIOUS_FILE_NAME:
             (folder.checkpoint / PREVIOUS_FILE_NAME).replace(folder.checkpoint / STATE_FILE)
@@ -157,11 +161,11 @@ class OpenedRun:
 
 @contextlib.contextmanager
 def open_earlier(run: Path, wanted: Path | Config | None, overrides: Sequence[str | Override]) -> Iterator[OpenedRun]:
-    """The run in the folder `run`, to go on, locked while the block works.
+    """Open the run in the folder `run` to resume it, and lock it while the block runs.
 
-    `wanted` is what it is to agree with, in place of the `config.yaml` in its folder. Raises ConfigError: where it
-    is no run, or one at work; where its state is damaged, and the one before that too; where the settings differ in
-    what cannot change.
+    `wanted` is a configuration that must agree with the run; by default the `config.yaml` in its folder. Raises
+    ConfigError if the folder holds no run, the run is in use, the last two states are both damaged, or a setting
+    differs that must not change.
     """
     with opened(run) as (folder, manifest):
         said: list[str] = []
@@ -189,9 +193,9 @@ def open_earlier(run: Path, wanted: Path | Config | None, overrides: Sequence[st
 
 
 def problem_before_nonfinite(run: Path, say: Say) -> tuple[Problem, int]:
-    """Return the problem as the first iteration began that met a value that is not finite, and that iteration, from 0.
+    """Return the problem at the start of the first iteration with a value that is not finite, and its index from 0.
 
-    Sets the run's variant. The run may be at work: nothing is locked. Raises ConfigError and UnsupportedScene.
+    Sets the run's variant. Locks nothing, so the run may be in progress. Raises ConfigError and UnsupportedScene.
     """
     stored = Stored(RunFolder(run).checkpoint / NONFINITE_FILE_NAME)
     settled = stored.read(Settled)
@@ -205,7 +209,7 @@ def problem_before_nonfinite(run: Path, say: Say) -> tuple[Problem, int]:
 
 
 def _read_state(folder: RunFolder, said: list[str]) -> Stored:
-    """The newest state in the folder that is whole."""
+    """Return the newest undamaged state in the folder."""
     failures: list[ConfigError] = []
     for name in (STATE_FILE, PREVIOUS_FILE_NAME):
         path = folder.checkpoint / name
@@ -228,7 +232,7 @@ def _read_state(folder: RunFolder, said: list[str]) -> Stored:
 def _read_config(
     run: Path, wanted: Path | Config | None, overrides: Sequence[str | Override], text: str
 ) -> tuple[Config, Config]:
-    """The configuration that the run is to go on with, and the same without overrides; `text` is what its state has."""
+    """Return the configuration to resume with, and the same without overrides; `text` is the one in the state."""
     if isinstance(wanted, Config):
         return changed(wanted, overrides), wanted
     own = run / "config.yaml"

@@ -1,6 +1,6 @@
-"""A sweep: every combination of settings, planned and checked before anything runs; and what is left to be done of it.
+"""Planning of a sweep: make and check every combination of settings before any run, and find the runs still to be done.
 
-Runs are processes of their own, which whoever calls begins: `commands` says what `reslrb` is to be called with.
+Each run is a separate process that the caller starts; `command` returns the arguments for `reslrb`.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ from reslrb_cli.records.sweeps import (
 from reslrb_cli.runs.prepare import changes
 from reslrb_cli.scene.files import digest_of, file_digests, files_of
 
-#: Runs of a sweep, at most: each has a folder, and a line of its page.
+#: Maximum number of runs of a sweep. Each has a folder and a line on the page.
 MOST_RUNS = 1000
 
-#: How long the end of a process is waited for that was killed: a GPU's memory takes its time to be given back.
+#: Maximum wait for the end of a killed process, in seconds; releasing GPU memory takes time.
 RELEASE_SECONDS, _POLL_SECONDS = 15.0, 0.05
 
-#: Bytes of a run's name that say its seed.
+#: Bytes for the seed in the name of a run.
 _SEED_BYTES = len(f"-seed={SEED_END}")
 
-#: Settings that a sweep makes itself.
+#: Settings that the sweep itself chooses.
 OWN: dict[Location, str] = {
     ("run", "seed"): "--seeds N has N of them",
     ("run", "name"): "runs are named by their settings",
@@ -60,7 +60,7 @@ OWN: dict[Location, str] = {
 
 @dataclass(frozen=True)
 class Varied:
-    """A setting and its values, each as an override of its own."""
+    """Varied setting, with one override per value."""
 
     key: str
     location: Location
@@ -69,14 +69,14 @@ class Varied:
 
 @dataclass(frozen=True)
 class Plan:
-    """A sweep that is checked: `configs` are those of its combinations by name, with the first seed."""
+    """Checked sweep; `configs` maps the names of the combinations to their configurations with the first seed."""
 
     sweep: Sweep
     configs: dict[str, Config]
 
 
 def parse_vary(text: str) -> Varied:
-    """What is varied, from `a.b=[1, 2]`. Raises ConfigError where `text` is none of that."""
+    """Parse a varied setting such as `a.b=[1, 2]`. Raises ConfigError if `text` has another form."""
     given = parse_override(text, "--vary", "KEY=[VALUE, ...], such as run.spp=[16, 32]")
     key = format_location(given.location)
     if not isinstance(given.value, list) or not given.value:
@@ -95,10 +95,10 @@ def parse_vary(text: str) -> Varied:
 
 
 def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[str], allow_code: bool = False) -> Plan:
-    """Every combination of what is varied, checked as a configuration, with `seeds` seeds from its own on.
+    """Make every combination of the varied settings, check its configuration, and plan `seeds` seeds for each.
 
-    Raises ConfigError, located by the first setting that is wrong, or that names code where that is not to be run,
-    or by a scene's file that is missing.
+    The seeds start at the configuration's `run.seed`. Raises ConfigError, located by the first setting that is wrong or
+    that names code that must not run, or by a missing scene file.
     """
     varied = [parse_vary(text) for text in vary]
     for place, each in enumerate(varied):
@@ -138,9 +138,9 @@ def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[s
 def _with_chosen(
     text: str, path: Path, overrides: Sequence[str], chosen: Sequence[Override], allow_code: bool
 ) -> Config:
-    """Return the experiment with one value of each setting that is varied. Raises ConfigError.
+    """Return the experiment with one value of each varied setting. Raises ConfigError.
 
-    A text as the value of `integrator` is a method as `convergence --integrators` has it: it keeps the depth and the
+    A string as the value of `integrator` is a method as in `convergence --integrators`: it keeps the depth and the
     shared options of the experiment's own integrator.
     """
     methods = [each for each in chosen if each.location == ("integrator",) and isinstance(each.value, str)]
@@ -155,7 +155,7 @@ def _with_chosen(
 
 
 def _names(varied: Sequence[Varied]) -> list[str]:
-    """The name of each combination, in the order of their product: no two are equal, not even by their case."""
+    """Return the name of each combination, in the order of the product; names are unique regardless of case."""
     short = short_keys([each.key for each in varied])
     names: list[str] = []
     taken: set[str] = set()
@@ -172,7 +172,7 @@ def _names(varied: Sequence[Varied]) -> list[str]:
 
 
 def _named(value: Any) -> str:
-    """A value in the name of a folder; of a section its `type` first, without the word."""
+    """Return a value as part of a folder name; a section starts with the value of its `type`."""
     if isinstance(value, Mapping):
         first = [str(value["type"])] if "type" in value else []
         return "-".join(first + [f"{key}={_named(each)}" for key, each in value.items() if key != "type"])
@@ -182,7 +182,7 @@ def _named(value: Any) -> str:
 
 
 def _bounded(name: str) -> str:
-    """A name that leaves room for a seed and a number behind it, in the letters that a run's folder may have."""
+    """Return a valid folder name that leaves room for a seed and a number after it."""
     most = NAME_BYTES - _SEED_BYTES - len(f"-{MOST_RUNS}")
     return folder_name(name).encode()[:most].decode(errors="ignore")
 
@@ -194,11 +194,13 @@ def _bounded(name: str) -> str:
 def opened(
     folder: Path, plan: Plan | None, seeds: int | None = None, retry: bool = False, allow_code: bool = False
 ) -> Iterator[Sweep]:
-    """The sweep in `folder`, which is locked while the block works: that of `plan`, begun where there is none yet.
+    """Yield the sweep in `folder`, which is locked while the block runs.
 
-    Without a plan it is the one that is there, with so many `seeds`, if these are more. With `retry` runs that failed
-    count as not done. Raises ConfigError, also where the folder has another sweep, or anything else, and where code of
-    the user's own is not to be run, or is another than the sweep began with.
+    With a `plan`, this is its sweep, which is started if the folder has none yet. Without a plan, it is the sweep in
+    the folder, extended to `seeds` seeds if that is more. With `retry`, failed runs count as not done.
+
+    Raises ConfigError if the folder holds another sweep or anything else, or if user code is not allowed to run or has
+    changed since the sweep started.
     """
     if plan is not None:
         _make(folder)
@@ -246,8 +248,8 @@ def _unwritable(folder: Path, error: OSError) -> ConfigError | MachineError:
 
 
 def _begin(folder: Path, plan: Plan) -> None:
-    """Write the configurations; the plan, which comes last, says that all of them are there."""
-    # a sweep that was killed while it began has written nothing but configurations
+    """Write the configurations; the plan is written after them, so it exists only if all of them do."""
+    # a sweep that was killed at its start has written only configurations
     if others := sorted(path.name for path in folder.iterdir() if path.name != "configs"):
         reason = f"{folder} has {one_line(others[0], 60)!r} in it, and no sweep; give a folder that is new, or empty"
         raise ConfigError("-o", "", reason)
@@ -265,7 +267,7 @@ def _put(text: bytes, file: IO[bytes]) -> None:
 
 
 def _check_same(folder: Path, kept: Sweep, plan: Plan) -> None:
-    """Raise ConfigError, which names the first difference, where the sweep in `folder` is not that of the plan."""
+    """Raise ConfigError, which names the first difference, if the sweep in `folder` differs from the plan."""
     advice = "give another folder with -o, or go on with that one: --resume"
     there = [(each.name, each.settings) for each in kept.combinations]
     here = [(each.name, each.settings) for each in plan.sweep.combinations]
@@ -291,7 +293,7 @@ def _check_same(folder: Path, kept: Sweep, plan: Plan) -> None:
 
 
 def _check_files(folder: Path, kept: Sweep, allowed: bool) -> None:
-    """Raise ConfigError where a file that the runs of the sweep read has changed, or code is not to be run."""
+    """Raise ConfigError if a file of the sweep has changed, or if it would run code that is not allowed."""
     for file, digest in (kept.codes | kept.files).items():
         if file in kept.codes and not allowed:
             reason = f"would run the code of {file}, with all your rights; --allow-code has it run"
@@ -302,7 +304,7 @@ def _check_files(folder: Path, kept: Sweep, allowed: bool) -> None:
 
 
 def _grown(kept: Sweep, planned: Sequence[int] | None, seeds: int | None) -> Sweep:
-    """With more seeds, where more are asked for; fewer than there are would leave out what was done."""
+    """Return the sweep extended to more seeds if requested; raise ConfigError for fewer seeds than there are."""
     wanted = len(planned) if planned is not None else seeds
     if wanted is None or wanted == len(kept.seeds):
         return kept
@@ -314,20 +316,19 @@ def _grown(kept: Sweep, planned: Sequence[int] | None, seeds: int | None) -> Swe
     return replace(kept, seeds=list(range(kept.seeds[0], kept.seeds[0] + wanted)))
 
 
-# --- what is left to be done ------------------------------------------------------------------------------------------
+# --- runs still to be done --------------------------------------------------------------------------------------------
 
 
 def is_left(folder: Path, sweep: Sweep, name: str) -> bool:
-    """Whether a run of the sweep is still to be done, or to be gone on with."""
+    """Whether a run of the sweep must still be started or resumed."""
     return name not in sweep.failures and (read_manifest(folder / name) or {}).get("status") != Status.FINISHED
 
 
 def command(folder: Path, sweep: Sweep, combination: Combination, seed: int) -> list[str]:
-    """What `reslrb` is to be called with for one run: it begins, or goes on from where it was cut off. Code of the
-    user's own is allowed: `opened` has asked.
+    """Return the arguments for `reslrb` that start one run, or resume it if it was interrupted.
 
-    A process that was killed and still has the run's folder is waited for. Raises ConfigError, located in that, where
-    one goes on working there.
+    User code is allowed, because `opened` has checked the permission. Waits for a killed process that still holds the
+    run folder. Raises ConfigError, located in the folder, if a process keeps using it.
     """
     folder, name = folder.absolute(), run_name(combination, seed)
     allowed = ["--allow-code"] if sweep.codes else []
@@ -341,5 +342,5 @@ def command(folder: Path, sweep: Sweep, combination: Combination, seed: int) -> 
     words = ["optimize", str(config_file(folder, combination)), *allowed]
     for key, value in (("run.seed", seed), ("run.output", str(folder)), ("run.name", name)):
         words += ["--set", f"{key}={json.dumps(value)}"]
-    # one that was killed before it kept anything is replaced
+    # a run that was killed before its first checkpoint is replaced
     return [*words, "--force"]

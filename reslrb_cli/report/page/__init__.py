@@ -1,4 +1,4 @@
-"""Pages about runs and measurements, each complete in itself: no script, no network, no other file."""
+"""Self-contained HTML pages about runs and measurements, without scripts, network access or other files."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from reslrb_cli.report.sources import Run, Source, read_run
 
 Array = np.ndarray[Any, Any]
 
-#: Seconds after which the page of a run that is still at work loads itself again.
+#: Seconds after which the page of a run in progress reloads itself.
 REFRESH_SECONDS = 5
 
 
 def write_report(
     folder: Path, manifest: Mapping[str, Any] | None = None, current: Mapping[str, Array] | None = None
 ) -> Path:
-    """Write `report.html` into a run folder from what the folder holds; return its path.
+    """Write `report.html` into a run folder from the content of the folder; return its path.
 
-    Images are embedded, so the page can be moved away from the run. What the folder lacks, as that of a run that failed
-    does, is left out. Of a run that is still at work `manifest` is what that would say now, and `current` its
-    parameters' values: its page loads itself again, until it is written for the last time.
+    Images are embedded, so the page can be moved. Files that the folder lacks, such as those of a failed run, are left
+    out. For a run in progress, pass its current manifest and parameter values; the page then reloads itself until its
+    last version.
     """
     run = read_run(folder)
     if manifest is not None:
@@ -40,13 +40,13 @@ def write_report(
 
 
 def write_page(sources: Sequence[Source], path: Path, live: bool = False) -> None:
-    """Write one page about all of `sources` to `path`, atomically; `live`: it is about to be written again."""
+    """Write one page about all `sources` to `path`, atomically; with `live`, the page reloads itself."""
     page = render(sources, live)
     write_atomically(path, lambda file: file.write(page.encode("utf-8", "replace")))
 
 
 def render(sources: Sequence[Source], live: bool = False) -> str:
-    """The page about these as HTML: of one run its own, of several with beside each other what can be compared."""
+    """Return the page about one run, or about several sources side by side, as HTML."""
     if len(sources) == 1 and isinstance(sources[0], Run):
         run = sources[0]
         title, head, parts = run.name, guarded(partial(header, run)), list(run_parts(run).items())

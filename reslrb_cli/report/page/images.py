@@ -1,4 +1,4 @@
-"""The images on the page: start, end, target and maps of every sensor, and tables of what they come to."""
+"""Images on the page: start, end, target and maps of every sensor, and tables of views and perceptual errors."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ from reslrb_cli.report.tonemap import (
 
 Array = np.ndarray[Any, Any]
 
-#: Pixels of a picture's longer side, at most: a page is sent around.
+#: Maximum length of a picture's longer side in pixels, to keep the page small.
 MOST_PIXELS = 640
 
-#: A picture with fewer pixels at its longer side is shown with squares for pixels.
+#: Smaller pictures are shown with square pixels instead of smooth interpolation.
 FEW_PIXELS = 256
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture as a `data:` address, with its size, (width, height), in its own pixels; `caption` has lines.
+    """Picture as a `data:` address, with its size (width, height) in pixels and the lines of its caption.
 
-    That of a map has a scale: some of its colours (`stops`), and what stands at its ends, and between them (`ends`).
+    A map also has a colour scale: some of its colours (`stops`), and labels from its start to its end (`ends`).
     """
 
     uri: str
@@ -54,19 +54,19 @@ class Picture:
 
     @property
     def smooth(self) -> bool:
-        """Whether it has pixels enough to be enlarged smoothly."""
+        """Whether the picture has enough pixels for smooth enlargement."""
         return max(self.size) >= FEW_PIXELS
 
 
 def show(values: Array, alt: str, *caption: str) -> Picture:
-    """Linear values (H, W, C) as an sRGB picture; fewer channels than three are shown as grey."""
+    """Return linear values (H, W, C) as an sRGB picture; fewer than three channels are shown as grey."""
     values = fit(np.nan_to_num(values[:, :, :3] if values.shape[2] >= 3 else values[:, :, :1], posinf=1e30))
     encoded = np.round(255 * encode(np.clip(values, 0.0, 1.0))).astype(np.uint8)
     return _embed(as_png(np.broadcast_to(encoded, (*encoded.shape[:2], 3))), encoded.shape, alt, caption)
 
 
 def show_map(values: Array, end: float, alt: str, *caption: str, signed: bool = False) -> Picture:
-    """Values (H, W, 1) in colours, from 0 to `end`, or if `signed` from -`end`, with the scale below the caption."""
+    """Return values (H, W, 1) from 0, or -`end` if `signed`, to `end` in colours, with a scale below the caption."""
     grey = fit(values)[:, :, 0]
     last = number(end)
     ends = [f"−{last}", "0", f"{last} or more"] if signed else ["0", f"{last} or more"]
@@ -75,12 +75,12 @@ def show_map(values: Array, end: float, alt: str, *caption: str, signed: bool = 
 
 
 def _embed(png: bytes, shape: tuple[int, ...], *about: Any) -> Picture:
-    """A PNG of an array of `shape`, (H, W, ...)."""
+    """Return a picture with an embedded PNG, made from an array of `shape` (H, W, ...)."""
     return Picture(f"data:image/png;base64,{base64.b64encode(png).decode()}", (shape[1], shape[0]), *about)
 
 
 def fit(values: Array) -> Array:
-    """`values` (H, W, C), shrunk to `MOST_PIXELS` where they are more."""
+    """Return `values` (H, W, C), shrunk to `MOST_PIXELS` if they are larger."""
     longest = max(values.shape[:2])
     if longest <= MOST_PIXELS:
         return values
@@ -93,12 +93,12 @@ def fit(values: Array) -> Array:
 #: z at the ends of the scale.
 MOST_Z = 5.0
 
-#: Maps on a page, at most: of a folder with more, the first.
+#: Maximum number of maps on a page; a page shows the first maps of a folder.
 MOST_MAPS = 40
 
 
 def gradient_maps(paths: Sequence[Path]) -> Markup:
-    """A row for each file of layers; of both gradients the sum over channels, on one scale."""
+    """Return a row for each file of layers; both gradients are summed over channels and share one scale."""
     rows = Markup()
     for path in paths[:MOST_MAPS]:
         try:
@@ -117,9 +117,9 @@ def gradient_maps(paths: Sequence[Path]) -> Markup:
 
 
 def view_table(views: Sequence[Mapping[str, Any]] | None, results: Mapping[str, Any]) -> Markup:
-    """A row for each view, and the loss of those that are held out.
+    """Return a table of the views, and the loss of those that are held out.
 
-    Nothing where there is but one, of which every pixel counts alike as it is.
+    Empty for a single view with the default settings, in which every pixel has the same weight.
     """
     if not views or (len(views) == 1 and not _is_special(views[0])):
         return Markup()
@@ -134,14 +134,14 @@ def _is_special(view: Mapping[str, Any]) -> bool:
 
 
 def _recovered(exposure: object, results: Mapping[str, Any]) -> list[float]:
-    """The values of a parameter that is an exposure, as far as they are known."""
+    """Return the known values of a recovered exposure."""
     final = ((results.get("parameters") or {}).get(exposure) or {}).get("final") or {}
     value = final.get("value")
     return value if isinstance(value, list) else [] if value is None else [value]
 
 
 def seen_tables(runs: Sequence[Run]) -> Markup:
-    """The errors of the images and colours of runs, a line for each at the start and at the end."""
+    """Return tables of the perceptual errors of images and colours of runs, at the start and at the end."""
     images: list[dict[str, Any]] = []
     colors: list[dict[str, Any]] = []
     for run in runs:
@@ -157,16 +157,16 @@ def seen_tables(runs: Sequence[Run]) -> Markup:
     return lay_out("run.seen", images, colors) if images or colors else Markup()
 
 
-#: Images between the first and the last that are shown of a sensor, at most.
+#: Maximum number of images shown per sensor between the first and the last.
 MOST_BETWEEN = 12
 _OF_A_SENSOR = re.compile(r"(?:initial|final|target)(-\d+)?\.exr")
 
 
 def image_rows(run: Run) -> Markup:
-    """Of every sensor a row: the initial image, the final one, the target, and maps of error and dL/dI.
+    """Return a row per sensor: the initial image, the final image, the target, and maps of the error and dL/dI.
 
-    A sensor's images have one exposure, that of the run's manifest, or else what suits the target. What is missing is
-    left out.
+    All images of a sensor share one exposure, from the manifest or else chosen for the target. Missing images are left
+    out.
     """
     folder, exposures = run.path / "images", shown_exposures(run.manifest.get("views"))
     suffixes = {match[1] or "" for path in folder.glob("*.exr") if (match := _OF_A_SENSOR.fullmatch(path.name))}
@@ -185,7 +185,7 @@ def _row(folder: Path, suffix: str, results: Mapping[str, Any], exposure: float 
         if image is not None
     ]
     weights = load_image(folder / f"weights{suffix}.exr")
-    if weights is not None:  # not all pixels count alike
+    if weights is not None:  # the weights of pixels differ
         share = weights[:, :, :1] / max(float(weights.max()), 1e-30)
         shown.append(show(share, f"mask{sensor}", lay_out("titled", "mask", ": black is left out of the loss")))
     shown += _error_maps(folder, suffix, results)
@@ -196,7 +196,7 @@ def _row(folder: Path, suffix: str, results: Mapping[str, Any], exposure: float 
 
 
 def _error_maps(folder: Path, suffix: str, results: Mapping[str, Any]) -> list[Picture]:
-    """The maps of |I - T| and of dL/dI, with their scales; without the first where it, or its scale, is missing."""
+    """Return the maps of |I - T| and dL/dI with their scales; a missing map, or one without a scale, is left out."""
     about = (results.get("error_maps") or {}).get(f"error{suffix}")
     layers = read_comparison(folder, suffix)
     shown = []
@@ -212,7 +212,7 @@ def _error_maps(folder: Path, suffix: str, results: Mapping[str, Any]) -> list[P
 
 
 def _between(folder: Path, suffix: str, exposure: float) -> list[Picture]:
-    """Images that were saved on the way, evenly chosen where they are many."""
+    """Return the images saved between iterations, an even selection if there are many."""
     pattern = re.compile(rf"iteration-(\d+){suffix}\.exr")
     found = sorted((int(match[1]), path) for path in folder.iterdir() if (match := pattern.fullmatch(path.name)))
     if len(found) > MOST_BETWEEN:

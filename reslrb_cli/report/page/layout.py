@@ -1,7 +1,6 @@
-"""The layout of a page: its pieces, which the templates in `report/templates` make of plain text and numbers, and its
-diagrams of curves, as SVG in the page's own colours.
+"""Layout of a page: pieces made by the templates in `report/templates`, and SVG diagrams in the colours of the page.
 
-What comes from outside is escaped by the templates, and nowhere else. `Markup` is what they made.
+The pieces take plain text and numbers. Only the templates escape text; their output is `Markup`.
 """
 
 from __future__ import annotations
@@ -24,25 +23,28 @@ if TYPE_CHECKING:
 
 
 def key(text: object) -> Markup:
-    """A key or a path, which may be broken after its dots and the like."""
+    """Return a key or a path that can wrap after separators such as dots."""
     return lay_out("key", str(text))
 
 
 def soft(line: str) -> Markup:
-    """A remark; nothing where it is empty."""
+    """Return a remark; empty for an empty line."""
     return lay_out("soft", line)
 
 
 def lay_out(piece: str, *values: object) -> Markup:
-    """A piece of a page: `FILE.MACRO` is the macro in the template `FILE.html.j2`, `MACRO` that in `pieces.html.j2`."""
+    """Render a piece: `FILE.MACRO` is a macro in the template `FILE.html.j2`, `MACRO` one in `pieces.html.j2`."""
     file, _, macro = piece.rpartition(".")
     made = getattr(_environment().get_template(f"{file or 'pieces'}.html.j2").module, macro)(*values)
     return Markup(made).strip()
 
 
 def document(title: str, head: Markup, parts: Iterable[tuple[str, Markup]], refresh_s: int | None = None) -> str:
-    """A whole page of sections, without those that are empty; with `refresh_s` it loads itself again after so many
-    seconds. Control characters, which a page must not hold, become replacement characters."""
+    """Return a whole page of the sections that are not empty.
+
+    With `refresh_s`, the page reloads itself after this number of seconds. Control characters, which a page must not
+    contain, become replacement characters.
+    """
     page = _environment().get_template("page.html.j2")
     text = page.render(title=title, head=head, parts=parts, refresh_s=refresh_s) + "\n"
     return text.translate({ord(c): "\ufffd" for c in set(text) if not c.isprintable() and c not in "\n\t"})
@@ -70,11 +72,11 @@ def _environment() -> Environment:
     return made
 
 
-#: Inches of a diagram; at its left, those of the axis's label and of a letter at its marks. Matplotlib would find out
-#: by drawing everything twice.
+#: Sizes in inches of a diagram, of the label at its left, and of a letter of its tick labels. They are fixed here,
+#: because Matplotlib would draw everything twice to find them.
 WIDTH, HEIGHT, LABEL, LETTER = 5.2, 2.9, 0.34, 0.078
 
-#: What matplotlib is told to draw text and lines in, and is then replaced by the page's own colour.
+#: Colour of text and lines in Matplotlib's output, which is then replaced by the colour of the page.
 _INK = "#010203"
 
 _CURVES = {
@@ -87,11 +89,11 @@ _CURVES = {
 def diagram(
     curves: Sequence[Curve], caption: str, label: str, log_x: float | None = None, floors: Sequence[float] = ()
 ) -> Markup:
-    """The curves over an axis that `caption` names; nothing where none has a point.
+    """Return a diagram of curves with the x label `caption` and the y label `label`; empty if no curve has a point.
 
-    The y axis is logarithmic where values differ much, the x axis, to the base `log_x`, where that is given and all are
-    above 0. `floors` are values that are drawn across, as dashes. Both labels are text of the page's own: matplotlib
-    takes $ for a formula.
+    The y axis is logarithmic if positive values span a large factor. The x axis is logarithmic with base `log_x` if
+    that is given and all values are positive. `floors` are drawn as dotted horizontal lines. Labels must not contain $,
+    which Matplotlib takes for a formula.
     """
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -101,7 +103,7 @@ def diagram(
     if not known:
         return Markup()
     with matplotlib.rc_context(_CURVES):
-        # A figure and canvas of our own: pyplot would pick a backend for the whole process.
+        # Without pyplot, which would choose a backend for the whole process.
         figure = Figure(figsize=(WIDTH, HEIGHT))
         FigureCanvasSVG(figure)
         axis = figure.subplots()
@@ -124,7 +126,7 @@ def diagram(
 
 
 def _labels(axis: Any) -> list[str]:
-    """What stands at the marks of an axis."""
+    """Return the tick labels of an axis."""
     low, high = sorted(axis.get_view_interval())
     found: list[str] = []
     for formatter, places in (

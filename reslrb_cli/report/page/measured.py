@@ -1,4 +1,4 @@
-"""Parts of a page on a file of measurements, by the command that wrote it, on a folder of maps, and on several runs."""
+"""Parts of a page about files of measurements, folders of maps, and several runs."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from reslrb_cli.report.tables import HEAD, cells, failure_line, summary_lines
 Entry = Mapping[str, Any]
 Naming = Callable[[Entry], str]
 
-#: What can be varied: its name in the records, in words, and what they are called where they are fixed.
+#: Quantities that can be varied, by field name, in words.
 SWEPT = {"max_depth": "path depth", "spp": "samples per pixel", "pixels": "pixels of the film", "texels": "texels"}
 
 
 def bench(objects: Sequence[Entry]) -> tuple[Markup, int]:
-    """Diagrams and a table; and how many lines are no records of a bench."""
+    """Return diagrams and a table of a bench, and the number of other lines."""
     entries = [_with_sizes(entry) for entry in objects if "integrator" in entry and "status" in entry]
     labels = list(dict.fromkeys(map(label, entries)))
     values = {name: [entry[name] for entry in entries if entry.get(name)] for name in SWEPT}
@@ -52,7 +52,7 @@ def bench(objects: Sequence[Entry]) -> tuple[Markup, int]:
 
 
 def label(entry: Entry) -> str:
-    """What names an integrator with what makes it another than by default, `reslrb:reservoir, capacity 4`."""
+    """Return the name of an integrator with its options that are not default, `reslrb:reservoir, capacity 4`."""
     parts = ":".join(str(entry[name]) for name in ("integrator", "estimator") if entry.get(name))
     return parts + (f", capacity {entry['capacity']}" if entry.get("capacity") not in (None, 1) else "")
 
@@ -64,7 +64,7 @@ def _with_sizes(entry: Entry) -> dict[str, Any]:
 
 
 def curves_of(entries: Sequence[Entry], labels: Sequence[str], naming: Naming, x: str, y: str) -> list[Curve]:
-    """A curve for each label, of the figures `y` over `x`; of those that are spreads the medians, with a band."""
+    """Return a curve of `y` over `x` for each label; spreads become medians with a band."""
     curves = []
     for place, name in enumerate(labels):
         rows = sorted((row for row in entries if naming(row) == name and row.get(x)), key=lambda row: float(row[x]))
@@ -78,12 +78,12 @@ def curves_of(entries: Sequence[Entry], labels: Sequence[str], naming: Naming, x
     return curves
 
 
-#: Quantities that are drawn, at most: all parameters together, the image, then single ones.
+#: Maximum number of drawn quantities: all parameters together, the image, then single parameters.
 MOST_DRAWN = 8
 
 
 def convergence(objects: Sequence[Entry]) -> tuple[Markup, int]:
-    """All that was measured of gradients, and in words; and how many lines are none of that."""
+    """Return the summary, diagrams and a table of a convergence, and the number of other lines."""
     kinds = {
         kind: [entry for entry in objects if entry.get("kind") == kind] for kind in ("point", "method", "reference")
     }
@@ -98,11 +98,11 @@ def convergence(objects: Sequence[Entry]) -> tuple[Markup, int]:
 
 
 def _steps(points: Sequence[Entry], methods: Sequence[Entry], name: Naming) -> Markup:
-    """A diagram for each quantity, and a table of the methods."""
+    """Return a diagram for each quantity, and a table of the methods."""
     labels = list(dict.fromkeys(map(name, [*methods, *points])))
     quantities = list(dict.fromkeys(map(quantity, [*points, *methods])))
     quantities.sort(key=lambda what: {"all": 0, "image": 1}.get(what, 2))
-    if len(quantities) == 2 and quantities[0] == "all":  # the only parameter is all of them
+    if len(quantities) == 2 and quantities[0] == "all":  # with one parameter, `all` is the same
         del quantities[0]
     drawn = [_error_diagram([entry for entry in points if quantity(entry) == what], labels, what, name)
              for what in quantities[:MOST_DRAWN]]  # fmt: skip
@@ -116,12 +116,12 @@ def _steps(points: Sequence[Entry], methods: Sequence[Entry], name: Naming) -> M
 
 
 def quantity(entry: Entry) -> str:
-    """What the error is of: a parameter's key, `all` or `image`."""
+    """Return the quantity of an error: a parameter key, `all` or `image`."""
     return str(entry.get("parameter") or "all")
 
 
 def method_label(entry: Entry, with_spp: bool = False) -> str:
-    """A method's name as the user wrote it, or its integrator and estimator; and how it takes its samples, if known."""
+    """Return a method's name as the user wrote it, or integrator and estimator, with its sampling if known."""
     parts = [str(entry.get("label") or label(entry)), str(entry.get("adjoint") or "")]
     parts += [f"{entry['spp']} spp"] if with_spp and entry.get("spp") else []
     return ", ".join(part for part in parts if part)
@@ -134,13 +134,13 @@ def _error_diagram(points: Sequence[Entry], labels: Sequence[str], what: str, na
     return {"all": "all parameters", "image": "the image"}.get(what, key(what)), drawing
 
 
-#: Names in the title of a page.
+#: Maximum number of names in the title of a page.
 MOST_NAMED = 3
 Parts = list[tuple[str, Markup]]
 
 
 def several_parts(sources: Sequence[Source]) -> tuple[str, Markup, Parts]:
-    """The title of a page about `sources`, its head, and its parts: titles and markup."""
+    """Return the title of a page about `sources`, its header, and its parts as titles and markup."""
     names = [source.name for source in sources]
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
     title = ", ".join(names[:MOST_NAMED]) + more
@@ -161,7 +161,7 @@ def several_parts(sources: Sequence[Source]) -> tuple[str, Markup, Parts]:
 
 
 def run_comparison(runs: Sequence[Run]) -> Parts:
-    """The parts in which runs lie beside each other."""
+    """Return the parts that show runs side by side."""
     made: dict[str, Callable[[], Markup]] = {
         "Runs": lambda: overview(runs),
         "Convergence": lambda: convergence_of_all(runs),
@@ -174,7 +174,7 @@ def run_comparison(runs: Sequence[Run]) -> Parts:
 
 
 def overview(runs: Sequence[Run]) -> Markup:
-    """A line for each run: how it ended, what it came to, and what an iteration took."""
+    """Return a table of the runs: how each ended, its results, and the time of an iteration."""
     rows = [
         {"run": run, "place": place, "estimator": _estimator(run), "error": _final_error(run),
          "loss": run.last("loss") if (loss := run.results.get("loss")) is None else loss,
@@ -185,13 +185,13 @@ def overview(runs: Sequence[Run]) -> Markup:
 
 
 def _estimator(run: Run) -> str:
-    """What computed the gradients, as far as the manifest says."""
+    """Return the estimator or the integrator of the gradients, if the manifest has it."""
     plan = run.manifest.get("plan")
     return str(plan.get("estimator") or plan.get("integrator") or "") if isinstance(plan, dict) else ""
 
 
 def _final_error(run: Run) -> str:
-    """The error of all parameters at the end; where their units differ, that of the worst as a share of the truth."""
+    """Return the final error of all parameters; if their units differ, the largest relative error."""
     total = run.results.get("rmse") or {}
     if total.get("final") is not None:
         return f"RMSE {number(total['final'], 3)}"
@@ -203,18 +203,18 @@ def _final_error(run: Run) -> str:
 
 
 def _each(runs: Sequence[Run], make: Callable[[Run], Markup]) -> Markup:
-    """What is made of each run, below its name; where that is damaged, a line that says so."""
+    """Return the result of `make` for each run below its name, or a line that its data are damaged."""
     made = [(run, guarded(partial(make, run))) for run in runs]
     return Markup().join(lay_out("heading", key(run.name)) + markup for run, markup in made if markup)
 
 
-#: What stands above a source, before its name.
+#: Heading of a source, before its name.
 HEADINGS = {"bench": "Cost of a step", "gradcheck": "Gradients against references",
             "convergence": "Error against run time", "maps": "Maps of gradients"}  # fmt: skip
 
 
 def measured(source: Measurements | Maps) -> Markup:
-    """Everything that there is to show of it."""
+    """Return the whole content of a file of measurements or a folder of maps."""
     if isinstance(source, Maps):
         return gradient_maps(source.files)
     make = {"bench": bench, "gradcheck": gradcheck, "convergence": convergence}[source.kind]
@@ -229,7 +229,7 @@ def measured(source: Measurements | Maps) -> Markup:
 
 
 def gradcheck(objects: Sequence[Mapping[str, Any]]) -> tuple[Markup, int]:
-    """The comparisons as a table, what fails first, and what is missing; and how many lines are neither."""
+    """Return a table of the comparisons, failures first, with incomplete derivatives, and the number of other lines."""
     records = [record for entry in objects if (record := record_of(GradcheckRecord, entry)) is not None]
     missing = [found for entry in objects if (found := record_of(MissingRecord, entry)) is not None]
     failed = [failure_line(record) for record in records if record.verdict is Verdict.FAILS]

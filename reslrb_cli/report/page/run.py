@@ -1,4 +1,4 @@
-"""The parts of the page that one run has: what it came to, what ran, on what, how long, and what it had measured."""
+"""Parts of the page of one run: its results, its settings, its machine, its times and its measurements."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from reslrb_cli.report.page.values import convergence, parameter_table, texture_
 from reslrb_cli.report.run_summary import error_line, measured_line, warnings
 from reslrb_cli.report.sources import Run
 
-#: Steps that are left out of medians: the first ones compile kernels.
+#: Number of first steps left out of medians, because they compile kernels.
 WARM_UP = 5
 
 
@@ -42,7 +42,7 @@ def step_ms(records: Sequence[Mapping[str, Any]], name: str = "step_ms") -> floa
 
 
 def step_words(records: Sequence[Mapping[str, Any]]) -> str:
-    """Return the time of a step in words, and the times of its image and gradient where they are measured apart."""
+    """Return the time of a step in words, with the times of image and gradient if they were measured separately."""
     step = step_ms(records)
     if step is None:
         return ""
@@ -61,7 +61,7 @@ def _wall(manifest: Mapping[str, Any]) -> str:
 
 
 def workers(shared: Mapping[str, Any] | None, elapsed_s: float | None) -> Markup:
-    """What the shards took that workers computed, by part and by worker, of all iterations; nothing without any."""
+    """Return the time of all iterations by part and by worker; empty without workers."""
     if not shared:
         return Markup()
     time = TypeAdapter(SharedTime).validate_python(shared)
@@ -79,8 +79,7 @@ DAMAGED = "This part cannot be shown: what was recorded of it is damaged."
 
 
 def fabrication(run: Run) -> Markup:
-    """The solid that a run shapes: what it throws, its measures, what was found where things are off, and a picture;
-    nothing where there is none."""
+    """Return the picture, the image quality, the dimensions and the tolerances of the run's solid; empty without one."""
     text = _read(run.path / FABRICATION_FILE)
     if not text:
         return Markup()
@@ -97,7 +96,7 @@ def fabrication(run: Run) -> Markup:
 
 
 def header(run: Run) -> Markup:
-    """The run's name, how it ended, what it came to, and what went wrong."""
+    """Return the run's name, how it ended, its results and its warnings."""
     seconds, loss = run.last("elapsed_s"), run.results.get("loss")
     parts = (
         "" if seconds is None else f"{count(len(run.records), 'iteration')} in {duration(seconds)}",
@@ -109,7 +108,7 @@ def header(run: Run) -> Markup:
 
 
 def problems(run: Run) -> Markup:
-    """What went wrong in a run, and what of its records could not be read."""
+    """Return the error and the warnings of a run, and a line about unreadable records."""
     lines, error = warnings(run.results, "±"), run.manifest.get("error")
     if run.damaged:
         where = f"{count(len(run.damaged), 'line')} of metrics.jsonl (the first is line {run.damaged[0]})"
@@ -118,7 +117,7 @@ def problems(run: Run) -> Markup:
 
 
 def run_parts(run: Run) -> dict[str, Markup]:
-    """By title, what there is to show of a run beside its header, in order; what it does not have is empty."""
+    """Return the parts of a run below its header, by title and in order; parts that do not apply are empty."""
     results = run.results
     parts: dict[str, Callable[[], Markup]] = {
         "Parameters": lambda: (
@@ -137,7 +136,7 @@ def run_parts(run: Run) -> dict[str, Markup]:
 
 
 def record_parts(run: Run) -> dict[str, Markup]:
-    """By title, those of the parts that tell how a run was done, of which nothing can be laid beside another run's."""
+    """Return the parts about the execution of a run, by title; they are not shown side by side with other runs."""
     results, manifest = run.results, run.manifest
     parts: dict[str, Callable[[], Markup]] = {
         "Not finite": lambda: lay_out("run.not_finite", results.get("nonfinite") or {}),
@@ -160,9 +159,9 @@ def record_parts(run: Run) -> dict[str, Markup]:
 
 
 def guarded(make: Callable[[], Markup]) -> Markup:
-    """What `make` makes; where what it reads is damaged, or another version's, a line that says so.
+    """Return the result of `make`, or a line that its data are damaged if `make` raises an exception.
 
-    Whatever stands in a manifest comes from a file, and one part that cannot be shown is not to keep the others away.
+    Manifests are files that can be damaged or of another version, and one such part must not prevent the others.
     """
     try:
         return make()

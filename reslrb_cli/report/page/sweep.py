@@ -1,4 +1,4 @@
-"""Parts of a page on a sweep: its table, curves of the medians with bands, and what was recovered side by side."""
+"""Parts of a page about a sweep: its table, curves of medians with bands, and recovered images side by side."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ from reslrb_cli.report.tonemap import exposure_for, exposure_words, shown_exposu
 
 Array = np.ndarray[Any, Any]
 
-#: Combinations that have curves, at most, and that have pictures; parameters that have pictures.
+#: Maximum numbers of combinations with curves, of combinations with pictures, and of parameters with pictures.
 MOST_CURVES, MOST_PICTURES, MOST_TEXTURES = 2 * len(COLORS), 24, 6
 
-#: Characters of a combination below a picture, and of a setting's value in the table.
+#: Maximum width of a combination below a picture, and of a setting's value in the table.
 CAPTION_WIDTH, VALUE_WIDTH = 80, 60
 
 
 def sweep_parts(source: SweepRuns) -> dict[str, Markup]:
-    """By title, what there is to show of a sweep, in order; what it does not have is empty."""
+    """Return the parts of a sweep, by title and in order; parts that do not apply are empty."""
     sweep, runs = source.sweep, run_records(source)
     figures, short = figures_of(runs), short_keys(sweep.keys)
     drawn = sweep.combinations[:MOST_CURVES]
@@ -77,7 +77,7 @@ def sweep_parts(source: SweepRuns) -> dict[str, Markup]:
 
 
 def _curves(source: SweepRuns, drawn: Sequence[Combination]) -> Markup:
-    """Loss, and the error of all parameters where it is known, against iteration and time: medians with bands."""
+    """Return diagrams of the loss and, if known, the parameter error over iteration and time: medians with bands."""
     own = [_runs(source, combination) for combination in drawn]
     if not any(run.records for runs in own for run in runs):
         return Markup()
@@ -97,13 +97,13 @@ def _curves(source: SweepRuns, drawn: Sequence[Combination]) -> Markup:
 
 
 def _runs(source: SweepRuns, combination: Combination) -> list[Run]:
-    """The runs of a combination that have an iteration."""
+    """Return the runs of a combination that have at least one iteration."""
     names = [run_name(combination, seed) for seed in source.sweep.seeds]
     return [run for name in names if (run := source.runs.get(name)) is not None and run.records]
 
 
 def _by_iteration(runs: Sequence[Run], name: str) -> tuple[Array, Array]:
-    """The iterations (N,) and the figure of each run (runs, N) at those, not a number where it is not known."""
+    """Return the iterations (N,) and the values of each run (runs, N), NaN where unknown."""
     most = max(len(run.records) for run in runs)
     values = np.full((len(runs), most), np.nan)
     for row, run in zip(values, runs, strict=True):
@@ -112,8 +112,10 @@ def _by_iteration(runs: Sequence[Run], name: str) -> tuple[Array, Array]:
 
 
 def _by_time(runs: Sequence[Run], name: str) -> tuple[Array, Array]:
-    """Seconds (N,), from where all runs have an iteration, and the figure of each run (runs, N) by its newest iteration
-    that was done by then: one that is over stays where it ended."""
+    """Return times in seconds (N,) and the values of each run (runs, N) after its last iteration before each time.
+
+    The times start when all runs have an iteration. A run that has ended keeps its last value.
+    """
     ends = [np.array(_column(run, "elapsed_s"), dtype=np.float64) for run in runs]
     times = np.unique(np.concatenate(ends))
     times = times[times >= max(end[0] for end in ends)]
@@ -129,7 +131,7 @@ def _column(run: Run, name: str) -> list[float | None]:
 
 
 def _median(title: str, place: int, xs: Array, values: Array) -> Curve:
-    """Medians over the runs where all of them have a figure, with the least and the greatest as a band."""
+    """Return the curve of medians where all runs have a value, with minimum and maximum as a band."""
     known = np.isfinite(values).all(axis=0)
     xs, values = xs[known], values[:, known]
     if not len(xs):
@@ -142,7 +144,7 @@ def _median(title: str, place: int, xs: Array, values: Array) -> Curve:
 
 
 def _shown(source: SweepRuns) -> tuple[list[tuple[Combination, Run]], Markup]:
-    """Of each combination the first run that is finished, and a line that says which they are."""
+    """Return the first finished run of each combination, and a line that says so."""
     found = []
     for combination in source.sweep.combinations:
         done = [run for run in _runs(source, combination) if run.manifest.get("status") == Status.FINISHED]
@@ -153,9 +155,9 @@ def _shown(source: SweepRuns) -> tuple[list[tuple[Combination, Run]], Markup]:
 
 
 def _images(source: SweepRuns) -> Markup:
-    """The target, and each combination's final image of the first sensor, all with one exposure."""
+    """Return the target and each combination's final image of the first sensor, all with one exposure."""
     shown, line = _shown(source)
-    names = ("", "-0")  # of several sensors the first
+    names = ("", "-0")  # the first of several sensors has the suffix -0
     first = next((run for _, run in shown), None)
     if first is None:
         return Markup()
@@ -172,7 +174,7 @@ def _images(source: SweepRuns) -> Markup:
 
 
 def _textures(source: SweepRuns) -> Markup:
-    """Each texture as it is in truth, where that is known, and as each combination recovered it."""
+    """Return each true texture, if known, and the texture that each combination recovered."""
     shown, line = _shown(source)
     if not shown:
         return Markup()
@@ -194,7 +196,7 @@ def _textures(source: SweepRuns) -> Markup:
 
 
 def _moment(place: int) -> str:
-    """What a combination's texture is called where it is made visible: the first one decides how."""
+    """Return the key of a combination's texture for `visible`, where the first one (`final`) sets the exposure."""
     return f"final {place}" if place else "final"
 
 

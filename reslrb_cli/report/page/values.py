@@ -1,4 +1,4 @@
-"""The parameters on the page as numbers, swatches and pictures, and curves of loss and errors of one run or several."""
+"""Parameters on the page as numbers, swatches and pictures, and curves of loss and errors of one or several runs."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from reslrb_cli.report.tonemap import encode, exposure_for, exposure_words
 
 Array = np.ndarray[Any, Any]
 
-#: Where a run folder has the values of a moment, below `parameters/`.
+#: Subfolders of `parameters/` with the initial, final and true values.
 _FOLDERS = {"initial": "initial", "final": "", "true": "true"}
 
 
 def parameter_table(results: Mapping[str, Any], end: str = "end", notes: bool = False) -> Markup:
-    """Value and error of each parameter at the start and at the end, and the true value where it is known.
+    """Return a table of the value and error of each parameter at start and end, and the true value if known.
 
-    With `notes` it says what errors are taken over.
+    `notes` adds a remark on how errors are computed.
     """
     parameters = results.get("parameters") or {}
     has_truth = any(about.get("true") for about in parameters.values())
@@ -51,8 +51,7 @@ def parameter_table(results: Mapping[str, Any], end: str = "end", notes: bool = 
 
 
 def texture_pictures(run: Run) -> Markup:
-    """Each texture at the start and at the end, or now, the true one where it is known, and what of it light and sensor
-    reach."""
+    """Return each texture at the start and at the end (or now), the true one if known, and the mask of reached texels."""
     folder = run.path / "parameters"
     archives = {moment: read_parameters(folder / sub) for moment, sub in _FOLDERS.items()}
     titles = {moment: title for title, moment in MOMENTS}
@@ -79,10 +78,10 @@ def texture_pictures(run: Run) -> Markup:
 
 
 def visible(arrays: Mapping[str, Array], heights: bool) -> tuple[dict[str, Array], str]:
-    """The same so that they can be seen, at all moments alike, and words that say how.
+    """Return the arrays scaled for viewing, all in the same way, and a remark on the scaling.
 
-    Heights, which may be negative, go from black to white; what is emitted may be far beyond 1, and has the exposure
-    of the truth, where that is known.
+    Heights, which may be negative, are mapped to black and white. Other textures, which may be far above 1, get the
+    exposure that suits the true texture, or the final one.
     """
     if heights:
         low, high = finite_range(arrays.values())
@@ -94,7 +93,7 @@ def visible(arrays: Mapping[str, Array], heights: bool) -> tuple[dict[str, Array
 
 
 def _swatches(key: str, about: Mapping[str, Any]) -> dict[str, str]:
-    """The colours of a parameter in CSS, by moment, with one exposure: what is emitted, or beyond 1, is at most 1."""
+    """Return the CSS colours of a parameter by moment, with one scale that maps emission and values above 1 to 1."""
     moments = {moment: about.get(moment) or {} for _, moment in MOMENTS}
     values = {moment: found.get("mean", found.get("value")) for moment, found in moments.items()}
     colors = {
@@ -110,17 +109,17 @@ def _swatches(key: str, about: Mapping[str, Any]) -> dict[str, str]:
     return {moment: f"rgb({','.join(f'{channel:.0f}' for channel in color)})" for moment, color in shown.items()}
 
 
-#: Curves in one diagram of one run, at most: those of the parameters that are the farthest off at the end.
+#: Maximum number of curves in a diagram of one run, for the parameters with the largest final errors.
 MOST_CURVES = len(COLORS)
 
-#: Parameters of several runs that have diagrams of their own, at most.
+#: Maximum number of parameters of several runs with their own diagrams.
 MOST_SHARED = 6
 ABSCISSAE = (("iteration", "iteration"), ("elapsed_s", "time in steps and updates (s)"))
 Figures = list[float | None]
 
 
 def convergence(run: Run) -> Markup:
-    """Loss, and errors by parameter where they are known, against iterations and against time."""
+    """Return diagrams of the loss and the known parameter errors over iterations and over time."""
     if not run.records:
         yet = "has been completed yet; the first one also compiles what the others use"
         return lay_out("paragraph", f"No iteration {yet if run.at_work else 'was completed'}.")
@@ -140,7 +139,7 @@ def convergence(run: Run) -> Markup:
 
 
 def convergence_of_all(runs: Sequence[Run]) -> Markup:
-    """Loss and error of several runs in one picture; of parameters that several have, each in a picture of its own."""
+    """Return diagrams of the loss and error of several runs, and one for each parameter that several runs share."""
     begun = [(place, run) for place, run in enumerate(runs) if run.records]
     if not begun:
         return lay_out("paragraph", "No iteration was completed.")
@@ -165,7 +164,7 @@ def convergence_of_all(runs: Sequence[Run]) -> Markup:
 
 
 def _both(label: str, curves: Sequence[tuple[Run, str, int, Figures]]) -> Markup:
-    """The same curves in two diagrams beside each other, against iterations and against time."""
+    """Return the same curves in two diagrams side by side, over iterations and over time."""
     drawn = [
         ("", diagram([Curve(title, _column(run, name), ys, k) for run, title, k, ys in curves], caption, label))
         for name, caption in ABSCISSAE
@@ -187,13 +186,13 @@ def _column(run: Run, name: str) -> Figures:
 
 
 def _errors(run: Run, name: str, scale: float | None) -> Figures:
-    """The errors of one parameter, over `scale` where that is given."""
+    """Return the errors of one parameter, divided by `scale` if given."""
     errors = [record["parameter_errors"].get(name) for record in run.records]
     return [None if error is None else error / (scale or 1.0) for error in errors]
 
 
 def _total_relative(run: Run) -> Figures:
-    """The root mean square over the parameters of their errors as shares of the truth."""
+    """Return the root mean square of the relative errors of all parameters."""
     curves = [_errors(run, name, scale) for name, scale in run.scales.items() if scale]
     known = [[error for error in errors if error is not None] for errors in zip(*curves, strict=True)]
     return [math.sqrt(sum(error**2 for error in errors) / len(errors)) if errors else None for errors in known] or (
