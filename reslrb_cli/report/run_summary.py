@@ -330,7 +330,7 @@ def terminal_width() -> int:
 
 
 def parameter_lines(results: Mapping[str, Any], width: int) -> list[str]:
-    """Return values at start and end, true values, errors, spreads and verdicts, in lines of `width` characters or less.
+    """Return the values at start and end, true values, errors, spreads and verdicts, in lines of at most `width`.
 
     Textures are shown as mean and range. The lines form a table if it fits, otherwise one block per parameter.
     `results` is the result of `Results.to_json`.

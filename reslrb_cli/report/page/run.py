@@ -79,7 +79,7 @@ DAMAGED = "This part cannot be shown: what was recorded of it is damaged."
 
 
 def fabrication(run: Run) -> Markup:
-    """Return the picture, the image quality, the dimensions and the tolerances of the run's solid; empty without one."""
+    """Return picture, image quality, dimensions and tolerances of the run's solid; empty without one."""
     text = _read(run.path / FABRICATION_FILE)
     if not text:
         return Markup()

@@ -51,7 +51,7 @@ def parameter_table(results: Mapping[str, Any], end: str = "end", notes: bool = 
 
 
 def texture_pictures(run: Run) -> Markup:
-    """Return each texture at the start and at the end (or now), the true one if known, and the mask of reached texels."""
+    """Return each texture at start and end (or now), the true texture if known, and the mask of reached texels."""
     folder = run.path / "parameters"
     archives = {moment: read_parameters(folder / sub) for moment, sub in _FOLDERS.items()}
     titles = {moment: title for title, moment in MOMENTS}
