@@ -72,9 +72,7 @@ class Run:
 
     def __iter__(self) -> Generator[Record, None, None]:
         loop = None if self._loop is None else self._loop()
-        if (
-            loop is not None and getgeneratorstate(loop) != GEN_CLOSED
-        ):  # a traceback can keep a closed loop alive
+        if loop is not None and getgeneratorstate(loop) != GEN_CLOSED:  # a traceback can keep a closed loop alive
             raise RuntimeError("this run is in a loop already; leave that first")
         loop = self._iterations()
         self._loop = weakref.ref(loop)
