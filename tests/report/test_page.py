@@ -214,7 +214,7 @@ def test_scaling_memory_and_run_are_tables(tmp_path):
     page = page_of(make_run(tmp_path / "lamp", memory=MEMORY, scaling=SCALING))
     assert page.row("Scale of the parameters", LAMP)[1] == "3e+06"
     assert page.row("Memory budget", "budget")[1] == "1024 MiB"
-    assert page.row("Run", "an iteration")[1] == "90 ms (median): 40 ms up to image and loss, 50 ms for the gradient"
+    assert page.row("Run", "time per iteration")[1] == "90 ms (median): 40 ms up to image and loss, 50 ms for the gradient"
     assert page.row("Run", "device")[1] == "a machine"
     everything = "".join(page.sections.values())
     assert "{'" not in everything
@@ -229,7 +229,7 @@ SHARED = SharedTime(("local:2",), 4.0, 2.5, 0.5, {"worker 0 (here)": WorkerTime(
 def test_what_workers_took_is_told_by_part_and_by_worker(tmp_path):
     page = page_of(make_run(tmp_path / "lamp", shared=asdict(SHARED)))
     elapsed = json.loads((tmp_path / "lamp" / "metrics.jsonl").read_text().splitlines()[-1])["elapsed_s"]
-    assert "By local:2, tls://there:1." in page.sections["Workers"]
+    assert "Workers: local:2, tls://there:1." in page.sections["Workers"]
     assert page.row("Workers", "computing, the mean of the workers")[1] == "4 s"
     assert page.row("Workers", "waiting for the worker that had most")[1] == "750 ms"
     assert page.row("Workers", "sending and handing out")[1:] == ["1.25 s", f"{100 * 1.25 / max(elapsed, 6):.3g} %"]

@@ -84,7 +84,7 @@ def test_every_record_of_each_run_is_there(tmp_path):
                   "Scale of the parameters", "Configuration", "versions", "mitsuba"):  # fmt: skip
         assert words in own
     assert page.row("Run b", "command line")[1] == "reslrb optimize b"
-    assert page.row("Run b", "to do it again")[1] == f"reslrb optimize {tmp_path / 'b' / 'config.yaml'}"
+    assert page.row("Run b", "to repeat it")[1] == f"reslrb optimize {tmp_path / 'b' / 'config.yaml'}"
     assert page.row("Runs", "a")[2] == PLAN["estimator"]
 
 
@@ -363,7 +363,7 @@ def test_two_files_in_one_have_two_origins(tmp_path: Path) -> None:
     text = (tmp_path / "a").read_text()
     (tmp_path / "a").write_text(f"{ORIGIN.to_json()}\n{text}{json.dumps(other)}\n{text}")
     told = page_of(tmp_path / "a").sections["Cost of a step: a"]
-    assert told.count("to do it again") == 2
+    assert told.count("to repeat it") == 2
     assert "reslrb bench --rounds 7" in told
 
 
@@ -379,4 +379,4 @@ def test_a_damaged_origin_leaves_the_rest(tmp_path: Path) -> None:
     (tmp_path / "a").write_text(json.dumps({"kind": "origin", "command": 3, "versions": "x"}) + "\n" + text)
     markup = render(read_sources([tmp_path / "a"]))
     assert DAMAGED not in markup
-    assert "to do it again" not in markup
+    assert "to repeat it" not in markup

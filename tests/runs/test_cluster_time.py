@@ -63,7 +63,7 @@ def test_a_run_that_goes_on_elsewhere_adds_up(experiment: Path, monkeypatch: pyt
     assert shared() == SharedTime(("local:2", "local:3"), 30.0, 24.0, 0.0, both)
     assert optimize(*on, "run.iterations=4") == 0
     assert shared() == SharedTime(("local:2", "local:3"), 30.0, 24.0, 0.0, both)
-    assert "asked of others too" in Path("runs/tiny/report.html").read_text()
+    assert "calls also sent to others" in Path("runs/tiny/report.html").read_text()
 
 
 def test_a_run_by_itself_has_none(experiment: Path) -> None:
