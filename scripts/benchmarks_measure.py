@@ -67,6 +67,11 @@ def experiment_record(experiment: str) -> str:
     return f"optimize_{experiment.replace('/', '_')}"
 
 
+def gallery_picture(experiment: str) -> Path:
+    """Return the file of an experiment's picture in the gallery."""
+    return ROOT / "docs" / "images" / "gallery" / f"{experiment.replace('/', '_')}.jpg"
+
+
 #: The words of `reslrb` that make each measurement, without the file of its record, which is NAME.jsonl.
 MEASUREMENTS = {
     name: shlex.split(command)
@@ -167,6 +172,8 @@ def measure(name: str, words: Sequence[str]) -> None:
 
     Raises SystemExit.
     """
+    from make_figures import image_panels, write_panels  # imports Mitsuba
+
     tree, is_run = code_state(), words[0] == "optimize"
     with tempfile.TemporaryDirectory(prefix="reslrb-benchmarks-") as temporary:
         folder, record = Path(temporary), Path(temporary) / "record.jsonl"
@@ -180,6 +187,9 @@ def measure(name: str, words: Sequence[str]) -> None:
         if code:
             raise SystemExit(f"benchmarks: {name}: exit code {code}; its record is left as it was")
         lines = run_lines(folder / "run") if is_run else read_lines(record)
+        pictures = {experiment_record(experiment): gallery_picture(experiment) for experiment in EXPERIMENTS}
+        if name in pictures:
+            write_panels([image_panels(folder / "run")], pictures[name])
         lines[0] |= {"command": ["reslrb", *words], "seconds": seconds} | tree
         if name == "extreme":  # the page has the thousands of comparisons
             EXTREME.write_text(extreme_page(lines), encoding="utf-8")

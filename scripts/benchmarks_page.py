@@ -27,6 +27,7 @@ from benchmarks_measure import (
     RECORDS,
     ROOT,
     experiment_record,
+    gallery_picture,
     measure,
     read_lines,
     stale,
@@ -35,6 +36,7 @@ from benchmarks_measure import (
 
 Row = Mapping[str, Any]
 PAGE, README, TEMPLATE = ROOT / "docs" / "benchmarks.md", ROOT / "README.md", "page.md"
+GALLERY = ROOT / "docs" / "gallery.md"
 #: The place of a table, in a line of its own of the template, and between two comments of the README.
 PLACE = re.compile(r"^\{\{ (\w+) \}\}$", re.MULTILINE)
 BLOCK = re.compile(r"<!-- benchmarks: (\w+) -->\n.*?<!-- end -->", re.DOTALL)
@@ -309,6 +311,28 @@ def page(blocks: Blocks) -> str:
     return PLACE.sub(lambda match: blocks.make(match[1]), (RECORDS / TEMPLATE).read_text(encoding="utf-8"))
 
 
+def gallery(blocks: Blocks) -> str:
+    """Return docs/gallery.md: for each recorded experiment a picture, its errors, what the run took and its command."""
+    parts = [
+        "# Gallery\n\n"
+        "Every experiment of `configs/`, as it is shipped. Each picture shows the target image, the image at the start "
+        "of\nthe run, and the image at its end. Copy an experiment with `reslrb example NAME`.\n"
+    ]
+    found = blocks.recorded({experiment_record(name): name for name in EXPERIMENTS})
+    for name, record in found.values():
+        row, picture = record.rows[0], gallery_picture(name)
+        start, end = (run_errors(record, moment) for moment in ("initial", "final"))
+        parts.append(
+            f"## `{name}`: {EXPERIMENTS[name]}\n\n"
+            f"![Target, image at the start, image at the end]({picture.relative_to(GALLERY.parent).as_posix()})\n\n"
+            f"- Parameter RMSE at the start: {start}. At the end: {end}.\n"
+            f"- {row['iterations']} iterations of {row['spp']} samples per pixel in {max(row['elapsed_s'], 1):.0f} s, "
+            f"{row['peak_mib']:.0f} MiB at most, on {record.origin['device']}.\n"
+            f"- `{record.command}`\n"
+        )
+    return "\n".join([*parts, measured_at({name: record.origin for name, record in found.values()}) + "\n"])
+
+
 def readme(blocks: Blocks, text: str) -> str:
     """Return the README with its tables made anew."""
 
@@ -324,7 +348,7 @@ def main(arguments: list[str]) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("list", help="the measurements, and the command of each")
     commands.add_parser("stale", help="records that are older than the code that they measure; exit code 1 if any")
-    commands.add_parser("write", help="docs/benchmarks.md and the README's tables, from docs/benchmarks/")
+    commands.add_parser("write", help="docs/benchmarks.md, docs/gallery.md and the README's tables, from docs/benchmarks/")
     measuring = commands.add_parser("measure", help="all, or these, into docs/benchmarks/; then write")
     measuring.add_argument("names", nargs="*", metavar="NAME")
     options = parser.parse_args(arguments)
@@ -344,6 +368,7 @@ def main(arguments: list[str]) -> int:
             measure(name, MEASUREMENTS[name])
     blocks = Blocks()
     PAGE.write_text(page(blocks), encoding="utf-8")
+    GALLERY.write_text(gallery(blocks), encoding="utf-8")
     README.write_text(readme(blocks, README.read_text(encoding="utf-8")), encoding="utf-8")
     return 0
 

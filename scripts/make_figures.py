@@ -57,6 +57,12 @@ def run_panels(folder: Path) -> list[Panel]:
     return [(title, imread(file.with_suffix(".png"))) for title, file in files.items() if file.exists()]
 
 
+def image_panels(folder: Path) -> list[Panel]:
+    """Return the target, the initial image and the final image of a run."""
+    names = {"target": "target", "start": "initial", "end": "final"}
+    return [(title, imread(folder / "images" / f"{name}.png")) for title, name in names.items()]
+
+
 def lens_panels(picture: Path, folder: Path) -> list[Panel]:
     """The picture, the face lit from its upper left (without its mean curvature), and the light it throws."""
     from reslrb_cli.backend.variant import set_variant
@@ -124,8 +130,9 @@ def write_panels(rows: Sequence[Sequence[Panel]], out: Path) -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    # 256 colours: noise compresses badly, and the repository is to stay small.
-    Picture.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3].copy()).quantize(256).save(out, optimize=True)
+    picture = Picture.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3].copy())
+    # Noise compresses badly, and the repository must stay small: 256 colours, or JPEG.
+    (picture if out.suffix == ".jpg" else picture.quantize(256)).save(out, optimize=True)
     print(f"{out}: {out.stat().st_size / 1000:.0f} kB")
 
 

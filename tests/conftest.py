@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from compilation import compute_alone, leave_out_optimisations
-from report import chromium
+from report.chromium import Chromium, find_chromium
 
 import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before any test imports Mitsuba
 from reslrb_cli.backend.variant import set_variant
@@ -25,16 +25,25 @@ HEAVY = ("colour", "matplotlib.pyplot", "reslrb_cli.cli.optimize", "reslrb_cli.r
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out the tests that need a browser, if there is none."""
-    if chromium.find_chromium() is None:
+    if find_chromium() is None:
         left_out = [item for item in items if "chromium" in getattr(item, "fixturenames", ())]
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in left_out]
 
 
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
+    executable = find_chromium()
+    assert executable is not None, "pytest_collection_modifyitems leaves these tests out"
+    browser = Chromium(executable, tmp_path_factory.mktemp("profile"))
+    yield browser
+    browser.close()
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Say in one line that they were left out."""
-    if chromium.find_chromium() is None:
+    if find_chromium() is None:
         terminalreporter.write_line(
             "no Chromium: tests that look at pages in a browser are left out (scripts/setup --test brings one)"
         )

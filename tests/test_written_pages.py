@@ -26,6 +26,7 @@ def test_the_pages_are_what_the_records_say() -> None:
     blocks = pages.Blocks()
     again = "`scripts/benchmarks write` makes it anew"
     assert pages.PAGE.read_text(encoding="utf-8") == pages.page(blocks), again
+    assert pages.GALLERY.read_text(encoding="utf-8") == pages.gallery(blocks), again
     text = pages.README.read_text(encoding="utf-8")
     assert text == pages.readme(blocks, text), again
     assert (ROOT / "docs" / "paper.md").read_text(encoding="utf-8") == paper_page.page(), "`scripts/paper write`"

@@ -12,7 +12,6 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
-from report.chromium import Chromium, find_chromium
 from report.measured import (
     FLOOR,
     LAMP,
@@ -214,7 +213,9 @@ def test_scaling_memory_and_run_are_tables(tmp_path):
     page = page_of(make_run(tmp_path / "lamp", memory=MEMORY, scaling=SCALING))
     assert page.row("Scale of the parameters", LAMP)[1] == "3e+06"
     assert page.row("Memory budget", "budget")[1] == "1024 MiB"
-    assert page.row("Run", "time per iteration")[1] == "90 ms (median): 40 ms up to image and loss, 50 ms for the gradient"
+    assert (
+        page.row("Run", "time per iteration")[1] == "90 ms (median): 40 ms up to image and loss, 50 ms for the gradient"
+    )
     assert page.row("Run", "device")[1] == "a machine"
     everything = "".join(page.sections.values())
     assert "{'" not in everything
@@ -407,15 +408,6 @@ RUNS = {
                             "command_line": ["reslrb", "optimize", "/a/very/long/path" * 20],
                             "results": {"loss_trend": NOISY, "worse": [LONG]}},
 }  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def chromium(tmp_path_factory):
-    executable = find_chromium()
-    assert executable is not None, "tests/conftest.py leaves these tests out"
-    browser = Chromium(executable, tmp_path_factory.mktemp("profile"))
-    yield browser
-    browser.close()
 
 
 @pytest.fixture(scope="module")

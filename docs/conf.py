@@ -1,0 +1,31 @@
+"""Settings of the documentation site. `scripts/docs` builds the site in build/docs."""
+
+from importlib.metadata import version as installed_version
+
+project = "reslrb"
+author = "The reslrb developers"
+copyright = "The reslrb developers"  # Sphinx reads this name
+version = release = installed_version("reslrb")
+
+extensions = ["myst_nb", "sphinx_copybutton", "sphinx-mathjax-offline"]
+source_suffix = {".md": "myst-nb", ".ipynb": "myst-nb"}
+# Templates and records of generated pages
+exclude_patterns = ["benchmarks/*", "paper/*"]
+
+myst_enable_extensions = ["dollarmath", "colon_fence"]
+# Links to headings work as on code hosts
+myst_heading_anchors = 4
+# `$ command` and prices are no formulas
+myst_dmath_allow_space = False
+myst_dmath_double_inline = True
+
+# The notebooks are stored without output; `scripts/docs` runs them
+nb_execution_mode = "auto"
+nb_execution_timeout = 600
+nb_execution_raise_on_error = True
+
+html_theme = "furo"
+html_title = f"reslrb {version}"
+html_show_sphinx = False
+html_theme_options = {"sidebar_hide_name": False}
+templates_path: list[str] = []
