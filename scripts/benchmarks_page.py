@@ -188,7 +188,6 @@ class Blocks:
             "gradcheck": self.gradcheck,
             "extreme": self.extreme,
             "experiments": self.experiments,
-            "others": self.others,
             "runs": self.runs,
             "gpu": self.gpu,
         }
@@ -251,30 +250,21 @@ class Blocks:
 
     def extreme(self) -> str:
         """Return the result of the extreme suite, from its page and, if there is one, from its record."""
-        rows = [line for line in EXTREME.read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
-        notes = [" ".join(re.findall(r"\*\*(.*?)\*\*", row)) for row in rows]
-        kinds = (": roughness", ": image", "no reference: expectation")
-        roughness, image, left_out = (sum(kind in note for note in notes) for kind in kinds)
+        scenes = EXTREME.read_text(encoding="utf-8").count("\n| `")
         found, origin = "none fails", {}
         if (self.folder / "extreme.jsonl").exists():
             record = self.record("extreme")
             counts, origin = record.rows[0], record.origin
             found = f"{counts['hold']} of {counts['comparisons']} comparisons hold, {counts['fail']} fail"
         return _filled(
-            "`reslrb gradcheck --suite extreme` ([docs/extreme.md](docs/extreme.md)) compares every estimator, and "
-            f"`stack` on both kinds of paths and on camera paths alone, in {len(rows)} scenes: {found}. The roughness "
-            f"of `principled` stays open in {roughness} scenes, because its lobes are chosen. An image of camera paths "
-            f"stays open in {image}. Camera paths are left out of {left_out} scenes, whose light they do not find, or "
-            f"too rarely. Measured at {commit_of(origin)}."
+            "`reslrb gradcheck --suite extreme` compares the gradients of every estimator with references in "
+            f"{scenes} difficult scenes: {found} ([docs/extreme.md](docs/extreme.md)). Measured at {commit_of(origin)}."
         )
 
     def experiments(self) -> str:
-        """Return the README's table of whole runs."""
-        return self._ends({experiment_record(name): f"`{name}`: {words}" for name, words in EXPERIMENTS.items()})
-
-    def others(self) -> str:
-        """Return the README's table of whole runs by other integrators."""
-        return self._ends({name: words for name, (words, _) in OTHERS.items()})
+        """Return the README's table of whole runs: the experiments in `configs/`, and one by other integrators."""
+        shipped = {experiment_record(name): f"`{name}`: {words}" for name, words in EXPERIMENTS.items()}
+        return self._ends(shipped | {name: words for name, (words, _) in OTHERS.items()})
 
     def _ends(self, names: Mapping[str, str]) -> str:
         """Return errors at the start and at the end of runs, by the names of their records and their words."""
