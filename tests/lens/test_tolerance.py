@@ -299,7 +299,7 @@ def test_the_page_of_a_run_has_what_a_maker_wants_to_know(
     assert numbers["volume_mm3"] == pytest.approx(2.5e5, rel=0.5)
     page = (run / "report.html").read_text()
     assert "<h2>Fabrication</h2>" in page
-    assert f"{100 * numbers['light']['inside']:.4g} % of what leaves the face" in page
+    assert f"{100 * numbers['light']['inside']:.4g} % of the light that leaves the face" in page
     assert "the solid of the lens" in page
     assert "with the picture before its dark parts were lifted" in page
     assert "where it is off" not in page
