@@ -305,7 +305,7 @@ def test_texels_that_no_view_shows_are_told_from_settled_ones(tmp_path: Path, mo
     page = Path("runs/tiny/report.html").read_text()
     assert "75 % not seen" in page
     assert "<b>reached</b> by light and sensor (white): 25 %" in page
-    assert "noise of the target is not in it" in page
+    assert "does not include the noise of the target" in page
 
 
 # From somebody's scene, which has no ids, and a photograph to its colours: `init`, an edit, `optimize`.

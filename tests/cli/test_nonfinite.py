@@ -321,7 +321,7 @@ def test_a_clamp_reports_its_bias(spoilt_experiment, capsys):
     assert 0 < tally["bias"][KEY] < 1
     line = f"{tally['entries']} entries of gradients clamped in {tally['iterations']} iterations: a bias of"
     assert line in out.splitlines()[-1]
-    assert f"{tally['entries']} entries of gradients were clamped" in Path("runs/config/report.html").read_text()
+    assert f"{tally['entries']} gradient entries were clamped" in Path("runs/config/report.html").read_text()
     records = [json.loads(text) for text in Path("runs/config/metrics.jsonl").read_text().splitlines()]
     assert sum(record["clamped"]["entries"] for record in records) == tally["entries"]
 

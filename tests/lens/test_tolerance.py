@@ -299,10 +299,10 @@ def test_the_page_of_a_run_has_what_a_maker_wants_to_know(
     assert numbers["volume_mm3"] == pytest.approx(2.5e5, rel=0.5)
     page = (run / "report.html").read_text()
     assert "<h2>Fabrication</h2>" in page
-    assert f"{100 * numbers['light']['inside']:.4g} % of what leaves the face" in page
+    assert f"{100 * numbers['light']['inside']:.4g} % of the light that leaves the face" in page
     assert "the solid of the lens" in page
-    assert "with the picture before its dark parts were lifted" in page
-    assert "where it is off" not in page
+    assert "with the picture before its dark parts were brightened" in page
+    assert "mean |image − target|" not in page
     read, render, called = export.read_photo, mi.render, []
     monkeypatch.setattr(export, "read_photo", lambda file: (called.append(file), read(file))[1])
     monkeypatch.setattr(mi, "render", lambda *given, **how: (called.append("image"), render(*given, **how))[1])
@@ -318,7 +318,7 @@ def test_the_page_of_a_run_has_what_a_maker_wants_to_know(
     found["thrown"]["ssim_of_picture"] = found["thrown"]["ssim"]  # as where nothing was lifted
     (run / "fabrication.json").write_text(json.dumps(found))
     write_report(run)
-    assert "dark parts were lifted" not in (run / "report.html").read_text()
+    assert "dark parts were brightened" not in (run / "report.html").read_text()
     shutil.rmtree(run / "images")
     (run / "fabrication.json").unlink()  # a run of before
     result = done("export", run, "-o", tmp_path / "again", "--tolerances", *settings("run.final_spp=8"))
