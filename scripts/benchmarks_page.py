@@ -338,7 +338,7 @@ def main(arguments: list[str]) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("list", help="the measurements, and the command of each")
     commands.add_parser("stale", help="records that are older than the code that they measure; exit code 1 if any")
-    commands.add_parser("write", help="docs/benchmarks.md, docs/gallery.md and the README's tables, from docs/benchmarks/")
+    commands.add_parser("write", help="write README tables, docs/benchmarks.md and docs/gallery.md from the records")
     measuring = commands.add_parser("measure", help="all, or these, into docs/benchmarks/; then write")
     measuring.add_argument("names", nargs="*", metavar="NAME")
     options = parser.parse_args(arguments)

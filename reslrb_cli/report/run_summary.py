@@ -146,7 +146,7 @@ def spread_words(results: Mapping[str, Any], key: str, sign: str = "+-") -> str:
 
 def certainty_lines(results: Mapping[str, Any]) -> list[str]:
     """Return one line for each verdict except `settled`, with the parameters that have it."""
-    verdicts = {key: about.get("verdict", SETTLED) for key, about in _parameters(results).items()}
+    verdicts = verdicts_of(results)
     lines = []
     for verdict in dict.fromkeys(verdict for verdict in verdicts.values() if verdict != SETTLED):
         keys = [key for key in verdicts if verdicts[key] == verdict]
@@ -197,6 +197,11 @@ def _rate_setting(measured: Mapping[str, Any], rate: float, factor: float) -> st
 
 def _parameters(results: Mapping[str, Any]) -> dict[str, Any]:
     return dict((results.get("certainty") or {}).get("parameters") or {})
+
+
+def verdicts_of(results: Mapping[str, Any]) -> dict[str, str]:
+    """Return the verdict on each parameter; empty if nothing was measured."""
+    return {key: str(about.get("verdict", SETTLED)) for key, about in _parameters(results).items()}
 
 
 def _about(results: Mapping[str, Any], key: str) -> dict[str, Any]:
@@ -252,7 +257,7 @@ def worst(results: Mapping[str, Any]) -> str | None:
 def warnings(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
     """Return warnings about a run that did not fail: a loss that did not fall, errors that rose, unreliable values."""
     lines = []
-    trend, ratio = results.get("loss_trend") or {}, _image_ratio(results)
+    trend, ratio = results.get("loss_trend") or {}, image_ratio(results)
     if trend.get("change") in ("rose", "flat") and not (ratio is not None and ratio < IMPROVED):
         start, end = (with_error(trend[at]["mean"], trend[at]["error"], sign) for at in ("start", "end"))
         less = trend["end"]["mean"] < trend["start"]["mean"]
@@ -291,7 +296,7 @@ def _reasons(results: Mapping[str, Any]) -> list[str]:
     return found
 
 
-def _image_ratio(results: Mapping[str, Any]) -> float | None:
+def image_ratio(results: Mapping[str, Any]) -> float | None:
     """Return the loss of the saved images at the end divided by that at the start; None if one is unknown.
 
     Saved images have less noise than those of the iterations.

@@ -1,4 +1,4 @@
-"""Self-contained HTML pages about runs and measurements, without scripts, network access or other files."""
+"""Self-contained HTML pages about runs and measurements, which load no other files."""
 
 from __future__ import annotations
 

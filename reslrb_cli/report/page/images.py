@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,8 @@ FEW_PIXELS = 256
 class Picture:
     """Picture as a `data:` address, with its size (width, height) in pixels and the lines of its caption.
 
-    A map also has a colour scale: some of its colours (`stops`), and labels from its start to its end (`ends`).
+    A map also has a colour scale: some of its colours (`stops`), and labels from its start to its end (`ends`). The
+    page compares pictures that have a `moment`, such as the start of the run, with each other.
     """
 
     uri: str
@@ -51,6 +52,7 @@ class Picture:
     caption: Sequence[str]
     stops: Sequence[str] = ()
     ends: Sequence[str] = ()
+    moment: str = ""
 
     @property
     def smooth(self) -> bool:
@@ -179,11 +181,11 @@ def _row(folder: Path, suffix: str, results: Mapping[str, Any], exposure: float 
     loaded = {title: load_image(folder / f"{name}{suffix}.exr") for title, name in names.items()}
     exposure = exposure_for(loaded["target"]) if exposure is None else exposure
     sensor = f" of sensor {suffix[1:]}" if suffix else ""
-    shown = [
-        show(image * exposure, f"{title}{sensor}", lay_out("titled", title, f", {image.shape[1]}×{image.shape[0]}"))
-        for title, image in loaded.items()
-        if image is not None
-    ]
+    shown = []
+    for title, image in loaded.items():
+        if image is not None:
+            caption = lay_out("titled", title, f", {image.shape[1]}×{image.shape[0]}")
+            shown.append(replace(show(image * exposure, f"{title}{sensor}", caption), moment=title))
     weights = load_image(folder / f"weights{suffix}.exr")
     if weights is not None:  # the weights of pixels differ
         share = weights[:, :, :1] / max(float(weights.max()), 1e-30)

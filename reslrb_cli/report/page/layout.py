@@ -5,11 +5,14 @@ The pieces take plain text and numbers. Only the templates escape text; their ou
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import io
 import re
 import shlex
 from collections.abc import Iterable, Sequence
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup, escape
@@ -45,9 +48,17 @@ def document(title: str, head: Markup, parts: Iterable[tuple[str, Markup]], refr
     With `refresh_s`, the page reloads itself after this number of seconds. Control characters, which a page must not
     contain, become replacement characters.
     """
-    page = _environment().get_template("page.html.j2")
-    text = page.render(title=title, head=head, parts=parts, refresh_s=refresh_s) + "\n"
+    page, script = _environment().get_template("page.html.j2"), _script()
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    names = {"title": title, "head": head, "parts": parts, "refresh_s": refresh_s, "script": script, "digest": digest}
+    text = page.render(names) + "\n"
     return text.translate({ord(c): "\ufffd" for c in set(text) if not c.isprintable() and c not in "\n\t"})
+
+
+@cache
+def _script() -> Markup:
+    """Return the script of the page, which compares and enlarges pictures."""
+    return Markup((Path(__file__).parents[1] / "templates" / "page.js").read_text(encoding="utf-8"))
 
 
 @cache
@@ -74,7 +85,7 @@ def _environment() -> Environment:
 
 #: Sizes in inches of a diagram, of the label at its left, and of a letter of its tick labels. They are fixed here,
 #: because Matplotlib would draw everything twice to find them.
-WIDTH, HEIGHT, LABEL, LETTER = 5.2, 2.9, 0.34, 0.078
+WIDTH, HEIGHT, LABEL, LETTER = 4.2, 2.6, 0.34, 0.078
 
 #: Colour of text and lines in Matplotlib's output, which is then replaced by the colour of the page.
 _INK = "#010203"

@@ -25,6 +25,7 @@ from reslrb_cli.records.images import load_image
 from reslrb_cli.records.measurements import incomplete_records
 from reslrb_cli.records.run_folder import FABRICATION_FILE, SOLID_PICTURE
 from reslrb_cli.report.format import count, number
+from reslrb_cli.report.outcome import outcome_of
 from reslrb_cli.report.page.images import image_rows, seen_tables, show, view_table
 from reslrb_cli.report.page.layout import lay_out, soft
 from reslrb_cli.report.page.values import convergence, parameter_table, texture_pictures
@@ -96,7 +97,7 @@ def fabrication(run: Run) -> Markup:
 
 
 def header(run: Run) -> Markup:
-    """Return the run's name, how it ended, its results and its warnings."""
+    """Return the run's name, its outcome in a sentence, what to do next, its results and its warnings."""
     seconds, loss = run.last("elapsed_s"), run.results.get("loss")
     parts = (
         "" if seconds is None else f"{count(len(run.records), 'iteration')} in {duration(seconds)}",
@@ -104,7 +105,14 @@ def header(run: Run) -> Markup:
         error_line(run.results),
     )
     lead = ", ".join(part for part in parts if part)
-    return lay_out("header", run.name, run.manifest.get("status", "unknown"), lead) + problems(run)
+    outcome = outcome_of(run.manifest, run.results, str(run.path))
+    status = run.manifest.get("status", "unknown")
+    return (
+        lay_out("header", run.name, status, outcome.grade, outcome.sentence)
+        + lay_out("next_step", outcome.proposal, outcome.command)
+        + lay_out("paragraph", lead)
+        + problems(run)
+    )
 
 
 def problems(run: Run) -> Markup:
@@ -120,12 +128,12 @@ def run_parts(run: Run) -> dict[str, Markup]:
     """Return the parts of a run below its header, by title and in order; parts that do not apply are empty."""
     results = run.results
     parts: dict[str, Callable[[], Markup]] = {
+        "Images": lambda: image_rows(run),
         "Parameters": lambda: (
             parameter_table(results, "now" if run.at_work else "end", notes=True)
             + Markup().join(soft(found.line()) for found in incomplete_records(run.manifest.get("incomplete") or ()))
             + lay_out("run.certainty", results.get("certainty") or {})
         ),
-        "Images": lambda: image_rows(run),
         "Fabrication": lambda: fabrication(run),
         "Views": lambda: view_table(run.manifest.get("views"), results),
         "Errors as people see them": lambda: seen_tables([run]),
