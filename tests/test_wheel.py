@@ -72,7 +72,7 @@ def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_wheel_has_all_that_is_no_module(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     wanted = {path.relative_to(ROOT).as_posix() for path in PACKAGE.rglob("*.j2")}
-    wanted |= {path.relative_to(ROOT).as_posix() for path in PACKAGE.rglob("*.py")}
+    wanted |= {path.relative_to(ROOT).as_posix() for kind in ("*.js", "*.py") for path in PACKAGE.rglob(kind)}
     wanted.add("reslrb_cli/py.typed")  # without it a user's type checker takes every public name for Any
     for name in ("configs", "scenes"):
         wanted |= {f"reslrb_cli/examples/{path.relative_to(ROOT).as_posix()}"
