@@ -46,7 +46,16 @@ def test_the_remedy_is_a_command() -> None:
     found["loss_trend"] = {"change": "fell", "late": "fell"}
     told = outcome(found)
     assert told.proposal == "Try more iterations:"
-    assert told.command == "reslrb optimize 'a room.yaml' --resume --set run.iterations=300"
+    assert told.command == "reslrb optimize --resume runs/room --set run.iterations=300"
+
+
+def test_a_remedy_that_needs_a_new_run_starts_from_the_configuration() -> None:
+    found = results("still moving", trend={"change": "rose"})
+    found["certainty"] |= {"learning_rate": 0.03}
+    found["certainty"]["parameters"]["p0"] |= {"moved": 1.0, "rate": 0.03}
+    told = outcome(found)
+    assert told.proposal == "Try a lower rate:"
+    assert told.command == "reslrb optimize 'a room.yaml' --set optimizer.learning_rate=0.01"
 
 
 def test_a_run_that_did_not_measure_certainty() -> None:
@@ -54,7 +63,7 @@ def test_a_run_that_did_not_measure_certainty() -> None:
              "image_loss": {"initial": 2.0, "final": 0.5}}  # fmt: skip
     assert outcome(found) == Outcome(
         "open", "The loss fell from 2 to 0.5, and was still falling at the end.", "Continue the run:",
-        "reslrb optimize 'a room.yaml' --resume --set run.iterations=100",
+        "reslrb optimize --resume runs/room --set run.iterations=100",
     )  # fmt: skip
     assert outcome(found | {"loss_trend": FELL}).grade == "open"
     assert outcome({"iterations": 3}).sentence == "The run finished after 3 iterations, too few to judge its result."
@@ -63,7 +72,7 @@ def test_a_run_that_did_not_measure_certainty() -> None:
 def test_runs_that_ended_early() -> None:
     failed = outcome({"iterations": 3}, status="failed")
     assert (failed.grade, failed.sentence) == ("failed", "The run failed after 3 iterations.")
-    assert failed.command == "reslrb optimize 'a room.yaml' --resume"
+    assert failed.command == "reslrb optimize --resume runs/room"
     assert outcome({}, status="failed").command == ""
     assert outcome({"iterations": 1}, status="interrupted").sentence == "The run was interrupted after 1 iteration."
     assert outcome({}, status="running") == Outcome("open", "The run is in progress.")
