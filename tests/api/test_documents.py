@@ -87,7 +87,7 @@ def blocks(name: str) -> list[str]:
 
 
 #: Pages with Python, and their blocks, each of which a test runs: here, or tests/conformance/test_plugin.py.
-PYTHON = {"README.md": 1, "docs/python.md": 7, "docs/integrator.md": 2, "docs/method.md": 2, "docs/benchmarks.md": 1,
+PYTHON = {"README.md": 1, "docs/python.md": 7, "docs/integrator.md": 2, "docs/steps.md": 1, "docs/losses.md": 1, "docs/benchmarks.md": 1,
           "docs/benchmarks/page.md": 1, "docs/your_integrator.md": 1}  # fmt: skip
 
 
@@ -100,7 +100,7 @@ def test_no_page_has_python_that_no_test_runs() -> None:
 
 def test_what_pages_do_with_a_run_does(checkout: Path) -> None:
     """The slope of recovered values, the median step of a run, and a loss of one's own."""
-    slope, edges = blocks("docs/method.md")
+    (slope,), (edges,) = blocks("docs/steps.md"), blocks("docs/losses.md")
     (steps,) = blocks("docs/benchmarks.md")
     (checkout / "my_loss.py").write_text(edges, encoding="utf-8")
     settings = ("scene.options={resx: 32, resy: 32}", "run.iterations=8", "run.final_spp=8", "target.render.spp=16",

@@ -92,7 +92,7 @@ def test_runs_whose_loss_still_falls_are_not_stopped_however_long_they_are(kind:
     ("normal, 10 %", 300), ("normal, 30 %", 600), ("t of 3 degrees", 360), ("fireflies", 360), ("grey_room", 700),
 ])  # fmt: skip
 def test_what_a_stop_costs(kind: str, longest: int) -> None:
-    """Medians over runs that stand from their first iteration on; docs/method.md has the figures."""
+    """Medians over runs that stand from their first iteration on; docs/steps.md has the figures."""
     random = np.random.default_rng(5)
     assert np.median(ends(NOISE[kind](random, (300, 1000)))) <= longest
     assert np.median(ends(NOISE[kind](random, (300, 1000)), relative=0.05)) <= 240
