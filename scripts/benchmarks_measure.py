@@ -247,13 +247,14 @@ def extreme_page(lines: Sequence[Mapping[str, Any]]) -> str:
         rows.append([f"`{case}`", CASES[case].about, named, str(own[0]["seeds"]), *cells])
     return (
         "# The extreme suite\n\n"
-        "Scenes in which gradients of light paths break, each with a reference. Written by\n\n"
+        "Scenes in which gradients of light paths often fail, each with its own reference. Written by\n\n"
         "    scripts/benchmarks measure extreme\n\n"
-        f"on {origin['device']}, {origin['variant']}.\n"
-        "Under each estimator stand the largest deviation in standard errors of all comparisons over many seeds\n"
-        f"(limit {z:.1f}, the same for all), the largest relative L2 distance at equal seeds (limit {distance:.0e}),\n"
-        "and each comparison that does not hold or stays open. References and verdicts: docs/gradcheck.md.\n\n"
-        f"{table(('case', 'what it is about', 'references', 'seeds', *estimators), rows)}\n"
+        f"on {origin['device']}, {origin['variant']}.\n\n"
+        "The columns of the estimators contain the largest deviation in standard errors of all comparisons over many\n"
+        f"seeds (limit {z:.1f}, the same for all), the largest relative L2 distance at equal seeds (limit {distance:.0e}),\n"
+        "and, in bold, each comparison that fails or stays open. [gradcheck.md](gradcheck.md) explains references and\n"
+        "verdicts.\n\n"
+        f"{table(('case', 'subject', 'references', 'seeds', *estimators), rows)}\n"
     )
 
 

@@ -275,7 +275,7 @@ def test_the_page_of_the_extreme_suite_has_a_line_for_each_case_and_a_column_for
     page = benchmarks_measure.extreme_page([{"kind": "origin", "device": "a CPU", "variant": "v"}, *records])
     assert "(limit 5.9, the same for all)" in page
     assert page.splitlines()[-4:] == [
-        "| case | what it is about | references | seeds | gather | stack |",
+        "| case | subject | references | seeds | gather | stack |",
         "|---|---|---|---|---|---|",
         f"| `{first.name}` | {first.about} | ptracer | 8 | 2.0 | 1.0 |",
         f"| `{second.name}` | {second.about} | ptracer | 8 | - | 3.0, **fails: reflectance** |",
