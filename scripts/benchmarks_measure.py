@@ -252,8 +252,8 @@ def extreme_page(lines: Sequence[Mapping[str, Any]]) -> str:
         f"on {origin['device']}, {origin['variant']}.\n\n"
         "The columns of the estimators contain the largest deviation in standard errors of all comparisons over many\n"
         f"seeds (limit {z:.1f}, the same for all), the largest relative L2 distance at equal seeds (limit\n"
-        f"{distance:.0e}), and, in bold, each comparison that fails or stays open. [gradcheck.md](gradcheck.md) explains\n"
-        "references and verdicts.\n\n"
+        f"{distance:.0e}), and, in bold, each comparison that fails or stays open. [gradcheck.md](gradcheck.md)\n"
+        "explains references and verdicts.\n\n"
         f"{table(('case', 'subject', 'references', 'seeds', *estimators), rows)}\n"
     )
 
