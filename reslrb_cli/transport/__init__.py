@@ -1,1 +1,1 @@
-"""Light transport: emission, scattering, connection to the sensor, splatting, and the one loop that joins them."""
+"""Light transport: emission, scattering, connection to the sensor, splatting, and the loops that combine them."""

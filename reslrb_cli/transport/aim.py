@@ -1,24 +1,24 @@
-"""Scattering that is aimed at what the sensor sees, mixed with the BSDF's own.
+"""Scattering towards visible points, mixed with the directions of the BSDF.
 
-A glossy surface that faces the sensor shows the light of directions which few paths come from, and those few count for
-so much that they make up most of the noise. So of the paths that scatter at a surface a share SHARE is sent to a point
-that the sensor sees: a position on the film is drawn, the first surface there is found, and the path goes on to it.
-Both ways of finding the next vertex z are one mixture (Veach's thesis, ch. 9; one-sample model, balance heuristic). In
-place of f cos / p_b a path has
+A glossy surface reflects light to the sensor from few directions. Few paths come from these directions, but they have
+such large weights that they dominate the noise. At each surface, a share SHARE of the paths is therefore aimed at a
+point that the sensor sees: a position on the film is sampled, the first surface there is found, and the path continues
+to it. Both ways to find the next vertex z form a mixture (Veach's thesis, ch. 9; one-sample model, balance heuristic).
+In place of f cos / p_b, a path has
 
     f cos / ((1 - SHARE) p_b + SHARE p_a)        p_a = p_film |cos_z| W / d^2 * |x - z|^2 / |cos|
 
-for p_b the density of the BSDF's own directions at x, W / d^2 the sensor's importance and geometry at z, cos_z towards
-the sensor and cos towards x. p_a is 0 where the sensor does not see z, which only z can know. So a path that leaves x
-has the weight f cos / p_b with either way, and at z the factor
+p_b is the density of the BSDF's directions at x, W / d^2 the sensor's importance and geometry at z, cos_z the cosine at
+z towards the sensor, and cos that at z towards x. p_a is 0 if the sensor does not see z, which is known only at z. A
+path therefore leaves x with the weight f cos / p_b in both cases, and at z its weight is multiplied by
 
     r = 1 / ((1 - SHARE) + SHARE p_a / p_b)
 
-which is at most 1 / (1 - SHARE). A path that was aimed and meets something else on its way, or a point that the sensor
-does not see, ends. r has no derivative, as little as a weight of roulette.
+which is at most 1 / (1 - SHARE). An aimed path ends if it meets another surface on its way, or a point that the sensor
+does not see. r has no derivative, like the weight of roulette.
 
-Positions on the film are drawn by blocks of pixels, AIM_UNIFORM of them evenly, the others by what earlier steps have
-found and by the step's own dL/dI, where that is known before its samples are drawn (`Aim`).
+Positions on the film are sampled by blocks of pixels: a share AIM_UNIFORM evenly, the others by the contributions found
+in earlier steps and by the step's own dL/dI if it is known before the samples are drawn (`Aim`).
 """
 
 from __future__ import annotations
@@ -44,15 +44,16 @@ REACHED = 1 - 1e-3  # of the distance to a point, where nothing stands in the wa
 
 @dataclass
 class Aim:
-    """Where on the film paths are sent: the block of each slot (SLOTS), and the density of each block's positions,
-    relative to an even one."""
+    """Sampling of positions on the film: the block of each slot (SLOTS), and the density of each block's positions
+    relative to a uniform density.
+    """
 
     slots: mi.UInt32
     density: mi.Float
 
     @staticmethod
     def of(blocks: Blocks, wanted: NDArray[np.float64]) -> Aim:
-        """Blocks in proportion to `wanted` (rows * columns), nowhere negative, and UNIFORM of them evenly."""
+        """Return blocks in proportion to `wanted` (rows * columns, nowhere negative), with a share UNIFORM evenly."""
         even = blocks.areas() / blocks.areas().sum()
         total = wanted.sum()
         density = AIM_UNIFORM * even + (1 - AIM_UNIFORM) * (
@@ -69,10 +70,10 @@ class Aim:
 
 @dataclass
 class Pending:
-    """Loop state: what the next vertex is to know of the event that its path comes from.
+    """Loop state: the last scattering event, as the next vertex needs it.
 
-    `share` is that of aimed paths there, `pdf` p_b (infinite where the direction was one of few, which no aimed path
-    takes), `distance` how far away the point is that it was aimed at; negative where it was not.
+    `share` is the share of aimed paths at the event, `pdf` is p_b (infinite for discrete directions, which aimed paths
+    never take), and `distance` is the distance to the point that the path is aimed at, negative if it is not aimed.
     """
 
     share: mi.Float
@@ -81,12 +82,14 @@ class Pending:
 
     @staticmethod
     def nothing() -> Pending:
-        """That of a path that leaves an emitter."""
+        """Return the state of a path that leaves an emitter."""
         return Pending(mi.Float(0), mi.Float(1), mi.Float(-1))
 
     @staticmethod
     def of(aimed: Aimed, si: mi.SurfaceInteraction3f, pdf: mi.Float, discrete: mi.Bool) -> Pending:
-        """That of an event at `si`, aimed or not, that gave a direction of this density, or one of few."""
+        """Return the state after an event at `si`, aimed or not, with a direction of this density, or a `discrete`
+        direction.
+        """
         distance = dr.select(aimed.active, dr.norm(aimed.point - si.p), -1)
         return Pending(aimed.share, dr.select(discrete, dr.inf, dr.detach(pdf)), dr.detach(distance))
 
@@ -94,9 +97,10 @@ class Pending:
         self, aim: Aim, sensor: mi.Sensor, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, connection: Connection,
         visible: mi.Bool,
     ) -> mi.Float:  # fmt: skip
-        """r at the vertex `si`, which `ray` reaches, and from which the sensor is `visible`; 0 where its path ends.
+        """Return r at the vertex `si` that `ray` reaches; 0 if the path ends there.
 
-        `connection` is as from an emitter, without the correction for shading normals.
+        `visible` says whether the sensor sees the vertex. `connection` is that from an emitter, without the correction
+        for shading normals.
         """
         film = film_blocks(sensor)
         p_film = dr.gather(mi.Float, aim.density, film.block(connection.u), visible)
@@ -109,15 +113,16 @@ class Pending:
 
 
 def worthwhile(needs: SceneNeeds, max_depth: int) -> bool:
-    """Whether paths are aimed in such a scene: where there are glossy surfaces, and a pinhole that sees them.
+    """Whether paths are aimed in the scene: it needs glossy surfaces, and a pinhole camera.
 
-    Diffuse ones gain little by it: they show what comes from anywhere. Perturbed normals have a mixture of their own.
+    Diffuse surfaces gain little, because they reflect light from all directions. Perturbed normals use their own
+    mixture.
     """
     return needs.has_glossy and not (needs.thin_lens or needs.has_perturbed_normals) and max_depth > 2
 
 
 def aims_from(bsdf: mi.BSDFPtr) -> mi.Bool:
-    """Lanes whose BSDF lets paths be aimed; no path is aimed at others either."""
+    """Return the lanes whose BSDF allows aiming. No path is aimed at the other surfaces either."""
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
 
@@ -125,9 +130,10 @@ def choose(
     scene: mi.Scene, sensor: mi.Sensor, aim: Aim, time: mi.Float, bsdf_1d: mi.Float, bsdf_2d: mi.Point2f,
     slot: mi.Float, able: mi.Bool,
 ) -> tuple[Aimed, mi.Float]:  # fmt: skip
-    """Which of the lanes that are `able` are aimed, and where to; and the BSDF's one number, new for the others.
+    """Choose the aimed lanes among the `able` ones, and their points.
 
-    The BSDF's one number chooses; `slot`, in [0, 1), and the BSDF's other two are the position on the film.
+    Also returns the 1D number of the BSDF, rescaled for the other lanes. This number chooses; `slot`, in [0, 1), and
+    the two other numbers of the BSDF give the position on the film.
     """
     share, below = dr.select(able, mi.Float(SHARE), 0), dr.one_minus_epsilon(mi.Float)
     active = bsdf_1d < share

@@ -1,17 +1,17 @@
-"""BSDFs along a light path: sampling a scattering event, evaluation, and the derivatives of both.
+"""BSDFs along a light path: sampling of scattering events, evaluation, and the derivatives of both.
 
-A path has BSDF factors of two kinds, s_j (along the path) and c_i (towards the sensor). Sampling is detached:
-directions and densities do not depend on the parameters. A factor is then f / pdf, where only
+A path has BSDF factors of two kinds: s_j (along the path) and c_i (towards the sensor). Sampling is detached:
+directions and densities do not depend on the parameters. A factor is then f / pdf, and only
 
     f = bsdf * cos        a smooth lobe, evaluated for a given direction
-    f = weight * pdf      a delta lobe, which has a weight and a discrete probability, and no value
+    f = weight * pdf      a delta lobe, which has a weight and a discrete probability, but no value
     f = transmission      passing straight through (a mask, a thin sheet)
 
 has a derivative (`tracked_factor`, `tracked_factors`). A scattering event (`scatter`) is a direction sampled from the
 BSDF, and its weight.
 
-Bump and normal maps perturb the shading frame inside of the BSDF, where Veach's correction cannot see it. In scenes
-that have them a smooth lobe is evaluated as a path from the camera would, with its two directions exchanged,
+Bump and normal maps perturb the shading frame inside the BSDF, where Veach's correction cannot see it. In scenes with
+such maps, a smooth lobe is evaluated as a camera path would, with exchanged directions,
 
     f = bsdf(wo -> wi) * cos_p wi * |n . wo| / |n . wi|        n: geometric normal, p: perturbed one
 
@@ -33,17 +33,18 @@ DEFENSIVE = 0.2  # share of samples that a perturbed BSDF does not draw itself
 
 
 def context_of(plan: Plan) -> mi.BSDFContext:
-    """BSDF queries of a walk's paths: those from the light carry importance towards the sensor, so that eta^2 is not
-    applied twice."""
+    """Return the context of BSDF queries. Light paths carry importance towards the sensor, so eta^2 is not applied
+    twice.
+    """
     return mi.BSDFContext(mi.TransportMode.Radiance if plan.camera else mi.TransportMode.Importance)
 
 
 def tracked_factor(
     plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, scattering: Scattering, active: mi.Bool
 ) -> mi.Spectrum:
-    """f (C,) with derivatives, of the event that `scattering` is.
+    """Return f (C,) of the event `scattering`, with derivatives.
 
-    Call under `dr.resume_grad()`. What the scene has no lobes for is not compiled.
+    Call under `dr.resume_grad()`. Lobes that the scene does not have are not compiled.
     """
     f = evaluate(plan, si, bsdf, scattering.wo, active & ~(scattering.is_delta | scattering.is_null))
     return _singular_factor(plan, si, bsdf, scattering, active, f)
@@ -53,7 +54,7 @@ def tracked_factors(
     plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, connection_wo: mi.Vector3f, connected: mi.Bool,
     scattering: Scattering, scattered: mi.Bool,
 ) -> tuple[mi.Spectrum, mi.Spectrum]:  # fmt: skip
-    """f (C,) towards the sensor and f along the path, both with derivatives, from one indirect call.
+    """Return f (C,) towards the sensor and f (C,) along the path, both with derivatives, from one indirect call.
 
     Call under `dr.resume_grad()`.
     """
@@ -72,7 +73,7 @@ def tracked_factors(
 def _singular_factor(
     plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, scattering: Scattering, active: mi.Bool, f: mi.Spectrum
 ) -> mi.Spectrum:
-    """`f`, replaced where a delta lobe was sampled or light passed straight through, where that has derivatives."""
+    """Return `f`, replaced by differentiable values for sampled delta lobes and null events."""
     if plan.differentiate_delta:
         delta = active & scattering.is_delta
         sample_1 = _defensive(scattering.sample_1)[1] if mixes(plan) else scattering.sample_1
@@ -91,7 +92,7 @@ def _singular_factor(
 
 @dataclass
 class Hit:
-    """A vertex as light meets it: the surface interaction, its BSDF, and the ray that reaches it."""
+    """Surface interaction of a vertex, its BSDF, and the ray that reaches it."""
 
     si: mi.SurfaceInteraction3f
     bsdf: mi.BSDFPtr
@@ -100,7 +101,7 @@ class Hit:
 
 @dataclass
 class Sample:
-    """A BSDF's sample: local direction, density, weight (C,), relative index of refraction, and what kind it is."""
+    """Sample of a BSDF: local direction, density, weight (C,), relative index of refraction, and type of the lobe."""
 
     wo: mi.Vector3f
     pdf: mi.Float
@@ -111,7 +112,7 @@ class Sample:
 
 @dataclass
 class Aimed:
-    """Which lanes of an event are aimed, where to (`point`), whether there is anything, and their `share`."""
+    """Aimed lanes of an event, their target `point`, whether this point exists, and the `share` of aimed paths."""
 
     active: mi.Bool
     point: mi.Point3f
@@ -121,8 +122,11 @@ class Aimed:
 
 @dataclass
 class Scattering:
-    """What happened at a vertex. `weight` is s_j (C,), with Veach's correction; `f` (C,) is what of it has derivatives,
-    weight = f correction / pdf; `wo` is local, `d` in world space."""
+    """Scattering event at a vertex.
+
+    `weight` is s_j (C,), with Veach's correction. `f` (C,) is its differentiable part: weight = f correction / pdf.
+    `wo` is the local direction, and `d` the direction in world space.
+    """
 
     weight: mi.Spectrum
     f: mi.Spectrum
@@ -140,19 +144,19 @@ class Scattering:
 
     @property
     def ways(self) -> Ways:
-        """What weights are made of, in walks that have any."""
+        """Densities for the weights of combined paths, in walks that need them."""
         assert self.own_ways is not None
         return self.own_ways
 
 
 @dataclass
 class Ways:
-    """What weights are made of (`weights.py`): densities of directions at a vertex, of solid angle; 0 where
-    nobody asks.
+    """Densities of directions at a vertex per solid angle, for the weights of combined paths (`weights.py`); 0 if not
+    requested.
 
-    `p` is that of the sampled direction, `back` that of the way back in the other side's walk; `ahead` and
-    `ahead_back` the same of the connection, or the next event. `valid` and `ahead_valid`: both directions lie on
-    consistent sides, as light paths ask for.
+    `p` is that of the sampled direction, `back` that of the way back in the walk from the other side; `ahead` and
+    `ahead_back` are the same for the connection, or the next event. `valid` and `ahead_valid` say whether both
+    directions lie on consistent sides, as light paths require.
     """
 
     p: mi.Float
@@ -164,14 +168,14 @@ class Ways:
 
 
 def mixes(plan: Plan) -> bool:
-    """Whether directions are drawn from a mixture: by light paths, at perturbed normals."""
+    """Whether directions are sampled from a mixture: by light paths, at perturbed normals."""
     return plan.needs.has_perturbed_normals and not plan.camera
 
 
 def density(
     plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr | mi.BSDF, wo: mi.Vector3f, active: mi.Bool, camera: bool
 ) -> mi.Float:
-    """The density of solid angle with which a walk from one side draws the direction `wo` of smooth lobes."""
+    """Return the density per solid angle with which a walk samples the direction `wo` of smooth lobes."""
     side = replace(plan, camera=camera)
     own = bsdf.pdf(context_of(side), si, wo, active)
     if not mixes(side):
@@ -184,7 +188,7 @@ def density(
 def _back(
     plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr | mi.BSDF, wo: mi.Vector3f, active: mi.Bool
 ) -> mi.Float:
-    """The density of the way back along `wo` and `si.wi`, in the other side's walk."""
+    """Return the density of the way back along `wo` and `si.wi`, in the walk from the other side."""
     turned = type(si)(si)
     turned.wi = wo
     return density(plan, turned, bsdf, si.wi, active, not plan.camera)
@@ -194,7 +198,7 @@ def _ways(
     plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr | mi.BSDF, connection_wo: mi.Vector3f,
     connected: mi.Bool | None, wo: mi.Vector3f, pdf: mi.Float, active: mi.Bool,
 ) -> tuple[mi.Float, ...]:  # fmt: skip
-    """The densities of `Ways`, 0 for those that nobody asks for."""
+    """Return the densities of `Ways`; 0 for those that are not requested."""
     zero = mi.Float(0)
     back, ahead, ahead_back = zero, zero, zero
     if plan.weighs:
@@ -210,12 +214,12 @@ def _ways(
 def shading_correction(
     plan: Plan, si: mi.SurfaceInteraction3f, wi_world: mi.Vector3f, wo_world: mi.Vector3f, wo: mi.Vector3f
 ) -> tuple[mi.Float, mi.Bool]:
-    """Veach's factor for shading normals (thesis, p. 155) and whether both directions are on consistent sides.
+    """Return Veach's factor for shading normals (thesis, p. 155), and whether both directions are on consistent sides.
 
-    Without shading normals the factor is 1 and both sides are consistent by construction: neither is computed. With
-    perturbed ones, it is |n . wo| / |n . wi|, what is left of it beside the exchanged BSDF. n is taken on the side of
-    the shading normal: faces of a mesh that a transform mirrors wind the other way, and paths from the sensor, which
-    know the shading normal alone, see nothing of that.
+    Without shading normals the factor is 1 and the sides are always consistent, so neither is computed. With perturbed
+    normals it is |n . wo| / |n . wi|, which remains beside the exchanged BSDF. n is taken on the side of the shading
+    normal: a transform that mirrors a mesh reverses the winding of its faces, and camera paths, which use only the
+    shading normal, do not notice this.
     """
     if not (plan.needs.has_shading_normals or plan.needs.has_perturbed_normals):
         return mi.Float(1), mi.Bool(True)
@@ -240,10 +244,9 @@ def scatter(
 ) -> tuple[Scattering, mi.Spectrum | None]:  # fmt: skip
     """Sample the next direction, and evaluate f (C,) towards `connection_wo` in `connected` lanes (None: in no lane).
 
-    Detached, unless `attached`; `bsdf.py` has the derivatives of the factors alone. Both queries share one
-    indirect call, and in it what they have in common (looking up textures, mostly). Lanes that are `aimed` have the
-    direction of their point, and the BSDF's own density of it. In `weighed` lanes the densities of that direction are
-    asked for (`Ways`).
+    Detached, unless `attached`. Both queries share one indirect call, and with it common work such as the lookup of
+    textures. Lanes that are `aimed` use the direction of their point, and the density of the BSDF for it. `weighed`
+    lanes also compute the densities of `Ways`.
     """
     si, bsdf, context, drawn = hit.si, hit.bsdf, context_of(plan), sample_1
     ways_asked = plan.camera or plan.weighs
@@ -316,13 +319,13 @@ def scatter(
 
 
 def following(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool, sample: Sample) -> Sample:
-    """A sample whose derivative is that of the integral it stands for.
+    """Return a sample whose derivative is that of the integral that it estimates.
 
-    Where all that a BSDF does to make a sample is smooth (or its choice of a lobe is weighed accordingly, as Mitsuba's
-    dielectrics do), that is the derivative of the sample itself: the direction follows the surface, and a roughness.
+    For a BSDF whose sampling is smooth (or whose choice of a lobe is weighted accordingly, as in Mitsuba's
+    dielectrics), this is the derivative of the sample itself: the direction follows the surface and the roughness.
     Other BSDFs choose a lobe by a probability that depends on their parameters and on the incident direction, and the
-    derivative of a sample knows nothing of the choice. Their smooth lobes keep their direction, in the local frame, and
-    f / pdf is differentiated by f alone; their delta lobes keep the probability.
+    derivative of a sample ignores this choice. Their smooth lobes keep their direction in the local frame, and f / pdf
+    is differentiated through f alone; their delta lobes keep the probability.
     """
     if not plan.needs.unfollowed:
         return sample
@@ -340,9 +343,9 @@ def following(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active:
 
 
 def stays_behind(plan: Plan, bsdf: mi.BSDFPtr, is_delta: mi.Bool) -> mi.Bool:
-    """Lanes in which the vertex behind a scattering event stays where it is on its surface.
+    """Return the lanes in which the vertex behind a scattering event stays at its place on its surface.
 
-    Where glossy BSDFs follow, one that has such a lobe beside a diffuse one follows with both.
+    If glossy BSDFs follow, a BSDF with a glossy and a diffuse lobe follows with both.
     """
     if not plan.glossy_follows:
         return ~is_delta
@@ -350,10 +353,11 @@ def stays_behind(plan: Plan, bsdf: mi.BSDFPtr, is_delta: mi.Bool) -> mi.Bool:
 
 
 def staying(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool, sample: Sample) -> Sample:
-    """The same where a smooth lobe's direction goes to a point that does not move with this vertex.
+    """Return the sample of `following`, except that a smooth lobe's direction leads to a point that does not move with
+    this vertex.
 
-    That the direction changes with either end is left to the vertex at its far end (`estimators.attached`): here it
-    stands still in the world, and f / pdf changes by f alone. Delta lobes are as in `following`.
+    The vertex at the far end accounts for the change of direction (`estimators.attached`). Here the direction is
+    constant in world space, and f / pdf changes through f alone. Delta lobes are as in `following`.
     """
     followed = following(plan, si, bsdf, active, sample)
     kept = dr.detach(sample.pdf)
@@ -366,7 +370,7 @@ def staying(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: m
 
 
 def _defensive(sample_1: mi.Float) -> tuple[mi.Bool, mi.Float]:
-    """Lanes that a perturbed BSDF does not draw itself, by their number, and what is left of that for the others."""
+    """Return the lanes in which a perturbed BSDF does not sample itself, and the rescaled number of the other lanes."""
     defensive = sample_1 < DEFENSIVE
     return defensive, dr.select(defensive, sample_1 / DEFENSIVE, (sample_1 - DEFENSIVE) / (1 - DEFENSIVE))
 
@@ -375,10 +379,11 @@ def _mixed(
     plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, sample_2: mi.Point2f, defensive: mi.Bool,
     active: mi.Bool, sample: Sample,
 ) -> Sample:  # fmt: skip
-    """A BSDF's sample, replaced by one of the cosine-weighted hemisphere in `defensive` lanes; the mixture's density.
+    """Return a BSDF's sample, replaced by a cosine-weighted direction in `defensive` lanes, with the density of the
+    mixture.
 
-    A BSDF with a perturbed normal samples around the normal as it is turned to wi, and its exchanged evaluation turns
-    it to wo: there are directions in which the latter is not zero and that the former never samples.
+    A BSDF with a perturbed normal samples around the normal that faces wi, and its exchanged evaluation uses the normal
+    that faces wo. Some directions have a nonzero value, but are never sampled by the BSDF.
     """
     hemisphere = mi.warp.square_to_cosine_hemisphere(sample_2)
     hemisphere.z = dr.mulsign(hemisphere.z, mi.Frame3f.cos_theta(si.wi))
@@ -392,8 +397,10 @@ def _mixed(
 
 
 def _to_point(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, aimed: Aimed, sample: Sample) -> Sample:
-    """A BSDF's sample, replaced by one towards their point in lanes that are aimed; of density 0 where there is no
-    point, or none of the BSDF's own samples goes there."""
+    """Return a BSDF's sample, replaced by the direction to the point in aimed lanes.
+
+    The density is 0 if there is no point, or if the BSDF itself never samples this direction.
+    """
     there = si.to_local(dr.normalize(aimed.point - si.p))
     f, own = bsdf.eval_pdf(context_of(plan), si, there, aimed.active & aimed.found)
     own = dr.select(aimed.found, own, 0)
@@ -402,12 +409,12 @@ def _to_point(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, aimed: 
 
 
 def _glossy(mask: mi.Bool, lobe: mi.UInt32) -> mi.UInt32:
-    """What kind of a sample it is, made that of a glossy reflection in these lanes."""
+    """Return the type of the sample, set to glossy reflection in these lanes."""
     return dr.select(mask, mi.UInt32(int(mi.BSDFFlags.GlossyReflection)), lobe)
 
 
 def _delta_correction(wi: mi.Vector3f, wo: mi.Vector3f, eta: mi.Float) -> mi.Float:
-    """cos_p wi / cos_p wo of a mirror or refraction, whose normal p is along wi + eta wo."""
+    """Return cos_p wi / cos_p wo of a mirror or refraction, whose normal p is along wi + eta wo."""
     h = dr.fma(eta, wo, wi)
     return dr.abs(dr.dot(h, wi) / dr.dot(h, wo))
 
@@ -415,7 +422,7 @@ def _delta_correction(wi: mi.Vector3f, wo: mi.Vector3f, eta: mi.Float) -> mi.Flo
 def evaluate(
     plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr | mi.BSDF, wo: mi.Vector3f, active: mi.Bool
 ) -> mi.Spectrum:
-    """A smooth lobe's bsdf * cos (C,) towards `wo`, for a path that carries importance."""
+    """Return bsdf * cos (C,) of smooth lobes towards `wo`, for a path that carries importance."""
     if not mixes(plan):
         return bsdf.eval(context_of(plan), si, wo, active)
     exchanged = type(si)(si)

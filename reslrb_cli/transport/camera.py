@@ -1,8 +1,8 @@
-"""The one camera-path loop: a ray through the film, the light that is met, next event estimation, scattering, roulette.
+"""The only camera-path loop: film ray, light that is met, next event estimation, scattering, roulette.
 
-What is done with the light that is found is the hooks' to say, as in the walk from the light (`walk.py`), with which it
-shares the scattering, the factors and the numbers of a segment. Light is found in two ways, which are weighed against
-one another, and against light paths where there are any (`weights.py`).
+The hooks process the light that is found, as in the light-path loop (`walk.py`), which shares the scattering, the
+factors and the random numbers of a segment. The two ways to find light are weighted against each other, and against
+light paths if there are any (`weights.py`).
 """
 
 from __future__ import annotations
@@ -28,8 +28,11 @@ from reslrb_cli.transport.weights import Rivals, cosine
 
 @dataclass
 class FilmRay:
-    """A ray through film position `u` (pixels, relative to the crop window), and `weight` (C,): the sensor's importance
-    times what brings a sum over lanes to an image. `near` is how far before its origin the sensor's aperture lies."""
+    """Ray through film position `u` (pixels, relative to the crop window).
+
+    `weight` (C,) is the sensor's importance, normalised so that a sum over lanes gives an image. `near` is the distance
+    from the sensor's aperture to the origin of the ray.
+    """
 
     ray: mi.Ray3f
     u: mi.Point2f
@@ -39,8 +42,10 @@ class FilmRay:
 
 
 def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
-    """A ray for each lane: in each pixel of the crop window as many, or one more, or as they are shared out; of fewer
-    rays than pixels, each in a random pixel of its own share of them."""
+    """Return a ray for each lane, distributed evenly over the pixels of the crop window or as the pixels are weighted.
+
+    If there are fewer rays than pixels, each ray goes to a random pixel of its own group of pixels.
+    """
     plan, sensor, size = samples.plan, samples.sensor, samples.film.size
     n_pixels = int(dr.prod(size))
     lane = dr.arange(mi.UInt32, samples.width)
@@ -67,9 +72,11 @@ def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
 
 
 def _within_pixel(samples: Samples, number: mi.UInt32, pixel: mi.UInt32, per_pixel: mi.Float) -> mi.Point2f:
-    """Places within their pixel, [0, 1)^2, spread evenly over the samples of each, which are numbered: Hammersley's
-    points, turned by a random offset of the pixel's own. Unevenly spread, what the filter makes of them would be
-    noise."""
+    """Return positions in [0, 1)^2 within pixels, distributed evenly over the numbered samples of each pixel.
+
+    They are Hammersley points, shifted by a random offset for each pixel. Independent positions would add noise through
+    the filter.
+    """
     x, y = (mi.Float(word) * 2**-32 for word in mi.sample_tea_32(pixel, samples.seed))
     inverse = mi.Float(dr.brev(number)) * 2**-32
     place = mi.Point2f(x + mi.Float(number) / dr.maximum(per_pixel, 1), y + inverse)
@@ -77,13 +84,13 @@ def _within_pixel(samples: Samples, number: mi.UInt32, pixel: mi.UInt32, per_pix
 
 
 def axis_of(sensor: mi.Sensor) -> mi.Vector3f:
-    """The direction that a sensor looks in."""
+    """Return the direction in which a sensor looks."""
     return dr.normalize(dr.detach(sensor.world_transform() @ mi.Vector3f(0, 0, 1)))
 
 
 @dataclass
 class MetLight:
-    """Light that a camera path meets: radiance `Le` (C,), detached, and its weight w_H, 0 where it does not count."""
+    """Light that a camera path meets: radiance `Le` (C,), detached, and its weight w_H, 0 if it does not count."""
 
     Le: mi.Spectrum
     weight: mi.Float
@@ -92,17 +99,16 @@ class MetLight:
     si: mi.SurfaceInteraction3f
 
     def radiance(self) -> mi.Spectrum:
-        """The same radiance, with its derivative where there is any."""
+        """Return the radiance, with its derivative if it has one."""
         return self.emitter.eval(self.si, self.active)
 
 
 @dataclass(kw_only=True)
 class NextEvent(Connection):
-    """A connection of a camera path's vertex to a point on an emitter, or a direction of one.
+    """Connection of a vertex of a camera path to a point on an emitter, or to a direction.
 
-    `weight` is everything of the contribution but BSDF and transmittance, (C,): Le w_N / density; `scale` is that
-    without the radiance, `Le` (C,) the radiance, detached; `through` (C,) the transmittance; `target` the point on the
-    emitter.
+    `weight` (C,) is the contribution without BSDF and transmittance: Le w_N / density. `scale` is `weight` without the
+    radiance, `Le` (C,) the radiance, detached, `through` (C,) the transmittance, and `target` the point on the emitter.
     """
 
     Le: mi.Spectrum
@@ -112,7 +118,7 @@ class NextEvent(Connection):
     unseen: frozenset[mi.Emitter]  # emitters that cannot be asked for what arrives from them
 
     def radiance(self, scene: mi.Scene, si: mi.SurfaceInteraction3f) -> mi.Spectrum:
-        """The radiance that arrives, with its derivative where there is any."""
+        """Return the arriving radiance, with its derivative if it has one."""
         if not self.unseen:
             return scene.eval_emitter_direction(si, self.ds, self.active)
 
@@ -125,30 +131,33 @@ class NextEvent(Connection):
 
 
 class CameraHooks:
-    """What is done along a camera path. All are pure but for the derivatives that they add; none draws a number.
+    """Hooks of a camera path. All are pure except for the derivatives that they add, and none draws a random number.
 
-    Hooks that are `tracked` keep derivatives of the factors in the loop's state, which is then evaluated vertex by
-    vertex (naive AD).
+    `tracked` hooks keep derivatives of the factors in the loop state. The loop is then evaluated vertex by vertex
+    (naive AD).
     """
 
     tracked: bool = False
 
     def start(self, first: FilmRay) -> Any:
-        """State before the first vertex, any PyTree."""
+        """Return the state before the first vertex, any PyTree."""
         return []
 
     def goes_on(self, state: Any, vertex: Vertex) -> mi.Bool:
-        """Lanes that go on from this vertex, as far as the hooks care."""
+        """Return the lanes that continue from this vertex, as far as the hooks are concerned."""
         return mi.Bool(True)
 
     def vertex(
         self, state: Any, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
     ) -> Any:  # fmt: skip
-        """Called at each vertex, and where a ray leaves the scene; None: there is nothing to meet, or to sample."""
+        """Return the state after a vertex, or after a ray has left the scene.
+
+        `met` and `event` are None if the path meets or samples no light.
+        """
         return state
 
     def survived(self, state: Any, weight: mi.Float) -> Any:
-        """Called with the weight that roulette has just given the path's product."""
+        """Return the state after roulette has multiplied the path's product by `weight`."""
         return state
 
 
@@ -156,8 +165,8 @@ class CameraHooks:
 class CameraPath:
     """Loop state of one camera path.
 
-    `before` is the last vertex that is no null event, `events` counts them, `M` is 1 / p of the last of them (0: the
-    sensor, or a delta event) where light paths are no rivals.
+    `before` is the last vertex that is no null event, `events` counts such vertices, and `M` is 1 / p of the last of
+    them (0 for the sensor or a delta event) if no light paths compete.
     """
 
     active: mi.Bool
@@ -173,7 +182,8 @@ class CameraPath:
 
 
 def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = True) -> tuple[FilmRay, Any]:
-    """Trace one camera path per lane of `samples`, in `active` lanes: the rays, and the final state of `hooks`."""
+    """Trace one camera path per lane of `samples`, in `active` lanes; return the rays and the final state of `hooks`.
+    """
     plan, scene = samples.plan, samples.scene
     sampler = samples.sampler()
     surrounded = plan.needs.environment is not None
@@ -276,7 +286,7 @@ def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = T
 
 
 def _behind_lamps(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Ray3f:
-    """The rays from behind the lamps that they meet first, which are hidden."""
+    """Return the rays moved behind the hidden lamps that they meet first."""
 
     def body(active: mi.Bool, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Ray3f]:
         si = scene.ray_intersect(ray, active)
@@ -288,7 +298,7 @@ def _behind_lamps(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Ray3f:
 
 
 def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> MetLight:
-    """The light at `si`, or, where the ray has left the scene, from there."""
+    """Return the light at `si`, or from the environment if the ray has left the scene."""
     plan, scene = samples.plan, samples.scene
     emitter = si.emitter(scene, path.active)
     active = path.active & (emitter != dr.zeros(mi.EmitterPtr))
@@ -334,7 +344,7 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
 def _next_event(
     samples: Samples, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, numbers: mi.Point2f, active: mi.Bool
 ) -> NextEvent:  # fmt: skip
-    """A point on an emitter, or a direction of one; `weight` and `scale` are not weighed yet."""
+    """Sample a point on an emitter, or a direction; `weight` and `scale` do not include w_N yet."""
     scene = samples.scene
     unseen = frozenset(lamp.emitter for lamp in samples.plan.needs.lamps if lamp.parallel)
     active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -356,7 +366,7 @@ def _sample_some(
     samples: Samples, unseen: frozenset[mi.Emitter], si: mi.SurfaceInteraction3f, numbers: mi.Point2f,
     active: mi.Bool,
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:  # fmt: skip
-    """What `sample_emitter_direction` does, where a scene has emitters that cannot be sampled so."""
+    """Replace `sample_emitter_direction` in scenes with emitters that cannot be sampled."""
     scene = samples.scene
     index, weight, reused = scene.sample_emitter(numbers.x, active)
     emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, active)
@@ -377,7 +387,7 @@ def _weigh(
     samples: Samples, path: CameraPath, arrived: list[Rivals], si: mi.SurfaceInteraction3f, event: NextEvent,
     scattering: Scattering,
 ) -> None:  # fmt: skip
-    """Multiply w_N to a next event."""
+    """Multiply a next event by w_N."""
     plan, ds, ways = samples.plan, event.ds, scattering.ways
     p = dr.select(ds.delta, 0, ways.ahead)
     rivals = p / ds.pdf
@@ -407,7 +417,7 @@ def _weigh(
 def _behind(
     plan: Plan, path: CameraPath, arrived: list[Rivals], si: mi.SurfaceInteraction3f, scattering: Scattering
 ) -> CameraPath:  # fmt: skip
-    """The path with what a vertex's event makes of its weights."""
+    """Return the path with its weights updated by the event of a vertex."""
     ways = scattering.ways
     renewed = dr.rcp(ways.p)
     null = scattering.is_null

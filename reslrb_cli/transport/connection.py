@@ -1,6 +1,7 @@
 """Connections of a light path's vertex to the sensor, straight through surfaces that only mask or filter light.
 
-Those are Mitsuba's `Null` lobes; `transmittance` passes them. `connect` finds where on the film a vertex appears.
+These surfaces have Mitsuba's `Null` lobes, and `transmittance` handles them. `connect` finds the position of a vertex
+on the film.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ from reslrb_cli.transport.plan import Plan
 
 
 def forward_derivatives(*values: mi.Spectrum) -> list[mi.Spectrum]:
-    """Derivatives of `values` along the parameters' tangents; zero for those that depend on none of them.
+    """Return the derivatives of `values` along the parameters' tangents; zero for values that depend on no parameter.
 
-    In one propagation: a second one would meet the edges of the first. It leaves the parameters' own tangents standing,
-    for the next vertex.
+    One propagation handles all values, because a second one would meet the edges of the first. The tangents of the
+    parameters remain for the next vertex.
     """
     tracked = [value for value in values if dr.grad_enabled(value)]
     if tracked:
@@ -29,10 +30,10 @@ def forward_derivatives(*values: mi.Spectrum) -> list[mi.Spectrum]:
 
 @dataclass
 class Passage:
-    """State of a ray on its way through null surfaces; loop state.
+    """Loop state of a ray on its way through null surfaces.
 
-    `value` is the product of the transmissions so far, (C,), `tangent` its derivative (empty unless asked for);
-    `reached` becomes true where nothing is left in the way.
+    `value` is the product of the transmissions so far, (C,), and `tangent` its derivative (empty unless requested).
+    `reached` becomes true once nothing blocks the way.
     """
 
     active: mi.Bool
@@ -49,10 +50,10 @@ def transmittance(
 ) -> Passage:  # fmt: skip
     """Follow the segment from the interaction `start` to the point `target` through at most `limit` null surfaces.
 
-    Each crossing counts as a vertex, as it does for `path`. `on_crossing(transmission, active)` is called at each one
-    with its transmission (C,), tracked where gradients are enabled, to take its derivative there and then.
-    With `tangents`, the derivative along the parameters' tangents is carried along (forward mode); call it where
-    gradients are suspended then, since the loop itself must not track any. `past_lamps`: those are no obstacle.
+    Each crossing counts as a vertex, as for `path`. `on_crossing(transmission, active)` is called at each crossing with
+    its transmission (C,), tracked if gradients are enabled, so that it can be differentiated there. With `tangents`,
+    the derivative along the parameters' tangents is computed (forward mode); gradients must then be suspended, because
+    the loop itself must not track any. With `past_lamps`, lamps do not block the way.
     """
 
     def body(passage: Passage, ray: mi.Ray3f) -> tuple[Passage, mi.Ray3f]:
@@ -98,13 +99,12 @@ def transmittance(
 
 @dataclass
 class Connection:
-    """The geometry of one connection, before the BSDF is evaluated and before visibility is known.
+    """Geometry of one connection, without BSDF and visibility.
 
-    `weight` is everything of c_i but the BSDF and the transmittance: sensor importance, geometry, Veach's correction,
-    (C,). `u` is the film position in pixels relative to the crop window, `target` the point on the aperture, or, where
-    anything stands before the near clip plane, that on the plane on the way there. A walk that evaluates connections
-    sets `f` (C,) to bsdf * cos, `through` (C,) to the transmittance, `c` to c_i (C,) as a whole, and `active` to where
-    the sensor is seen.
+    `weight` (C,) is c_i without BSDF and transmittance: sensor importance, geometry and Veach's correction. `u` is the
+    film position in pixels relative to the crop window. `target` is the point on the aperture, or on the near clip
+    plane if anything stands before that plane. A walk that evaluates connections sets `f` (C,) to bsdf * cos, `through`
+    (C,) to the transmittance, `c` to c_i (C,), and `active` to the lanes that the sensor sees.
     """
 
     weight: mi.Spectrum
@@ -123,9 +123,9 @@ def connect(
     plan: Plan, sensor: mi.Sensor, si: mi.SurfaceInteraction3f, ray: mi.Ray3f | None, sample: mi.Point2f,
     active: mi.Bool, attached: bool = False,
 ) -> Connection:  # fmt: skip
-    """Find where the vertex `si` appears on the film; film positions move with it if `attached`, else they do not.
+    """Find the film position of the vertex `si`; it moves with the vertex if `attached`.
 
-    `ray` reaches the vertex; None: light begins there, on an emitter.
+    `ray` reaches the vertex; None if light starts there, on an emitter.
     """
     with dr.suspend_grad(when=not attached):
         ds, importance = sensor.sample_direction(si, sample, active)
@@ -147,10 +147,10 @@ def connect(
 
 
 def _clip(plan: Plan, sensor: mi.Sensor, ds: mi.DirectionSample3f) -> tuple[mi.Bool, mi.Point3f]:
-    """Where the sensor sees the point, and as far as to where nothing may stand in between: its near plane, from which
-    rays of a camera start.
+    """Return whether the sensor's clip planes include the point, and the point on the near plane where camera rays
+    start.
 
-    Of thin lenses Mitsuba leaves out the planes, and what focuses on none between them it has see nothing.
+    For thin lenses, Mitsuba ignores the planes, and sees nothing if the lens focuses outside of them.
     """
     params = mi.traverse(sensor)
     near, far = mi.Float(params["near_clip"]), mi.Float(params["far_clip"])
@@ -163,10 +163,10 @@ def _clip(plan: Plan, sensor: mi.Sensor, ds: mi.DirectionSample3f) -> tuple[mi.B
 
 
 def _importance(sensor: mi.Sensor, ds: mi.DirectionSample3f, sees: mi.Bool) -> mi.Spectrum:
-    """Importance and geometry of a camera, where it sees the point.
+    """Return importance and geometry of a camera if it sees the point.
 
-    Mitsuba's own is zero wherever a film would end whose principal point is not shifted, or a thin lens focuses outside
-    of the clip planes.
+    Mitsuba's own importance is zero outside of a film whose principal point is not shifted, and if a thin lens focuses
+    outside of the clip planes.
     """
     pixels = int(dr.prod(sensor.film().crop_size()))
     cos = -dr.dot(ds.d, dr.normalize(ds.n))
@@ -174,7 +174,7 @@ def _importance(sensor: mi.Sensor, ds: mi.DirectionSample3f, sees: mi.Bool) -> m
 
 
 def film_density(sensor: mi.Sensor, cos: mi.Float) -> mi.Float:
-    """The density of directions, of this cosine to the axis, of camera rays through one pixel."""
+    """Return the density of directions of camera rays through one pixel, at this cosine to the axis."""
     size = sensor.film().size()
     half = dr.tan(dr.deg2rad(mi.Float(mi.traverse(sensor)["x_fov"])) / 2)
     pixel = 4 * half**2 * (int(size.y) / int(size.x)) / int(dr.prod(size))
@@ -183,14 +183,15 @@ def film_density(sensor: mi.Sensor, cos: mi.Float) -> mi.Float:
 
 @dataclass
 class Seen:
-    """What an earlier walk saw of the sensor: `visible`, in the lanes that are `known` (None: in all)."""
+    """Visibility of the sensor from an earlier walk: `visible`, in the lanes that are `known` (None: in all lanes)."""
 
     visible: mi.Bool
     known: mi.Bool | None = None
 
 
 def stand_in(connection: Connection) -> tuple[mi.Float, mi.Spectrum]:
-    """What stands for bsdf * cos, and for c_i (C,), where they are zero (`Product.times`): those of a white surface."""
+    """Return replacements for bsdf * cos and for c_i (C,) if they are zero (`Product.times`): those of a white surface.
+    """
     f = dr.maximum(dr.abs(mi.Frame3f.cos_theta(connection.wo)), 1e-3) * dr.inv_pi
     return f, connection.weight * f
 
@@ -199,11 +200,10 @@ def passage(
     plan: Plan, scene: mi.Scene, si: mi.SurfaceInteraction3f, depth: mi.UInt32, connection: Connection,
     seen: Seen | None = None, loop_mode: str = "symbolic",
 ) -> tuple[mi.Bool, mi.Spectrum]:  # fmt: skip
-    """Where the sensor is seen, and the transmittance (C,) of masks on the way: traces the shadow ray.
+    """Trace the shadow ray; return the lanes that the sensor sees, and the transmittance (C,) of masks on the way.
 
-    No ray is traced in lanes in which `seen` knows the answer. In a scene without surfaces that light passes straight
-    through, no transmittance is computed; in one that has them, `seen` is no help. `loop_mode` is that of its loop:
-    naive AD needs it evaluated.
+    No ray is traced in lanes with a known visibility `seen`. Without null surfaces in the scene, no transmittance is
+    computed; with them, `seen` cannot be used. `loop_mode` is the mode of the loop; naive AD needs it evaluated.
     """
     active, one = connection.active, mi.Spectrum(1)
     past_lamps = plan.passes_lamps

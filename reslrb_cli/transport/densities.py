@@ -1,7 +1,7 @@
-"""Densities of the rays that a scene's emitters send out, known of any ray, and not of those alone that were sampled.
+"""Densities of the rays that a scene's emitters send out, for any ray, not only for sampled ones.
 
-Mitsuba has none: they are those of its own `sample_ray`, and of the rays that are placed here (`emission.py`,
-`lamps.py`).
+Mitsuba does not provide them. They are the densities of its `sample_ray`, and of the rays that `emission.py` and
+`lamps.py` sample:
 
     lamp                 choice / area * cos / pi;  textured, in proportion to its texture
     constant, map, sky   choice p(d) / (pi r^2)         r: of the sphere around the scene
@@ -29,8 +29,8 @@ EVEN, TEXTURED, ENVIRONMENT, PROJECTOR, UNSEEN = range(5)  # how the density of 
 class EmitterDensities:
     """Densities of a scene's emitters by their numbers in Dr.Jit's registry (as pointers are), (R,) each, opaque.
 
-    `choice`: the probability that an emitter is picked. `emitted`: e, or what is left of it beside the density of a
-    place or a direction that depends on a texture. `kind`: which of these.
+    `choice` is the probability of selecting an emitter. `emitted` is e, without a factor that depends on a texture.
+    `kind` says which factor this is.
     """
 
     choice: mi.Float
@@ -39,7 +39,7 @@ class EmitterDensities:
 
     @staticmethod
     def of(plan: Plan, scene: mi.Scene) -> EmitterDensities:
-        """Those of all emitters of a scene."""
+        """Return the densities of all emitters of a scene."""
         emitters = scene.emitters()
         numbers = [int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]) for emitter in emitters]
         sampled = np.array([float(np.ravel(emitter.sampling_weight())[0]) for emitter in emitters])
@@ -56,7 +56,7 @@ class EmitterDensities:
 
 
 def _ray_density(plan: Plan, emitter: mi.Emitter, lamp: Lamp | None, surrounds: bool) -> tuple[float, int]:
-    """What of an emitter's e is the same for all its rays, and how the rest is found."""
+    """Return the part of an emitter's e that is the same for all its rays, and the kind of the rest."""
     name = emitter.class_name()
     disk = 0.0 if plan.horizon is None else 1 / (np.pi * plan.horizon.radius**2)
     if lamp is not None:
@@ -77,7 +77,7 @@ def _ray_density(plan: Plan, emitter: mi.Emitter, lamp: Lamp | None, surrounds: 
 
 
 def _cosine_of_cutoff(spot: mi.Emitter) -> float:
-    """The cosine of the angle at which the cone ends that a spot's rays are drawn from; its plugin does not tell it."""
+    """Return the cosine of the cutoff angle of a spot's rays, which its plugin does not expose."""
     rim = mi.Point2f(1 - 1e-7, 0.5)  # the end of the unit disk; it is the numbers of the place that it takes
     axis = np.ravel(mi.traverse(spot)["to_world"] @ mi.Vector3f(0, 0, 1))
     d = np.ravel(spot.sample_ray(0, 0.5, rim, rim, True)[0].d)
@@ -85,7 +85,7 @@ def _cosine_of_cutoff(spot: mi.Emitter) -> float:
 
 
 def _projected_area(projector: mi.Emitter) -> float:
-    """The area of a projector's picture at a distance of 1."""
+    """Return the area of a projector's picture at a distance of 1."""
     params = mi.traverse(projector)
     toward = params["to_world"] @ mi.Vector3f(mi.Float([0.0, 1e-3, 0.0]), mi.Float([0.0, 0.0, 1e-3]), 1)
     si = dr.zeros(mi.SurfaceInteraction3f, 3)
@@ -97,9 +97,12 @@ def _projected_area(projector: mi.Emitter) -> float:
 
 @dataclass
 class Place:
-    """Where light leaves an emitter, as its density needs to know: `own` is the density of the place (of a lamp, over
-    its area), or of the direction (of what surrounds the scene), with which next event estimation draws it, without the
-    choice of the emitter; `uv` are texture coordinates, `d` is the direction that light leaves in."""
+    """Place where light leaves an emitter, for the density.
+
+    `own` is the density with which next event estimation samples this place (for a lamp, per area) or direction (for
+    environments), without the choice of the emitter. `uv` are texture coordinates, and `d` is the direction of the
+    light.
+    """
 
     emitter: mi.EmitterPtr
     own: mi.Float
@@ -108,7 +111,7 @@ class Place:
 
 
 def density_of_rays(plan: Plan, table: EmitterDensities, at: Place, active: mi.Bool) -> mi.Float:
-    """e of the rays that leave there."""
+    """Return e of the rays that leave these places."""
     number = dr.reinterpret_array(mi.UInt32, at.emitter)
     e = dr.gather(mi.Float, table.emitted, number, active)
     textured = any(lamp.texture is not None for lamp in plan.needs.lamps)
@@ -138,7 +141,7 @@ def _constant_environment(plan: Plan) -> bool:
 
 
 def _evened(lamp: Lamp, at: Place, active: mi.Bool) -> mi.Float:
-    """The density over the area of a lamp whose points are drawn from its texture, and some of them evenly."""
+    """Return the density per area of a lamp whose points are sampled from its texture, and in part uniformly."""
     here = active & (at.emitter == mi.EmitterPtr(lamp.emitter))
     there = lamp.shape.eval_parameterization(at.uv, mi.RayFlags.All, here)
     stretch = dr.norm(dr.cross(there.dp_du, there.dp_dv))
@@ -147,7 +150,8 @@ def _evened(lamp: Lamp, at: Place, active: mi.Bool) -> mi.Float:
 
 
 def _projected(at: Place, active: mi.Bool) -> mi.Float:
-    """The density of a projector's directions, but for the area of its picture; `at.uv` are those of the picture."""
+    """Return the density of a projector's directions without the area of its picture; `at.uv` are those of the picture.
+    """
 
     def density(self: mi.Emitter, uv: mi.Point2f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
         if self.class_name() != "Projector":

@@ -1,6 +1,6 @@
-"""The start of light paths: rays from the emitters, those of lamps as `lamps.py` has them where need be.
+"""Start of light paths: rays from the emitters, sampled by `lamps.py` if necessary.
 
-`used_numbers` says which of the numbers that emission is drawn from the emitters of a scene make anything of.
+`used_numbers` says which of the random numbers of emission the emitters of a scene use.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ PROBES = 1024  # light paths that are looked at
 
 
 def used_numbers(samples: Samples) -> list[bool]:
-    """Which of the four numbers (place, direction) the emission of any emitter depends on."""
+    """Return which of the four numbers (place, direction) the emission of any emitter depends on."""
     random = np.random.default_rng(1)
     first, other = (random.random((4, PROBES), np.float32) for _ in range(2))
     choice = random.random(PROBES, np.float32)
@@ -40,11 +40,10 @@ def used_numbers(samples: Samples) -> list[bool]:
 
 @dataclass
 class Emission:
-    """A ray that leaves an emitter. `weight` is E of the design notes: radiance over the density of the ray, (C,).
+    """Ray that leaves an emitter, with the weight E: radiance divided by the density of the ray, (C,).
 
-    `weight` tracks derivatives of emission where they are enabled; ray and density do where emitters move.
-    `guided` is the part of `weight` that a guide has brought in; None without one. `position` are the numbers that the
-    place was drawn with.
+    `weight` tracks derivatives of emission if they are enabled; ray and density do if emitters move. `guided` is the
+    factor of `weight` from a guide; None without a guide. `position` contains the numbers that sampled the place.
     """
 
     ray: mi.Ray3f
@@ -55,7 +54,7 @@ class Emission:
 
 
 def sample_time(plan: Plan, sensor: mi.Sensor, sampler: mi.Sampler | NumberStream) -> mi.Float:
-    """A time within the shutter interval; draws a number only where the shutter is open for some time."""
+    """Return a time within the shutter interval; draws a number only if this interval has a length."""
     time = mi.Float(sensor.shutter_open())
     if plan.needs.moving_shutter:
         time += sampler.next_1d() * sensor.shutter_open_time()
@@ -63,7 +62,7 @@ def sample_time(plan: Plan, sensor: mi.Sensor, sampler: mi.Sampler | NumberStrea
 
 
 def sample_emission(samples: Samples, sampler: mi.Sampler) -> Emission:
-    """Sample a ray from a random emitter of the scene. Draws as many numbers, in the same order, as `ptracer`."""
+    """Sample a ray from a random emitter of the scene, with as many numbers, in the same order, as `ptracer`."""
     time = sample_time(samples.plan, samples.sensor, sampler)
     wavelength_sample, sample_2, sample_3 = samples.emission_numbers(sampler)
     drawn = samples.drawn(wavelength_sample, sample_2, sample_3)
@@ -76,7 +75,7 @@ def sample_emission(samples: Samples, sampler: mi.Sampler) -> Emission:
 def emission_of(
     samples: Samples, time: mi.Float, wavelength_sample: mi.Float, sample_2: mi.Point2f, sample_3: mi.Point2f
 ) -> Emission:
-    """The ray that these numbers stand for."""
+    """Return the ray of these random numbers."""
     plan, scene = samples.plan, samples.scene
     if not (plan.environment_map or plan.placed_lamps):
         ray, weight, emitter = scene.sample_emitter_ray(time, wavelength_sample, sample_2, sample_3, True)
@@ -100,7 +99,7 @@ def _emitter_ray(
     samples: Samples, emitter: mi.EmitterPtr, time: mi.Float, number: mi.Float, position: mi.Point2f,
     direction: mi.Point2f, active: mi.Bool,
 ) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
-    """A ray that leaves each lane's emitter: from lamps that we place as `lamp_ray` has it, else as Mitsuba has it."""
+    """Return a ray that leaves each lane's emitter, by `lamp_ray` or by Mitsuba."""
     placed = samples.plan.placed_lamps
     lamps = {lamp.emitter: (lamp, samples.areas(lamp), lamp in samples.plan.evened_lamps) for lamp in placed}
     if samples.plan.moving_emission:
@@ -128,11 +127,11 @@ def _emitter_ray(
 def _environment_ray(
     plan: Plan, environment: mi.Emitter, time: mi.Float, disk: mi.Point2f, direction: mi.Point2f
 ) -> tuple[mi.Ray3f, mi.Spectrum]:
-    """A ray from an environment map, on a disk perpendicular to it that covers the scene's bounding sphere.
+    """Return a ray from an environment map, through a disk perpendicular to it that covers the scene's bounding sphere.
 
-    Stock `envmap.sample_ray` places the disk in the map's local frame, which is wrong where `to_world` rotates it.
-    Directions are drawn in proportion to the map's radiance, and, where that is differentiated, some uniformly: texels
-    that are black beside a sun have derivatives as large as any.
+    Mitsuba's `envmap.sample_ray` places the disk in the local frame of the map, which is wrong if `to_world` rotates
+    it. Directions are sampled in proportion to the map's radiance, and in part uniformly if the map is differentiated:
+    black texels beside a sun have derivatives as large as any.
     """
     assert plan.horizon is not None
     center, radius = mi.Point3f(*plan.horizon.center), plan.horizon.radius * (1 + 1e-4)
@@ -152,7 +151,9 @@ def _environment_ray(
 def _any_direction(
     environment: mi.Emitter, reference: mi.Interaction3f, sample: mi.Point2f
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """A direction from a mixture of the environment's own density and the uniform one; radiance over density."""
+    """Sample a direction from a mixture of the environment's own density and the uniform density; return radiance /
+    density, too.
+    """
     with dr.suspend_grad():
         uniform = sample.x < DEFENSIVE
         x = dr.select(uniform, sample.x / DEFENSIVE, (sample.x - DEFENSIVE) / (1 - DEFENSIVE))

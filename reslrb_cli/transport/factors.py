@@ -1,14 +1,14 @@
-"""Products of path factors whose zeros are counted, so that the derivative at a zero factor is not lost.
+"""Products of path factors that count zeros, so that the derivative at a zero factor is not lost.
 
 The contribution of a path is a product of factors, f_0 f_1 ... f_k, per channel. Its derivative with respect to f_j is
-the product of all others. Dividing the whole by f_j loses it where f_j = 0, so the product of the nonzero factors is
-carried beside the index of the zero one:
+the product of all others. Dividing the product by f_j fails if f_j = 0, so the product of the nonzero factors is stored
+with the index of the zero factor:
 
     one zero factor, f_j:  d(f_0 ... f_k) = (product of the others) df_j       nothing for any other factor
     two or more:           d(f_0 ... f_k) = 0
 
-Nor must a factor of a millionth keep a path from being followed, or a connection from being chosen, for which its
-derivative is as large as any. Roulette and selection go by `weight`, in which no factor is below DIM.
+A tiny factor must not end a path, or prevent the selection of a connection, because its derivative is as large as any.
+Roulette and selection therefore use `weight`, in which no factor is below DIM.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ DIM = 0.1  # the least that a factor counts in a weight, as a fraction of its st
 
 
 def showing(value: mi.Float | mi.Spectrum) -> mi.Float | mi.Spectrum:
-    """`value`, with infinity in place of NaN where the backend's atomic sums would drop that.
+    """Return `value` with infinity in place of NaN if the backend's atomic sums would drop NaN.
 
-    On a CPU they pass over a NaN unless it shares its address with other numbers of the same packet (Dr.Jit 1.5): it
-    would vanish from images and gradients, which are then finite, and wrong.
+    On a CPU they ignore a NaN unless it shares its address with other numbers of the same packet (Dr.Jit 1.5). Images
+    and gradients would then be finite, and wrong.
     """
     return dr.select(dr.isnan(value), dr.inf, value) if dr.backend_v(value) == dr.JitBackend.LLVM else value
 
 
 @dataclass
 class Product:
-    """A product of factors, one value per channel; part of the loop state.
+    """Product of factors, one value per channel; part of the loop state.
 
-    `nonzero` is the product of all factors (untracked), or of those that are not zero, with stand-ins for the others
-    (tracked). `zero` holds, per channel, the index of the zero factor, NO_ZERO or MANY_ZEROS; it is empty where zeros
-    are not tracked. `tracked` is the plain product with derivatives, for naive AD only; otherwise it is empty.
-    `raised` is the product of the factors, each at least DIM of its stand-in; it is empty where zeros are not tracked.
+    `nonzero` is the product of all factors (untracked), or of the nonzero factors with replacements for the others
+    (tracked). `zero` is, per channel, the index of the zero factor, NO_ZERO or MANY_ZEROS; it is empty if zeros are not
+    tracked. `tracked` is the plain product with derivatives, for naive AD only; otherwise it is empty. `raised` is the
+    product of the factors, each at least DIM times its replacement; it is empty if zeros are not tracked.
     """
 
     nonzero: mi.Spectrum
@@ -49,19 +49,20 @@ class Product:
 
     @staticmethod
     def one(track_zeros: bool, tracked: bool = False) -> Product:
-        """The empty product."""
+        """Return the empty product."""
         zero = [mi.Int32(NO_ZERO) for _ in range(len(mi.Spectrum(0)))] if track_zeros else []
         return Product(mi.Spectrum(1), zero, [mi.Spectrum(1)] if tracked else [], [mi.Spectrum(1)] if zero else [])
 
     @staticmethod
     def none(track_zeros: bool) -> Product:
-        """The product of a connection that is not there: neither its value nor its derivative is anything."""
+        """Return the product of a connection that does not exist; its value and derivative are zero."""
         return Product(mi.Spectrum(0), [mi.Int32(MANY_ZEROS) for _ in Product.one(track_zeros).zero])
 
     def times(self, factor: mi.Spectrum, index: mi.UInt32 | mi.Int32, stand_in: mi.Spectrum | float = 1) -> Product:
-        """The product with one more factor, (C,) per lane, that stands at position `index` of the path.
+        """Return the product with one more factor, (C,) per lane, at position `index` of the path.
 
-        `stand_in` takes its place in `nonzero` where it is zero: a positive number of the size of its derivative.
+        `stand_in` replaces the factor in `nonzero` if it is zero. It is a positive number of the size of the factor's
+        derivative.
         """
         tracked = [self.tracked[0] * factor] if self.tracked else []
         factor = dr.detach(factor)
@@ -74,28 +75,32 @@ class Product:
         return Product(nonzero, zero, tracked, raised)
 
     def scaled(self, scale: mi.Float) -> Product:
-        """The product times a positive number that no parameter reaches, such as a roulette weight."""
+        """Return the product times a positive number without derivatives, such as a roulette weight."""
         tracked, raised = ([value * scale for value in values] for values in (self.tracked, self.raised))
         return Product(self.nonzero * scale, self.zero, tracked, raised)
 
     def stored(self) -> Product:
-        """The product without what is of no more use once it has been chosen."""
+        """Return the product without data that is not needed after it has been selected."""
         return replace(self, raised=[])
 
     def value(self) -> mi.Spectrum:
-        """The contribution itself: zero in every channel that has a zero factor. Tracked under naive AD."""
+        """Return the contribution: zero in every channel with a zero factor. Tracked under naive AD."""
         return self.tracked[0] if self.tracked else self._where(self.nonzero, [z == NO_ZERO for z in self.zero])
 
     def differentiable(self) -> mi.Spectrum:
-        """Product of the nonzero factors in every channel whose value or derivative can be nonzero; else zero."""
+        """Return the product of the nonzero factors in channels whose value or derivative can be nonzero, otherwise
+        zero.
+        """
         return self._where(self.nonzero, [z != MANY_ZEROS for z in self.zero])
 
     def weight(self) -> mi.Spectrum:
-        """How much there may be to differentiate behind this product, (C,): what roulette and selection go by."""
+        """Return the weight (C,) for roulette and selection: the possible size of value and derivative behind this
+        product.
+        """
         return self._where(self.raised[0] if self.raised else self.nonzero, [z != MANY_ZEROS for z in self.zero])
 
     def alive(self) -> mi.Bool:
-        """Whether any channel's value or derivative can be nonzero."""
+        """Whether the value or derivative of any channel can be nonzero."""
         return dr.any(self.differentiable() != 0)
 
     @staticmethod

@@ -1,12 +1,12 @@
-"""The film: splatting through its reconstruction filter, the exact adjoint of that, and blocks of its pixels.
+"""The film: splatting through its reconstruction filter, the exact adjoint of splatting, and blocks of pixels.
 
-The adjoint of a splat is looking up dL/dI where it lands:
+The adjoint of a splat looks up dL/dI at the film position:
 
 splat:   I_p += filter_p(u) C        filter_p(u): weight of pixel p for film position u, summing to 1 over pixels
 lookup:  delta = sum_p filter_p(u) dL/dI_p
 
-Into blocks of pixels a film is divided where what is said at a place of it is learned; over its pixels camera paths are
-shared out.
+`Blocks` divides a film into blocks of pixels, for learning by position. `PixelShares` distributes camera paths over its
+pixels.
 """
 
 from __future__ import annotations
@@ -26,11 +26,14 @@ N_COLOR = 3  # a film's block holds R, G, B, perhaps alpha, and a weight that li
 
 
 class Film:
-    """The film of one sensor as light tracing uses it: image blocks to splat into, adjoint images to look up."""
+    """Film of one sensor in light tracing: image blocks for splatting, adjoint images for lookups."""
 
     def __init__(self, sensor: mi.Sensor, whole: bool = False) -> None:
-        """`whole`: each pixel is divided by the part of its filter that lies on the film, as stock integrators do that
-        begin at the sensor; else pixels at the border lack what falls off the film, as for `ptracer`."""
+        """Prepare the film of a sensor.
+
+        With `whole`, each pixel is divided by the part of its filter that lies on the film, as Mitsuba's camera
+        integrators do. Otherwise, pixels at the border lack the light that falls off the film, as with `ptracer`.
+        """
         self.film, self.whole = sensor.film(), whole
         self.integrals = _integrals(self.film.rfilter()) if whole else []
         self.film.prepare([])
@@ -38,7 +41,7 @@ class Film:
         self.offset = self.film.crop_offset()
 
     def block(self) -> mi.ImageBlock:
-        """An empty image block that covers the crop window; filter weights are normalised per splat."""
+        """Return an empty image block that covers the crop window; filter weights are normalised per splat."""
         block = self.film.create_block(normalize=not self.whole, borders=False)
         block.set_offset(self.offset)
         block.set_coalesce(False)  # splats of neighbouring lanes land anywhere
@@ -49,8 +52,8 @@ class Film:
     ) -> None:
         """Add `value` (C,) at film position `u` (pixels, relative to the crop window) through the filter.
 
-        Under naive AD the weights of the pixels move with `u`. Mitsuba divides them by their sum, which it detaches;
-        with `normalization` the sum has its derivative too. A `whole` film divides by no sum.
+        Under naive AD, the weights of the pixels move with `u`. Mitsuba divides them by their sum, and detaches this
+        sum; with `normalization`, the sum is differentiated as well. A `whole` film divides by no sum.
         """
         if normalization and not self.whole:
             total = filter_weights(self.film.rfilter(), u)[2]
@@ -61,7 +64,9 @@ class Film:
         block.put(u + mi.Vector2f(self.offset), color + [mi.Float(0)] * (block.channel_count() - N_COLOR), active)
 
     def taps(self, u: mi.Point2f, normalization: bool) -> list[tuple[mi.Point2u, mi.Float]]:
-        """The pixels that a splat at film position `u` touches, some of them off the film, and the weight of each."""
+        """Return the pixels that a splat at film position `u` touches, some of them off the film, and the weight of
+        each.
+        """
         first, (weights_x, weights_y), total = filter_weights(self.film.rfilter(), u)
         if self.whole:
             total = mi.Float(1)
@@ -75,7 +80,7 @@ class Film:
         ]
 
     def add(self, block: mi.ImageBlock, pixel: mi.Point2u, value: mi.Spectrum, active: mi.Bool) -> None:
-        """Add `value` (C,) to one pixel, where that is on the film."""
+        """Add `value` (C,) to one pixel if it is on the film."""
         inside = active & (pixel.x < self.size.x) & (pixel.y < self.size.y)
         index, channels = dr.fma(pixel.y, mi.UInt32(self.size.x), pixel.x), block.channel_count()
         for c in range(N_COLOR):
@@ -83,9 +88,9 @@ class Film:
             dr.scatter_reduce(dr.ReduceOp.Add, block.tensor().array, one, at, inside)
 
     def develop(self, block: mi.ImageBlock, tangent: bool = False) -> mi.TensorXf:
-        """The image (H, W, channels) in the film's own pixel format; differentiable with respect to the block.
+        """Return the image (H, W, channels) in the film's own pixel format; differentiable with respect to the block.
 
-        The block's `tangent` becomes the image's alike, but for the opaque alpha channel.
+        With `tangent`, the block is a derivative, and the opaque alpha channel has none.
         """
         self.film.prepare([])
         if block.channel_count() == len("RGBAW") and not tangent:
@@ -97,7 +102,7 @@ class Film:
         return image / self._filter_on_film(image.shape) if self.whole else image
 
     def _filter_on_film(self, shape: tuple[int, ...]) -> mi.TensorXf:
-        """What of each pixel's filter lies on the film, for an image of this shape (H, W, channels)."""
+        """Return the part of each pixel's filter that lies on the film, for an image of this shape (H, W, channels)."""
         height, width, channels = shape
         lane = dr.arange(mi.UInt32, height * width * channels)
         pixel = lane // channels
@@ -113,7 +118,7 @@ class Film:
         return mi.TensorXf(part, shape)
 
     def adjoint(self, image_gradient: mi.TensorXf) -> AdjointImage:
-        """dL/d(block) from dL/d(developed image): what `AdjointImage` looks up."""
+        """Return dL/d(block) from dL/d(developed image), for lookups."""
         with dr.resume_grad():
             block = self.block()
             dr.enable_grad(block.tensor())
@@ -136,9 +141,10 @@ class AdjointImage:
         self.filter = film.film.rfilter()
 
     def lookup(self, u: mi.Point2f, active: mi.Bool, normalization: bool = True) -> mi.Spectrum:
-        """delta (C,) at film position `u` (pixels, relative to the crop window), with its derivative by `u` if any.
+        """Return delta (C,) at film position `u` (pixels, relative to the crop window), with its derivative by `u` if
+        enabled.
 
-        Without `normalization` the sum that the filter's weights are divided by has no derivative, as in Mitsuba.
+        Without `normalization`, the sum that divides the filter's weights has no derivative, as in Mitsuba.
         """
         if self.filter.is_box_filter():  # 1 within a pixel, with or without division by its sum
             pixel = mi.Point2u(mi.Point2i(dr.floor(u)))
@@ -175,7 +181,7 @@ STEPS = 256  # of a filter's integral, in each pixel
 
 @functools.lru_cache(maxsize=64)
 def _integrals(rfilter: mi.ReconstructionFilter) -> list[tuple[int, float]]:
-    """The integral of a pixel's filter over each pixel that it reaches into along one axis, by its offset."""
+    """Return the integral of a pixel's filter over each pixel that it reaches along one axis, by offset."""
     taps = int(np.ceil(float(rfilter.radius()) - 0.5))
     x = (np.arange((2 * taps + 1) * STEPS) + 0.5) / STEPS - taps - 0.5
     values = np.array(rfilter.eval(mi.Float(x.astype(np.float32))), np.float64)
@@ -185,8 +191,11 @@ def _integrals(rfilter: mi.ReconstructionFilter) -> list[tuple[int, float]]:
 def filter_weights(
     rfilter: mi.ReconstructionFilter, u: mi.Point2f
 ) -> tuple[mi.Point2i, tuple[list[mi.Float], list[mi.Float]], mi.Float]:
-    """What `ImageBlock.put` does at film position `u`: the first pixel that is touched, weights by column and by row,
-    and their sum over all pixels, off the film too."""
+    """Return the filter weights that `ImageBlock.put` uses at film position `u`.
+
+    They are the first touched pixel, the weights by column and by row, and their sum over all pixels, including those
+    off the film.
+    """
     radius = rfilter.radius()
     taps = int(dr.ceil(2 * radius))
     center = u - 0.5
@@ -209,7 +218,7 @@ class Blocks:
 
     @staticmethod
     def of(size: tuple[int, int]) -> Blocks:
-        """The smallest that are not more than BLOCKS."""
+        """Return the smallest blocks of which there are at most BLOCKS."""
         side = 1
         while -(-size[0] // side) * -(-size[1] // side) > BLOCKS:
             side += 1
@@ -228,19 +237,20 @@ class Blocks:
         return self.rows * self.columns
 
     def block(self, u: mi.Point2f) -> mi.UInt32:
-        """The block that a film position (pixels) lies in, or is nearest to."""
+        """Return the block of a film position (pixels), or the nearest block."""
         column, row = (mi.UInt32(dr.clip(x, 0, n - 1)) // self.side for x, n in ((u.x, self.width), (u.y, self.height)))
         return row * self.columns + column
 
     def areas(self) -> NDArray[np.float64]:
-        """Pixels of each block (rows * columns)."""
+        """Return the number of pixels of each block (rows * columns)."""
         across, down = (np.minimum(self.side, n - np.arange(0, n, self.side)) for n in (self.width, self.height))
         return np.outer(down, across).ravel().astype(np.float64)
 
     def root_means(self, image: mi.TensorXf) -> NDArray[np.float64]:
-        """Of an image (height, width, C) the root of the mean square in each block (rows * columns), times its area.
+        """Return the root mean square of an image (height, width, C) in each block (rows * columns), times the area of
+        the block.
 
-        The unit is the image's largest value; what is not finite counts as 0.
+        The unit is the largest value of the image. Values that are not finite count as 0.
         """
         channels, values = image.shape[2], dr.abs(image.array)
         values = dr.select(dr.isfinite(values), values, 0)
@@ -257,7 +267,7 @@ class Blocks:
 
 
 def film_blocks(sensor: mi.Sensor) -> Blocks:
-    """The blocks of a sensor's film."""
+    """Return the blocks of a sensor's film."""
     size = sensor.film().crop_size()
     return Blocks.of((int(size[0]), int(size[1])))
 
@@ -268,12 +278,12 @@ MOST_SLOTS = 4  # for each pixel
 
 @dataclass
 class PixelShares:
-    """How the camera paths of a pass are shared out over the n pixels of a film, each of which has some.
+    """Distribution of the camera paths of a pass over the n pixels of a film; each pixel has some.
 
-    The first `even` of them (width 1) go to all pixels alike, as many to each or one more. The others go `rounds`
-    times (width 1) through all `slots` (S,), which hold the pixels in order, each in `each` (n,) of them from the one
-    numbered `first` (n,) on. So it is known of each pixel how many it has, and nothing of that is random: what they
-    find is divided by that number, and no noise comes of it.
+    The first `even` paths (width 1) are distributed evenly, with at most one more in some pixels. The other paths go
+    `rounds` times (width 1) through all `slots` (S,), which hold the pixels in order: pixel i has `each[i]` (n,) slots
+    from number `first[i]` (n,) on. The number of paths of a pixel is therefore not random, and dividing by it adds no
+    noise.
     """
 
     slots: mi.UInt32
@@ -284,8 +294,10 @@ class PixelShares:
 
     @staticmethod
     def of(wanted: NDArray[np.floating], paths: int) -> PixelShares | None:
-        """So many paths in proportion to `wanted` (n,), as far as EVEN of them leave that; None where there are not
-        more than pixels."""
+        """Return this number of paths in proportion to `wanted` (n,), with a share of EVEN distributed evenly.
+
+        None if there are not more paths than pixels.
+        """
         n = wanted.size
         spare = min(int((1 - EVEN) * paths), paths - n)  # each pixel has one: what none finds would be lost
         if spare <= 0 or not wanted.sum() > 0:
@@ -306,19 +318,19 @@ class PixelShares:
 
     @staticmethod
     def bytes(pixels: int) -> int:
-        """Bytes of those of one film and one number of paths."""
+        """Return the size in bytes of the distribution for one film and one number of paths."""
         return (MOST_SLOTS + 2) * 4 * pixels
 
     def count(self, pixel: mi.UInt32, active: mi.Bool | bool = True) -> mi.Float:
-        """How many paths a pixel has."""
+        """Return the number of paths of a pixel."""
         return mi.Float(self._of_even(pixel) + self.rounds * dr.gather(mi.UInt32, self.each, pixel, active))
 
     def mean(self) -> mi.Float:
-        """How many a pixel has in the mean."""
+        """Return the mean number of paths of a pixel."""
         return mi.Float(self.even + self.rounds * dr.width(self.slots)) / dr.width(self.each)
 
     def draw(self, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
-        """The pixel of each path, and its number among those of that pixel."""
+        """Return the pixel of each path, and the number of the path in that pixel."""
         n, slots = dr.width(self.each), dr.width(self.slots)
         evenly, behind = lane < self.even, lane - self.even
         slot = behind % slots

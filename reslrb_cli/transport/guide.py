@@ -1,15 +1,15 @@
-"""Guided emission: light paths start where earlier ones had something to say.
+"""Guided emission: light paths start where earlier paths contributed.
 
-A path's start is a point of the unit cube in four dimensions (two numbers for a place or a disk, two for a
-direction) and a number that chooses an emitter. The cube is cut into cells, for each emitter its own. A cell k of
-measure v_k is drawn with probability p_k; within it numbers stay evenly spread, and the path's weight is multiplied by
-v_k / p_k. Whatever an emitter makes of its numbers, the mean of what a path contributes stays what it was, as long as
-every cell can be drawn and p does not depend on the numbers that it is used with.
+The start of a path is a point of the unit cube in four dimensions (two numbers for a place or a disk, two for a
+direction) and a number that selects an emitter. The cube is divided into cells, separately for each emitter. A cell k
+with measure v_k is sampled with probability p_k; numbers are uniform within it, and the path's weight is multiplied by
+v_k / p_k. The expected contribution of a path stays the same for every emitter, if every cell can be sampled and p does
+not depend on the numbers that it is used with.
 
-Drawing takes one look-up: of M slots, cell k owns m_k, and p_k = m_k / M exactly. Lanes draw stratified, lane i of n
-from the i-th n-th of all slots: what is left of the noise is that within cells, and paths that start alike are traced
-side by side. At least GUIDE_UNIFORM of all slots are shared out evenly, so that no table makes a weight larger than
-1 / GUIDE_UNIFORM.
+Sampling takes one lookup: of M slots, cell k owns m_k, and p_k = m_k / M exactly. Lanes are stratified: lane i of n
+samples from the i-th n-th of all slots. Only the noise within cells remains, and similar paths are traced side by side.
+At least a share GUIDE_UNIFORM of all slots is distributed evenly, so that no table makes a weight larger than 1 /
+GUIDE_UNIFORM.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ MOST_EMITTERS = 1024  # that have cells of their own; of more, neighbours share 
 
 
 def make_grid(used: Sequence[bool], weights: Sequence[float], cell_bits: int = CELL_BITS) -> Grid:
-    """A grid of at most 2^cell_bits cells for emitters of these sampling weights, cut along the used numbers."""
+    """Return a grid of at most 2^cell_bits cells for emitters of these sampling weights, divided along the used
+    numbers.
+    """
     if not sum(weights) > 0:
         weights = [1.0] * max(len(weights), 1)  # nothing shines; the grid is of no use, and does no harm
     total = np.append(0.0, np.cumsum(np.asarray(weights, np.float64)))
@@ -48,7 +50,7 @@ def make_grid(used: Sequence[bool], weights: Sequence[float], cell_bits: int = C
 
 
 def apportion(grid: Grid, density: Array) -> Array:
-    """Slots of each cell (int64), at least UNIFORM of its measure, the others in proportion to `density`."""
+    """Return the slots of each cell (int64): at least UNIFORM of its measure, the others in proportion to `density`."""
     least = least_slots(grid)
     # Rounded along the cells' order, so that what one loses a neighbour gains.
     ends = np.cumsum(density, dtype=np.float64)
@@ -63,8 +65,9 @@ def apportion(grid: Grid, density: Array) -> Array:
 
 @dataclass
 class Table:
-    """What is drawn from: of each slot its cell, of each cell v / p, and the grid's edges; which paths go on, and
-    where those that scatter are sent."""
+    """Table for sampling: the cell of each slot, v / p of each cell, the edges of the grid, and data for roulette and
+    aiming.
+    """
 
     slots: mi.UInt32
     weights: mi.Float
@@ -74,7 +77,7 @@ class Table:
 
     @staticmethod
     def of(grid: Grid, counts: Array, survival: Survival | None = None, aim: Aim | None = None) -> Table:
-        """The table in which cell k has `counts[k]` slots, all of them together `grid.slots`."""
+        """Return the table in which cell k has `counts[k]` slots, `grid.slots` in total."""
         weights = grid.measures() * grid.slots  # 0 where there is no slot
         weights /= np.maximum(counts, 1)
         return Table(
@@ -88,7 +91,7 @@ class Table:
 
 @dataclass
 class Drawn:
-    """Numbers that were drawn with a guide: those of emission, the cell they lie in, and v / p of it."""
+    """Random numbers of emission drawn with a guide, with their cell and its v / p."""
 
     choice: mi.Float
     position: mi.Point2f
@@ -99,20 +102,22 @@ class Drawn:
 
 @dataclass
 class Guide:
-    """A table, and how many lanes share it (opaque)."""
+    """Table with the number of lanes that share it (opaque)."""
 
     table: Table
     lanes: mi.UInt64
 
     @staticmethod
     def of(table: Table, width: int) -> Guide:
-        """For a pass of `width` light paths."""
+        """Return a guide for a pass of `width` light paths."""
         return Guide(table, dr.opaque(mi.UInt64, width))
 
     def draw(
         self, grid: Grid, width: int, stream: mi.PCG32, choice: mi.Float, position: mi.Point2f, direction: mi.Point2f,
     ) -> Drawn:  # fmt: skip
-        """Where each of `width` lanes starts; `choice`, `position` and `direction` say where within its cell."""
+        """Draw the start of each of `width` lanes; `choice`, `position` and `direction` determine the place within its
+        cell.
+        """
         lane, jitter = mi.UInt64(dr.arange(mi.UInt32, width)), mi.UInt64(stream.next_uint32())
         slot = ((lane << 32) | jitter) // self.lanes >> (32 - (grid.slots.bit_length() - 1))
         cell = dr.gather(mi.UInt32, self.table.slots, mi.UInt32(slot))

@@ -1,17 +1,17 @@
-"""Points on lamps, shapes that emit, and the rays that leave them.
+"""Points on lamps (shapes that emit), and the rays that leave them.
 
-Light is sampled here (`lamp_ray`) where Mitsuba's own samples are wrong, or lack a derivative:
+`lamp_ray` samples light if Mitsuba's own samples are wrong, or lack a derivative:
 
-sphere             Mitsuba turns the points of a sphere with its `to_world`, and not their normals
-directionalarea    it remembers the area that the shape had when it was loaded
-mesh that moves    it draws a face in proportion to its area, and so divides by the area of the whole. Both are
-                   constants to it; the density on face f is P_f / A_f(theta), of which P_f alone is one
-textured mesh that moves
-                   its points are looked up by a ray in the plane of texture coordinates, and Mitsuba differentiates
-                   them as if they moved along that ray
-textured lamp whose texture is differentiated
-                   it draws texels in proportion to their radiance, and so none that are black, which have derivatives
-                   as large as any
+sphere             Mitsuba rotates the points of a sphere with its `to_world`, but not their normals
+directionalarea    it keeps the area that the shape had when it was loaded
+moving mesh        it samples a face in proportion to its area, and divides by the area of the mesh. Both are constants
+                   to it; the density on face f is P_f / A_f(theta), and only P_f is constant
+textured moving mesh
+                   it finds points by a ray in the plane of texture coordinates, and differentiates them as if they
+                   moved along this ray
+differentiated texture
+                   it samples texels in proportion to their radiance, and never black texels, whose derivatives are as
+                   large as any
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ def lamp_ray(
     lamp: Lamp, areas: mi.Float | None, time: mi.Float, wavelength_sample: mi.Float, position: mi.Point2f,
     direction: mi.Point2f, active: mi.Bool, evened: bool = False,
 ) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
-    """A ray that leaves the lamp, and radiance over density (C,), from the numbers that Mitsuba takes.
+    """Return a ray that leaves the lamp, and radiance / density (C,), from the same random numbers as Mitsuba.
 
-    `areas` are the sums of `sums_of_areas` for a mesh whose faces move, else None; `evened`: black texels are drawn,
-    too.
+    `areas` are the sums of `sums_of_areas` for a mesh whose faces move, else None. With `evened`, black texels are
+    sampled, too.
     """
     si, weight = lamp_point(lamp, areas, time, position, active, evened)
     _, radiance = lamp.emitter.sample_wavelengths(si, wavelength_sample, active)
@@ -48,7 +48,7 @@ def lamp_ray(
 def lamp_point(
     lamp: Lamp, areas: mi.Float | None, time: mi.Float, sample: mi.Point2f, active: mi.Bool, evened: bool = False
 ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
-    """A point of the lamp, and the reciprocal of its density; both move with the lamp."""
+    """Return a point on the lamp, and the reciprocal of its density; both move with the lamp."""
     if lamp.texture is not None and lamp.has_faces:
         return _textured_point(lamp.shape, lamp.texture, sample, active, evened)
     if lamp.texture is not None and evened:
@@ -72,7 +72,8 @@ def lamp_point(
 def _textured_point(
     mesh: mi.Mesh, texture: mi.Texture, sample: mi.Point2f, active: mi.Bool, evened: bool
 ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
-    """The point that Mitsuba draws from a texture, or any, which stays where it is within its face as that moves."""
+    """Return a point that Mitsuba samples from a texture, or uniformly; the point keeps its place in its moving face.
+    """
     uv, density = _any_uv(texture, sample, active) if evened else texture.sample_position(sample, active)
     active = active & (density != 0)
     there = mesh.eval_parameterization(uv, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
@@ -84,7 +85,7 @@ def _textured_point(
 def _any_point(
     shape: mi.Shape, texture: mi.Texture, time: mi.Float, sample: mi.Point2f, active: mi.Bool
 ) -> tuple[mi.PositionSample3f, mi.Float]:
-    """What Mitsuba's emitter draws from a texture on a shape, or any other point of it."""
+    """Return a point that Mitsuba's emitter samples from a texture on a shape, or in part any other point."""
     uv, density = _any_uv(texture, sample, active)
     there = shape.eval_parameterization(uv, mi.RayFlags.All, active)
     there.time = time
@@ -92,12 +93,14 @@ def _any_point(
 
 
 def _weight(there: mi.SurfaceInteraction3f, density: mi.Float, active: mi.Bool) -> mi.Float:
-    """The reciprocal of the density over area of a point that was drawn with this density of texture coordinates."""
+    """Return the reciprocal of the density per area of a point that was sampled with this density of texture
+    coordinates.
+    """
     return dr.select(active & there.is_valid(), dr.norm(dr.cross(there.dp_du, there.dp_dv)) / density, 0)
 
 
 def _any_uv(texture: mi.Texture, sample: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Float]:
-    """Texture coordinates from a mixture of the texture's own density and the uniform one, and their density."""
+    """Return texture coordinates from a mixture of the texture's density and the uniform one, and their density."""
     with dr.suspend_grad():
         even = sample.x < DEFENSIVE
         x = dr.select(even, sample.x / DEFENSIVE, (sample.x - DEFENSIVE) / (1 - DEFENSIVE))
@@ -110,14 +113,14 @@ def _any_uv(texture: mi.Texture, sample: mi.Point2f, active: mi.Bool) -> tuple[m
 
 
 def drawn_face(areas: mi.Float, sample: mi.Float) -> mi.UInt32:
-    """The face that Mitsuba draws with this number, by these sums of areas."""
+    """Return the face that Mitsuba samples with this number, by these sums of areas."""
     last = dr.width(areas) - 1
     value = sample * dr.gather(mi.Float, areas, mi.UInt32(last))
     return dr.binary_search(0, last, lambda index: dr.gather(mi.Float, areas, index) < value)
 
 
 def sums_of_areas(lamps: Sequence[Lamp]) -> list[mi.Float]:
-    """Of each lamp, a mesh, the areas of its first faces, summed: (F,), evaluated and detached."""
+    """Return the cumulative areas of the faces of each lamp, a mesh: (F,), evaluated and detached."""
     with dr.suspend_grad():
         found = [dr.cumsum(face_area(lamp.shape, dr.arange(mi.UInt32, lamp.shape.face_count()))) for lamp in lamps]
         dr.eval(found)
@@ -125,6 +128,6 @@ def sums_of_areas(lamps: Sequence[Lamp]) -> list[mi.Float]:
 
 
 def face_area(mesh: mi.Mesh, face: mi.UInt32) -> mi.Float:
-    """The area of a face of a mesh."""
+    """Return the area of a face of a mesh."""
     a, b, c = (mesh.vertex_position(vertex) for vertex in mesh.face_indices(face))
     return 0.5 * dr.norm(dr.cross(b - a, c - a))

@@ -1,4 +1,4 @@
-"""What one walk has to do, decided before it is traced: what a scene does not need never reaches the kernel."""
+"""Plan of a walk, made before tracing: features that a scene does not need are not compiled."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ SLOTS_OF_SEVERAL = 8  # where emitters have unequal shares, which are rounded up
 
 @dataclass(frozen=True)
 class Grid:
-    """How the cube is cut: into 2^bits along each of its four numbers, those of the place first.
+    """Grid of the cells: the cube is divided into 2^bits along each of its four numbers, those of the place first.
 
-    `edges` (E + 1) are where the share of each emitter (or of some together) in the choosing number begins and ends.
+    `edges` (E + 1) are the bounds of the choosing number for each emitter, or for groups of emitters.
     """
 
     bits: tuple[int, int, int, int]
@@ -32,39 +32,42 @@ class Grid:
 
     @property
     def emitters(self) -> int:
-        """How many emitters, or groups of them, have cells of their own."""
+        """Number of emitters, or groups of emitters, with their own cells."""
         return len(self.edges) - 1
 
     @property
     def cells(self) -> int:
-        """Cells of all emitters; those of one stand together."""
+        """Number of cells of all emitters; those of one emitter are contiguous."""
         return self.emitters << sum(self.bits)
 
     @property
     def slots(self) -> int:
-        """Slots, a power of two."""
+        """Number of slots, a power of two."""
         each = SLOTS_PER_CELL if self.emitters == 1 else SLOTS_OF_SEVERAL
         return 1 << (each * self.cells - 1).bit_length()
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of an array of all cells: the emitter, then the four numbers, the last of which comes first in a cell's index
-        and so last here."""
+        """Shape of an array of all cells: the emitter, then the four numbers in reverse order, because the first number
+        varies fastest in a cell's index.
+        """
         return (self.emitters, *(1 << bits for bits in reversed(self.bits)))
 
     def measures(self) -> Array:
-        """v_k of all cells, float64, not to be written to; they sum to 1."""
+        """Return v_k of all cells, float64, read-only; they sum to 1."""
         return _measures(self)
 
     def coarser(self, cells: float) -> Grid:
-        """The same cut into at most so many cells, or one of each emitter; each is made of this one's."""
+        """Return the same grid with at most this number of cells, or one per emitter; each is a union of cells of this
+        grid.
+        """
         bits = list(self.bits)
         while sum(bits) > 0 and self.emitters << sum(bits) > cells:
             bits[3 - bits[::-1].index(max(bits))] -= 1  # the one that was cut last
         return Grid((bits[0], bits[1], bits[2], bits[3]), self.edges)
 
     def summed(self, values: Array, coarser: Grid) -> Array:
-        """Of values for these cells (cells,) the sums over each coarser one's, of the same type."""
+        """Return the sums of values (cells,) over the cells of each coarser cell, of the same type."""
         result = values.reshape(self.shape)
         for axis, few in enumerate(coarser.shape):
             while result.shape[axis] > few:
@@ -73,7 +76,7 @@ class Grid:
         return result.ravel()
 
     def shared_out(self, values: Array, coarser: Grid) -> Array:
-        """Of values for coarser cells, each one's spread evenly over its own; the inverse of `summed`."""
+        """Return the values of coarser cells, distributed evenly over their cells; the inverse of `summed`."""
         result = values.reshape(coarser.shape) * (coarser.cells / self.cells)
         for axis, (fine, few) in enumerate(zip(self.shape, coarser.shape, strict=True)):
             result = result.repeat(fine // few, axis)
@@ -90,7 +93,7 @@ def _measures(grid: Grid) -> Array:
 
 @functools.lru_cache(maxsize=4)
 def least_slots(grid: Grid) -> Array:
-    """Slots that each cell has at least, float64: UNIFORM of its measure."""
+    """Return the minimum slots of each cell, float64: UNIFORM of its measure."""
     measures = grid.measures()
     result = np.where(measures > 0, np.maximum(np.ceil(GUIDE_UNIFORM * grid.slots * measures - 1e-6), 1), 0)
     result.setflags(write=False)
@@ -102,9 +105,9 @@ UNBOUNDED = 0xFFFFFFFF
 
 @dataclass(frozen=True)
 class Plan:
-    """Static choices of a walk; all of them Python values, none of them part of a kernel's data.
+    """Static choices of a walk: Python values that are not part of a kernel's data.
 
-    `max_depth`, `rr_depth` count path edges as Mitsuba's `ptracer` does; `max_depth` is UNBOUNDED for -1.
+    `max_depth` and `rr_depth` count path edges as Mitsuba's `ptracer` does; `max_depth` is UNBOUNDED for -1.
     """
 
     needs: SceneNeeds
@@ -151,22 +154,22 @@ class Plan:
 
     @property
     def aimed(self) -> bool:
-        """Whether guided paths are aimed."""
+        """Whether guided paths are aimed at visible points."""
         return self.aims and not self.attached
 
     @property
     def weighs(self) -> bool:
-        """Whether what a path finds is weighed against what paths from the other side find."""
+        """Whether contributions are weighted against paths from the other side."""
         return self.paths == "both"
 
     @property
     def passes_lamps(self) -> bool:
-        """Whether connections to the sensor pass lamps, which are hidden from its rays."""
+        """Whether connections to the sensor pass through lamps, which are hidden from its rays."""
         return self.weighs and self.hide_emitters and not self.camera and bool(self.needs.lamps)
 
     @property
     def samples_emitters(self) -> bool:
-        """Whether there is an emitter that next event estimation can find."""
+        """Whether next event estimation can find an emitter."""
         return any(name != "DirectionalArea" for name in self.needs.emitters)
 
     @property
@@ -181,30 +184,30 @@ class Plan:
 
     @property
     def roulette(self) -> bool:
-        """Whether roulette on throughput can end a path before the depth limit does."""
+        """Whether roulette on throughput can end a path before the depth limit."""
         return self.rr_depth < self.max_depth - 1
 
     @property
     def plays_roulette(self) -> bool:
-        """Whether light paths play any Russian roulette: on throughput, or the learned one of guided paths."""
+        """Whether light paths use Russian roulette: on throughput, or the learned roulette of guided paths."""
         return self.roulette or self.grid is not None
 
     @property
     def visible_emission(self) -> bool:
-        """Whether any emitter can be seen directly and is to be."""
+        """Whether any emitter can be seen directly, and is not hidden."""
         return self.needs.has_visible_emitters and not self.hide_emitters and self.max_depth > 0
 
     @property
     def small_lamps(self) -> tuple[Lamp, ...]:
-        """Lamps smaller than a pixel, which are seen directly by points on them in place of rays through the pixels.
+        """Lamps smaller than a pixel, which are seen through points on them instead of rays through the pixels.
 
-        None where masks have derivatives, which primary rays take.
+        Empty if masks have derivatives, which need primary rays.
         """
         return self.needs.small_lamps if self.visible_emission and not self.differentiate_null else ()
 
     @property
     def environment_map(self) -> bool:
-        """Whether an environment map emits, whose rays we place ourselves."""
+        """Whether an environment map emits, whose rays `emission.py` samples."""
         return (
             self.needs.environment is not None
             and self.needs.emitters[self.needs.environment] == "EnvironmentMapEmitter"
@@ -212,7 +215,7 @@ class Plan:
 
     @property
     def placed_lamps(self) -> tuple[Lamp, ...]:
-        """Shapes whose light we place ourselves."""
+        """Shapes whose light `lamps.py` samples."""
         return tuple(
             lamp
             for lamp in self.needs.lamps
@@ -224,7 +227,7 @@ class Plan:
 
     @property
     def reshaped_lamps(self) -> tuple[Lamp, ...]:
-        """Those of them, meshes, whose faces move, and are drawn in proportion to their areas."""
+        """Meshes among the placed lamps whose faces move, and are sampled in proportion to their areas."""
         return tuple(lamp for lamp in self.needs.lamps if lamp.faces_by_area and lamp.shape in self.moving_shapes)
 
     @property
@@ -236,22 +239,23 @@ class Plan:
 
     @property
     def passage_in_gradient(self) -> bool:
-        """Whether a gradient asks for the masks between a vertex and the sensor: their derivative, or, beside a zero
-        factor, their transmittance."""
+        """Whether a gradient needs the masks between a vertex and the sensor: their derivative, or, beside a zero
+        factor, their transmittance.
+        """
         return self.needs.has_null and (self.differentiate_null or self.track_zeros)
 
     @property
     def keep_geometry(self) -> bool:
-        """Whether a vertex that is kept has to be found again on its surface."""
+        """Whether a stored vertex must be found again on its surface."""
         return self.attached or self.needs.bsdfs_read_geometry or self.passage_in_gradient
 
     @property
     def sole_bsdf(self) -> mi.BSDFPtr | None:
-        """The one BSDF that is differentiated (a pointer), where there is just one; otherwise None."""
+        """The only differentiated BSDF (a pointer) if there is just one; otherwise None."""
         return mi.BSDFPtr(self.only_bsdfs[0]) if len(self.only_bsdfs) == 1 else None
 
     def differentiates(self, bsdf: mi.BSDFPtr) -> mi.Bool:
-        """Lanes in which the BSDF (a pointer) has anything to differentiate."""
+        """Return the lanes in which the BSDF (a pointer) has a differentiated parameter."""
         if not self.only_bsdfs:
             return mi.Bool(self.differentiate_bsdfs)
         result = bsdf == mi.BSDFPtr(self.only_bsdfs[0])
@@ -260,12 +264,13 @@ class Plan:
         return result
 
     def concerns(self, bsdf: mi.BSDFPtr) -> mi.Bool:
-        """Lanes in which a vertex with this BSDF (a pointer) has anything to differentiate, its connection's passage
-        through masks included."""
+        """Return the lanes in which a vertex with this BSDF (a pointer) has something to differentiate, including masks
+        on its connection.
+        """
         return mi.Bool(True) if self.differentiate_null else self.differentiates(bsdf)
 
     def moves(self, shape: mi.ShapePtr) -> mi.Bool:
-        """Lanes in which the shape moves by itself."""
+        """Return the lanes in which the shape itself moves."""
         result = mi.Bool(False)
         for other in self.moving_shapes:
             result |= shape == mi.ShapePtr(other)
@@ -274,7 +279,9 @@ class Plan:
     def differentiating(
         self, bsdfs: bool, emission: bool, track_zeros: bool, only_bsdfs: tuple[mi.BSDF, ...] = ()
     ) -> Plan:
-        """The same plan for a step that differentiates these; `track_zeros`: some of their factors may be zero."""
+        """Return the same plan for a step that differentiates these; with `track_zeros`, some of their factors may be
+        zero.
+        """
         delta, null = self.needs.has_delta_lobes, self.needs.has_null
         if only_bsdfs:
             flags = [int(bsdf.flags()) for bsdf in only_bsdfs]
@@ -292,5 +299,5 @@ class Plan:
 
 
 def make_plan(needs: SceneNeeds, max_depth: int, rr_depth: int, hide_emitters: bool) -> Plan:
-    """Plan of a walk through a scene with these needs; `max_depth` may be -1."""
+    """Return the plan of a walk through a scene with these needs; `max_depth` may be -1."""
     return Plan(needs, UNBOUNDED if max_depth < 0 else max_depth, rr_depth, hide_emitters)

@@ -1,17 +1,16 @@
-"""Russian roulette: on throughput, as in `ptracer`, and learned, by where a path goes.
+"""Russian roulette on throughput, as in `ptracer`, and learned roulette, by the direction of a path.
 
-Learned: paths that go where earlier ones had little left to say end early. The scene's bounding box is cut into cubes,
-and the directions of each cube into octants. A path that leaves a vertex with throughput w (the largest channel,
-emission and the weights of earlier roulette included) goes on with probability
+The learned roulette ends paths in directions where earlier paths contributed little. The bounding box of the scene is
+divided into cubes, and the directions in each cube into octants. A path that leaves a vertex with throughput w (the
+largest channel, including emission and earlier roulette) survives with probability
 
-    q = min(1, max(LEAST, w s))        s: the number of the cell that the vertex and the new direction lie in
+    q = min(1, max(LEAST, w s))        s: the value of the cell of the vertex and the new direction
 
-and counts for 1 / q if it does. The mean of whatever is computed from paths stays what it was for any s that does not
-depend on the random numbers that it is used with. How s is learned says `guiding/collect.py`.
+and its weight is divided by q. The expected value does not change for any s that does not depend on the random numbers
+that it is used with. `guiding/collect.py` explains how s is learned.
 
-The more a path has been weighted up, the larger is its w, and so its q: since q is at least w s where it is below 1, no
-throughput is raised beyond 1 / s_0, where s is nowhere below s_0. Roulette on throughput alone is played beside it from
-`rr_depth` on, so that paths end that nothing else would end.
+Paths with larger weights have a larger w, and so a larger q. Since q is at least w s where it is below 1, no throughput
+is raised beyond 1 / s_0, where s_0 is the smallest s. Roulette on throughput also applies from `rr_depth` on.
 """
 
 from __future__ import annotations
@@ -38,8 +37,9 @@ LEAST = 0.5  # the smallest probability of going on
 
 @dataclass
 class Survival:
-    """`chances` (CELLS) are s of all cells; `corner` is where the box begins, `cubes` how many there are to a unit of
-    length along each axis. The latter two are opaque."""
+    """Learned roulette: `chances` (CELLS) are s of all cells, `corner` is the lower corner of the box, and `cubes` the
+    number of cubes per unit length along each axis. The latter two are opaque.
+    """
 
     chances: mi.Float
     corner: mi.Point3f
@@ -47,7 +47,7 @@ class Survival:
 
     @staticmethod
     def of(box: Array, chances: Array) -> Survival:
-        """For a box (2, 3), its lower and its upper corner."""
+        """Return the roulette for a box (2, 3), given by its lower and its upper corner."""
         cubes = (1 << BITS) / np.where(box[1] > box[0], box[1] - box[0], np.inf)
         own = own_memory(mi.Float, chances.astype(np.float32))
         corner, per_unit = (
@@ -58,11 +58,11 @@ class Survival:
 
     @staticmethod
     def certain() -> Survival:
-        """That of somebody who has learned nothing: all paths go on."""
+        """Return a roulette that no path ends by."""
         return Survival.of(np.zeros((2, 3)), np.full(CELLS, np.inf))
 
     def cell(self, o: mi.Point3f, d: mi.Vector3f) -> mi.UInt32:
-        """The cell of a ray that leaves `o`; what lies outside of the box counts to the nearest cube."""
+        """Return the cell of a ray that leaves `o`; positions outside of the box belong to the nearest cube."""
         place, most = dr.detach((o - self.corner) * self.cubes), (1 << BITS) - 1
         result = mi.UInt32(0)
         for k in range(3):
@@ -73,24 +73,24 @@ class Survival:
         return result
 
     def probability(self, o: mi.Point3f, d: mi.Vector3f, throughput: mi.Float) -> mi.Float:
-        """q of a ray that leaves `o` along `d`; detached."""
+        """Return q of a ray that leaves `o` along `d`; detached."""
         # A throughput that is not a number has q = LEAST: it is to be seen, not to vanish.
         chance = dr.gather(mi.Float, self.chances, self.cell(o, d))
         return dr.fmin(dr.fmax(dr.detach(throughput) * chance, LEAST), 1)
 
 
 def box_of(scene: mi.Scene) -> Array:
-    """The box (2, 3) of a scene's shapes, float32; of size 0 where it has none."""
+    """Return the box (2, 3) of a scene's shapes, float32; of size 0 without shapes."""
     bounds = scene.bbox()
     box = np.array([np.array(bounds.min).ravel(), np.array(bounds.max).ravel()], np.float32)
     return box if np.isfinite(box).all() and (box[1] >= box[0]).all() else np.zeros((2, 3), np.float32)
 
 
 def first_eta(light: mi.Float, guided: mi.Float | None) -> mi.Float:
-    """What a path's index of refraction begins with, for roulette alone: larger where emission, `light`, is dim.
+    """Return the initial index of refraction of a path for roulette: larger if its emission `light` is dim.
 
-    Else light of small lamps, or in large units, would end at once. `guided` is what a guide has brought in, without
-    which this is computed: paths that it has found would end for being many.
+    Otherwise, light of small lamps, or in large units, would end at once. `guided` is the weight of a guide and is
+    excluded, because paths that the guide samples often would end otherwise.
     """
     if guided is None:
         return dr.rsqrt(dr.clip(light, DIMMEST, 1))
@@ -101,7 +101,7 @@ def play(
     plan: Plan, survival: Survival | None, depth: mi.UInt32, throughput: mi.Float, eta: mi.Float, o: mi.Point3f,
     d: mi.Vector3f, number: mi.Float,
 ) -> tuple[mi.Bool, mi.Float]:  # fmt: skip
-    """Where a path goes on from vertex `depth`, which it leaves with the ray (o, d), and what it then counts for."""
+    """Return whether a path survives at vertex `depth`, which it leaves with the ray (o, d), and its weight."""
     q, playing = mi.Float(1), mi.Bool(False)
     if plan.roulette:
         q = dr.minimum(throughput * dr.square(eta), LIMIT)

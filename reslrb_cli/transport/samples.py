@@ -1,11 +1,10 @@
-"""The samples of a light-traced image, in passes: which random numbers, how many light paths, for which film.
+"""Samples of an image in passes: random numbers, number of paths, and film.
 
-Images and gradients of several passes are added up. In single precision a sum over all samples would lose the last of
-them (1e8 samples: a quarter of a pixel), so each pass has a block and gradients of its own, and these are added to one
-another.
+Images and gradients of several passes are added. In single precision, a sum over all samples would lose the last ones
+(1e8 samples: a quarter of a pixel). Each pass therefore has its own block and gradients.
 
-Random numbers are drawn in the order of Mitsuba's `ptracer`, used or not: from one seed both trace the same paths.
-Those of low discrepancy (`sobol.py`) take the place of the first.
+Random numbers are drawn in the order of Mitsuba's `ptracer`, used or not, so that both trace the same paths from one
+seed. Low-discrepancy numbers (`sobol.py`) replace the first ones.
 """
 
 from __future__ import annotations
@@ -30,8 +29,10 @@ def in_passes(
     samples: list[Samples], work: Callable[[Samples, mi.ImageBlock | None], None], block: mi.ImageBlock | None,
     params: mi.SceneParameters | None = None,
 ) -> None:  # fmt: skip
-    """Call `work(part, block)` for each pass. It splats into the block (None: nothing), and differentiates `params`
-    (None: nothing)."""
+    """Call `work(part, block)` for each pass, which splats into the block and adds gradients of `params`.
+
+    `block` is None if nothing is splatted, and `params` is None if nothing is differentiated.
+    """
     if len(samples) == 1:
         work(samples[0], block)
         return
@@ -49,7 +50,7 @@ def in_passes(
 
 
 class GradientSum:
-    """Sums the parameters' gradients over passes, apart from where each pass adds its own."""
+    """Sum of the parameters' gradients over passes, separate from the gradients of the current pass."""
 
     def __init__(self, params: mi.SceneParameters) -> None:
         with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
@@ -58,7 +59,7 @@ class GradientSum:
         self.totals: list[dr.ArrayBase] = []
 
     def take(self) -> None:
-        """Take what has been added to the gradients since the last time."""
+        """Add the current gradients of the parameters to the sums, and clear them."""
         with dr.resume_grad():
             found = [dr.detach(dr.grad(value)) for value in self.values]
             self.totals = [a + b for a, b in zip(self.totals, found, strict=True)] if self.totals else found
@@ -67,19 +68,19 @@ class GradientSum:
         finish_pass(self.totals)
 
     def put(self) -> None:
-        """Give the sums to the parameters."""
+        """Write the sums to the gradients of the parameters."""
         with dr.resume_grad():
             for value, total in zip(self.values, self.totals, strict=True):
                 dr.accum_grad(value, total)
 
 
 def _arrays(value: dr.ArrayBase | mi.AffineTransform4f) -> list[dr.ArrayBase]:
-    """The arrays of a parameter that gradients can be added to: a transform, which cannot be added, has two."""
+    """Return the arrays of a parameter that have gradients; a transform, which cannot be added, has two."""
     return [value.matrix, value.inverse_transpose] if isinstance(value, mi.AffineTransform4f) else [value]
 
 
 def finish_pass(*results: object) -> None:
-    """Evaluate what a pass yields, and wait for it: memory of passes that are still queued would pile up."""
+    """Evaluate the result of a pass and wait for it; queued passes would otherwise accumulate memory."""
     dr.eval(*results)
     dr.sync_thread()
 
@@ -97,7 +98,7 @@ NET_STREAM = 0x5EC0E  # scrambles of numbers of low discrepancy
 
 @dataclass
 class Numbers:
-    """What one segment draws: a point on the sensor's aperture, then two numbers and one for the BSDF."""
+    """Random numbers of one segment: a point on the sensor's aperture, then two numbers and one for the BSDF."""
 
     aperture: mi.Point2f
     bsdf_2d: mi.Point2f
@@ -105,11 +106,11 @@ class Numbers:
 
     @staticmethod
     def draw(sampler: mi.Sampler, active: mi.Bool) -> Numbers:
-        """The numbers of the next segment. Roulette's follows them, and is drawn by the walk."""
+        """Return the numbers of the next segment. The walk then draws the number of roulette."""
         return Numbers(sampler.next_2d(active), sampler.next_2d(active), sampler.next_1d(active))
 
     def of_early(self, early: list[Early], depth: mi.UInt32) -> Numbers:
-        """The same, but those for the BSDF as `early` has them for the first vertices; the first is of depth 1."""
+        """Return the same numbers, with those of `early` for the BSDFs of the first vertices; the first has depth 1."""
         bsdf = Early(self.bsdf_2d, self.bsdf_1d)
         for bounce, own in enumerate(early):
             bsdf = dr.select(depth == bounce + 1, own, bsdf)
@@ -118,7 +119,7 @@ class Numbers:
 
 @dataclass
 class Early:
-    """What the BSDF of one of the first vertices has, known before the path is traced."""
+    """Random numbers of the BSDF of one of the first vertices, known before the path is traced."""
 
     bsdf_2d: mi.Point2f
     bsdf_1d: mi.Float
@@ -126,11 +127,11 @@ class Early:
 
 @dataclass
 class Samples:
-    """The samples of one pass. `seed` is an opaque UInt32; `width` is the number of light paths.
+    """Samples of one pass: `width` light paths, or camera paths if the plan says so. `seed` is an opaque UInt32.
 
-    They are light paths, or, where the plan says so, camera paths, of which `width` is the number then.
-    `scale` (width 1) brings a sum over light paths to an image; of all samples of that image, these are the part
-    `fraction` (width 1). With a `guide` emission is drawn from its table, with a `net` numbers are of low discrepancy.
+    `scale` (width 1) normalises a sum over paths to an image. The pass contains the part `fraction` (width 1) of all
+    samples of this image. With a `guide`, emission is sampled from its table. With a `net`, numbers are of low
+    discrepancy.
     """
 
     scene: mi.Scene
@@ -160,13 +161,15 @@ class Samples:
         self._areas = sums_of_areas(lamps) if lamps else []
 
     def areas(self, lamp: Lamp) -> mi.Float | None:
-        """Sums of the areas of a lamp's faces, where these move; else None."""
+        """Return the cumulative areas of a lamp's faces if these move, else None."""
         reshaped = self.plan.reshaped_lamps
         return self._areas[reshaped.index(lamp)] if lamp in reshaped else None
 
     def ratio_at(self, u: mi.Point2f) -> mi.Float:
-        """All light paths over the camera paths of the pixel that film position `u` lies in; off the film over those of
-        one in the mean."""
+        """Return the number of all light paths divided by that of the camera paths of the pixel at film position `u`.
+
+        Off the film, the mean number of camera paths per pixel is used.
+        """
         assert self.ratio is not None
         if self.shares is None:
             return self.ratio
@@ -177,7 +180,7 @@ class Samples:
         return self.ratio * dr.select(inside, mean / self.shares.count(pixel, inside), 1)
 
     def sampler(self) -> mi.Sampler:
-        """A sampler at the beginning of these samples' stream."""
+        """Return a sampler at the beginning of the stream of these samples."""
         if self.plan.paths != "light":  # whose number of paths may be any; the sensor's may ask for so many in a pixel
             sampler = mi.load_dict({"type": "independent"})
         else:
@@ -188,28 +191,31 @@ class Samples:
         return sampler
 
     def sides(self) -> list[Samples]:
-        """These samples, and the camera paths beside them."""
+        """Return these samples, and the camera paths that go with them."""
         return [self] if self.camera is None else [self, self.camera]
 
     def stream(self, name: int) -> mi.PCG32:
-        """Random numbers beside the sampler's own.
+        """Return a stream of random numbers independent of the sampler.
 
-        Hashed for each lane, as Mitsuba's samplers do: generators that differ in their sequence's number alone begin
-        with numbers that are evenly spread over the lanes, and off their mean alike for all seeds.
+        It is hashed for each lane, as in Mitsuba's samplers. Generators that differ only in the number of their
+        sequence start with numbers that are evenly distributed over the lanes, with the same offset for all seeds.
         """
         seed = mi.sample_tea_32(self.seed, mi.UInt32(name))[0]
         state, sequence = mi.sample_tea_32(seed, dr.arange(mi.UInt32, self.width))
         return mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))
 
     def emission_numbers(self, sampler: mi.Sampler) -> tuple[mi.Float, mi.Point2f, mi.Point2f]:
-        """What says where paths start: the choice of an emitter, the place, the direction; in `ptracer`'s order."""
+        """Return the numbers of emission in the order of `ptracer`: the choice of an emitter, the place, the direction.
+        """
         choice, place, direction = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
         if self.net is None:
             return choice, place, direction
         return self._points(choice, place, direction)[1]
 
     def early_numbers(self) -> list[Early]:
-        """What the BSDFs of the first vertices have, where that is of low discrepancy; else nothing."""
+        """Return the numbers of the BSDFs of the first vertices if they are of low discrepancy; otherwise an empty
+        list.
+        """
         if self.net is None:
             return []
         assert self.plan.sequence is not None
@@ -220,7 +226,10 @@ class Samples:
     def _points(
         self, choice: mi.Float, place: mi.Point2f, direction: mi.Point2f
     ) -> tuple[Points, tuple[mi.Float, mi.Point2f, mi.Point2f]]:
-        """The net's points behind those of emission, and the latter, of these independent numbers."""
+        """Return the points of the net, after those of emission have been drawn, and the numbers of emission.
+
+        The arguments are the corresponding independent numbers.
+        """
         which = self.plan.sequence
         assert which is not None
         # A guide stratifies the lanes itself, emitters among them: where in its share the choice lies says nothing.
@@ -234,7 +243,7 @@ class Samples:
         return points, (choice, place, direction)
 
     def drawn(self, choice: mi.Float, position: mi.Point2f, direction: mi.Point2f) -> Drawn | None:
-        """Where the guide has each path start, of emission's own numbers; None without a guide."""
+        """Return the start of each path from the guide, for emission's own numbers; None without a guide."""
         if self.guide is None:
             return None
         assert self.plan.grid is not None
@@ -242,12 +251,12 @@ class Samples:
         return self.guide.draw(self.plan.grid, self.width, stream, choice, position, direction)
 
     def numbers(self, name: int) -> NumberStream:
-        """Random numbers beside the sampler's own: the light paths are those of `ptracer` with or without them."""
+        """Return a stream of numbers independent of the sampler, so that the light paths remain those of `ptracer`."""
         return NumberStream(self.stream(name))
 
 
 class NumberStream:
-    """The two methods of a Mitsuba sampler that emission asks for, over a bare generator."""
+    """The two sampler methods that emission needs, for a plain generator."""
 
     def __init__(self, generator: mi.PCG32) -> None:
         self.generator = generator
@@ -264,12 +273,12 @@ def passes(
     table: Table | None = None, light_share: float = 1, emitters: EmitterDensities | None = None,
     shares: Callable[[int], PixelShares | None] | None = None,
 ) -> list[Samples]:  # fmt: skip
-    """All samples of an image, in passes of `spp_per_pass` samples per pixel, which must divide `spp`, or less.
+    """Return all samples of an image, in passes of at most `spp_per_pass` samples per pixel, which must divide `spp`.
 
-    The first pass has the seed itself, so that it traces what `ptracer` does. With a `table`, which belongs to the
-    plan's grid, emission is drawn from that. Of the samples of each pass `light_share` are light paths where the plan
-    has both kinds of paths, and then the `emitters` have their densities. Raises ValueError for too many passes, or
-    paths in one pass.
+    The first pass has the seed itself, so that it traces the same paths as `ptracer`. With a `table` for the plan's
+    grid, emission is sampled from the table. If the plan has both kinds of paths, a share `light_share` of each pass
+    are light paths, and `emitters` contains their densities. Raises ValueError for too many passes, or too many paths
+    in one pass.
     """
     unit = spp if spp_per_pass is None else min(spp_per_pass, spp)
     if spp % unit:
@@ -305,7 +314,7 @@ def passes(
 
 
 def _seeded(samples: Samples, seed: mi.UInt32) -> Samples:
-    """The same samples with another seed."""
+    """Return the same samples with another seed."""
     camera = samples.camera
     if camera is not None:
         apart = mi.sample_tea_32(seed, mi.UInt32(CAMERA_STREAM))[0]
@@ -318,7 +327,7 @@ def _camera_samples(
     plan: Plan, scene: mi.Scene, sensor: mi.Sensor, film: Film, spp: int, width: int, fraction: mi.Float,
     shares: Callable[[int], PixelShares | None] | None,
 ) -> Samples:  # fmt: skip
-    """So many camera paths, which are this `fraction` of an image's samples."""
+    """Return `width` camera paths, which are this `fraction` of an image's samples."""
     if width > PASS_PATHS:
         raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {spp}")
     scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / width) * fraction
@@ -332,7 +341,7 @@ def _of_both(
     plan: Plan, scene: mi.Scene, sensor: mi.Sensor, film: Film, spp: int, fraction: mi.Float, light_share: float,
     table: Table | None, emitters: EmitterDensities | None, shares: Callable[[int], PixelShares | None] | None,
 ) -> Samples:  # fmt: skip
-    """Light paths and camera paths together as many as `spp` samples per pixel are; one of each at least."""
+    """Return light paths and camera paths, together `spp` samples per pixel; at least one of each."""
     pixels, crop = int(dr.prod(sensor.film().size())), int(dr.prod(film.size))
     width = max(round(light_share * spp * pixels), 1)
     n_camera = max(round((1 - light_share) * spp * crop), 1)
@@ -347,6 +356,6 @@ def _of_both(
 
 
 def _parts(spp: int) -> list[int]:
-    """The fewest parts of at most PASS_SAMPLES samples, of sizes that differ by 1 at most."""
+    """Return sizes of the fewest parts of at most PASS_SAMPLES samples, which differ by 1 at most."""
     count = -(-spp // PASS_SAMPLES)
     return [spp // count + (part < spp % count) for part in range(count)]

@@ -1,18 +1,18 @@
-"""Numbers of low discrepancy: Sobol's points, scrambled.
+"""Low-discrepancy numbers: scrambled Sobol points.
 
-They have where light paths start, and how they first scatter, evenly spread over all paths. The
-first number is stratified: lane i of n has it in the i-th n-th of [0, 1). So n need be no power of two, and paths
-that start alike are traced side by side. The others are Sobol's points with the lanes' numbers for indices. Of 2^k
-lanes in a row that begin at a multiple of 2^k, every box of area 2^-k along the first two of these, whose sides are
-[a, a + 1) times powers of two, holds exactly one point; along more of them boxes hold few points each.
+They distribute the starts of light paths, and their first scattering events, evenly over all paths. The first number is
+stratified: lane i of n has it in the i-th n-th of [0, 1). n does not need to be a power of two, and similar paths are
+traced side by side. The other numbers are Sobol points with the lane number as index. Of 2^k consecutive lanes that
+start at a multiple of 2^k, every box of area 2^-k along the first two of these numbers, whose sides are [a, a + 1)
+times powers of two, contains exactly one point. Along more numbers, boxes contain few points each.
 
-Points are scrambled anew for every pass: binary digits are permuted, each by a permutation that those before it choose
-(Owen 1995), which keeps the boxes. The permutations are hashes, as Laine and Karras (2011), Burley (2020) and Vegdahl
-(2022) have them. Whatever the hash is worth, each point is evenly distributed in the cube on its own, since a random
-number is added to each coordinate. Hence a sum over the lanes is unbiased, and sums of different seeds are independent.
-Direction numbers are those of Joe and Kuo (2008).
+Points are scrambled for every pass: binary digits are permuted, each by a permutation that depends on the digits before
+it (Owen 1995), which preserves the boxes. The permutations are hashes, as in Laine and Karras (2011), Burley (2020) and
+Vegdahl (2022). A random number is added to each coordinate, so each point is uniformly distributed for any hash. A sum
+over the lanes is therefore unbiased, and sums of different seeds are independent. Direction numbers are those of Joe
+and Kuo (2008).
 
-Digits are kept in reverse order, the first one lowest: sums and products carry from each digit to later ones alone.
+Digits are stored in reverse order, the first one lowest, so that sums and products carry only to later digits.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ BOUNCES = 2
 
 @cache
 def directions(coordinate: int) -> tuple[int, ...]:
-    """What each binary digit of an index, the lowest first, adds (modulo 2) to the point's 32 digits."""
+    """Return the number that each binary digit of an index, the lowest first, adds (modulo 2) to the point's 32 digits.
+    """
     if coordinate == 0:
         return tuple(1 << k for k in range(DIGITS))
     inner, numbers = JOE_KUO[coordinate - 1]
@@ -64,7 +65,9 @@ def _reversed(digits: int) -> int:
 
 
 def point(index: mi.UInt32, coordinate: int, digits: int = DIGITS) -> mi.UInt32:
-    """The digits of a coordinate of Sobol's points with these indices, which have at most `digits` binary digits."""
+    """Return the digits of a coordinate of the Sobol points with these indices, which have at most `digits` binary
+    digits.
+    """
     if coordinate == 0:
         return mi.UInt32(index)
     result = mi.UInt32(0)
@@ -74,7 +77,7 @@ def point(index: mi.UInt32, coordinate: int, digits: int = DIGITS) -> mi.UInt32:
 
 
 def scrambled(point: mi.UInt32, shift: mi.UInt32, key: mi.UInt32) -> mi.UInt32:
-    """The same digits permuted, each as those before it say; evenly distributed over all `shift`."""
+    """Return the digits, each permuted by the digits before it; uniformly distributed over all `shift`."""
     x = point ^ (point * 0x3D20ADEA)
     x = (x + shift) * (key | 1)
     x ^= x * 0x05526C56
@@ -83,8 +86,11 @@ def scrambled(point: mi.UInt32, shift: mi.UInt32, key: mi.UInt32) -> mi.UInt32:
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Which numbers of a path are coordinates: of emission those that emitters use, the choice of one, the two of the
-    place and those of the direction; and three of each of the first `bounces` scattering events."""
+    """Numbers of a path that are coordinates of its point.
+
+    They are the numbers that emitters use (the choice, the two of the place and those of the direction), and three
+    numbers of each of the first `bounces` scattering events.
+    """
 
     choice: bool
     place: tuple[bool, bool]
@@ -93,32 +99,33 @@ class Coordinates:
 
 
 def make_coordinates(used: Sequence[bool], emitters: int, max_depth: int) -> Coordinates:
-    """Of scenes with so many emitters, which use these of the four numbers of place and direction."""
+    """Return the coordinates for this number of emitters, which use these of the four numbers of place and direction.
+    """
     bounces = min(max(max_depth - 2, 0), BOUNCES)
     return Coordinates(emitters > 1, (used[0], used[1]), (used[2], used[3]), bounces)
 
 
 @dataclass
 class Net:
-    """How far apart lanes are in the first coordinate, in 2^-64 (opaque, width 1)."""
+    """Distance of lanes in the first coordinate, in 2^-64 (opaque, width 1)."""
 
     step: mi.UInt64
 
     @staticmethod
     def of(width: int) -> Net:
-        """For a pass of `width` light paths."""
+        """Return the net for a pass of `width` light paths."""
         return Net(dr.opaque(mi.UInt64, min(2**64 // width, 2**64 - 1)))
 
     def stratified(self, lane: mi.UInt32, jitter: mi.Float) -> mi.Float:
-        """The first coordinate: `jitter` in [0, 1) is where in its stratum."""
+        """Return the first coordinate; `jitter` in [0, 1) is the position in its stratum."""
         within = mi.UInt64(mi.UInt32(jitter * 2.0**24)) * (self.step >> 24)
         return _float(mi.UInt32((mi.UInt64(lane) * self.step + within) >> 32))
 
 
 class Points:
-    """Coordinates of the lanes' points, handed out in their order, from `used` on; `seed` is opaque.
+    """Coordinates of the lanes' points, returned in order, from `used` on; `seed` is opaque.
 
-    With `net` the first that is asked for is stratified; without, as where a guide has stratified the lanes, none is.
+    With `net`, the first requested coordinate is stratified. Without, a guide has stratified the lanes already.
     """
 
     def __init__(self, seed: mi.UInt32, width: int, net: Net | None, used: int = 0) -> None:
@@ -127,7 +134,7 @@ class Points:
         self.digits = 24 if width <= 2**24 else DIGITS
 
     def next_1d(self, independent: mi.Float | None = None) -> mi.Float:
-        """The next coordinate, in [0, 1), in place of a random number, `independent`, which strata need."""
+        """Return the next coordinate, in [0, 1), in place of the random number `independent`, which strata use."""
         if self.net is not None:
             assert independent is not None
             net, self.net = self.net, None
@@ -138,11 +145,11 @@ class Points:
         return _float(dr.brev(scrambled(digits, shift, key)))
 
     def next_2d(self, independent: mi.Point2f | None = None, used: tuple[bool, bool] = (True, True)) -> mi.Point2f:
-        """Two of them, in place of those that are `used`."""
+        """Return the next two coordinates, in place of the numbers that are `used`."""
         own = mi.Point2f(0.5) if independent is None else independent
         return mi.Point2f(*(self.next_1d(u) if used[k] else u for k, u in enumerate((own.x, own.y))))
 
 
 def _float(digits: mi.UInt32) -> mi.Float:
-    """In [0, 1), of digits of which the first is the highest bit."""
+    """Return a number in [0, 1) from digits whose first is the highest bit."""
     return mi.Float(digits >> 8) * 2.0**-24

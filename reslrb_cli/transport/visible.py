@@ -1,18 +1,18 @@
-"""Emitters that the sensor sees directly: C_0, by points on lamps that move or are small, and by primary rays.
+"""Directly visible emitters: C_0, by points on lamps that move or are small, and by primary rays.
 
-By points on lamps, in place of primary rays, which hit them or not:
+By points on lamps, instead of primary rays:
 
     C_0 = Le(x) |n . w| W(x) / p(x)        at film position u(x)
 
-Lamps that move have the derivative by where they are in this form: film position, normal and density move with the
-lamp. Its own outline needs no care then: the points at the rim move, too. What stands before the lamp is missing, and
-so is what it covers. Their light itself, and its derivative by their radiance, is that of primary rays.
+For moving lamps, this form has the derivative with respect to their position: film position, normal and density move
+with the lamp. The outline of the lamp is included, because points at its rim move, too. Occlusion of and by the lamp is
+missing. The light itself, and its derivative with respect to radiance, comes from primary rays.
 
-Of lamps smaller than a pixel primary rays hit few or none: there this form is the light itself.
+Primary rays rarely hit lamps smaller than a pixel. For these, the form above is the light itself.
 
-By primary rays, one per light path, a sample of its own: lanes are spread evenly over the pixels, so that a constant
-background is free of noise; connecting random points of the emitters to the sensor, as `ptracer` does, is the noisier
-the larger the emitter.
+There is one primary ray per light path, with its own samples. The lanes are distributed evenly over the pixels, so that
+a constant background has no noise. Connecting random points of the emitters to the sensor, as `ptracer` does, has more
+noise for larger emitters.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from reslrb_cli.transport.samples import LAMP_STREAM, SMALL_LAMP_STREAM, VISIBLE
 
 
 def moving_splats(samples: Samples) -> Iterator[tuple[mi.Point2f, mi.Spectrum, mi.Bool]]:
-    """For each lamp that moves and can be seen: film position u, C_0 (C,), and the active lanes.
+    """Yield film position u, C_0 (C,) and the active lanes for each visible lamp that moves.
 
-    u and C_0 have their derivatives where gradients are enabled; what they sum up to is already in the image.
+    u and C_0 have derivatives if gradients are enabled. Their light is already in the image.
     """
     for lamp in samples.plan.visible_moving_lamps:
         point = _points(samples, (lamp,), mi.UInt32(lamp.index), samples.numbers(LAMP_STREAM + lamp.index), True)
@@ -44,16 +44,16 @@ def moving_splats(samples: Samples) -> Iterator[tuple[mi.Point2f, mi.Spectrum, m
 
 
 def small_splat(samples: Samples) -> tuple[mi.Point2f, mi.Spectrum, mi.Bool]:
-    """Of the lamps that are smaller than a pixel: film position u, C_0 (C,), and the active lanes.
+    """Return film position u, C_0 (C,) and the active lanes for lamps smaller than a pixel.
 
-    C_0 has its derivative by their radiance where gradients are enabled.
+    C_0 has its derivative with respect to radiance if gradients are enabled.
     """
     point = small_points(samples)
     return point.u, dr.select(point.active, point.radiance() * point.weight, 0), point.active
 
 
 def small_points(samples: Samples) -> LampPoints:
-    """Points on the lamps that are smaller than a pixel, which take turns; detached."""
+    """Return points on the lamps smaller than a pixel, which take turns; detached."""
     lamps, numbers = samples.plan.small_lamps, samples.numbers(SMALL_LAMP_STREAM)
     count, lane = dr.opaque(mi.UInt32, samples.width), dr.arange(mi.UInt32, samples.width)
     turn, index = lane % len(lamps), mi.UInt32(lamps[0].index)
@@ -67,7 +67,7 @@ def small_points(samples: Samples) -> LampPoints:
 
 @dataclass
 class LampPoints:
-    """Points on lamps as the sensor sees them: `weight` (C,) is C_0 over radiance, as a part of the image."""
+    """Points on lamps as the sensor sees them: `weight` (C,) is C_0 / radiance, normalised for the image."""
 
     emitter: mi.EmitterPtr
     si: mi.SurfaceInteraction3f
@@ -76,14 +76,14 @@ class LampPoints:
     active: mi.Bool
 
     def radiance(self) -> mi.Spectrum:
-        """What leaves them towards the sensor (C,), with its derivative by their radiance where there is any."""
+        """Return the radiance towards the sensor (C,), with its derivative if it has one."""
         return self.emitter.eval(self.si, self.active)
 
 
 def _points(
     samples: Samples, lamps: Sequence[Lamp], index: mi.UInt32, numbers: NumberStream, attached: bool
 ) -> LampPoints:
-    """A point of each lane's lamp, the one of that index in `scene.emitters()`."""
+    """Return a point on each lane's lamp, given by its index in `scene.emitters()`."""
     plan, sensor = samples.plan, samples.sensor
     time = sample_time(plan, sensor, numbers)
     position, aperture = numbers.next_2d(), numbers.next_2d()
@@ -112,8 +112,11 @@ def _points(
 
 @dataclass
 class PrimaryRay:
-    """A ray through film position `u` (pixels, relative to the crop window); `weight` (C,) is its sensor importance
-    times what brings a sum over lanes to the mean over each pixel's samples."""
+    """Ray through film position `u` (pixels, relative to the crop window).
+
+    `weight` (C,) is the sensor's importance, normalised so that a sum over lanes gives the mean over each pixel's
+    samples.
+    """
 
     ray: mi.Ray3f
     u: mi.Point2f
@@ -122,9 +125,9 @@ class PrimaryRay:
 
 
 def primary_ray(samples: Samples) -> PrimaryRay:
-    """Rays for C_0, one for each path: as many in each pixel of the crop window, or one more.
+    """Return a primary ray for each path, distributed evenly over the pixels of the crop window.
 
-    Their numbers are a stream of their own.
+    Their random numbers are a separate stream.
     """
     plan, sensor, width, sampler = samples.plan, samples.sensor, samples.width, samples.numbers(VISIBLE_STREAM)
     size = sensor.film().crop_size()
@@ -142,8 +145,9 @@ def primary_ray(samples: Samples) -> PrimaryRay:
 
 @dataclass
 class _Look:
-    """State of a primary ray on its way through null surfaces; `tangents`, in forward mode, are the derivatives of
-    transmittance and radiance."""
+    """Loop state of a primary ray on its way through null surfaces; `tangents`, in forward mode, are the derivatives of
+    transmittance and radiance.
+    """
 
     active: mi.Bool
     ray: mi.Ray3f
@@ -154,15 +158,15 @@ class _Look:
 
 
 def visible_radiance(plan: Plan, scene: mi.Scene, primary: PrimaryRay, loop_mode: str = "symbolic") -> mi.Spectrum:
-    """Radiance (C,) that arrives along the primary ray, through null surfaces where the scene has any.
+    """Return the radiance (C,) that arrives along the primary ray, through null surfaces if the scene has any.
 
-    With `loop_mode` evaluated it carries derivatives where they are enabled, for naive AD.
+    With an evaluated `loop_mode`, it has derivatives if they are enabled, for naive AD.
     """
     return _look(plan, scene, primary, None, loop_mode).radiance
 
 
 def visible_tangent(plan: Plan, scene: mi.Scene, primary: PrimaryRay) -> mi.Spectrum:
-    """Derivative (C,) of that radiance along the parameters' tangents (forward mode)."""
+    """Return the derivative (C,) of this radiance along the parameters' tangents (forward mode)."""
     with dr.suspend_grad():  # the loop itself tracks nothing
         return _look(plan, scene, primary, None, "symbolic", tangents=True).tangents[1]
 
@@ -189,7 +193,7 @@ def differentiate_visible_radiance(plan: Plan, scene: mi.Scene, primary: Primary
 
 
 def _radiance(plan: Plan, scene: mi.Scene, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
-    """Radiance (C,) that leaves `si`, but that of lamps smaller than a pixel, which `visible.py` has."""
+    """Return the radiance (C,) that leaves `si`, without lamps smaller than a pixel, which have their own samples."""
     emitter = si.emitter(scene)
     for lamp in plan.small_lamps:
         active = active & (emitter != mi.EmitterPtr(lamp.emitter))

@@ -1,14 +1,15 @@
-"""The one light-path loop: numbers, segment, hooks, roulette.
+"""The only light-path loop: random numbers, segment, hooks, roulette.
 
-What is done with the connections is the hooks' to say (`Hooks`: what an estimator sees of a walk, and what it may do
-along it), and no estimator or integrator repeats the loop.
+The hooks process the connections (`Hooks` is the interface between a walk and an estimator). No estimator or integrator
+repeats the loop.
 
-One segment of a light path leads from the ray that reaches a vertex to the connection from there, the scattering event,
-and the next ray. It depends on nothing but the ray, what it hits, the segment's random numbers and the scene. So it can
-be done again, wherever these are known.
+One segment of a light path leads from the ray that reaches a vertex to its connection, the scattering event, and the
+next ray. It depends only on the ray, the intersection, the random numbers of the segment, and the scene, so it can be
+evaluated again from these.
 
 Random numbers are drawn in the order of Mitsuba's `ptracer`, so that both trace the same paths from the same seed.
-Those that hooks need for a selection come from a stream of their own: a replay that selects nothing stays in step.
+Numbers for selections by hooks come from a separate stream, so that a replay that selects nothing meets the same
+vertices.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from reslrb_cli.transport.weights import Rivals, cosine, leave_emitter, weight_o
 
 @dataclass
 class Vertex(Hit):
-    """The current vertex as hooks see it; `product` does not include the vertex's own scattering."""
+    """Current vertex for hooks; `product` does not include the vertex's own scattering."""
 
     pi: mi.PreliminaryIntersection3f
     depth: mi.UInt32
@@ -41,14 +42,15 @@ class Vertex(Hit):
 
 
 class Hooks:
-    """What an estimator does along a walk. All are pure: state in, state out; none draws a random number.
+    """Hooks of an estimator along a walk. All are pure (state in, state out), and none draws a random number.
 
-    `numbers` is how many random numbers `vertex` gets at each vertex. Without `connects` no connection is evaluated:
-    `vertex` gets its geometry alone. A walk whose hooks are `replaying` follows a path that is known to get as far as
-    `goes_on` asks, so that neither its throughput nor its roulette is computed.
-    Hooks that are `tracked` keep derivatives of the factors in the loop state, which is then evaluated vertex by vertex
-    (naive AD); with `max_iterations` the loop stays symbolic, and Dr.Jit itself reverses it, from a record of the loop
-    state in thread-local memory. Where they are `attached` too, so are the rays.
+    - `numbers` is the number of random numbers that `vertex` gets at each vertex.
+    - Without `connects`, no connection is evaluated, and `vertex` gets only its geometry.
+    - With `replaying`, the path is known to continue as far as `goes_on` requests, so throughput and roulette are not
+      computed.
+    - `tracked` hooks keep derivatives of the factors in the loop state, and the loop is evaluated vertex by vertex
+      (naive AD). With `max_iterations`, the loop stays symbolic, and Dr.Jit reverses it from a record of the loop state
+      in thread-local memory. If the hooks are also `attached`, the rays have derivatives, too.
     """
 
     numbers: int = 0
@@ -59,43 +61,46 @@ class Hooks:
     max_iterations: int | None = None
 
     def start(self, product: Product) -> Any:
-        """State before the first vertex, any PyTree; `product` is E."""
+        """Return the state before the first vertex, any PyTree; `product` is E."""
         return []
 
     def seen(self, vertex: Vertex) -> Seen | None:
-        """What is known of the sensor's visibility from this vertex."""
+        """Return the known visibility of the sensor from this vertex, or None."""
         return None
 
     def wants(self, state: Any, vertex: Vertex) -> mi.Bool:
-        """Lanes whose connection from this vertex is of use; others trace no shadow ray."""
+        """Return the lanes that need a connection from this vertex; others trace no shadow ray."""
         return mi.Bool(True)
 
     def goes_on(self, state: Any, vertex: Vertex) -> mi.Bool:
-        """Lanes that scatter on from this vertex, as far as the hooks care."""
+        """Return the lanes that continue from this vertex, as far as the hooks are concerned."""
         return mi.Bool(True)
 
     def is_followed(self, state: Any, vertex: Vertex) -> mi.Bool:
-        """In a replay: lanes that `goes_on` let scatter, and whose next vertex is wanted as well."""
+        """Return, in a replay, the lanes that scatter by `goes_on` and also need their next vertex."""
         return mi.Bool(True)
 
     def vertex(
         self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
     ) -> Any:  # fmt: skip
-        """Called at each vertex with its connection to the sensor, and with the sampled scattering event, also in lanes
-        that `goes_on` ended."""
+        """Return the state after a vertex, given its connection to the sensor and the sampled scattering event.
+
+        Also called in lanes that `goes_on` has ended.
+        """
         return state
 
     def survived(self, state: Any, weight: mi.Float) -> Any:
-        """Called with the weight that roulette has just given the path's product, 1 where it was not played."""
+        """Return the state after roulette has multiplied the path's product by `weight`, which is 1 without roulette.
+        """
         return state
 
     def aimed(self, state: Any, factor: mi.Float) -> Any:
-        """Called, where paths are aimed (`aim.py`), with the factor r that the path's product has just been given."""
+        """Return the state after aiming (`aim.py`) has multiplied the path's product by the factor r."""
         return self.survived(state, factor)
 
 
 class Splat(Hooks):
-    """Splat every connection, and keep nothing."""
+    """Hooks that splat every connection and store nothing."""
 
     def __init__(self, samples: Samples, block: mi.ImageBlock) -> None:
         self.samples, self.block = samples, block
@@ -112,21 +117,22 @@ class Splat(Hooks):
 
 @dataclass
 class Segment:
-    """What follows from a vertex. Visibility is not known here: `connection.c` is not set, and `connection.active` says
-    where the sensor would be seen if nothing stood in the way."""
+    """Segment from a vertex, without visibility: `connection.c` is not set, and `connection.active` says whether the
+    sensor would see the vertex without occlusion.
+    """
 
     si: mi.SurfaceInteraction3f
     connection: Connection
     scattering: Scattering
 
     def next_ray(self, attached: bool = False) -> mi.Ray3f:
-        """The ray that leaves in the sampled direction; its derivatives go with it if `attached`."""
+        """Return the ray in the sampled direction, with derivatives if `attached`."""
         ray = self.si.spawn_ray(self.scattering.d)
         return ray if attached else dr.detach(ray)
 
 
 def find_vertex(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool) -> Hit:
-    """The vertex where `ray` hits what `pi` says."""
+    """Return the vertex at the intersection `pi` of `ray`."""
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
     return Hit(si, si.bsdf(), ray)
 
@@ -134,11 +140,11 @@ def find_vertex(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool
 def find_following_vertex(
     ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> tuple[mi.SurfaceInteraction3f, mi.Ray3f, mi.Float]:
-    """The surface interaction of a vertex that stays where it is on its surface, and moves with that alone.
+    """Return the surface interaction of a vertex that stays at its place on its surface, and moves only with it.
 
-    Also the ray that reaches it, whose direction turns with both ends, and by what factor (1, with a derivative) a
-    measure of directions at its origin becomes one of places on the surface: |cos| / distance^2 times the surface's
-    own stretching.
+    Also returns the ray that reaches the vertex, whose direction changes with both ends, and the factor (1, with a
+    derivative) that converts a measure of directions at the ray's origin to one on the surface: |cos| / distance^2
+    times the stretching of the surface.
     """
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
     there = si.p - ray.o
@@ -155,12 +161,12 @@ def segment(
     samples: Samples, hit: Hit, numbers: Numbers, connected: mi.Bool, scattered: mi.Bool, evaluates: bool = True,
     tracked: bool = False, attached: bool = False, aimed: Aimed | None = None,
 ) -> Segment:  # fmt: skip
-    """The segment from a vertex: connected in some lanes, scattered in some.
+    """Return the segment from a vertex, with `connected` and `scattered` lanes.
 
-    Without `evaluates` the BSDF is not evaluated towards the sensor. With `tracked` the scattering weight carries the
-    derivatives of the scene's parameters, where gradients are enabled, and the connection is left to be evaluated where
-    it turns out to be visible; directions, densities and film positions have no derivatives then. With `attached` they
-    have, and so has everything else. Lanes that are `aimed` scatter to their points.
+    Without `evaluates`, the BSDF is not evaluated towards the sensor. With `tracked`, the scattering weight has
+    derivatives of the scene's parameters if gradients are enabled, and the connection is evaluated later if it is
+    visible; directions, densities and film positions have no derivatives. With `attached`, everything has derivatives.
+    `aimed` lanes scatter to their points.
     """
     plan, si = samples.plan, hit.si
     connection = connect(plan, samples.sensor, si, hit.ray, numbers.aperture, connected, attached)
@@ -317,7 +323,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
 def intersect(
     plan: Plan, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool
 ) -> tuple[mi.PreliminaryIntersection3f, mi.Bool]:
-    """What the ray hits, and the active lanes in which it hits anything."""
+    """Return the intersection of the ray, and the active lanes with a hit."""
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     active = active & pi.is_valid()
     pi.valid = mi.Bool(True)  # in active lanes
@@ -327,7 +333,9 @@ def intersect(
 
 
 def _without_masks(path: Path) -> Path:
-    """The same for a record of the loop state: masked writes of booleans to thread-local memory end the process."""
+    """Return the path without masks, for a record of the loop state: masked writes of booleans to thread-local memory
+    end the process.
+    """
     path.pi.valid = mi.Bool(True)
     return replace(path, active=dr.select(path.active, mi.UInt32(1), 0))
 

@@ -1,16 +1,17 @@
-"""Weights of paths that are looked for from both sides: one path, one contribution, shared out (balance heuristic).
+"""Weights of paths that both sides can find: the balance heuristic.
 
 A path z_0 (sensor), z_1 .. z_{K-1} (surfaces), z_K (on an emitter) can be found in three ways: a camera path meets the
 emitter (H), its last vertex z_{K-1} samples the emitter (N, next event), or a light path's last vertex z_1 connects to
-the sensor (L). Each way's weight is its density over the sum of all three, so that w_H + w_N + w_L = 1. They depend on
-the path alone, and have no derivative.
+the sensor (L). The weight of each way is its density over the sum of all three, so that w_H + w_N + w_L = 1. The
+weights depend only on the path, and have no derivative.
 
-Two numbers go along with each walk: M, the density of the rival that joins at the newest vertex, over one's own, and V,
-that of the rivals from further back. p and p~ are the BSDF's density of the direction taken, and of the one back in the
-other walk; c is the |cosine| of the direction taken, d the length of the segment; N is the number of all light paths
-over that of the camera paths of a pixel, p_cam the sensor's density of a direction for one pixel. Of an emitter e is
-the density of its rays (of place and direction) over the cosine there, where it is a surface, and p_D the density with
-which next event estimation draws its directions as a vertex sees them; both with the choice of the emitter.
+Each walk carries two numbers: M, the density of the other walk that joins at the newest vertex, relative to its own,
+and V, that of the other ways from earlier vertices. p and p~ are the BSDF's densities of the direction taken, and of
+the way back in the other walk; c is the |cosine| of the direction taken, d the length of the segment; N is the number
+of all light paths over that of the camera paths of a pixel, and p_cam the sensor's density of a direction for one
+pixel. For an emitter, e is the density of its rays (of place and direction) over the cosine at its surface, if it has
+one, and p_D the density with which next event estimation samples its directions as a vertex sees them; both include the
+choice of the emitter.
 
     every arrival     M *= d^2 (not from infinity);  M, V /= |cos| at the surface that is reached
     camera walk       start: M = N / p_cam, V = 0.    m = M at the first vertex, V p~ at later ones
@@ -21,9 +22,9 @@ which next event estimation draws its directions as a vertex sees them; both wit
       connection      w_L = 1 / (1 + p_camA / N (M + V p~))        p_camA: p_cam as a density of area at the vertex
       smooth event    V = (c / p) (M + V p~), then M = 0 for good  delta event   V *= c,  M = 0
 
-A null event is no vertex: M and V stay, and d runs on. Roulette, guiding and aiming stay out of the weights, which sum
-to 1 all the same. Source: Georgiev 2012, "Implementing Vertex Connection and Merging", whose recursion weighs all
-connections; this is its restriction to three ways.
+A null event is no vertex: M and V stay the same, and d continues. Roulette, guiding and aiming are not in the weights,
+which sum to 1 nevertheless. Source: Georgiev 2012, "Implementing Vertex Connection and Merging", whose recursion
+weights all connections; this is its restriction to three ways.
 """
 
 from __future__ import annotations
@@ -44,11 +45,11 @@ FROM_INFINITY = -1e30  # the length of a path that comes from there, so far
 
 @dataclass
 class Rivals:
-    """M and V of a walk, before the arrival at its current vertex, and d since the last vertex that is no null event;
-    loop state.
+    """Loop state: M and V of a walk before the arrival at its current vertex, and d since the last vertex that is no
+    null event.
 
-    `sphere` holds, where any lamp is a sphere (whose p_D depends on the vertex), the number of the shape that the path
-    comes from, 0 for others.
+    If any lamp is a sphere (whose p_D depends on the vertex), `sphere` is the number of the shape that the path comes
+    from, and 0 for other shapes.
     """
 
     M: mi.Float
@@ -57,7 +58,7 @@ class Rivals:
     sphere: list[mi.UInt32] = field(default_factory=list)
 
     def arrive(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> Rivals:
-        """Those at the vertex `si`, which `ray` reaches."""
+        """Return M and V at the vertex `si` that `ray` reaches."""
         d = self.distance + si.t
         cos = dr.maximum(dr.abs(dr.dot(si.n, ray.d)), 1e-12)
         M = self.M * dr.select(d < 0, 1, dr.square(d)) / cos
@@ -70,11 +71,11 @@ class Rivals:
         return Rivals(M, self.V / cos, d, self.sphere)
 
     def after_null(self, arrived: Rivals) -> Rivals:
-        """Those behind a null event, at which `arrived` are those of the vertex."""
+        """Return M and V after a null event; `arrived` are those at the vertex."""
         return replace(self, distance=arrived.distance)
 
     def after(self, renewed: mi.Float, joined: mi.Float, scattering: Scattering, cos: mi.Float) -> Rivals:
-        """Those behind an event at which they arrived: M is `renewed` by a smooth one, and V made of `joined`."""
+        """Return M and V after an event: M is `renewed` by a smooth event, and V is computed from `joined`."""
         p, is_delta = scattering.ways.p, scattering.is_delta
         V = dr.select(is_delta, self.V * cos, dr.select(joined > 0, cos / p * joined, 0))
         sphere = [mi.UInt32(0) for _ in self.sphere]
@@ -82,7 +83,7 @@ class Rivals:
 
 
 def cosine(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Float:
-    """|cos| of a direction at a surface."""
+    """Return |cos| of a direction at a surface."""
     return dr.abs(dr.dot(si.n, d))
 
 
@@ -90,7 +91,7 @@ def cosine(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Float:
 
 
 def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission: Emission) -> Rivals:
-    """Those of a light path on its way to its first vertex."""
+    """Return M and V of a light path on its way to its first vertex."""
     ray, emitter = emission.ray, emission.emitter
     choice = dr.gather(mi.Float, table.choice, dr.reinterpret_array(mi.UInt32, emitter))
     lamps = {lamp.emitter: lamp for lamp in plan.needs.lamps}
@@ -99,7 +100,7 @@ def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission
     def leave(
         self: mi.Emitter, time: mi.Float, position: mi.Point2f, o: mi.Point3f, d: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float, mi.Point2f, mi.Float, mi.Float]:  # fmt: skip
-        """Its density of places or directions, the cosine, texture coordinates, whether there is a V, and d so far."""
+        """Return the density of places or directions, the cosine, texture coordinates, whether there is a V, and d."""
         one, zero = mi.Float(1), mi.Float(0)
         lamp = lamps.get(self)
         if lamp is not None and not lamp.parallel:
@@ -150,6 +151,6 @@ def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission
 def weight_of_connection(
     arrived: Rivals, p_camA: mi.Float, N: mi.Float, back: mi.Float
 ) -> mi.Float:  # fmt: skip
-    """w_L of a connection to the sensor, by the density `back`, p~, of the way from there on."""
+    """Return w_L of a connection to the sensor; `back` is p~, the density of the way from the sensor on."""
     rivals = p_camA / N * (arrived.M + arrived.V * back)
     return dr.rcp(1 + dr.select(p_camA > 0, rivals, 0))
