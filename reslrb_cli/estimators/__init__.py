@@ -1,4 +1,4 @@
-"""How the connections of a path enter its gradient: one file an estimator, tables from name to class."""
+"""Estimators of a path's gradient: one file per estimator, and tables from name to class."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def options_of(name: str) -> dict[str, Any]:
 
 
 def make_estimator(name: str, options: dict[str, Any]) -> Estimator:
-    """Make an estimator by its name. Raises ValueError where an option has a wrong value."""
+    """Make an estimator by its name. Raises ValueError if an option has a wrong value."""
     kinds = [{key: options[key] for key in kind.OPTIONS if key in options} for kind in _kinds(name)]
     made, *attached = (kind(**own) for kind, own in zip(_kinds(name), kinds, strict=True))
     made.attached = attached[0] if attached else None

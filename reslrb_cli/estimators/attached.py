@@ -1,34 +1,33 @@
-"""Derivatives of what moves light: each segment is done again on a walk back over the stack, in an AD scope of its own.
+"""Attached derivatives by `stack`: a walk back over the stack evaluates each segment again, in its own AD scope.
 
-Segment i maps the ray v_i that reaches vertex i to the next one, v_{i+1}, to a factor s_i and to a connection (c_i,
-u_i). Let P_i be the path's throughput before vertex i, r_i the weight of its roulette, and B_i what all later
-connections contribute to the objective per unit of throughput behind it, all of them detached. Then, from the last
-vertex to the first,
+Segment i maps the ray v_i that reaches vertex i to the next ray v_{i+1}, to a factor s_i and to a connection (c_i,
+u_i). Let P_i be the path's throughput before vertex i, r_i the weight of its roulette, and B_i the contribution of all
+later connections to the objective per unit of throughput behind it, all of them detached. Then, from the last vertex to
+the first,
 
     S_i     = <P_i, delta(u_i) c_i + r_i s_i B_i> + <a_{i+1}, v_{i+1}>
     a_i     = dS_i/dv_i,   B_{i-1} = delta(u_i) c_i + r_i s_i B_i         a_{k+1} = 0,   B_k = 0 behind the last one
     dS     += dS_i/dtheta
 
-and at the emitter dS += <a_1, dv_1/dtheta> + <B_0, dE/dtheta>. Nothing is divided and nothing is inverted: factors that
-are zero, and chains of any conditioning, need no care.
+and at the emitter dS += <a_1, dv_1/dtheta> + <B_0, dE/dtheta>. Nothing is divided or inverted, so zero factors and the
+conditioning of the chain do not matter.
 
-Where vertices stay where they are on their surfaces, instead of going where a turned direction meets them, `Before` is
-what is kept of the vertex before the current one. Behind a vertex i-1 that is not specular, light goes to all places.
-`follow` has the sampled direction turn with surface i-1, so that x_i slides over whatever it meets. `stay` integrates
-over places instead: x_i moves with its own surface alone, and the factor of the scattering carries what that changes,
+A vertex can also stay at its place on its surface, instead of following a direction that turns; `Before` stores the
+data of the previous vertex for this. Behind a vertex i-1 that is not specular, light goes to all places. With `follow`,
+the sampled direction turns with surface i-1, so that x_i slides over the next surface. With `stay`, the integral is
+over places: x_i moves only with its own surface, and the factor of the scattering contains the change,
 
     s_{i-1} = f_{i-1}(x_{i-2}, x_{i-1}, x_i) |cos_i| / |x_i - x_{i-1}|^2 dA_i / (the same density, detached)
 
-with dA_i the area that a piece of surface i takes. All of it but what f_{i-1} changes with x_{i-1} is differentiated at
-vertex i, whose adjoint then hands to i-1 a derivative by its place and none by its direction.
+where dA_i is the area of a piece of surface i. Vertex i differentiates all of it except the dependence of f_{i-1} on
+x_{i-1}. Its adjoint then gives vertex i-1 a derivative with respect to its place, and none with respect to its
+direction.
 
-Source: Worchel et al. 2025, "Radiative Backpropagation with Non-Static Geometry", whose surface-integral form this
-is. Edges at rest are not swept over, so that their part in the derivative is not lost; visibility's part is, in
-either form.
+Source: Worchel et al. 2025, "Radiative Backpropagation with Non-Static Geometry", which has this surface-integral form.
+No edges at rest are swept over, so their contribution is not lost. That of visibility is lost in either form.
 
-All vertices are pushed from the first on that a parameter moves, or gives its BSDF. What comes before depends on no
-parameter but those of the emitter. The stack is that of `stack.py`: behind the vertex that was pushed last its T is
-r_i.
+All vertices are pushed from the first one on that a parameter moves, or whose BSDF has a parameter. Earlier vertices
+depend only on parameters of the emitter. The stack is that of `stack.py`: behind the last pushed vertex its T is r_i.
 """
 
 from __future__ import annotations
@@ -69,19 +68,19 @@ from reslrb_cli.transport.walk import (
 
 @dataclass
 class Before:
-    """The vertex before the current one; `stays` is 1 where it is not specular, so that the current one stays."""
+    """Vertex before the current one; `stays` is 1 if it is not specular, so that the current vertex stays."""
 
     point: SurfacePoint
     stays: mi.UInt32
 
     @staticmethod
     def start(plan: Plan) -> list[Before]:
-        """At the beginning of a path; nothing where no vertex stays."""
+        """Return the state at the start of a path; empty if no vertex stays."""
         return [Before(SurfacePoint.blank(plan), mi.UInt32(0))] if plan.stays else []
 
     @staticmethod
     def of(plan: Plan, vertex: Vertex, scattering: Scattering) -> list[Before]:
-        """What the vertex is to the next one."""
+        """Return the state that a vertex passes to the next one."""
         if not plan.stays:
             return []
         stays = stays_behind(plan, vertex.bsdf, scattering.is_delta)
@@ -89,7 +88,7 @@ class Before:
 
 
 def is_staying(before: list[Before]) -> mi.Bool:
-    """Lanes in which the vertex behind `before` stays where it is."""
+    """Return the lanes in which the vertex after `before` stays at its place."""
     return before[0].stays != 0 if before else mi.Bool(False)
 
 
@@ -97,11 +96,11 @@ def reach(
     plan: Plan, before: list[Before], ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool,
     parameters: bool = True,
 ) -> tuple[Hit, mi.Spectrum]:  # fmt: skip
-    """The vertex where `ray` hits what `pi` says, and a factor (C,) of value 1 that carries the derivatives of s_{i-1}
-    which belong to it.
+    """Return the vertex at the intersection `pi` of `ray`, and a factor (C,) of value 1 with the derivatives of s_{i-1}
+    that belong to this vertex.
 
-    Call under `dr.resume_grad()`, the ray being differentiable; without `parameters`, where it is resumed for the ray
-    alone.
+    Call under `dr.resume_grad()` with a differentiable ray; without `parameters` if gradients are resumed only for the
+    ray.
     """
     if not before:
         return find_vertex(ray, pi, active), mi.Spectrum(1)
@@ -125,7 +124,7 @@ def segment_again(
     samples: Samples, before: list[Before], ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, numbers: Numbers,
     connected: mi.Bool, scattered: mi.Bool, evaluates: bool = True, parameters: bool = True,
 ) -> tuple[Segment, mi.Spectrum]:  # fmt: skip
-    """The segment from there, with attached derivatives, and that factor."""
+    """Return the segment from a vertex with attached derivatives, and the factor of `reach`."""
     hit, factor = reach(samples.plan, before, ray, pi, connected | scattered, parameters)
     return segment(samples, hit, numbers, connected, scattered, evaluates, attached=True), factor
 
@@ -135,7 +134,7 @@ def segment_again(
 
 @dataclass
 class Adjoint:
-    """What the walk back carries: a = dS/dv of the ray's origin and direction, and B (C,)."""
+    """Adjoint on the walk back: a = dS/dv of the ray's origin and direction, and B (C,)."""
 
     origin: mi.Vector3f
     direction: mi.Vector3f
@@ -143,22 +142,22 @@ class Adjoint:
 
     @staticmethod
     def where(mask: mi.Bool, origin: mi.Point3f, direction: mi.Vector3f, B: mi.Spectrum) -> Adjoint:
-        """These in the lanes of the mask, zero in the others."""
+        """Return these values in the lanes of the mask, and zero in the others."""
         values = mi.Vector3f(origin), direction, B
         return Adjoint(*(dr.select(mask, value, 0) for value in values))
 
     @staticmethod
     def zero() -> Adjoint:
-        """Behind the last vertex."""
+        """Return the adjoint behind the last vertex."""
         return Adjoint(mi.Vector3f(0), mi.Vector3f(0), mi.Spectrum(0))
 
 
 @dataclass
 class AttachedFrame:
-    """One vertex on the stack: all that its segment is done again from, P_i, and r_{i-1}.
+    """Vertex on the stack: the data to evaluate its segment again, P_i, and r_{i-1}.
 
-    `connected` is 1 where the sensor was seen. `aperture` holds the sample of the aperture where the sensor has one,
-    `before` the vertex before where vertices stay on their surfaces.
+    `connected` is 1 if the sensor was visible. `aperture` holds the sample of the aperture if the sensor has one, and
+    `before` the previous vertex if vertices can stay.
     """
 
     point: SurfacePoint
@@ -172,14 +171,16 @@ class AttachedFrame:
 
     @staticmethod
     def blank(plan: Plan) -> AttachedFrame:
-        """A frame of zeros with the members that the plan needs."""
+        """Return a frame of zeros with the members that the plan needs."""
         aperture = [mi.Point2f(0)] if plan.needs.thin_lens else []
         zeros = mi.Float(0), mi.Point2f(0), mi.Spectrum(0), mi.Float(0), mi.UInt32(0)
         return AttachedFrame(SurfacePoint.blank(plan), *zeros, aperture, Before.start(plan))
 
     def differentiate(self, p: Pass, adjoint: Adjoint) -> Adjoint:
-        """Add the derivatives of the vertex's segment, given the adjoint of the ray that it ends in; return that of the
-        ray that reaches the vertex."""
+        """Add the derivatives of the vertex's segment.
+
+        Takes the adjoint of the segment's outgoing ray, and returns the adjoint of the ray that reaches the vertex.
+        """
         assert p.adjoint is not None
         plan, P, B = p.plan, self.prefix, adjoint.B
         connected = self.connected != 0
@@ -204,16 +205,15 @@ class AttachedFrame:
 
 @dataclass
 class AttachedState:
-    """Loop state of the way out: the stack, and what the next vertex asks for of the current one."""
+    """Loop state of the way out: the stack, and the data that the next vertex needs of the current one."""
 
     stack: StackState
     before: list[Before]
 
 
 class AttachedSweep(VertexHooks):
-    """The way out: splat, and push the vertices before number `end`, beyond which no path is followed.
-
-    Where `end` is None all vertices are pushed.
+    """Way out: splat, and push the vertices before number `end`; paths end there. If `end` is None, all vertices are
+    pushed.
     """
 
     def __init__(self, p: Pass, ring: Ring, end: mi.UInt32 | None = None) -> None:
@@ -226,7 +226,7 @@ class AttachedSweep(VertexHooks):
         return AttachedState(stack, Before.start(plan))
 
     def wants(self, state: AttachedState, vertex: Vertex) -> mi.Bool:
-        """Where there is no image to splat into, connections behind something that is differentiated."""
+        """Return all lanes if there is an image, otherwise those behind a differentiated vertex."""
         return mi.Bool(True) if self.p.block is not None else self._useful(state, vertex)
 
     def goes_on(self, state: AttachedState, vertex: Vertex) -> mi.Bool:
@@ -260,13 +260,13 @@ class AttachedSweep(VertexHooks):
         return AttachedState(state.stack.scaled(weight), state.before)
 
     def _useful(self, state: AttachedState, vertex: Vertex) -> mi.Bool:
-        """Lanes in which the vertex, or one before it, depends on a parameter."""
+        """Return the lanes in which the vertex, or one before it, depends on a parameter."""
         plan = self.p.plan  # where B_0 is asked for, all of them
         return (state.stack.count > 0) | (mi.Bool(True) if concerns_emission(plan) else begins(plan, vertex))
 
 
 class AttachedStack(Estimator):
-    """`stack` where light moves."""
+    """The estimator `stack` with attached derivatives."""
 
     exact = True
 
@@ -292,7 +292,7 @@ class AttachedStack(Estimator):
         return sum(entry_bytes(AttachedFrame.blank(plan))) * (places(plan, self.stack_size) + 1)
 
     def _sweep(self, p: Pass) -> Adjoint:
-        """Trace the paths, splat them where there is an image, and walk back: the adjoint at the emitter."""
+        """Trace the paths, splat them if there is an image, and walk back; return the adjoint at the emitter."""
         ring, again = Ring.of(p.plan, self.stack_size), Pass(p.samples, None, p.adjoint)
         state: AttachedState = p.walk(AttachedSweep(p, ring))
 
@@ -303,17 +303,17 @@ class AttachedStack(Estimator):
 
 
 def begins(plan: Plan, vertex: Vertex) -> mi.Bool:
-    """Lanes in which the vertex itself depends on a parameter."""
+    """Return the lanes in which the vertex itself depends on a parameter."""
     return plan.moves(vertex.si.shape) | plan.differentiates(vertex.bsdf)
 
 
 def concerns_emission(plan: Plan) -> bool:
-    """Whether a parameter has a part in the rays that leave the emitters, or in E."""
+    """Whether a parameter affects the rays that leave the emitters, or E."""
     return plan.differentiate_emission or plan.moving_emission
 
 
 def differentiate_start(p: Pass, adjoint: Adjoint) -> None:
-    """Add the derivatives of the rays that leave the emitters, and of E, where a parameter has a part in either."""
+    """Add the derivatives of the rays that leave the emitters, and of E, if a parameter affects them."""
     plan = p.plan
     if not concerns_emission(plan):
         return

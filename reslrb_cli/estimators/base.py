@@ -1,4 +1,4 @@
-"""What every estimator offers, and the step that all share: from an adjoint contribution to derivatives at a vertex."""
+"""Interface of all estimators, and their common step: from the adjoint of a contribution to derivatives at a vertex."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STACK_SIZE = 64  # vertices
 
 @dataclass
 class Pass:
-    """One set of samples as an estimator sees it.
+    """One set of samples for an estimator.
 
     `block` is the image to splat into, or None. `adjoint` is dL/dI, or None while it is not known.
     """
@@ -35,41 +35,41 @@ class Pass:
 
     @property
     def plan(self) -> Plan:
-        """What a walk has to do."""
+        """Plan of the walk."""
         return self.samples.plan
 
     @property
     def scale(self) -> mi.Float:
-        """What brings a sum over paths to an image."""
+        """Factor that normalises a sum over paths to an image."""
         return self.samples.scale
 
     def walk(self, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
-        """Trace the paths, the same ones each time; the hooks' final state."""
+        """Trace the paths, the same ones each time, and return the final state of the hooks."""
         return walk(self.samples, hooks, active)
 
     def emission(self) -> Emission:
-        """The rays that leave the emitters, and E (C,) of each path, with derivatives."""
+        """Return the rays that leave the emitters, and E (C,) of each path, with derivatives."""
         return sample_emission(self.samples, self.samples.sampler())
 
     def delta(self, u: mi.Point2f, active: mi.Bool) -> mi.Spectrum:
-        """The adjoint (C,) at film position `u`; dL/dI is known."""
+        """Return the adjoint (C,) at film position `u`; dL/dI must be known."""
         assert self.adjoint is not None
         return self.adjoint.lookup(u, active)
 
     def splat(self, u: mi.Point2f, value: mi.Spectrum, active: mi.Bool) -> None:
-        """Add `value` (C,) to the image, where there is one."""
+        """Add `value` (C,) to the image if there is one."""
         if self.block is not None:
             self.samples.film.put(self.block, u, value, active)
 
 
 class Estimator(ABC):
-    """One way to estimate the gradient of a path's contributions without keeping the path.
+    """Estimator of the gradient of a path's contributions without storing the path.
 
-    `forward` splats the image and returns what is kept of each path; `backward` adds the derivatives, once dL/dI is
-    known. Where it is known from the start (`Pass.adjoint` in `forward`), an estimator may do better with that.
+    `forward` splats the image and returns the stored data of each path; `backward` adds the derivatives once dL/dI is
+    known. If dL/dI is known from the start (`Pass.adjoint` in `forward`), an estimator may use it there.
 
-    OPTIONS names the options of the plugin that this estimator has, with their defaults; its constructor takes them and
-    raises ValueError where one is wrong.
+    OPTIONS maps the estimator's options of the plugin to their defaults. The constructor takes them, and raises
+    ValueError if one is wrong.
     """
 
     OPTIONS: ClassVar[dict[str, Any]] = {}
@@ -78,35 +78,39 @@ class Estimator(ABC):
     attached: Estimator | None = None  # the estimator of the same name where light moves; None: there is none
 
     def of(self, plan: Plan) -> Estimator:
-        """Return this estimator, or `attached` where the plan asks for attached derivatives."""
+        """Return this estimator, or `attached` if the plan needs attached derivatives."""
         return self.attached if plan.attached and self.attached is not None else self
 
     @abstractmethod
     def forward(self, p: Pass) -> Any:
-        """Splat the image and return the state to keep, a PyTree of arrays, one entry per path; not evaluated here."""
+        """Splat the image and return the state to store, a PyTree of arrays with one entry per path; not evaluated
+        here.
+        """
 
     @abstractmethod
     def backward(self, p: Pass, state: Any) -> None:
-        """Add the derivatives to the parameters' gradients; `p.adjoint` is known, `p.block` is not used."""
+        """Add the derivatives to the parameters' gradients; `p.adjoint` is known, and `p.block` is not used."""
 
     @abstractmethod
     def kept(self, plan: Plan) -> Any:
-        """All that memory holds of a path at once, a PyTree of the same form; only the types of its leaves count."""
+        """Return all simultaneously stored data of a path, a PyTree of the same form; only the types of its leaves
+        matter.
+        """
 
     def scratch_bytes(self, plan: Plan) -> int:
-        """Thread-local bytes of each path that is being traced, which the allocator does not see."""
+        """Return the thread-local bytes of each traced path, which the allocator does not count."""
         return 0
 
 
 def arrays(tree: Any) -> list[dr.ArrayBase]:
-    """All arrays of a PyTree of dataclasses and lists, in their order."""
+    """Return all arrays of a PyTree of dataclasses and lists, in order."""
     if is_dataclass(tree):
         tree = [getattr(tree, field.name) for field in fields(tree)]
     return [array for part in tree for array in arrays(part)] if isinstance(tree, (list, tuple)) else [tree]
 
 
 def like(form: T, values: Iterator[dr.ArrayBase]) -> T:
-    """A PyTree of the same form, of the next of these arrays."""
+    """Return a PyTree of the same form, filled with the next of these arrays."""
     made: Any = type(form)
     if isinstance(form, list):
         return made(like(part, values) for part in form)
@@ -116,34 +120,33 @@ def like(form: T, values: Iterator[dr.ArrayBase]) -> T:
 
 
 def entry_bytes(tree: Any) -> list[int]:
-    """Bytes of one entry of each array in a PyTree."""
+    """Return the bytes of one entry of each array in a PyTree."""
     found = arrays(tree)
     parts = [list(array) if dr.depth_v(array) > 1 else [] for array in found]
     return [n for array, own in zip(found, parts, strict=True) for n in (entry_bytes(own) or [dr.itemsize_v(array)])]
 
 
 def allocate(form: Any, size: int) -> list[dr.Local]:
-    """Thread-local memory for so many PyTrees of this form, and one more place, for what nobody is to read.
+    """Return thread-local memory for `size` PyTrees of this form, and one more place for discarded values.
 
-    No place of it can be written twice, be it that the first write is masked out: the second was seen to be lost
-    (Dr.Jit 1.5, LLVM).
+    No place may be written twice, even if the first write is masked out: the second write was lost (Dr.Jit 1.5, LLVM).
     """
     return [dr.alloc_local(type(array), size + 1) for array in arrays(form)]
 
 
 def write(stack: list[dr.Local], value: Any, place: mi.UInt32, active: mi.Bool) -> None:
-    """Write a PyTree to a place of such memory."""
+    """Write a PyTree to a place of this memory."""
     for array, member in zip(stack, arrays(value), strict=True):
         array.write(member, place, active)
 
 
 def read(stack: list[dr.Local], form: T, place: mi.UInt32) -> T:
-    """The PyTree at a place."""
+    """Return the PyTree at a place."""
     return like(form, (array.read(place) for array in stack))
 
 
 def differentiate_emission(p: Pass, weight: Callable[[mi.Spectrum], mi.Spectrum]) -> None:
-    """Add the derivative of E, (C,), times `weight(E)`, where the plan differentiates emission at all."""
+    """Add the derivative of E, (C,), times `weight(E)`, if the plan differentiates emission."""
     if p.plan.differentiate_emission:
         with dr.resume_grad(), dr.isolate_grad():
             E = p.emission().weight
@@ -154,8 +157,8 @@ def differentiate_emission(p: Pass, weight: Callable[[mi.Spectrum], mi.Spectrum]
 class PathAdjoint:
     """Sensitivity of the objective to one connection of a path.
 
-    `value` is (C,): delta times the product of the nonzero factors, the estimator's weight included, and 0 in lanes
-    without one; `product` says which factor is zero, if any.
+    `value` is (C,): delta times the product of the nonzero factors, including the weight of the estimator, and 0 in
+    lanes without a connection. `product` says which factor is zero, if any.
     """
 
     value: mi.Spectrum
@@ -165,10 +168,9 @@ class PathAdjoint:
 def adjoint_of_factor(
     adjoint: PathAdjoint, index: mi.UInt32 | mi.Int32, f: mi.Spectrum, rest: mi.Spectrum | float
 ) -> mi.Spectrum:
-    """d(objective)/df (C,), for the factor `f * rest` that stands at position `index` of the path; detached.
+    """Return d(objective)/df (C,) for the factor `f * rest` at position `index` of the path; detached.
 
-    A factor that is not zero gets adjoint / f where no factor is zero; one that is, adjoint * rest where it is the only
-    one.
+    A nonzero factor gets adjoint / f if no factor is zero; a zero factor gets adjoint * rest if it is the only one.
     """
     f, value, zeros = dr.detach(f), adjoint.value, adjoint.product.zero
     if not zeros:
@@ -184,10 +186,10 @@ def differentiate_passage(
     p: Pass, si: mi.SurfaceInteraction3f, depth: mi.UInt32, connection: Connection, active: mi.Bool,
     adjoint: PathAdjoint,
 ) -> mi.Spectrum:  # fmt: skip
-    """Transmittance (C,) of the masks between a vertex and the sensor; adds its derivative, by that of the connection.
+    """Return the transmittance (C,) of the masks between a vertex and the sensor, and add its derivative.
 
-    A mask with a transmission of zero ends the segment, so that none is ever the zero factor of a product. Only beside
-    a zero factor is the transmittance of use; where there is none, and no derivative either, nothing is traced.
+    A mask with a transmission of zero ends the segment, so a mask is never the zero factor of a product. Only beside a
+    zero factor is the transmittance needed. Otherwise, without a derivative, nothing is traced.
     """
     if not p.plan.passage_in_gradient:
         return mi.Spectrum(1)
@@ -208,7 +210,7 @@ def differentiate_passage(
 
 
 def contribution(p: Pass, vertex: Vertex, connection: Connection) -> Product:
-    """C_i of an evaluated connection."""
+    """Return C_i of an evaluated connection."""
     return vertex.product.times(connection.c, vertex.depth, stand_in(connection)[1]).scaled(p.scale)
 
 
@@ -219,11 +221,11 @@ class VertexHooks(Hooks):
         self.p = p
 
     def concerned(self, state: Any) -> mi.Bool:
-        """Lanes with anything to differentiate before the current vertex, where emission is not differentiated."""
+        """Return the lanes with a differentiated vertex before the current one, if emission is not differentiated."""
         return mi.Bool(True)
 
     def wants(self, state: Any, vertex: Vertex) -> mi.Bool:
-        """Where there is no image to splat into, connections with anything to differentiate."""
+        """Return all lanes if there is an image, otherwise connections with something to differentiate."""
         plan = self.p.plan
         if self.p.block is not None or plan.differentiate_emission:
             return mi.Bool(True)
@@ -231,23 +233,23 @@ class VertexHooks(Hooks):
 
 
 def vertices(plan: Plan) -> int:
-    """The most vertices that a path can have."""
+    """Return the maximum number of vertices of a path."""
     return max(plan.max_depth - 1, 0)
 
 
 def places(plan: Plan, stack_size: int) -> int:
-    """How many vertices a stack has room for: no more than a path can have, and one at least."""
+    """Return the number of vertices that a stack holds: at least one, and at most those of a path."""
     return min(stack_size, max(vertices(plan), 1))
 
 
 def one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
-    """Raise ValueError where an option has none of the values it may have."""
+    """Raise ValueError if an option has none of its allowed values."""
     if value not in allowed:
         raise ValueError(f'"{name}" must be one of {", ".join(allowed)}, not "{value}"')
 
 
 def at_least_one(name: str, value: int, most: int | None = None) -> None:
-    """Raise ValueError where an option that counts something is less than 1, or more than `most`."""
+    """Raise ValueError if an option that counts something is less than 1, or more than `most`."""
     if value < 1:
         raise ValueError(f'"{name}" must be at least 1, not {value}')
     if most is not None and value > most:

@@ -1,11 +1,11 @@
-"""Camera paths: their image, and its derivative in one traversal, for a film whose dL/dI is known.
+"""Camera paths: their image, and its derivative in one traversal, for a film with known dL/dI.
 
-All light that a camera path finds arrives at one place of the film, so that delta is one number a channel, known before
+All light that a camera path finds arrives at one place of the film, so delta is one number per channel, known before
 the path is traced. The walk back is that of `stack.py`, with c_j the contribution of vertex j's next event. Light that
-is met at a vertex does not depend on the BSDF there, so it counts to what lies before the vertex.
+is met at a vertex does not depend on the BSDF there, so it belongs to the vertices before.
 
-The radiance of both is a last factor, whose derivative needs nothing that comes later: it is differentiated on the way
-out. The weights of the ways to find a path have no derivative.
+The radiance of both is a last factor, whose derivative needs nothing that comes later. It is differentiated on the way
+out. The weights of combined paths have no derivative.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
 class Radiance(CameraHooks):
-    """What arrives along each path, (C,)."""
+    """Radiance that arrives along each path, (C,)."""
 
     def start(self, first: FilmRay) -> mi.Spectrum:
         return mi.Spectrum(0)
@@ -44,7 +44,7 @@ class Radiance(CameraHooks):
 
 
 class TrackedRadiance(Radiance):
-    """The same with derivatives of all factors, for naive AD."""
+    """The same radiance with derivatives of all factors, for naive AD."""
 
     tracked = True
 
@@ -57,16 +57,16 @@ def splat_camera_paths(samples: Samples, block: mi.ImageBlock, tracked: bool = F
 
 @dataclass
 class CameraState:
-    """Loop state of the way out: the stack, and the radiance so far, (C,), where there is an image."""
+    """Loop state of the way out: the stack, and the radiance so far, (C,), if there is an image."""
 
     stack: StackState
     L: list[mi.Spectrum]
 
 
 class CameraSweep(CameraHooks):
-    """The way out of camera paths: sum up the image, differentiate radiances, and push vertices.
+    """Way out of camera paths: sum the image, differentiate radiances, and push vertices.
 
-    With `end` it is done again for the vertices before that number: they are pushed, and the path ends with them.
+    With `end`, the vertices before that number are traced again: they are pushed, and the path ends with them.
     """
 
     def __init__(self, p: Pass, ring: Ring, end: mi.UInt32 | None = None) -> None:
@@ -110,7 +110,7 @@ class CameraSweep(CameraHooks):
         return CameraState(state.stack.scaled(weight), state.L)
 
     def _differentiate_emission(self, vertex: Vertex, met: MetLight | None, event: NextEvent | None) -> None:
-        """Add the derivatives by the radiance that a vertex finds."""
+        """Add the derivatives with respect to the radiance that a vertex finds."""
         weight = self.delta * vertex.product.value()
         with dr.resume_grad():
             objective = mi.Spectrum(0)
@@ -125,7 +125,7 @@ class CameraSweep(CameraHooks):
 
 
 def differentiate_camera_paths(p: Pass, stack_size: int = STACK_SIZE) -> None:
-    """Add the derivatives of the camera paths of a pass, whose dL/dI is known, and their image to its block, if any."""
+    """Add the derivatives of the camera paths of a pass with known dL/dI, and their image to its block, if any."""
     ring, again = Ring.of(p.plan, stack_size), Pass(p.samples, None, p.adjoint)
     first, state = camera_walk(p.samples, CameraSweep(p, ring))
     if p.block is not None:

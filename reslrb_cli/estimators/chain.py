@@ -1,32 +1,31 @@
-"""Attached derivatives of the connections that a reservoir keeps, by chains of Jacobians: constant memory, no stack.
+"""Attached derivatives of a reservoir's connections, by chains of Jacobians: constant memory, no stack.
 
-Chain: let p_i be the coordinates of the ray that reaches vertex i, J_i = dp_{i+1}/dp_i, and
-J_{0->i} their product from the first vertex on that a parameter has a part in. Beside it each channel carries what the
-factors so far change by,
+Chain: let p_i be the coordinates of the ray that reaches vertex i, J_i = dp_{i+1}/dp_i, and J_{0->i} their product from
+the first vertex on that depends on a parameter. Each channel also carries the logarithmic derivative of the factors so
+far,
 
     G_i = sum_{m<i} dlog s_m/dp_m J_{0->m}
 
-Of a connection I that is kept, so are du_I/dp_I J_{0->I} and dlog c_I/dp_I J_{0->I} + G_I; with delta they make the
-adjoint of the first ray (W / (m w_I), which stands before all of it, is left out here),
+For a selected connection I, du_I/dp_I J_{0->I} and dlog c_I/dp_I J_{0->I} + G_I are stored. With delta they give the
+adjoint of the first ray (without the factor W / (m w_I)),
 
     a_0 = <d delta/du, C_I> du_I/dp_I J_{0->I} + delta C_I (dlog c_I/dp_I J_{0->I} + G_I)
 
-Damping (`segment_jacobian`) makes an inverse of what has none, at the price of digits: one for every vertex that is not
-specular. So such paths are taken in blocks of BLOCK of these vertices. A chain begins with one block, chosen with equal
-probability among those that are there when a connection is met, and replaying takes the adjoint through this one alone,
-times their number. Radiometric derivatives, which need no chain, are taken at every vertex of a path all the same.
+Damping (`segment_jacobian`) makes singular Jacobians invertible, but costs digits at every vertex that is not specular.
+Paths are therefore divided into blocks of BLOCK such vertices. A chain starts with one block, chosen with equal
+probability among the blocks before the connection, and the replay takes the adjoint only through this block, multiplied
+by the number of blocks. Radiometric derivatives, which need no chain, are added at every vertex.
 
-Replay: it takes a_0 to every vertex through the inverse of what it passes, and differentiates each segment on its own:
+Replay: it takes a_0 to every vertex through the inverse of the passed Jacobians, and differentiates each segment:
 
     a_{j+1} = (a_j - delta C_I dlog s_j/dp_j) J_j^{-1}
     dS     += a_{j+1} dp_{j+1}/dtheta + delta C_I ds_j/s_j          at I:   d<delta(u_I), C_I> by c_I and u_I
 
-This is J_{j+1->I} = J_{0->I} J_{0->j+1}^{-1} of the ResLRB paper's Section 2.5, one factor of the inverse after the
-other. Both chain and replay compute the same J_j to the last bit, so that the inverse undoes it however badly
-conditioned it is.
+This is J_{j+1->I} = J_{0->I} J_{0->j+1}^{-1} of the ResLRB paper's Section 2.5, one factor of the inverse at a time.
+Chain and replay compute the same J_j to the last bit, so the inverse undoes it for any conditioning.
 
-Source: the ResLRB paper, Section 2.5, which has neither G nor blocks, and says of vertices that are not specular that
-the inverse is regularised. With a random sign in the regularisation there is no bias.
+Source: the ResLRB paper, Section 2.5, which has neither G nor blocks, and regularises the inverse at vertices that are
+not specular. A random sign of the regularisation avoids its bias.
 """
 
 from __future__ import annotations
@@ -71,11 +70,11 @@ JACOBIAN_DAMPING = 0.1
 
 @dataclass
 class ChainSlot:
-    """One kept connection. `last` is the last vertex up to its own, `number`, with anything to differentiate; 0: none.
+    """Selected connection.
 
-    `prefix` (C,) is the path's throughput before its vertex. `u_rows` and `C_rows` are du_I/dp_I J_{0->I} and
-    dlog c_I/dp_I J_{0->I} + G_I. `block` holds the number of the block that J begins with, and that of all up to here,
-    where there may be several.
+    `last` is the last differentiated vertex up to its own, `number`; 0 if there is none. `prefix` (C,) is the path's
+    throughput before its vertex. `u_rows` and `C_rows` are du_I/dp_I J_{0->I} and dlog c_I/dp_I J_{0->I} + G_I. `block`
+    holds the number of the block that J starts with, and the number of blocks so far, if there may be several.
     """
 
     w: mi.Float
@@ -91,34 +90,34 @@ class ChainSlot:
 
 @dataclass
 class ChainBlocks:
-    """Where a path stands in its blocks: vertices passed that are not specular, and which block the chain begins
-    with."""
+    """Position of a path in its blocks: number of non-specular vertices passed, and the block that the chain starts
+    with.
+    """
 
     passed: mi.UInt32
     chosen: mi.UInt32
 
     @staticmethod
     def of(plan: Plan) -> list[ChainBlocks]:
-        """At the beginning; nothing where a path cannot have more than one."""
+        """Return the position at the start; empty if a path cannot have more than one block."""
         return [ChainBlocks(mi.UInt32(0), mi.UInt32(0))] if plan.max_depth - 2 > BLOCK else []
 
     @property
     def number(self) -> mi.UInt32:
-        """Of the block that the ray from here on belongs to, from 0."""
+        """Number of the block of the ray from here on, starting at 0."""
         return self.passed // BLOCK
 
     def past(self, damped: mi.Bool) -> tuple[ChainBlocks, mi.Bool]:
-        """Behind a vertex, and where a block begins with it."""
+        """Return the position behind a vertex, and whether a block starts with it."""
         passed = self.passed + dr.select(damped, mi.UInt32(1), 0)
         return ChainBlocks(passed, self.chosen), damped & (passed % BLOCK == 0)
 
 
 @dataclass
 class ChainState:
-    """What is kept of a path; what is in a list is there on the way alone.
+    """Stored data of a path; lists exist only on the way.
 
-    `latest` is the latest vertex with anything to differentiate (0: none), `J` is J_{0->i}, and `G` has a row for each
-    channel.
+    `latest` is the latest differentiated vertex (0: none), `J` is J_{0->i}, and `G` has a row for each channel.
     """
 
     W: mi.Float
@@ -131,7 +130,7 @@ class ChainState:
 
     @staticmethod
     def empty(plan: Plan, capacity: int) -> ChainState:
-        """Nothing kept yet."""
+        """Return the empty state."""
 
         def rows(count: int) -> list[mi.Vector4d]:
             return [mi.Vector4d(0) for _ in range(count)]
@@ -146,17 +145,17 @@ class ChainState:
         return ChainState(mi.Float(0), slots, latest, J, rows(channels), blocks, Before.start(plan))
 
     def stored(self) -> ChainState:
-        """What is left of it at the end of a path."""
+        """Return the part of the state that is stored at the end of a path."""
         return ChainState(self.W, self.slots, [], [], [], [], [])
 
 
 def numbers_of(connection: Connection, scattering: Scattering) -> Numbers:
-    """The numbers that a segment was made from."""
+    """Return the random numbers of a segment."""
     return Numbers(connection.sample, scattering.sample_2, scattering.sample_1)
 
 
 class ChainSelection(VertexHooks):
-    """Image pass: splat, chain Jacobians, and keep connections by a reservoir."""
+    """Image pass: splat, multiply Jacobians, and select connections by a reservoir."""
 
     def __init__(self, p: Pass, capacity: int, weight: str, damping: float) -> None:
         super().__init__(p)
@@ -211,7 +210,7 @@ class ChainSelection(VertexHooks):
         return replace(self._begun_anew(after, jacobian.damped, numbers[-1]), before=before)
 
     def _begun_anew(self, state: ChainState, damped: mi.Bool, number: mi.Float) -> ChainState:
-        """The chain begins anew with a block, instead of any before it, with one over their number as probability."""
+        """Start the chain anew with a block, with probability one over the number of blocks."""
         if not state.blocks:
             return state
         blocks, begins = state.blocks[0].past(damped)
@@ -224,10 +223,10 @@ class ChainSelection(VertexHooks):
 
 @dataclass
 class KeptConnection:
-    """A slot in a replay.
+    """Selected connection in a replay.
 
-    `share` is W / (m w_I), `adjoint` the sensitivity of the objective to its connection, `A` = delta C_I (C,) what of
-    it is left where factors are zero, `row` a_0; each with `share` in it.
+    `share` is W / (m w_I), `adjoint` the sensitivity of the objective to the connection, `A` = delta C_I (C,) its
+    nonzero part, and `row` is a_0; each includes `share`.
     """
 
     slot: ChainSlot
@@ -238,7 +237,7 @@ class KeptConnection:
 
     @staticmethod
     def of(p: Pass, slot: ChainSlot, share: mi.Float) -> KeptConnection:
-        """That of a slot, dL/dI being known."""
+        """Return the connection of a slot; dL/dI must be known."""
         assert p.adjoint is not None
         C = slot.C.value() * share
         with dr.resume_grad():
@@ -254,7 +253,7 @@ class KeptConnection:
         return KeptConnection(slot, share, PathAdjoint(delta * slot.C.nonzero * share, slot.C), A, row)
 
     def part(self, blocks: list[ChainBlocks]) -> tuple[mi.Bool, mi.Float64]:
-        """Where a ray belongs to the block that the chain begins with, and what stands for all other blocks."""
+        """Return whether a ray belongs to the block that the chain starts with, and the factor for all other blocks."""
         if not blocks:
             return mi.Bool(True), mi.Float64(1)
         chosen, count = self.slot.block
@@ -263,7 +262,7 @@ class KeptConnection:
 
 @dataclass
 class ReplayState:
-    """Loop state of a replay: a_j of each slot, and whether the path has met anything to differentiate."""
+    """Loop state of a replay: a_j of each slot, and whether the path has met a differentiated vertex."""
 
     rows: list[mi.Vector4d]
     begun: mi.Bool
@@ -272,7 +271,7 @@ class ReplayState:
 
 
 class ChainReplay(SlotReplay):
-    """Replay up to the last vertex with anything to differentiate, and differentiate each segment's ray and factors."""
+    """Replay up to the last differentiated vertex, and differentiate each segment's ray and factors."""
 
     def __init__(self, p: Pass, kept: list[KeptConnection], damping: float) -> None:
         super().__init__(p, [one.slot.last for one in kept])
@@ -307,7 +306,7 @@ class ChainReplay(SlotReplay):
     def _differentiate(
         self, vertex: Vertex, before: list[Before], numbers: Numbers, scattering: Scattering, rows: list[mi.Vector4d]
     ) -> None:
-        """Add the derivatives of the vertex's segment; `rows` are the adjoints of the ray that it ends in."""
+        """Add the derivatives of the vertex's segment; `rows` are the adjoints of its outgoing ray."""
         p, plan, depth = self.p, self.p.plan, vertex.depth
         here = vertex.active & begins(plan, vertex)
         connected, scattered = mi.Bool(False), mi.Bool(False)
@@ -332,12 +331,12 @@ class ChainReplay(SlotReplay):
 
 
 class AttachedReservoir(Estimator):
-    """`reservoir` where light moves."""
+    """The estimator `reservoir` with attached derivatives."""
 
     OPTIONS: ClassVar[dict[str, Any]] = Reservoir.OPTIONS | {"jacobian_damping": JACOBIAN_DAMPING}
 
     def __init__(self, jacobian_damping: float = JACOBIAN_DAMPING, **options: Any) -> None:
-        """`options` are those of `Reservoir`."""
+        """Make the estimator; `options` are those of `Reservoir`."""
         if not jacobian_damping > 0:
             raise ValueError(f'"jacobian_damping" must be positive, not {jacobian_damping}')
         checked = Reservoir(**options)
@@ -356,7 +355,7 @@ class AttachedReservoir(Estimator):
 
 
 def differentiate(p: Pass, kept: list[KeptConnection], damping: float) -> None:
-    """Add the derivatives of the kept connections."""
+    """Add the derivatives of the selected connections."""
     if concerns_emission(p.plan):
         emission = p.emission()
         B, origin, direction = mi.Spectrum(0), mi.Vector3f(0), mi.Vector3f(0)
@@ -376,10 +375,10 @@ AXES = 4
 
 @dataclass
 class SegmentJacobian:
-    """Derivatives by p_i, in double precision: products of many of them have to be inverted.
+    """Derivatives with respect to p_i, in double precision, because products of many of them are inverted.
 
-    `ray` is dp_{i+1}/dp_i, and `damped` says where `damping` has a part in it; `log_s` and `log_c` have a row for
-    each channel, 0 where the factor is 0, and `u` one for each film coordinate (in pixels).
+    `ray` is dp_{i+1}/dp_i, and `damped` says whether it contains `damping`. `log_s` and `log_c` have a row for each
+    channel, 0 if the factor is 0, and `u` one for each film coordinate (in pixels).
     """
 
     ray: mi.Matrix4d
@@ -390,12 +389,12 @@ class SegmentJacobian:
 
 
 def row_times(row: mi.Vector4d, matrix: mi.Matrix4d) -> mi.Vector4d:
-    """row @ matrix."""
+    """Return row @ matrix."""
     return mi.Vector4d(matrix.T @ row)
 
 
 def coordinates(d: mi.Vector3f, o_change: mi.Vector3f, d_change: mi.Vector3f, stays: mi.Bool) -> list[mi.Float]:
-    """The coordinates of a small change of a ray's origin and direction, `d` being its direction."""
+    """Return the coordinates of a small change of a ray's origin and direction `d`."""
     frame = mi.Frame3f(d)
     return [
         dr.dot(frame.s, o_change),
@@ -406,7 +405,9 @@ def coordinates(d: mi.Vector3f, o_change: mi.Vector3f, d_change: mi.Vector3f, st
 
 
 def spread(d: mi.Vector3f, row: mi.Vector4d, stays: mi.Bool) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """The derivatives by a ray's origin and by its direction `d` that a row of derivatives by p stands for."""
+    """Return the derivatives with respect to a ray's origin and direction `d`, from a row of derivatives with respect
+    to p.
+    """
     frame = mi.Frame3f(d)
     q_s, q_t, third, fourth = (mi.Float(value) for value in row)
     along = d * dr.select(stays, third, 0)
@@ -417,13 +418,13 @@ def segment_jacobian(
     samples: Samples, vertex: Vertex, before: list[Before], numbers: Numbers, connected: mi.Bool | None,
     scattered: mi.Bool, damping: float,
 ) -> SegmentJacobian:  # fmt: skip
-    """The Jacobians of a vertex's segment; without `connected` (a mask) none of the connection's.
+    """Return the Jacobians of a vertex's segment; lanes without `connected` have none of the connection.
 
-    Where a diffuse surface scatters, the next ray does not depend on the direction of the one before, so that the
-    Jacobian has no inverse; and nor has that of a vertex that stays on its surface. `damping` makes one of it: behind
-    a vertex that is not specular the ray turns by `damping` with the one before, and behind one that stays it is also
-    shifted with it, to either side with probability 1/2. What stands in a chain before its inverse depends on each of
-    these terms linearly, so that its mean is what it is without them.
+    Behind a diffuse scattering event, the next ray does not depend on the previous direction, so the Jacobian is
+    singular. The same holds for a vertex that stays on its surface. `damping` makes it invertible: behind a vertex that
+    is not specular, the ray turns by `damping` with the previous ray, and behind one that stays it is also shifted with
+    it, to either side with probability 1/2. The chain before the inverse is linear in each of these terms, so the
+    expected value does not change.
     """
     p = [mi.Float(0) for _ in range(AXES)]
     frame, stays = mi.Frame3f(vertex.ray.d), is_staying(before)
@@ -468,9 +469,9 @@ def segment_jacobian(
 
 
 def sign(numbers: Numbers) -> mi.Float:
-    """1 or -1, with probability 1/2 each: the last bit of a number that the BSDF draws by.
+    """Return 1 or -1 with probability 1/2 each: the last bit of a random number of the BSDF.
 
-    It has no part in where light goes, and a replay finds it again.
+    This bit does not affect the direction, and a replay reads the same bit.
     """
     return dr.select((mi.UInt32(numbers.bsdf_2d.x * float(1 << 23)) & 1) == 0, mi.Float(1), -1)
 
@@ -480,7 +481,7 @@ def _matrix(columns: list[list[mi.Float64]]) -> mi.Matrix4d:
 
 
 def _logarithmic(value: mi.Spectrum, changes: list[mi.Spectrum], active: mi.Bool) -> list[mi.Vector4d]:
-    """Rows of the derivatives of log(value), one for each channel."""
+    """Return rows of the derivatives of log(value), one for each channel."""
     value = dr.detach(value)
     used = active & (value != 0)
     rows = [dr.select(used, change / value, 0) for change in changes]

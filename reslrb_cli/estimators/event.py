@@ -1,16 +1,16 @@
-"""Keep single scattering events of each path, chosen by two nested reservoirs, and differentiate those: no replay.
+"""Select single scattering events of each path by two nested reservoirs, and differentiate them without a replay.
 
-A path's gradient is a double sum, over the connections i, and over what each of them went through: emission, the
-scattering events j < i, and the connection's own BSDF (j = i). The inner reservoir keeps one of these, with weight
-q_j = 1, or 0 where there is nothing to differentiate; the outer keeps a connection with weight w_i Q_i,
-Q_i = sum_j q_j.
+The gradient of a path is a double sum over the connections i, and over the events of each connection: emission, the
+scattering events j < i, and the connection's own BSDF (j = i). The inner reservoir selects one of these events, with
+weight q_j = 1, or 0 if it has no parameter. The outer reservoir selects a connection with weight w_i Q_i, Q_i = sum_j
+q_j.
 
     the pair (i, j) is kept with probability w_i q_j / W,   W = sum_i w_i Q_i
     dS ~ 1/m sum_slots W / (w_i q_j) delta_i C_i df_j/f_j
 
-Reservoir sampling: Chao 1982. What is kept of an event is enough to evaluate its BSDF again, about 50 bytes. One number
-chooses the event of a vertex's own connection and that of its prefix: only one of the two is ever kept of a path, so
-that they may depend on each other.
+Reservoir sampling: Chao 1982. The stored event suffices to evaluate its BSDF again, and takes about 50 bytes. One
+random number selects both the event of a vertex's own connection and that of its prefix. Only one of the two is ever
+stored for a path, so they may depend on each other.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from reslrb_cli.transport.walk import Vertex
 
 @dataclass
 class EventSlot:
-    """One kept pair of a connection and an event."""
+    """Selected pair of a connection and an event."""
 
     w: mi.Float  # selection weight of the connection; 0: nothing kept
     C: Product
@@ -58,13 +58,13 @@ class EventSlot:
 
     @staticmethod
     def empty(plan: Plan) -> EventSlot:
-        """Nothing kept yet."""
+        """Return an empty slot."""
         return EventSlot(mi.Float(0), Product.none(plan.track_zeros), mi.Point2f(0), Event.emission(plan))
 
 
 @dataclass
 class EventState:
-    """Loop state: Q, W, and for each slot the prefix's event, and the kept pair."""
+    """Loop state: Q, W, and for each slot the prefix's event, and the selected pair."""
 
     Q: mi.Float
     W: mi.Float
@@ -74,14 +74,14 @@ class EventState:
 
 @dataclass
 class KeptEvents:
-    """What is kept of a path."""
+    """Stored data of a path."""
 
     W: mi.Float
     slots: list[EventSlot]
 
 
 class EventSelection(VertexHooks):
-    """Image pass: splat, and keep events."""
+    """Image pass: splat, and select events."""
 
     def __init__(self, p: Pass, capacity: int, weight: str) -> None:
         super().__init__(p)
@@ -130,7 +130,9 @@ class EventSelection(VertexHooks):
 
 
 class EventEstimator(Estimator):
-    """`capacity` independent pairs of a connection and an event, with selection weight `luminance` or `adjoint`."""
+    """Estimator with `capacity` independent pairs of a connection and an event, with selection weight `luminance` or
+    `adjoint`.
+    """
 
     OPTIONS: ClassVar[dict[str, Any]] = {"capacity": 1, "weight": "luminance"}
 

@@ -1,10 +1,11 @@
-"""Every connection of a path, at no extra variance: the image pass keeps a sum, the replay takes it apart again.
+"""Use every connection of a path without additional variance: the image pass stores a sum, and the replay subtracts
+from it.
 
     S_0 = sum_i delta_i C_i,   S_j = S_{j-1} - delta_j C_j
     dS  = S_0 dE/E + sum_j [ S_j ds_j/s_j + delta_j C_j dc_j/c_j ]
 
-Source: the ResLRB paper's conclusion, second extension. The sum needs delta: where dL/dI is known only after the image,
-a walk that traces no shadow rays sums first. One bit per vertex remembers which connections were visible; vertices
+Source: the ResLRB paper's conclusion, second extension. The sum needs delta: if dL/dI is known only after the image, a
+walk without shadow rays computes the sum first. One bit per vertex stores which connections were visible. Vertices
 beyond the last bit trace their shadow rays again, so that memory is constant.
 """
 
@@ -38,7 +39,7 @@ WORDS = 2  # of visibility bits, 32 vertices each
 
 @dataclass
 class Visibility:
-    """Which connections of a path were visible: one bit for each of 32 * WORDS vertices, and the last of all."""
+    """Visibility of a path's connections: one bit for each of 32 * WORDS vertices, and the last visible vertex."""
 
     words: list[mi.UInt32]
     # The last vertex that there is need to visit again, mostly the last with a visible connection; 0: none.
@@ -46,18 +47,20 @@ class Visibility:
 
     @staticmethod
     def none(plan_depth: int) -> Visibility:
-        """No vertex seen yet, with as many words as paths of that many vertices can fill."""
+        """Return an empty visibility, with as many words as paths of this depth can fill."""
         return Visibility([mi.UInt32(0) for _ in range(min(WORDS, -(-plan_depth // 32)))], mi.UInt32(0))
 
     def with_vertex(self, depth: mi.UInt32, visible: mi.Bool, last: mi.UInt32) -> Visibility:
-        """Remember whether the connection from vertex `depth` is visible; if so, `last` is to be visited."""
+        """Return the visibility with that of the connection from vertex `depth`; if visible, `last` is the last vertex
+        to visit.
+        """
         index = depth - 1
         bit = mi.UInt32(1) << (index & 31)
         words = [word | dr.select(visible & ((index >> 5) == k), bit, 0) for k, word in enumerate(self.words)]
         return Visibility(words, dr.select(visible, last, self.last))
 
     def seen(self, depth: mi.UInt32, vertices: int) -> Seen:
-        """What is known at vertex `depth`, of paths that have at most so many vertices."""
+        """Return the known visibility at vertex `depth`, for paths with at most `vertices` vertices."""
         index = depth - 1
         visible = mi.Bool(False)
         for k, word in enumerate(self.words):
@@ -68,11 +71,12 @@ class Visibility:
 
 @dataclass
 class AdjointSum:
-    """sum_i delta_i C_i over connections of a path, (C,), as `value` + `rest`.
+    """Sum of delta_i C_i over connections of a path, (C,), as `value` + `rest`.
 
-    `rest` is what rounding lost (Knuth's two-sum), so that taking off what was added leaves zero also after a thousand
-    vertices. `behind_zero` is the same pair for contributions whose prefix holds exactly one zero factor, without it:
-    their value is nothing, and their derivative by that factor is the sum. It is empty where zeros are not tracked.
+    `rest` is the rounding error (Knuth's two-sum), so that subtracting all terms leaves zero after a thousand vertices.
+    `behind_zero` is the same pair for contributions whose prefix has exactly one zero factor, without this factor:
+    their value is zero, and their derivative with respect to the factor is the sum. It is empty if zeros are not
+    tracked.
     """
 
     value: mi.Spectrum
@@ -81,12 +85,12 @@ class AdjointSum:
 
     @staticmethod
     def zero(track_zeros: bool) -> AdjointSum:
-        """The empty sum."""
+        """Return the empty sum."""
         behind_zero = [mi.Spectrum(0), mi.Spectrum(0)] if track_zeros else []
         return AdjointSum(mi.Spectrum(0), mi.Spectrum(0), behind_zero)
 
     def plus(self, delta: mi.Spectrum, C: Product, index: mi.UInt32, active: mi.Bool) -> AdjointSum:
-        """The sum with delta C of one more connection, that of vertex `index`."""
+        """Return the sum with delta C of one more connection, at vertex `index`."""
         delta = dr.select(active, delta, 0)
         value, rest = self._add(self.value, self.rest, delta * C.value())
         if not self.behind_zero:
@@ -98,11 +102,13 @@ class AdjointSum:
         return AdjointSum(value, rest, list(self._add(self.behind_zero[0], self.behind_zero[1], term)))
 
     def minus(self, delta: mi.Spectrum, C: Product, index: mi.UInt32, active: mi.Bool) -> AdjointSum:
-        """The sum without delta C of a connection that is in it."""
+        """Return the sum without delta C of a connection that it contains."""
         return self.plus(-delta, C, index, active)
 
     def adjoint_of_factor(self, f: mi.Spectrum, prefix: Product, rest: mi.Float | float) -> mi.Spectrum:
-        """d(sum)/df (C,), for a factor `f * rest` of the path with this prefix, before all connections in the sum."""
+        """Return d(sum)/df (C,), for a factor `f * rest` of the path with this prefix, before all connections in the
+        sum.
+        """
         f, total = dr.detach(f), self.value + self.rest
         result = dr.select(f != 0, total / f, 0)
         if self.behind_zero:
@@ -112,12 +118,12 @@ class AdjointSum:
         return showing(result)
 
     def adjoint_of_emission(self, E: mi.Spectrum) -> mi.Spectrum:
-        """d(sum)/dE (C,)."""
+        """Return d(sum)/dE (C,)."""
         return self.adjoint_of_factor(E, Product.one(bool(self.behind_zero)), 1)
 
     @staticmethod
     def _add(value: mi.Spectrum, rest: mi.Spectrum, term: mi.Spectrum) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """value + rest + term, as the rounded sum and what it lost (Knuth 1969, 4.2.2, theorem B)."""
+        """Return value + rest + term as a rounded sum and its error (Knuth 1969, 4.2.2, theorem B)."""
         total = value + term
         part = total - value
         return total, rest + ((value - (total - part)) + (term - part))
@@ -125,9 +131,9 @@ class AdjointSum:
 
 @dataclass
 class GatherState:
-    """What is kept of a path: visibility, and S_0 where delta is known already (else nothing).
+    """Stored data of a path: visibility, and S_0 if delta is known (else nothing).
 
-    On the way there, where delta is known, `latest` is the latest vertex with anything to differentiate.
+    If delta is known, `latest` is the latest differentiated vertex on the way.
     """
 
     visibility: Visibility
@@ -136,7 +142,7 @@ class GatherState:
 
 
 class Gathering(VertexHooks):
-    """Image pass: splat, remember visibility, and sum where delta is known."""
+    """Image pass: splat, store the visibility, and sum if delta is known."""
 
     def start(self, product: Product) -> GatherState:
         p = self.p
@@ -164,7 +170,7 @@ class Gathering(VertexHooks):
 
 
 class Revisiting(VertexHooks):
-    """A walk along paths that were traced before, as far as there is need to, without shadow rays."""
+    """Walk along paths that were traced before, as far as necessary, without shadow rays."""
 
     def __init__(self, p: Pass, visibility: Visibility) -> None:
         super().__init__(p)
@@ -178,14 +184,14 @@ class Revisiting(VertexHooks):
 
 
 class Summing(Revisiting, Gathering):
-    """Sum delta_i C_i along the same paths again; of visibility, say which vertex is the last to visit once more."""
+    """Sum delta_i C_i along the same paths; the visibility says which vertex is the last to visit."""
 
     def start(self, product: Product) -> GatherState:
         return GatherState(Visibility.none(0), [AdjointSum.zero(self.p.plan.track_zeros)], [mi.UInt32(0)])
 
 
 class Taking(Revisiting):
-    """Replay: take each contribution off the sum again, and differentiate both factors of each vertex."""
+    """Replay: subtract each contribution from the sum, and differentiate both factors of each vertex."""
 
     def __init__(self, p: Pass, visibility: Visibility, S: AdjointSum) -> None:
         super().__init__(p, visibility)
@@ -215,20 +221,22 @@ class Taking(Revisiting):
 def adjoint_of_connection(
     p: Pass, vertex: Vertex, connection: Connection, active: mi.Bool, adjoint: PathAdjoint
 ) -> mi.Spectrum:
-    """d(objective)/df (C,) of a connection's BSDF; adds the derivative of the masks on its way."""
+    """Return d(objective)/df (C,) of a connection's BSDF, and add the derivative of masks on its way."""
     rest = mi.Spectrum(dr.rcp(stand_in(connection)[0]))
     rest *= differentiate_passage(p, vertex.si, vertex.depth, connection, active, adjoint)
     return adjoint_of_factor(adjoint, vertex.depth, connection.f, rest)
 
 
 def needed(latest: mi.UInt32, depth: mi.UInt32) -> mi.UInt32:
-    """The last vertex that a replay has to visit for a connection from vertex `depth`: one after the latest with
-    anything to differentiate, whose scattering is then sampled, or that vertex itself; 0: none."""
+    """Return the last vertex that a replay must visit for a connection from vertex `depth`; 0 if there is none.
+
+    This is the vertex after the latest differentiated one, whose scattering is then sampled, or that vertex itself.
+    """
     return dr.select(latest > 0, dr.minimum(latest + 1, depth), 0)
 
 
 class Gather(Estimator):
-    """Every connection, by a replay."""
+    """The estimator `gather`: every connection, by a replay."""
 
     exact = True
 

@@ -1,4 +1,4 @@
-"""What is kept of a vertex and of a sampled event, so that a BSDF can be evaluated there again."""
+"""Stored data of a vertex and of a sampled event, for another evaluation of the BSDF."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from reslrb_cli.transport.walk import Vertex
 
 @dataclass
 class SurfacePoint:
-    """What of a vertex its BSDF reads, as plain numbers (pointers are their indices).
+    """Data of a vertex that its BSDF reads, as plain numbers (pointers are their indices).
 
-    Where BSDFs read texture coordinates and directions alone, these are `[uv, wi, bsdf]`, without `bsdf` where just one
-    is differentiated; otherwise what the shape needs to find the interaction again: `[t, prim_uv, prim_index, shape,
+    If BSDFs read only texture coordinates and directions, these are `[uv, wi, bsdf]`, without `bsdf` if just one is
+    differentiated. Otherwise they are the data to find the interaction again: `[t, prim_uv, prim_index, shape,
     instance, o, d]`.
     """
 
@@ -25,7 +25,7 @@ class SurfacePoint:
 
     @staticmethod
     def of(plan: Plan, vertex: Vertex) -> SurfacePoint:
-        """That of a walk's current vertex."""
+        """Return the data of a walk's current vertex."""
         if not plan.keep_geometry:
             pointer = [] if plan.sole_bsdf is not None else [_index(vertex.bsdf)]
             return SurfacePoint([vertex.si.uv, vertex.si.wi, *pointer])
@@ -35,7 +35,7 @@ class SurfacePoint:
 
     @staticmethod
     def blank(plan: Plan) -> SurfacePoint:
-        """One of zeros, of the same form."""
+        """Return data of zeros of the same form."""
         if not plan.keep_geometry:
             pointer = [] if plan.sole_bsdf is not None else [mi.UInt32(0)]
             return SurfacePoint([mi.Point2f(0), mi.Vector3f(0), *pointer])
@@ -43,11 +43,11 @@ class SurfacePoint:
         return SurfacePoint([mi.Float(0), mi.Point2f(0), *indices, mi.Point3f(0), mi.Vector3f(0)])
 
     def ray(self) -> mi.Ray3f:
-        """The ray that reached the vertex; kept in scenes in which BSDFs read geometry."""
+        """Return the ray that reached the vertex; stored in scenes whose BSDFs read geometry."""
         return mi.Ray3f(*self.numbers[-2:])
 
     def hit(self) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f]:
-        """What was hit, and the ray that hit it; kept in scenes in which BSDFs read geometry."""
+        """Return the intersection and its ray; stored in scenes whose BSDFs read geometry."""
         pi = dr.zeros(mi.PreliminaryIntersection3f)
         pi.valid = mi.Bool(True)  # not kept: a masked write of booleans to thread-local memory ends the process
         pi.t, pi.prim_uv, pi.prim_index, shape, instance, o, d = self.numbers
@@ -56,7 +56,7 @@ class SurfacePoint:
         return pi, mi.Ray3f(o, d)
 
     def interaction(self, plan: Plan, active: mi.Bool | bool = True) -> tuple[mi.SurfaceInteraction3f, mi.BSDFPtr]:
-        """The surface interaction, as far as BSDFs read it, and the BSDF."""
+        """Return the surface interaction, as far as BSDFs read it, and the BSDF."""
         if not plan.keep_geometry:
             si = dr.zeros(mi.SurfaceInteraction3f)
             si.uv, si.wi, *pointer = self.numbers
@@ -68,7 +68,7 @@ class SurfacePoint:
 
 
 def event(wo: mi.Vector3f, lobe: list[mi.UInt32 | mi.Float | mi.Point2f]) -> Scattering:
-    """A sampled event that was kept as its direction and `lobe`, as far as its factor needs it."""
+    """Return a sampled event from its stored direction and `lobe`, as far as its factor needs it."""
     kind, sample_1, sample_2 = lobe or [mi.UInt32(0), None, None]
     return Scattering(
         weight=None, f=None, wo=wo, d=None, pdf=None, eta=None, correction=None,
@@ -81,9 +81,9 @@ def _index(pointer: mi.BSDFPtr | mi.ShapePtr) -> mi.UInt32:
 
 
 def lobe(plan: Plan, scattering: Scattering | None) -> list[mi.UInt32 | mi.Float | mi.Point2f]:
-    """Which lobe was sampled (1: delta, 2: null), with which numbers; nothing where just smooth ones matter.
+    """Return which lobe was sampled (1: delta, 2: null), with its random numbers; empty if only smooth lobes matter.
 
-    Of no event (None) zeros of the same form.
+    Without an event (None), return zeros of the same form.
     """
     if not (plan.differentiate_delta or plan.differentiate_null):
         return []

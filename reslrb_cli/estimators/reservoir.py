@@ -1,15 +1,15 @@
-"""ResLRB: keep few connections of each path by weighted reservoir sampling, then replay the path towards them.
+"""ResLRB: select few connections of each path by weighted reservoir sampling, then replay the path up to them.
 
     slot k keeps candidate i with probability w_i / W,   W = sum_i w_i
     dS ~ 1/m sum_k (W / w_I) delta_I [ C_I dE/E + sum_{j<I} C_I ds_j/s_j + C_I dc_I/c_I ],   I = I_k
 
 Source: the ResLRB paper, Sections 2.2 to 2.4, for m = 1 and w = luminance(C); its conclusion names m > 1, here m
-independent slots that one replay serves. Reservoir sampling: Chao 1982. Where delta is known before the paths are
-traced, w = sum_c |delta_c C_c| leaves less variance. With zero factors the weight is that of the nonzero ones, so that
-a connection whose value is zero and whose derivative is not can be kept; and no weight is below SHARE of those before
-it. Of the kept connection the surface point is kept as well: c_I is differentiated without a replay, which has to reach
-x_{I-1} only, or the last vertex before it that has anything to differentiate. A connection whose path has nothing to
-differentiate is no candidate.
+independent slots with one common replay. Reservoir sampling: Chao 1982. If delta is known before the paths are traced,
+w = sum_c |delta_c C_c| has less variance. With zero factors, the weight is that of the nonzero factors, so that a
+connection whose value is zero but whose derivative is not can be selected. No weight is below SHARE of those before it.
+The surface point of the selected connection is stored, too: c_I is differentiated without a replay, which needs to
+reach only x_{I-1}, or the last differentiated vertex before it. A connection of a path without differentiated vertices
+is no candidate.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ from reslrb_cli.transport.walk import Vertex
 
 @dataclass
 class Slot:
-    """One kept connection, 28 bytes (and 12 more where zero factors are tracked).
+    """Selected connection, 28 bytes (and 12 more if zero factors are tracked).
 
-    Where BSDFs are differentiated, `event` holds c_I, about 50 bytes, so that the replay ends a vertex earlier.
+    If BSDFs are differentiated, `event` holds c_I, about 50 bytes, so that the replay ends a vertex earlier.
     """
 
     w: mi.Float  # its selection weight
@@ -64,7 +64,7 @@ class Slot:
 
 @dataclass
 class ReservoirState:
-    """What is kept of a path."""
+    """Stored data of a path."""
 
     W: mi.Float  # sum of all candidates' weights
     slots: list[Slot]
@@ -72,7 +72,7 @@ class ReservoirState:
 
     @staticmethod
     def empty(plan: Plan, capacity: int) -> ReservoirState:
-        """Nothing kept yet."""
+        """Return the empty state."""
 
         def slot() -> Slot:
             event = [Event.emission(plan)] if plan.differentiate_bsdfs else []
@@ -82,7 +82,7 @@ class ReservoirState:
 
 
 class ReservoirSelection(VertexHooks):
-    """Image pass: splat, and keep connections."""
+    """Image pass: splat, and select connections."""
 
     def __init__(self, p: Pass, capacity: int, weight: str) -> None:
         super().__init__(p)
@@ -112,7 +112,7 @@ class ReservoirSelection(VertexHooks):
 
 
 class ReservoirReplay(SlotReplay):
-    """Replay up to the last vertex that any slot has to differentiate before its own, and differentiate s_j."""
+    """Replay up to the last vertex that any slot differentiates before its own, and differentiate s_j."""
 
     def __init__(self, p: Pass, slots: list[Slot], adjoints: list[PathAdjoint]) -> None:
         super().__init__(p, [slot.last for slot in slots])

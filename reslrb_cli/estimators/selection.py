@@ -1,8 +1,8 @@
-"""Weighted reservoir sampling of a path's connections (Chao 1982), and replays towards those that were chosen.
+"""Weighted reservoir sampling of a path's connections (Chao 1982), and replays up to the selected ones.
 
 slot k keeps candidate i with probability w_i / W,   W = sum_i w_i
 
-Of the choice an `Event` is kept, a single factor of a path, so that its derivative needs no replay.
+An `Event` stores a single factor of a path, so that its derivative needs no replay.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SHARE = 0.01  # the least share of a candidate in the weights up to it
 
 
 class Chosen(Protocol):
-    """What any slot holds of its connection: selection weight (0: it holds none), contribution, film position."""
+    """Common data of slots: selection weight (0: empty), contribution, film position."""
 
     w: mi.Float
     C: Product
@@ -34,9 +34,9 @@ class Chosen(Protocol):
 
 
 def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -> mi.Float:
-    """w of a connection: `luminance` of C, or `adjoint`, sum_c |delta_c C_c|.
+    """Return w of a connection: `luminance` of C, or `adjoint`, sum_c |delta_c C_c|.
 
-    Raises ValueError where the latter is asked for and delta is not known.
+    Raises ValueError for `adjoint` if delta is not known.
     """
     value = C.weight()
     if weight == "luminance":
@@ -47,42 +47,44 @@ def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -
 
 
 def is_taken(number: mi.Float, w: mi.Float, W: mi.Float) -> mi.Bool:
-    """Whether a candidate of weight `w` takes the slot, `W` being the sum up to it: with probability w / W.
+    """Return whether a candidate of weight `w` takes the slot, with probability w / W; `W` is the sum including `w`.
 
-    A weight that is not finite is always taken, and so is all that follows: what is wrong must not be lost.
+    A weight that is not finite is always taken, and so are all later ones, so that errors are not lost.
     """
     return (w != 0) & ((number * W < w) | ~dr.isfinite(W))
 
 
 def at_least_share(w: mi.Float, W: mi.Float) -> mi.Float:
-    """A candidate's weight, raised to SHARE of all before it, W, unless it is 0.
+    """Return a candidate's weight, raised to SHARE of the sum W of all before it, unless it is 0.
 
-    What comes after a heavy connection may be all that some parameter has: it is chosen with a probability of SHARE at
-    least, where its own weight may be a millionth. What comes before needs no such care, since its parameters have a
-    part in the heavy one too.
+    Connections after a heavy one may be the only ones that depend on some parameter. They are selected with a
+    probability of at least SHARE, although their own weight may be a millionth. Earlier connections need no such
+    minimum, because the heavy one depends on their parameters, too.
     """
     least = SHARE * W
     return dr.select((w != 0) & (w < least), least, w)  # a comparison: what is not a number stays
 
 
 def inverse_probability(W: mi.Float, slot: Chosen, capacity: int) -> mi.Float:
-    """W / (m w): 1 over the probability of a slot's selection, shared among the slots; 0 where it holds nothing."""
+    """Return W / (m w): the inverse probability of a slot's selection, divided by the number of slots; 0 for an empty
+    slot.
+    """
     return dr.select(slot.w != 0, W / (capacity * slot.w), 0)
 
 
 def slot_adjoint(p: Pass, W: mi.Float, slot: Chosen, capacity: int) -> PathAdjoint:
-    """Sensitivity of the objective to what a slot holds, standing for all that it was chosen from."""
+    """Return the sensitivity of the objective to a slot's connection, weighted for all candidates."""
     delta = p.delta(slot.u, slot.w != 0)
     return PathAdjoint(delta * slot.C.nonzero * inverse_probability(W, slot, capacity), slot.C)
 
 
 def chosen_by(numbers: list[mi.Float], w: mi.Float, W: mi.Float, this: S, slots: list[S]) -> list[S]:
-    """The slots behind one more candidate, `this`, each of which has a number to choose by."""
+    """Return the slots after one more candidate, `this`; each slot has its own random number."""
     return [dr.select(is_taken(number, w, W), this, slot) for number, slot in zip(numbers, slots, strict=True)]
 
 
 class SlotReplay(VertexHooks):
-    """A replay up to the last vertex, `last`, that any slot has anything to differentiate at."""
+    """Replay up to the last vertex, `last`, that any slot differentiates."""
 
     replaying = True
     connects = False
@@ -102,11 +104,11 @@ class SlotReplay(VertexHooks):
 
 @dataclass
 class Event:
-    """One factor of a path: f towards local direction `wo`; `index` is its vertex, 0 for emission.
+    """One factor of a path: f towards the local direction `wo`; `index` is its vertex, 0 for emission.
 
-    `rest` times f is the factor as a whole, but for the transmittance of masks; it is kept where zero factors are
-    tracked, beside which alone it is of use. `own` holds whether the event is a connection's own, and the sample of the
-    aperture, where masks may stand between it and the sensor.
+    The whole factor is `rest` times f, without the transmittance of masks; `rest` is stored only if zero factors are
+    tracked. `own` says whether the event is a connection's own, and holds the sample of the aperture, if masks may
+    stand between it and the sensor.
     """
 
     index: mi.UInt32
@@ -119,13 +121,13 @@ class Event:
 
     @staticmethod
     def emission(plan: Plan) -> Event:
-        """The event before the first vertex."""
+        """Return the event before the first vertex."""
         rest, wo, f = [mi.Float(0)] if plan.track_zeros else [], mi.Vector3f(0), mi.Spectrum(0)
         return Event(mi.UInt32(0), SurfacePoint.blank(plan), wo, f, rest, lobe(plan, None), _own(plan, None))
 
     @staticmethod
     def of_connection(plan: Plan, vertex: Vertex, connection: Connection) -> Event:
-        """The BSDF of the vertex towards the sensor; index 0 where there is nothing to differentiate."""
+        """Return the BSDF of the vertex towards the sensor as an event; index 0 if nothing is differentiated."""
         useful = mi.Bool(True) if plan.passage_in_gradient else plan.differentiates(vertex.bsdf)
         index, point = dr.select(useful, mi.UInt32(vertex.depth), 0), SurfacePoint.of(plan, vertex)
         rest = [dr.rcp(stand_in(connection)[0])] if plan.track_zeros else []
@@ -133,14 +135,14 @@ class Event:
 
     @staticmethod
     def of_scattering(plan: Plan, vertex: Vertex, scattering: Scattering) -> Event:
-        """The BSDF of the vertex along the path."""
+        """Return the BSDF of the vertex along the path as an event."""
         rest = [scattering.correction / scattering.pdf] if plan.track_zeros else []
         index, point, wo = mi.UInt32(vertex.depth), SurfacePoint.of(plan, vertex), scattering.wo
         return Event(index, point, wo, scattering.f, rest, lobe(plan, scattering), _own(plan, None))
 
 
 def _own(plan: Plan, connection: Connection | None) -> list[mi.Bool | mi.Point2f]:
-    """`Event.own` of an event that is a connection's, or of another."""
+    """Return `Event.own` for the event of a connection, or of scattering."""
     if not plan.passage_in_gradient:
         return []
     return [mi.Bool(False), mi.Point2f(0)] if connection is None else [mi.Bool(True), connection.sample]

@@ -1,26 +1,26 @@
-"""Every connection of a path, at no extra variance and in one traversal: push vertices, then walk back over them.
+"""Use every connection of a path without additional variance, in one traversal: push vertices, then walk back.
 
 Let P_j be the throughput before vertex j, s_j its scattering, and c_j its connection, both f = bsdf * cos times numbers
-without a derivative. Let B_j be what all later contributions add to the objective per unit of throughput behind s_j,
-and delta_j = dL/dI where c_j lands. Then, from the last vertex to the first,
+without a derivative. Let B_j be the contribution of all later connections to the objective per unit of throughput
+behind s_j, and delta_j = dL/dI at the film position of c_j. Then, from the last vertex to the first,
 
     dS     += P_j [ delta_j dc_j + B_j ds_j ]
     B_{j-1} = delta_j c_j + s_j B_j                      B = 0 behind the last vertex
 
-and at the emitter dS += B_0 dE. Nothing is divided, so factors that are zero need no care.
+and at the emitter dS += B_0 dE. Nothing is divided, so zero factors need no special treatment.
 
-Only vertices with something to differentiate are pushed. What lies between two of them is folded on the way out:
-behind the vertex that was pushed last, T is the throughput so far, roulette included, and D what the vertices since
-contribute. When vertex k is pushed, it takes both with it, and the recursion becomes
+Only differentiated vertices are pushed. The vertices between them are combined on the way out: behind the last pushed
+vertex, T is the throughput so far, including roulette, and D the contribution of the vertices since. When vertex k is
+pushed, it stores both, and the recursion becomes
 
     B = (D + T delta_k c_k) + (T s_k) B_k                of the vertex that was pushed before k
 
-The stack is a ring of `stack_size` places in thread-local memory, some 95 bytes each, so it holds the last vertices.
-Longer paths are traced again for the vertices before those, block by block, the last block first. If delta is known
-before the paths are traced, image and gradient are one kernel. Otherwise paths are traced again for the gradient,
-without shadow rays.
+The stack is a ring of `stack_size` places in thread-local memory, about 95 bytes each, so it holds the last vertices.
+Longer paths are traced again for the vertices before, block by block, the last block first. If delta is known before
+the paths are traced, image and gradient are one kernel. Otherwise, paths are traced again for the gradient, without
+shadow rays.
 
-`attached.py` has the same recursion for what moves light, and `camera.py` that of camera paths.
+`attached.py` has the same recursion for parameters that move light, and `camera.py` that of camera paths.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ A = TypeVar("A")
 
 
 class Differentiable(Protocol[A]):
-    """A vertex on the stack: a PyTree of arrays."""
+    """Vertex on the stack: a PyTree of arrays."""
 
     def differentiate(self, p: Pass, adjoint: A) -> A:
         """Add the derivatives of the vertex, given the adjoint behind it; return the adjoint before it."""
@@ -72,7 +72,7 @@ class Differentiable(Protocol[A]):
 
 @dataclass(frozen=True)
 class Ring:
-    """Which place a vertex has on the stack, by its number; the place number `size` is one that nobody reads."""
+    """Places of vertices on the stack, by number; the place number `size` is for discarded values."""
 
     size: int
     wraps: bool
@@ -84,11 +84,11 @@ class Ring:
         return Ring(size, vertices(plan) > size)
 
     def place(self, number: mi.UInt32) -> mi.UInt32:
-        """The place of a vertex."""
+        """Return the place of a vertex."""
         return number % self.size if self.wraps else number
 
     def bottom(self, count: mi.UInt32) -> mi.UInt32:
-        """The first vertex that is still on the stack after so many."""
+        """Return the first vertex that is still on the stack after `count` vertices."""
         return dr.select(count > self.size, count - self.size, 0) if self.wraps else mi.UInt32(0)
 
 
@@ -96,9 +96,9 @@ class Ring:
 class StackState:
     """Loop state of the way out.
 
-    `count` vertices have been pushed so far, `needed` of them up to the last contribution. `throughput` is T at the
-    current vertex: roulette alone where no vertex is left out. `since` is D behind vertex number `needed`. `stack` has
-    an array for each member of a frame.
+    `count` vertices have been pushed, `needed` of them up to the last contribution. `throughput` is T at the current
+    vertex: roulette alone if no vertex is left out. `since` is D behind vertex number `needed`. `stack` has an array
+    for each member of a frame.
     """
 
     stack: list[dr.Local]
@@ -109,25 +109,27 @@ class StackState:
 
     @staticmethod
     def begin(form: Any, ring: Ring, throughput: mi.Float | mi.Spectrum) -> StackState:
-        """An empty stack of frames of this form; None: nothing is ever pushed. `throughput` is 1."""
+        """Return an empty stack of frames of this form (None: nothing is ever pushed); `throughput` is 1."""
         stack = [] if form is None else allocate(form, ring.size)
         return StackState(stack, mi.UInt32(0), mi.UInt32(0), throughput, mi.Spectrum(0))
 
     def gap(self) -> mi.Spectrum:
-        """D behind the vertex that was pushed last."""
+        """Return D behind the last pushed vertex."""
         return dr.select(self.needed == self.count, self.since, 0)
 
     def plus(self, value: mi.Spectrum, active: mi.Bool) -> StackState:
-        """The state with a contribution, delta times `value` per unit of throughput, in active lanes."""
+        """Return the state with a contribution, delta times `value` per unit of throughput, in active lanes."""
         since = dr.select(active, self.gap() + self.throughput * value, self.since)
         return replace(self, needed=dr.select(active, self.count, self.needed), since=since)
 
     def scaled(self, weight: mi.Float | mi.Spectrum) -> StackState:
-        """The state behind a factor of the path."""
+        """Return the state behind a factor of the path."""
         return replace(self, throughput=self.throughput * weight)
 
     def pushed(self, frame: Any, ring: Ring, here: mi.Bool, contributes: mi.Bool) -> StackState:
-        """The state with a vertex on the stack, in lanes `here`; `contributes`: lanes in which it does so itself."""
+        """Return the state with a vertex on the stack, in lanes `here`; in lanes `contributes` the vertex has its own
+        contribution.
+        """
         place = dr.select(here, ring.place(self.count), ring.size)
         write(self.stack, frame, place, here)
         count, contributes = self.count + dr.select(here, mi.UInt32(1), 0), here & contributes
@@ -145,8 +147,8 @@ def walk_back(
 ) -> A:
     """Differentiate all vertices, the last one first; return the adjoint before the first.
 
-    `adjoint` is that behind the last contribution. `again(end)` traces the paths anew and pushes the vertices before
-    number `end`; it is called only where paths may be longer than the stack.
+    `adjoint` is that behind the last contribution. `again(end)` traces the paths again, and pushes the vertices before
+    number `end`; it is called only if paths may be longer than the stack.
     """
     if not state.stack:
         return adjoint
@@ -191,9 +193,9 @@ def pop(p: Pass, form: Any, ring: Ring, state: StackState, top: mi.UInt32, botto
 
 @dataclass
 class Frame:
-    """One vertex on the stack: its BSDF is evaluated again, towards the sensor and along the path.
+    """Vertex on the stack, whose BSDF is evaluated again towards the sensor and along the path.
 
-    `weight_c` is P_k delta_k c_k / f_c and `weight_s` is P_k s_k / f_s, (C,): what the derivatives of both f count for,
+    `weight_c` is P_k delta_k c_k / f_c and `weight_s` is P_k s_k / f_s, (C,): the weights of the derivatives of both f,
     the latter times B_k. `own` + `onward` B_k is B of the vertex that was pushed before.
     """
 
@@ -208,18 +210,18 @@ class Frame:
 
     @staticmethod
     def blank(plan: Plan) -> Frame:
-        """A frame of zeros with the members that the plan needs."""
+        """Return a frame of zeros with the members that the plan needs."""
         wo, zero = mi.Vector3f(0), mi.Spectrum(0)
         return Frame(SurfacePoint.blank(plan), wo, wo, zero, zero, zero, zero, kept_lobe(plan, None))
 
     @staticmethod
     def empty_stack(plan: Plan, ring: Ring) -> StackState:
-        """The state before the first vertex."""
+        """Return the state before the first vertex."""
         throughput = mi.Float(1) if is_gapless(plan) else mi.Spectrum(1)
         return StackState.begin(Frame.blank(plan) if plan.differentiate_bsdfs else None, ring, throughput)
 
     def differentiate(self, p: Pass, adjoint: mi.Spectrum) -> mi.Spectrum:
-        """Add the derivatives of both factors, given B (C,) behind the vertex; return B of the one pushed before."""
+        """Add the derivatives of both factors, given B (C,) behind the vertex; return B of the vertex pushed before."""
         si, bsdf = self.point.interaction(p.plan)
         weight_c, weight_s = self.weight_c, showing(self.weight_s * adjoint)
         connected, scattered = dr.any(weight_c != 0), dr.any(weight_s != 0)
@@ -234,9 +236,9 @@ def push(
     plan: Plan, state: StackState, ring: Ring, here: mi.Bool, vertex: Vertex, scattering: Scattering,
     connection: Connection | None, weight: mi.Spectrum,
 ) -> StackState:  # fmt: skip
-    """The state behind a vertex, which is on the stack in lanes `here`.
+    """Return the state behind a vertex, which is on the stack in lanes `here`.
 
-    `weight` (C,) is delta times all of the connection but its BSDF; 0 where the connection does not count.
+    `weight` (C,) is delta times the connection without its BSDF; 0 if the connection does not count.
     """
     T, P, on = state.throughput, vertex.product.value(), scattering.active
     wo, own, seen = mi.Vector3f(0), mi.Spectrum(0), mi.Bool(False)
@@ -268,9 +270,9 @@ def is_gapless(plan: Plan) -> bool:
 
 
 class LightSweep(VertexHooks):
-    """The way out of light paths: splat, and push the vertices before number `end`. None: all of them.
+    """Way out of light paths: splat, and push the vertices before number `end` (None: all of them).
 
-    `visibility` is what an earlier walk saw, if there was one.
+    `visibility` is that of an earlier walk, if there was one.
     """
 
     def __init__(self, p: Pass, ring: Ring, visibility: Visibility | None = None, end: mi.UInt32 | None = None) -> None:
@@ -312,7 +314,7 @@ class LightSweep(VertexHooks):
 
 
 class Stack(Estimator):
-    """Exact, like `gather`, without tracing the paths a second time."""
+    """The estimator `stack`: exact, like `gather`, without tracing the paths a second time."""
 
     exact = True
 
@@ -323,7 +325,7 @@ class Stack(Estimator):
         self.stack_size = stack_size
 
     def forward(self, p: Pass) -> Visibility | mi.Spectrum:
-        """The image pass: B_0 (C,) where delta is known, and otherwise which connections are visible."""
+        """Trace the image pass; return B_0 (C,) if delta is known, otherwise the visibility of the connections."""
         if p.adjoint is not None:
             return self._sweep(p, None)
         return p.walk(Gathering(p)).visibility
@@ -350,7 +352,7 @@ class Stack(Estimator):
 
 
 def stack_bytes(plan: Plan, stack_size: int) -> int:
-    """Thread-local bytes of each path that is being traced."""
+    """Return the thread-local bytes of each traced path."""
     if not plan.differentiate_bsdfs:
         return 0
     return sum(entry_bytes(Frame.blank(plan))) * (places(plan, stack_size) + 1)

@@ -1,1 +1,1 @@
-"""Guided emission: what light paths say by the cell that they start in, and tables that are learned of it."""
+"""Guided emission: contributions of light paths by the cell that they start in, and tables learned from them."""

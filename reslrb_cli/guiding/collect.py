@@ -1,32 +1,31 @@
-"""The words that guiding learns from: what light paths say, by the cells that they start in and go on through.
+"""Contributions that guiding learns from, by the cells that light paths start in and pass through.
 
-Trail: the vertices of a path, kept until it ends, as only then is it known what it went on to say behind each of them.
-They lie in thread-local memory, the first PLACES of them. From the last one back the sum over all later vertices is at
-hand when a vertex is reached, as in `estimators/stack.py`.
+Trail: the vertices of a path, stored until it ends, because the contribution behind each vertex is known only then. The
+first PLACES vertices are stored in thread-local memory. A walk back sums over all later vertices, as in
+`estimators/stack.py`.
 
-Onward: what light paths go on to say from where they are, and whether they are worth following by that. Of every cell
-of place and direction (`transport/roulette.py`) two means are learned over the rays that leave a vertex there: the
-square of what the path still says behind it if its throughput is 1 (m), and how many vertices still follow (c). A ray
-that leaves with throughput w goes on with probability q = min(1, max(LEAST, w s)). Of all q those make variance times
-work least for which
+Onward: later contributions of light paths by their position and direction, for roulette. For every cell
+(`transport/roulette.py`), two means over the rays that leave a vertex in it are learned: the squared later contribution
+at throughput 1 (m), and the number of later vertices (c). A ray that leaves with throughput w survives with probability
+q = min(1, max(LEAST, w s)). Variance times work is smallest for
 
-    s = sqrt(m W / (c V))        V: the mean square of what a whole path says; W: the mean number of its vertices
+    s = sqrt(m W / (c V))        V: mean squared contribution of whole paths; W: mean number of their vertices
 
-(Rath et al. 2022, "EARS: efficiency-aware Russian roulette and splitting"). Here s is SURE times that: few of the paths
-that a cell is known by say nearly all that it ever says, so that most cells look quieter than they are, and what ends
-there too often makes for much more noise than what goes on too long makes for work.
+(Rath et al. 2022, "EARS: efficiency-aware Russian roulette and splitting"). Here s is SURE times larger: few of the
+paths of a cell have nearly all of its contribution, so most cells are underestimated, and ending a path too early costs
+much more noise than following it too long costs work.
 
-For the same reason a cell leans on the larger cube that it lies in, with the weight of LEAN rays, that one on the next,
-and so on up to the whole scene; and no cell has less than FLOOR of the scene's own m / c.
+For the same reason, each cell is averaged with the larger cube around it with the weight of LEAN rays, that cube with
+the next larger, and so on up to the whole scene. No cell has less than FLOOR of the scene's m / c.
 
-Hearing: what light paths have to say, by the cell that they start in: how much they would move gradient and image. It
-is a walk of its own, with random numbers that nothing else has. Of each path and each BSDF that is differentiated
+Hearing: contributions of light paths by the cell that they start in: their effect on gradient and image. This is a
+separate walk with its own random numbers. For each path and each differentiated BSDF,
 
-    G = sum_i delta_i C_i n_i        n_i: how many factors of C_i are this BSDF's
+    G = sum_i delta_i C_i n_i        n_i: number of factors of C_i from this BSDF
 
-is the derivative by the logarithm of a factor that all its values share; of emission n = 1. Where light moves, it is
-the sum of |delta_i C_i|. Summed are the squares of what a path would say if all paths started evenly, G p / v, as the
-variance of the sum over all paths is made of these.
+is the derivative with respect to the logarithm of a factor common to all its values; for emission, n = 1. If light
+moves, it is the sum of |delta_i C_i|. The squares of G p / v are summed, the contributions if all paths started
+uniformly, because they determine the variance of the sum over all paths.
 """
 
 from __future__ import annotations
@@ -56,10 +55,11 @@ PLACES = 32  # vertices
 
 @dataclass
 class Trail:
-    """Loop state. Of each vertex: what it says, by voice (C,), and about the image; the cell that its ray leaves by,
-    and one over its throughput, 0 where none leaves; the weight of roulette.
+    """Loop state of a path's vertices.
 
-    What finds no room goes to one more place, which nobody reads; what those said is summed in `later`.
+    For each vertex: its contribution to each quantity (C,) and to the image; the cell of the outgoing ray, and the
+    inverse of its throughput (0 without a ray); the weight of roulette. Vertices beyond the last place share one place
+    that is not read; `later` is the sum of their contributions.
     """
 
     said: list[dr.Local]
@@ -70,25 +70,25 @@ class Trail:
 
     @staticmethod
     def begin(voices: int) -> Trail:
-        """An empty one, for so many voices beside the image."""
+        """Return an empty trail for this number of quantities besides the image."""
         later = [*(mi.Spectrum(0) for _ in range(voices)), mi.Float(0)]
         said, left = allocate(later, PLACES), allocate([mi.UInt32(0), mi.Float(0)], PLACES)
         return Trail(said, left, allocate([mi.Float(0)], PLACES), mi.UInt32(0), later)
 
     def with_vertex(self, said: list[mi.Spectrum | mi.Float]) -> Trail:
-        """With one more vertex, and what it says, about the image last."""
+        """Return the trail with one more vertex and its contributions, that to the image last."""
         fits, place = self._place(self.count)
         write(self.said, said, place, fits)
         later = [a + dr.select(fits, 0, part) for a, part in zip(self.later, said, strict=True)]
         return replace(self, count=self.count + 1, later=later)
 
     def leaves(self, cell: mi.UInt32, inverse: mi.Float) -> None:
-        """Write how the ray of the vertex that was named last leaves it."""
+        """Store the cell of the ray that leaves the last vertex, and the inverse of its throughput."""
         fits, place = self._place(self.count - 1)
         write(self.left, [cell, inverse], place, fits)
 
     def survives(self, weight: mi.Float) -> None:
-        """Write the weight of roulette there."""
+        """Store the weight of roulette at the last vertex."""
         fits, place = self._place(self.count - 1)
         write(self.roulette, [weight], place, fits)
 
@@ -99,10 +99,10 @@ class Trail:
 
 
 def walk_back(trail: Trail) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """What all paths went on to say, as `Said` has it; what is not finite does not count.
+    """Return the later contributions of all paths in the form of `Said`; values that are not finite do not count.
 
-    What roulette lets live it weights up by 1 / q: of all rays that leave, whether it lets them live or not, q times
-    such a square and 1 / q times such a number of vertices have the means that they would have without it.
+    Roulette divides the weight of surviving paths by q. For all rays, whether they survive or not, q times the squared
+    contribution and 1 / q times the number of vertices have the means without roulette.
     """
     squares, followed, left = (dr.zeros(mi.Float, rows * CELLS) for rows in (len(trail.later), 1, 1))
 
@@ -141,11 +141,11 @@ RAY = 0.2  # what a ray costs that meets nothing, in vertices
 
 @dataclass
 class Walked:
-    """What one walk has shown, float64: of each cell the squares of what paths still said at a throughput of 1
-    (voices, CELLS), the vertices that followed, and the rays that left there, summed over its paths.
+    """Result of one walk, float64.
 
-    Means over its paths: `said`, the squares of all they said (voices); `light`, the weight they left emitters with;
-    `length`, their vertices, and one for their start.
+    For each cell, sums over the paths: squared later contributions at throughput 1 (voices, CELLS), number of later
+    vertices, and number of rays. Means over the paths: `said`, the squared contributions (voices); `light`, their
+    weight at the emitter; `length`, the number of their vertices, plus one for the start.
     """
 
     squares: Array
@@ -158,10 +158,10 @@ class Walked:
 
 @dataclass
 class Onward:
-    """Sums (4, CELLS), float32: of squares that concern the gradient and the image, of vertices that followed, of rays.
+    """Sums (4, CELLS), float32: squared contributions to gradient and image, later vertices, rays.
 
-    Squares are in units of what whole paths said, and of `light`. `box` (2, 3) is what is cut into cubes. No array is
-    ever changed.
+    Squares are in units of those of whole paths, and of `light`. The box (2, 3) `box` is divided into cubes. Arrays are
+    never modified.
     """
 
     box: Array
@@ -171,13 +171,14 @@ class Onward:
 
     @staticmethod
     def nothing(box: Array) -> Onward:
-        """Before the first walk."""
+        """Return the state before the first walk."""
         return Onward(np.asarray(box, np.float32), np.zeros((4, CELLS), np.float32))
 
     def with_more(self, walked: Walked) -> Onward:
-        """With what one more walk has shown, each voice of the gradient as much as another, the image last.
+        """Return the state after one more walk; all quantities of the gradient have equal weights, and the image is
+        last.
 
-        A walk in which nothing was said about either tells nothing of where paths would say something.
+        A walk without contributions to gradient or image adds nothing.
         """
         heard = np.isfinite(walked.said) & (walked.said > 0)
         if not (heard[:-1].any() and heard[-1] and np.isfinite(walked.light) and walked.light > 0):
@@ -190,13 +191,13 @@ class Onward:
         return Onward(self.box, (KEEP * self.sums + newest).astype(np.float32), light, length)
 
     def arrays(self) -> dict[str, Array]:
-        """All of it, by name; the inverse of `taken`."""
+        """Return all arrays by name; the inverse of `taken`."""
         frame = np.array([*self.box.ravel(), self.light, self.length], np.float64)
         return dict(zip(NAMES, (self.sums, frame), strict=True))
 
     @staticmethod
     def taken(arrays: Mapping[str, Array]) -> Onward | str:
-        """What had these `arrays`; the name of one that cannot be."""
+        """Return the state with these `arrays`, or the name of an array that does not fit."""
         sums, frame = (arrays[name] for name in NAMES)
         if sums.shape != (4, CELLS) or not (np.isfinite(sums) & (sums >= 0)).all():
             return "onward"
@@ -206,9 +207,9 @@ class Onward:
         return Onward(box, sums.astype(np.float32), float(frame[6]), float(frame[7]))
 
     def chances(self, share: float) -> Array:
-        """s of all cells (CELLS); `share` is that of the gradient in what counts as said, the rest is the image's.
+        """Return s of all cells (CELLS); `share` is the weight of the gradient, and the rest is that of the image.
 
-        Where no ray has ever left a vertex all are infinite: whatever does go on.
+        If no ray has ever left a vertex, all are infinite, so that every path survives.
         """
         if not (self.light > 0 and self.sums[3].any()):
             return np.full(CELLS, np.inf)
@@ -221,7 +222,7 @@ class Onward:
 
 
 def _leaning(sums: Array, counts: Array) -> Array:
-    """Means (K, CELLS) of sums (K, CELLS) over counts (CELLS), each leaning on that of the larger cubes about it."""
+    """Return the means (K, CELLS) of sums (K, CELLS) over counts (CELLS), averaged with those of the larger cubes."""
     total = max(float(counts.sum()), 1.0)
     means = np.broadcast_to((sums.sum(1) / total)[:, None, None, None, None], (len(sums), 1, 1, 1, SHAPE[-1]))
     for level in range(BITS + 1):
@@ -234,7 +235,7 @@ def _leaning(sums: Array, counts: Array) -> Array:
 
 
 def _cubes(values: Array, level: int) -> Array:
-    """Sums over the cubes of a level, 2^level along each axis, octants apart: (K, 2^level, 2^level, 2^level, 8)."""
+    """Return sums over the cubes of a level, 2^level along each axis, per octant: (K, 2^level, 2^level, 2^level, 8)."""
     few, each = 1 << level, 1 << (BITS - level)
     return np.asarray(values.reshape(len(values), few, each, few, each, few, each, SHAPE[-1]).sum((2, 4, 6)))
 
@@ -244,7 +245,9 @@ BINS = 1024  # of sums over all paths, so that none loses small numbers
 
 
 def bsdf_groups(plan: Plan) -> list[tuple[mi.BSDF, ...]]:
-    """BSDFs whose derivatives are heard apart from one another; an empty group is all of the scene's."""
+    """Return the groups of BSDFs whose derivatives are recorded separately; an empty group means all BSDFs of the
+    scene.
+    """
     if not plan.differentiate_bsdfs:
         return []
     if not plan.only_bsdfs:
@@ -254,7 +257,7 @@ def bsdf_groups(plan: Plan) -> list[tuple[mi.BSDF, ...]]:
 
 
 def meets(group: tuple[mi.BSDF, ...], vertex: Vertex) -> mi.UInt32:
-    """1 where a vertex is on a surface with one of the group's BSDFs, of an empty group anywhere; else 0."""
+    """Return 1 if a vertex is on a surface with one of the group's BSDFs (any for an empty group), otherwise 0."""
     met = mi.Bool(not group)
     for bsdf in group:
         met |= vertex.bsdf == mi.BSDFPtr(bsdf)
@@ -262,14 +265,17 @@ def meets(group: tuple[mi.BSDF, ...], vertex: Vertex) -> mi.UInt32:
 
 
 def voices(plan: Plan) -> int:
-    """How many things are heard apart: groups of BSDFs, emission, what moves, and last the image."""
+    """Return the number of separate quantities: groups of BSDFs, emission, moving parameters, and the image, which is
+    last.
+    """
     return len(bsdf_groups(plan)) + plan.differentiate_emission + plan.attached + 1
 
 
 @dataclass
 class Heard:
-    """Loop state. `counts` says how often a group's BSDFs have been met, `sums` are G (C,): of the groups, of emission,
-    of what moves. `image` is sum_i |C_i|^2, `light` the weight that the path left the emitter with."""
+    """Loop state. `counts` is how often the path met each group's BSDFs, `sums` are G (C,) of groups, emission and
+    moving parameters. `image` is sum_i |C_i|^2, and `light` the weight of the path at the emitter.
+    """
 
     counts: list[mi.UInt32]
     sums: list[mi.Spectrum]
@@ -280,7 +286,9 @@ class Heard:
 
 
 class Hearing(Hooks):
-    """Sums what each path says; dL/dI and contributions are scaled by `loudness` and by the number of paths."""
+    """Hooks that sum the contributions of each path; dL/dI and contributions are scaled by `loudness` and the number of
+    paths.
+    """
 
     def __init__(self, samples: Samples, adjoint: AdjointImage, loudness: mi.Float) -> None:
         self.samples, self.adjoint, self.loudness = samples, adjoint, loudness
@@ -337,13 +345,15 @@ class Hearing(Hooks):
 
 @dataclass
 class Said:
-    """What guided samples have said, evaluated: sums over paths.
+    """Evaluated contributions of guided samples: sums over paths.
 
-    `starts` (voices * cells), voice by voice, the image last, are squares by the cell that a path starts in. By the
-    cell that a ray leaves a vertex by (`transport/roulette.py`): `squares` (voices * CELLS) of what paths still said at
-    a throughput of 1, the vertices that `followed` and the rays that `left` (CELLS). `whole` (rows * BINS) are squares
-    by voice, the weights that paths left emitters with, and their vertices. `places` (voices * blocks, or none) are
-    squares of what was said at a block of the film, as if no path had been aimed there.
+    - `starts` (voices * cells), quantity by quantity with the image last, are squares by the cell that a path starts
+      in.
+    - By the cell of a ray that leaves a vertex (`transport/roulette.py`): `squares` (voices * CELLS) of later
+      contributions at throughput 1, later vertices `followed`, and rays `left` (CELLS).
+    - `whole` (rows * BINS) are squares by quantity, the weights of paths at the emitter, and their vertices.
+    - `places` (voices * blocks, or empty) are squares of contributions at a block of the film, as if no path had been
+      aimed.
     """
 
     starts: mi.Float
@@ -354,16 +364,16 @@ class Said:
     places: list[mi.Float]
 
     def by_start(self, cells: int) -> Array:
-        """Sums of squares (voices, cells), float32."""
+        """Return sums of squares (voices, cells), float32."""
         return np.array(self.starts).reshape(-1, cells)
 
     def by_block(self) -> Array | None:
-        """Sums of squares (voices, blocks of the film), float32; None where no path is aimed."""
+        """Return sums of squares (voices, blocks of the film), float32; None if no path is aimed."""
         rows = len(self.whole) // BINS - 2
         return np.array(self.places[0]).reshape(rows, -1) if self.places else None
 
     def walked(self, paths: int) -> Walked:
-        """What that says of where paths go on to."""
+        """Return the result for `Onward`, for this number of paths."""
         *said, light, count = np.array(self.whole, np.float64).reshape(-1, BINS).sum(1) / paths
         squares, followed, left = (np.array(sums) for sums in (self.squares, self.followed, self.left))
         squares = squares.reshape(len(said), CELLS)
@@ -371,7 +381,7 @@ class Said:
 
 
 def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
-    """What guided samples with dL/dI `gradient` (H, W, C) say; what is not finite is not heard."""
+    """Return the contributions of guided samples with dL/dI `gradient` (H, W, C), without values that are not finite."""
     plan, adjoint = samples.plan, samples.film.adjoint(gradient)
     assert plan.grid is not None
     loudest = dr.max(dr.abs(dr.select(dr.isfinite(adjoint.image), adjoint.image, 0)))
@@ -398,7 +408,7 @@ def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
 
 
 def _sums(values: list[mi.Float], width: int) -> mi.Float:
-    """Sums (len(values) * BINS) over paths, what is not finite left out."""
+    """Return sums (len(values) * BINS) over paths, without values that are not finite."""
     result, lane = dr.zeros(mi.Float, len(values) * BINS), dr.arange(mi.UInt32, width) % BINS
     for number, value in enumerate(values):
         dr.scatter_reduce(dr.ReduceOp.Add, result, value, lane + number * BINS, dr.isfinite(value))

@@ -1,21 +1,21 @@
-"""Camera paths shared out over the pixels by what their noise does to the gradient.
+"""Distribution of camera paths over the pixels by the effect of their noise on the gradient.
 
-A pixel that a mirror fills may be all that shows a wall, and be known from camera paths alone, where others are known
-from light paths too; another shows nothing that is differentiated. So before the first iteration a few camera paths are
-traced through each pixel, and noted is of each what it would do to the gradient of a loss whose dL/dI were 1: of each
-BSDF that is differentiated, as in `collect.py`,
+The pixels of a mirror may be the only ones that show a wall, by camera paths alone, while light paths also show other
+pixels. Some pixels show nothing that is differentiated. Before the first iteration, a few camera paths are therefore
+traced through each pixel, and their effect on the gradient of a loss with dL/dI = 1 is recorded. For each
+differentiated BSDF, as in `collect.py`,
 
-    G = sum_i C_i n_i        n_i: how many factors of contribution C_i are this BSDF's;  n = 1 of emission
+    G = sum_i C_i n_i        n_i: number of factors of contribution C_i from this BSDF;  n = 1 for emission
 
-Near the end of a run dL/dI is mostly noise: w_j times the noise of the pixel, I_j. w_j is the curvature of the loss, 0
-in a pixel that is left out. With n_j paths in pixel j the variance of the gradient has parts
+Near the end of a run, dL/dI is mostly noise: w_j times the noise of the pixel I_j. w_j is the curvature of the loss, 0
+in an excluded pixel. With n_j paths in pixel j, the variance of the gradient has parts
 
     w_j^2 Var(I_j) (E G_j)^2 / n_j        The sum is least, at equal sums of n_j, for  n_j ~ w_j sd(I_j) E|G_j|.
 
-The variances of several groups are added up. Each is divided by the square of the group's whole gradient,
-sum_j w_j E|G_j|, and multiplied by the number K of its entries: each texel is known from K times fewer pixels than a
-colour is. A rare bright path would draw all others to its pixel: means are over blocks of pixels, and none has more
-than MOST times the mean.
+The variances of several groups are added. Each is divided by the square of the group's whole gradient, sum_j w_j
+E|G_j|, and multiplied by the number K of its entries, because each texel is visible in K times fewer pixels than a
+colour. A rare bright path would attract all others to its pixel, so means are over blocks of pixels, and no pixel has
+more than MOST times the mean.
 """
 
 from __future__ import annotations
@@ -45,15 +45,16 @@ LEAST_PATHS, MOST_PART = 1e7, 0.02  # of a run that has time for it, and what ma
 
 @dataclass
 class NotedSums:
-    """Loop state. `counts` says how often each group's BSDFs were met, `sums` are G (C,) of the groups and of emission,
-    the radiance last."""
+    """Loop state. `counts` is how often the path met each group's BSDFs; `sums` are G (C,) of groups, emission and,
+    last, radiance.
+    """
 
     counts: list[mi.UInt32]
     sums: list[mi.Spectrum]
 
 
 class Noting(CameraHooks):
-    """Sums what each camera path says; it adds no derivatives."""
+    """Hooks that sum the contributions of each camera path, and add no derivatives."""
 
     def __init__(self, samples: Samples) -> None:
         self.plan, self.groups = samples.plan, bsdf_groups(samples.plan)
@@ -76,8 +77,10 @@ class Noting(CameraHooks):
 
 
 def note(samples: Samples) -> NDArray[np.float64]:
-    """Means over the camera paths of each pixel: |G| of each group and of emission, |I|, and |I|^2, last, (K, H, W);
-    what is not finite counts as 0."""
+    """Return means over the camera paths of each pixel, (K, H, W): |G| of each group and of emission, |I|, and |I|^2.
+
+    Values that are not finite count as 0.
+    """
     first, noted = camera_walk(samples, Noting(samples))
     width, height = (int(n) for n in samples.film.size)
     pixel = mi.UInt32(first.u.y) * width + mi.UInt32(first.u.x)
@@ -91,8 +94,11 @@ def note(samples: Samples) -> NDArray[np.float64]:
 
 
 def noted_part(paths: float, spp: float) -> float | None:
-    """What is noted, as a part of a run of so many paths, `spp` through each pixel in all its iterations; None where
-    the run has no time for it."""
+    """Return the share of the recorded paths in a run of this number of paths, `spp` through each pixel in all
+    iterations.
+
+    None if the run has no time for the measurement.
+    """
     part = NOTED_SPP / spp
     return part if paths >= LEAST_PATHS and part <= MOST_PART else None
 

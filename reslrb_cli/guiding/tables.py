@@ -1,14 +1,13 @@
-"""Tables of where light paths start, for each sensor, learned from steps that are done, for those to come.
+"""Tables of the starts of light paths, for each sensor, learned from earlier steps for later ones.
 
-Cells are drawn by what the paths that started in them have said. What the variance of a sum over paths is made of is
-the mean square of what those of a cell say; it is least where cells are drawn in proportion to its root (`collect.py`
-says what is heard). Each voice is scaled to a total of 1, so that no parameter drowns another.
+Cells are sampled by the contributions of the paths that started in them. The variance of a sum over paths depends on
+the mean square contribution in each cell, and is smallest if cells are sampled in proportion to its root (`collect.py`
+defines the contributions). Each quantity is scaled to a total of 1, so that no parameter dominates another.
 
-Cells are as fine as there are paths to tell them apart: of a few thousand paths they are put together by hundreds. The
-more have been heard, the finer they are, up to the grid's own.
+The resolution of the cells depends on the number of recorded paths: after a few thousand paths, hundreds of cells are
+merged. With more paths, cells are divided, up to the cells of the grid.
 
-`Guiding` keeps the tables of one scene. Samples that serve image and gradient both are drawn half for the one, half for
-the other.
+`Guiding` holds the tables of one scene. Samples that serve image and gradient are drawn half for each.
 """
 
 from __future__ import annotations
@@ -41,21 +40,25 @@ FINE = 2.0  # cells, at most, for each path that has been heard
 
 
 def most_cells(paths: int) -> float:
-    """More cells than can ever be told apart where each walk that is learned from has so many paths: what counts of all
-    of them stays below the sum of the past's geometric series."""
+    """Return an upper limit for the number of distinguishable cells if each learning walk has this number of paths.
+
+    The total weight of all recorded paths stays below the sum of the geometric series of the past.
+    """
     return FINE * paths / (1 - KEEP) * (1 - 1e-6)
 
 
 @dataclass
 class Learned:
-    """What the paths for one sensor have said: sums of squares (2, cells), about the gradient and about the image, and
-    how many started in each cell.
+    """Contributions of the paths of one sensor: sums of squares (2, cells) for gradient and image, and the number of
+    paths that started in each cell.
 
-    `calls` is the number of gradients so far, or since what was learned was found to be wrong. Arrays are float32, and
-    never changed. `onward` is what paths went on to say from where they were; None where nothing of that is known.
-    `worse` is the mean square of what the newest paths said, in that of evenly drawn ones: far above 1 the table that
-    they were drawn from did harm, as it does where a scene has changed. `film` (2, blocks) are sums of squares too, by
-    where on the film paths said it (`transport/aim.py`); without blocks where none is aimed.
+    - `calls` is the number of gradients so far, or since a table was found to be wrong. Arrays are float32, and never
+      modified.
+    - `onward` are the later contributions by position; None if unknown.
+    - `worse` is the mean square contribution of the newest paths divided by that of uniform paths. Far above 1, the
+      table did harm, as after a change of the scene.
+    - `film` (2, blocks) are sums of squares by block of the film (`transport/aim.py`); without blocks if no path is
+      aimed.
     """
 
     sums: Array
@@ -68,15 +71,16 @@ class Learned:
 
     @staticmethod
     def nothing(grid: Grid) -> Learned:
-        """Before the first gradient."""
+        """Return the state before the first gradient."""
         return Learned(np.zeros((2, grid.cells), np.float32), np.zeros(grid.cells, np.float32))
 
     def with_more(
         self, grid: Grid, heard: Array, draws: Array, onward: Onward | None = None, film: Array | None = None
     ) -> Learned:
-        """With what newer paths have said (voices, cells), the image last, `draws` (cells) of them.
+        """Return the state after newer paths, with contributions (voices, cells), the image last, and `draws` (cells)
+        paths.
 
-        Each voice is scaled to a total of 1. `onward` has learned from the same paths already.
+        Each quantity is scaled to a total of 1. `onward` has already learned from the same paths.
         """
         sums = np.float32(KEEP) * self.sums
         means = np.zeros(grid.cells, np.float32)
@@ -88,7 +92,7 @@ class Learned:
         return Learned(sums, started, self.calls, onward, self._places(film), worse)
 
     def _places(self, heard: Array | None) -> Array:
-        """`film` with what newer paths have said by block (voices, blocks), the image last."""
+        """Return `film` after newer contributions by block (voices, blocks), the image last."""
         if heard is None:
             return self.film
         shape = 2, heard.shape[1]
@@ -97,16 +101,16 @@ class Learned:
         return film
 
     def on(self, grid: Grid, before: Grid) -> Learned:
-        """The same about the cells of another grid, of which those of the one before are made, spread evenly."""
+        """Return the same contributions on the cells of another grid, distributed evenly."""
         sums = np.stack([grid.shared_out(row, before) for row in self.sums])
         draws = grid.shared_out(self.draws, before).astype(np.float32)
         return Learned(sums.astype(np.float32), draws, self.calls, self.onward, self.film)
 
     def density(self, grid: Grid, share: float) -> Array:
-        """How cells are to be drawn (cells,), normalised, before any are shared out evenly: `share` of them by what was
-        said about the gradient, the others by what was said about the image.
+        """Return the density of the cells (cells,), normalised, before the uniform part is added.
 
-        Cells that few paths have been heard of are put together, all of them alike.
+        `share` is the weight of the gradient, and the rest is that of the image. Cells with few recorded paths are
+        merged.
         """
         if self._densities is None:
             self._densities = self._both(grid)
@@ -114,7 +118,7 @@ class Learned:
         return grid.shared_out(np.float32(share) * gradient + np.float32(1 - share) * image, coarser)
 
     def _both(self, grid: Grid) -> tuple[Grid, list[Array]]:
-        """The densities by the gradient and by the image, float32, and the cells that they are of."""
+        """Return the densities for gradient and image, float32, and their grid."""
         coarser = grid.coarser(FINE * self.draws.sum(dtype=np.float64))
         measures, found = coarser.measures().astype(np.float32), []
         draws = _blurred(coarser, grid.summed(self.draws, coarser))
@@ -129,10 +133,10 @@ class Learned:
 
 
 def _add(sums: Array, heard: Array, means: Array) -> list[float]:
-    """Add to `sums` (2, n), about the gradient and about the image, what each of the voices (voices, n) has said, the
-    image last, scaled to a total of 1; `means` (n) are what a thing said at each counts for in the total.
+    """Add the contributions to each quantity (voices, n), the image last, scaled to a total of 1, to `sums` (2, n).
 
-    Returns the mean of `means` over what each voice has said; a voice without a finite total is left out.
+    `means` (n) are the weights of the places in this total. Returns the mean of `means` for each quantity; a quantity
+    without a finite total is left out.
     """
     found = []
     for voice, said in enumerate(heard.astype(np.float32, copy=False)):
@@ -144,7 +148,7 @@ def _add(sums: Array, heard: Array, means: Array) -> list[float]:
 
 
 def _blurred(grid: Grid, values: Array) -> Array:
-    """Sums over neighbouring cells, weighted; the cells of one emitter are none of another's neighbours."""
+    """Return weighted sums over neighbouring cells; cells of different emitters are not neighbours."""
     from scipy import ndimage  # here: few commands ever learn, and all import this module
 
     result = values.reshape(grid.shape)
@@ -166,7 +170,7 @@ KNOWN = ("sums", "draws", "film", *NAMES)
 
 
 class Purpose(enum.Enum):
-    """What samples are for; the value is the gradient's share in what they are drawn by, the rest is the image's."""
+    """Purpose of samples; the value is the weight of the gradient in their table, and the rest is that of the image."""
 
     IMAGE = 0.0
     GRADIENT = 1.0
@@ -174,17 +178,18 @@ class Purpose(enum.Enum):
 
 
 def sensor_bytes(grid: Grid, aims: bool = True) -> int:
-    """Bytes for one sensor: a table for each purpose, and what has been learned; `aims`: where paths are sent, too, of
-    which a gradient has one of its own."""
+    """Return the bytes for one sensor: a table for each purpose, and the recorded contributions; with `aims`, also
+    aiming.
+    """
     emission = len(Purpose) * (grid.slots + 2 * grid.cells) + 3 * grid.cells
     aim = (len(Purpose) + 1) * (AIM_SLOTS + BLOCKS) + 2 * BLOCKS
     return 4 * (emission + (len(Purpose) + 4) * CELLS + (aim if aims else 0))
 
 
 def grid_for(used: Sequence[bool], weights: Sequence[float], sensors: int, paths: int | None = None) -> Grid:
-    """A grid of which so many sensors have tables of their own, as fine as these leave room for; of more they share.
+    """Return a grid whose tables fit into memory for this number of sensors; more sensors share tables.
 
-    No finer than walks of so many `paths` can ever tell; None: nobody knows how many they will have.
+    The grid is not finer than walks of `paths` paths can resolve (None: the number is unknown).
     """
     grids = (make_grid(used, weights, bits) for bits in range(CELL_BITS, LEAST_BITS, -1))
     fitting = (grid for grid in grids if sensors * sensor_bytes(grid) <= MOST_BYTES)
@@ -193,10 +198,10 @@ def grid_for(used: Sequence[bool], weights: Sequence[float], sensors: int, paths
 
 
 class Guiding:
-    """Grid and tables of one scene, as a light tracer keeps them.
+    """Grid and tables of one scene, for a light tracer.
 
-    `images` says whether samples that serve an image alone are guided. Tables that are `held` learn no more. `lessons`
-    counts how often any have learned.
+    `images` says whether samples that serve only an image are guided. Tables that are `held` do not learn. `lessons`
+    counts how often any table has learned.
     """
 
     def __init__(self) -> None:
@@ -209,21 +214,21 @@ class Guiding:
         self._tables: dict[tuple[int, Purpose], tuple[Table, Array]] = {}
 
     def clear(self) -> None:
-        """Forget everything, for a new scene."""
+        """Clear everything, for a new scene."""
         self.grid = self._emission = None
         self.films.clear()
         self.forget()
 
     def forget(self) -> None:
-        """Forget what has been learned."""
+        """Clear all recorded contributions."""
         self.learned.clear()
         self._tables.clear()
 
     def grid_of(self, samples: Samples, paths: int | None) -> Grid:
-        """The grid of the samples' scene for walks of so many paths.
+        """Return the grid of the samples' scene for walks of this number of paths.
 
-        Where it was another before, that had been made for fewer, or for nobody knew how many and nothing was learned:
-        what was learned is kept.
+        A coarser grid, or one for an unknown number of paths that has learned nothing, is replaced; recorded
+        contributions are kept.
         """
         if self._emission is None:
             weights = [float(emitter.sampling_weight()) for emitter in samples.scene.emitters()]
@@ -237,12 +242,15 @@ class Guiding:
         return self.grid
 
     def serves(self, purpose: Purpose) -> bool:
-        """Whether samples for this are guided."""
+        """Whether samples for this purpose are guided."""
         return self.images or purpose is not Purpose.IMAGE
 
     def table(self, number: int, purpose: Purpose, delta: mi.TensorXf | None = None) -> Table:
-        """What samples for sensor `number` are drawn from; of the places on the film that paths are aimed at, some are
-        those of dL/dI `delta` (H, W, C), where it is known before the samples are."""
+        """Return the table for samples of sensor `number`.
+
+        If dL/dI `delta` (H, W, C) is known before the samples, it determines some of the film positions that paths are
+        aimed at.
+        """
         table = self._table(number, purpose)[0]
         if delta is None or table.aim is None:
             return table
@@ -250,7 +258,7 @@ class Guiding:
         return replace(table, aim=self._aim(number, purpose, self.learned.get(number), delta))
 
     def counts(self, number: int, purpose: Purpose) -> Array:
-        """Slots of each cell of that table."""
+        """Return the slots of each cell of this table."""
         return self._table(number, purpose)[1]
 
     def _table(self, number: int, purpose: Purpose) -> tuple[Table, Array]:
@@ -267,7 +275,7 @@ class Guiding:
         return self._tables[number, purpose]
 
     def aims(self, number: int, film: Blocks) -> bool:
-        """Have the paths for a sensor with this film be aimed; not where it shares its tables with others."""
+        """Return whether the paths of a sensor with this film are aimed; not if the sensor shares its tables."""
         assert self._emission is not None
         if max(number + 1, self._emission[2]) > self._apart:
             return False
@@ -277,7 +285,9 @@ class Guiding:
     def _aim(
         self, number: int, purpose: Purpose, learned: Learned | None, delta: mi.TensorXf | None = None
     ) -> Aim | None:
-        """Where on the film of a sensor paths are sent, by what was said there, and where dL/dI is large now."""
+        """Return the film positions that paths of a sensor are aimed at, by recorded contributions and the current
+        dL/dI.
+        """
         if number not in self.films:
             return None
         film, said = self.films[number], np.zeros((2, 0)) if learned is None else learned.film
@@ -289,27 +299,27 @@ class Guiding:
         return Aim.of(film, purpose.value * gradient + (1 - purpose.value) * image)
 
     def _onward(self, number: int) -> Onward:
-        """What is known of where the paths for a sensor go on to, `number` being what its tables are kept under."""
+        """Return the later contributions by position for a sensor; `number` is that of its tables."""
         learned = self.learned.get(number)
         return Onward.nothing(self.box) if learned is None or learned.onward is None else learned.onward
 
     def _shared(self, number: int) -> int:
-        """The number of the sensor that the tables are kept under."""
+        """Return the number of the sensor whose tables this sensor uses."""
         return number % self._apart
 
     @property
     def _apart(self) -> int:
-        """How many sensors have tables of their own."""
+        """Number of sensors with their own tables."""
         assert self.grid is not None
         return max(MOST_BYTES // sensor_bytes(self.grid), 1)
 
     def bytes(self, sensors: int) -> int:
-        """What the tables for so many sensors take."""
+        """Return the bytes of the tables for this number of sensors."""
         assert self.grid is not None
         return min(sensors, self._apart) * sensor_bytes(self.grid)
 
     def state(self) -> tuple[dict[str, int], dict[str, Array]]:
-        """What has been learned: the number of gradients of each sensor, and arrays by `<sensor>/<what>`."""
+        """Return the learned state: the number of gradients of each sensor, and arrays by `<sensor>/<what>`."""
         arrays: dict[str, Array] = {}
         for number, learned in self.learned.items():
             found = {name: getattr(learned, name) for name in ("sums", "draws", "film")}
@@ -317,9 +327,9 @@ class Guiding:
         return {str(number): learned.calls for number, learned in self.learned.items()}, arrays
 
     def restore(self, calls: Mapping[str, int], take: Callable[[str], Array]) -> str | None:
-        """Go on from what `state` said, and nothing else; `take(name)` is the array of a name.
+        """Restore the result of `state`; `take(name)` returns the array of a name.
 
-        Returns the name of an array that is not of this scene's grid; then nothing has changed.
+        Returns the name of an array that does not fit this scene's grid; the state is then unchanged.
         """
         assert self.grid is not None
         found = {}
@@ -338,7 +348,7 @@ class Guiding:
         return None
 
     def due(self, number: int) -> bool:
-        """Count one more gradient for a sensor, and say whether its table is to learn from that."""
+        """Count one more gradient of a sensor, and return whether its table should learn from it."""
         if self.held:
             return False
         learned = self.learned.get(self._shared(number))
@@ -348,9 +358,9 @@ class Guiding:
         return learned is None or learns_after(calls)
 
     def learn(self, number: int, paths: int, said: Said) -> None:
-        """Have the table of a sensor learn from what so many paths said (`collect.py`).
+        """Let the table of a sensor learn from the contributions of this number of paths (`collect.py`).
 
-        They are drawn from its table for BOTH, and serve nothing else.
+        The paths are drawn from its table for BOTH, and serve nothing else.
         """
         assert self.grid is not None
         counts, number = self.counts(number, Purpose.BOTH), self._shared(number)
@@ -370,26 +380,26 @@ class Guiding:
 
 
 def _shares(row: Array, even: Array) -> Array:
-    """What each has of the sum of all; as much as is `even` where there is nothing."""
+    """Return each share of the total; `even` if the total is zero."""
     return row / row.sum() if row.sum() > 0 else even
 
 
 def learns_after(gradients: int) -> bool:
     """Whether a table learns from the gradient of this number, counted from 1.
 
-    What it knows doubles each time at first. Later it has to look again soon enough for a scene that has changed; if it
-    finds one, counting begins anew.
+    At first the knowledge doubles each time. Later, the table must check often enough whether the scene has changed. If
+    it has, counting starts again.
     """
     return gradients % EVERY == 0 or (gradients < EVERY and gradients.bit_count() == 1)
 
 
 def learnings(gradients: int) -> int:
-    """How often a table has learned after so many gradients of its sensor."""
+    """Return how often a table has learned after this number of gradients of its sensor."""
     return min(gradients, EVERY - 1).bit_length() + gradients // EVERY
 
 
 def learning_seed(seed: mi.UInt32 | int) -> mi.UInt32:
-    """The seed of the samples that are learned from, beside those of a gradient."""
+    """Return the seed of the samples that a table learns from, independent of those of a gradient."""
     result = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(LEARNING_STREAM))[0]
     dr.make_opaque(result)
     return result
