@@ -1,1 +1,1 @@
-"""The choice of libLLVM and of the Mitsuba variant, both made before anything is traced."""
+"""Choice of libLLVM and of the Mitsuba variant, both before anything is traced."""

@@ -1,7 +1,6 @@
-"""The examination that `reslrb doctor` reports: versions, libraries, device, and a trial of each backend.
+"""Examination for `reslrb doctor`: versions, libraries, device, and a trial of each backend.
 
-First what is known of the devices that kernels run on: their names, their memory, and how many paths they trace at a
-time.
+Also facts of the devices that kernels run on: names, memory, and the number of simultaneous paths.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ PATIENCE = 20.0
 
 
 def device_name(variant: str) -> str:
-    """The device that the Mitsuba variant `variant` runs on: GPU and driver's version, or processor and threads."""
+    """Return the device of a Mitsuba variant: GPU and driver version, or processor and threads."""
     if variant.startswith("cuda"):
         return "; ".join(ask_gpu("name,driver_version")) or "NVIDIA GPU"
     return f"{of_system('/proc/cpuinfo', 'model name') or platform.machine()}, {os.cpu_count()} threads"
@@ -38,7 +37,7 @@ def device_name(variant: str) -> str:
 def ask_gpu(query: str) -> list[str]:
     """Return the line that `nvidia-smi` prints for each GPU, numbers without their units.
 
-    The list is empty if there is no such program, or if it gives no answer in time.
+    The list is empty if there is no such program, or if it does not answer in time.
     """
     command = shutil.which("nvidia-smi")
     if command is None:
@@ -52,12 +51,12 @@ def ask_gpu(query: str) -> list[str]:
 
 
 def gpu_bytes(kind: str, most: int) -> int:
-    """The least `memory.total`, `memory.free` of the GPUs; `most` where that is less, or nothing tells."""
+    """Return the smallest `memory.total` or `memory.free` of the GPUs, at most `most`; `most` if it is unknown."""
     return min([most, *(int(line) * 2**20 for line in ask_gpu(kind) if line.isdigit())])
 
 
 def of_system(file: str, name: str) -> str | None:
-    """What a file of the kernel's says of `name`, the first time; None where it does not, or there is no such file."""
+    """Return the first entry `name` of a system file; None if there is none."""
     try:
         found = re.search(rf"^{name}\s*:\s*(.+)$", Path(file).read_text(), re.MULTILINE)
     except OSError:
@@ -66,7 +65,9 @@ def of_system(file: str, name: str) -> str | None:
 
 
 def memory_bytes(variant: str) -> int:
-    """The memory that `variant` can use: the GPU's, or the machine's as far as this process may have it."""
+    """Return the memory that `variant` can use: that of the GPU, or that of the machine as far as this process may use
+    it.
+    """
     if variant.startswith("cuda"):
         return gpu_bytes("memory.total", 2**40)  # unknown: more than any has, so that it never counts as scarce
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -77,7 +78,7 @@ def memory_bytes(variant: str) -> int:
 
 
 def resident_paths() -> int:
-    """How many lanes of a kernel the current device runs at a time, each with thread-local memory of its own."""
+    """Return the number of lanes that the current device runs simultaneously, each with its own thread-local memory."""
     import drjit as dr
     import mitsuba as mi
 
@@ -102,7 +103,9 @@ _WITHOUT_METADATA = ["mitsuba", "drjit", "numpy"]
 
 @dataclass(frozen=True)
 class Backend:
-    """One backend: `missing` says in one line what it lacks (empty: nothing), `trial` what a kernel and a ray took."""
+    """Backend: `missing` says in one line what it lacks (empty: nothing), and `trial` has the times of a kernel and a
+    ray.
+    """
 
     variant: str
     missing: str
@@ -113,7 +116,7 @@ class Backend:
 
 @dataclass(frozen=True)
 class Report:
-    """All of it; `variant` is what `auto` stands for here, None where no backend works."""
+    """Result of the examination; `variant` is the one that `auto` selects, None if no backend works."""
 
     variant: str | None
     python: str
@@ -123,7 +126,7 @@ class Report:
 
 
 def examine() -> Report:
-    """Looks at this machine; takes a few seconds, and never raises for what is missing."""
+    """Examine this machine; takes a few seconds, and never raises for missing parts."""
     missing = missing_cuda()
     device, trial = ("", Probe(missing)) if missing else (device_name("cuda_ad_rgb"), probe("cuda_ad_rgb"))
     backends = (Backend("cuda_ad_rgb", missing, device, "", trial), _llvm())
@@ -137,7 +140,7 @@ def examine() -> Report:
 
 
 def _required() -> list[str]:
-    """Names of the packages that this one needs, its optional ones left out."""
+    """Return the names of the required packages, without optional ones."""
     try:
         needs = metadata.requires("reslrb") or []
     except metadata.PackageNotFoundError:

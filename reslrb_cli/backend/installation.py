@@ -1,10 +1,10 @@
-"""The installation of Mitsuba and Dr.Jit: the real ones, of a version that works, loadable; and its plugins.
+"""Installation of Mitsuba and Dr.Jit: whether they are complete, supported and loadable; and Mitsuba's plugins.
 
-`python_command` is the command line of a Python process of our own, which has to find the same packages.
+`python_command` is the command line of a new Python process that finds the same packages.
 
-Plugins are loaded from Mitsuba's own folder alone. A plugin is a shared library, and loading it runs its code. Mitsuba
-looks for `plugins/NAME.so` in the folder of the scene and in the working folder before its own, and takes any NAME that
-a scene file says.
+Plugins are loaded only from Mitsuba's own folder. A plugin is a shared library, and loading it runs its code. Mitsuba
+looks for `plugins/NAME.so` in the folder of the scene and in the working folder before its own, for any NAME in a scene
+file.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _BUILT_IN = frozenset({"scene", "rgb", "spectrum"})
 
 
 def package_folder() -> Path:
-    """The folder of Mitsuba's package, with `plugins/` and `data/` in it."""
+    """Return the folder of Mitsuba's package, which contains `plugins/` and `data/`."""
     import mitsuba as mi
 
     return Path(mi.__file__).parent
@@ -44,18 +44,18 @@ def package_folder() -> Path:
 
 @functools.cache
 def shipped_plugins() -> frozenset[str]:
-    """Names of the plugins that came with Mitsuba and that a scene file may say."""
+    """Return the names of Mitsuba's plugins that a scene file may use."""
     libraries = (path for path in (package_folder() / "plugins").iterdir() if path.suffix in (".so", ".dylib"))
     return frozenset(path.stem for path in libraries) - _UNSAFE | _BUILT_IN
 
 
 def is_known(name: str) -> bool:
-    """Whether `name` is a plugin of Mitsuba's or one that this process has registered; loads none from elsewhere."""
+    """Whether `name` is a plugin of Mitsuba, or registered in this process; loads no other plugin."""
     return name in shipped_plugins() or _is_registered(name)
 
 
 def _is_registered(name: str) -> bool:
-    """Whether Python has registered a plugin of that name for the variant that is set."""
+    """Whether Python has registered a plugin of this name for the current variant."""
     import mitsuba as mi
 
     # Mitsuba can be asked only in a way that makes it load a library of that name where it finds one. A new resolver
@@ -75,7 +75,7 @@ def _is_registered(name: str) -> bool:
 
 @functools.cache
 def likely_parameters(name: str) -> list[str]:
-    """Words in the library of a shipped plugin that can be names of its parameters, among others; for suggestions."""
+    """Return words in the library of a shipped plugin that may be names of its parameters, for suggestions."""
     for library in (package_folder() / "plugins").glob(f"{name}.*"):
         words = re.findall(rb"(?<=\0)[a-z][a-z0-9_]{2,40}(?=\0)", library.read_bytes())
         return sorted({word.decode("ascii") for word in words})
@@ -83,14 +83,14 @@ def likely_parameters(name: str) -> list[str]:
 
 
 def nearest_plugin(name: str, type: mi.ObjectType) -> str | None:
-    """The plugin of that type whose name is most like `name`, if any is."""
+    """Return the plugin of this type with the most similar name, if any."""
     near = difflib.get_close_matches(name.lower(), sorted(shipped_plugins()), n=5)
     return next((candidate for candidate in near if plugin_type(candidate) == type), None)
 
 
 @functools.cache
 def plugin_type(name: str) -> mi.ObjectType:
-    """What a plugin makes; `Unknown` for one that has not been shipped."""
+    """Return the type of a plugin's objects; `Unknown` for a plugin that is not shipped."""
     import mitsuba as mi
 
     if name not in shipped_plugins() - _BUILT_IN:
@@ -100,7 +100,7 @@ def plugin_type(name: str) -> mi.ObjectType:
 
 
 def prefer_own_plugins() -> None:
-    """Have Mitsuba look for plugins in its own folder first, for the rest of the process."""
+    """Make Mitsuba look for plugins in its own folder first, for the rest of the process."""
     import mitsuba as mi
 
     resolver = mi.file_resolver()
@@ -110,7 +110,7 @@ def prefer_own_plugins() -> None:
 
 @contextmanager
 def looking_in(folders: Iterable[Path]) -> Iterator[None]:
-    """Have Mitsuba look for files in `folders`, first to last, but for plugins in its own folder before."""
+    """Make Mitsuba look for files in `folders`, in order, but for plugins in its own folder first."""
     import mitsuba as mi
 
     before = mi.file_resolver()
@@ -125,9 +125,9 @@ def looking_in(folders: Iterable[Path]) -> Iterator[None]:
 
 
 def python_command(code: str) -> list[str]:
-    """The command line of a Python that runs `code` and imports modules from where this process does.
+    """Return the command line of a Python that runs `code` with the same modules as this process.
 
-    Left to itself Python looks in the working folder first, where a scene may bring a `numpy.py` along.
+    By default, Python looks in the working folder first, where a scene may contain a `numpy.py`.
     """
     path = [entry or os.getcwd() for entry in sys.path]
     return [sys.executable, "-c", f"import sys\nsys.path[:] = {path!r}\n{code}"]
@@ -144,7 +144,7 @@ _WANTED = {
 
 
 def load_packages() -> tuple[ModuleType, ModuleType]:
-    """Import Dr.Jit and Mitsuba; return both. Raises BackendError, which says what was found where, if it cannot be."""
+    """Import Dr.Jit and Mitsuba, and return both. Raises BackendError, which says what was found where, on failure."""
     drjit, mitsuba = (_load(name) for name in _WANTED)
     return drjit, mitsuba
 
@@ -173,7 +173,7 @@ def _load(name: str) -> ModuleType:
 
 
 def _place(name: str) -> str:
-    """Where the package `name` lies, without importing it."""
+    """Return the location of the package `name`, without importing it."""
     try:
         found = importlib.util.find_spec(name)
     except (ImportError, ValueError):  # a module that is there has no specification
@@ -182,7 +182,7 @@ def _place(name: str) -> str:
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """The first two numbers of a version."""
+    """Return the first two numbers of a version."""
     parts = version.split(".")[:2]
     return tuple(int(part) if part.isdecimal() else -1 for part in parts)
 

@@ -1,8 +1,8 @@
-"""Finds the libLLVM that Dr.Jit shall load: the newest on this machine that works.
+"""Search for the libLLVM that Dr.Jit should load: the newest one on this machine that works.
 
-Dr.Jit looks into Debian's folders alone and takes what it finds there, also a version under which it ends the process
-("Cannot select fminimum", LLVM 15 and 16 on AVX-512 machines). So the choice is made here, before Dr.Jit is imported,
-and handed over in DRJIT_LIBLLVM_PATH.
+Dr.Jit looks only in Debian's folders, and accepts versions under which it ends the process ("Cannot select fminimum",
+LLVM 15 and 16 on AVX-512 machines). The choice is therefore made here, before Dr.Jit is imported, and passed in
+DRJIT_LIBLLVM_PATH.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _NAME = re.compile(r"libLLVM(?:-(\d+)(?:\.\d+)*)?(?:\.so(?:\.(\d+)(?:\.\d+)*)?|(
 
 @dataclass(frozen=True)
 class Library:
-    """A libLLVM that was found: its file and its version (`19.1.7`), or the `fault` for which it is not used."""
+    """Found libLLVM: its file and its version (`19.1.7`), or the `fault` because of which it is not used."""
 
     path: Path
     version: str = ""
@@ -40,8 +40,10 @@ class Library:
 
 
 def prepare() -> None:
-    """Chooses libLLVM, unless the user did or Dr.Jit is loaded already, and loads what Dr.Jit needs and the system
-    lacks. Never raises: `require` tells of what failed, to those who need LLVM."""
+    """Choose libLLVM, unless the user did or Dr.Jit is loaded already, and load its missing dependencies.
+
+    Never raises; `require` reports failures if LLVM is needed.
+    """
     if not os.environ.get(VARIABLE) and "drjit" not in sys.modules:
         library, _ = choose()
         if library is not None:
@@ -54,7 +56,7 @@ def prepare() -> None:
 
 
 def require() -> Library:
-    """The libLLVM that Dr.Jit loads. Raises BackendError where it is missing, broken, or would end the process."""
+    """Return the libLLVM that Dr.Jit loads. Raises BackendError if it is missing, broken, or would end the process."""
     named = os.environ.get(VARIABLE)
     if named:
         library = _examine(Path(named))
@@ -72,7 +74,7 @@ def require() -> Library:
 
 @functools.cache
 def choose() -> tuple[Library | None, list[Library]]:
-    """The newest libLLVM on this machine that works (None: there is none), and those that were passed over."""
+    """Return the newest working libLLVM on this machine (None: there is none), and the rejected ones."""
     passed_over: list[Library] = []
     best: Library | None = None
     for path in sorted(candidates(), key=lambda path: -(version_from_name(path) or MIN_VERSION)):
@@ -88,7 +90,9 @@ def choose() -> tuple[Library | None, list[Library]]:
 
 
 def candidates() -> list[Path]:
-    """Every libLLVM in the known folders and in the dynamic loader's cache, each file once, nearest folder first."""
+    """Return every libLLVM in the known folders and in the dynamic loader's cache, each file once, nearest folder
+    first.
+    """
     found = [path for folder in _folders() for path in sorted(folder.glob("libLLVM*")) if _NAME.fullmatch(path.name)]
     unique: dict[Path, Path] = {}
     for path in [*found, *_loader_cache()]:
@@ -98,14 +102,14 @@ def candidates() -> list[Path]:
 
 
 def version_from_name(path: Path) -> int | None:
-    """Major version that the name of the file tells (`libLLVM-15.so.1`, `libLLVM.so.19.1`); None if it tells none."""
+    """Return the major version in the name of the file (`libLLVM-15.so.1`, `libLLVM.so.19.1`), or None."""
     found = _NAME.fullmatch(path.name)
     return next((int(part) for part in found.groups() if part), None) if found else None
 
 
 @functools.cache
 def _examine(path: Path) -> Library:
-    """Loads `path` in a process of its own, unless its name already rules it out."""
+    """Load `path` in a separate process, unless its name already rules it out."""
     named = version_from_name(path.resolve())
     if named is not None and named < MIN_VERSION:
         return Library(path, fault=_too_old(str(named)))
@@ -137,7 +141,7 @@ def _major(version: str) -> int:
 
 
 def _folders() -> Iterator[Path]:
-    """Folders that may hold a libLLVM and exist, the environment's own first."""
+    """Yield the existing folders that may contain a libLLVM, those of the environment first."""
     yield UNPACKED
     roots = [sys.prefix, os.environ.get("CONDA_PREFIX"), sys.base_prefix]
     yield from (Path(root) / "lib" for root in dict.fromkeys(roots) if root)
@@ -150,7 +154,7 @@ def _folders() -> Iterator[Path]:
 
 
 def _loader_cache() -> list[Path]:
-    """The libLLVMs that ldconfig knows; its folder is not on an ordinary user's PATH."""
+    """Return the libLLVMs that ldconfig knows; its folder is not on an ordinary user's PATH."""
     ldconfig = shutil.which("ldconfig", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
     if ldconfig is None or sys.platform != "linux":
         return []
@@ -163,7 +167,7 @@ def _loader_cache() -> list[Path]:
 
 
 def _what_to_install() -> str:
-    """The command that mends it on this machine."""
+    """Return the command that installs a libLLVM on this machine."""
     if os.environ.get("CONDA_PREFIX"):
         return f"install it with `conda install -c conda-forge 'llvmdev>={MIN_VERSION}'`"
     if sys.platform == "darwin":

@@ -1,9 +1,9 @@
-"""Memory: what is free now, what a thread has for its own, and arrays of NumPy's copied into Dr.Jit's own.
+"""Memory: free memory, thread-local memory, and copies of NumPy arrays in Dr.Jit's memory.
 
-`free_bytes`, `resident_bytes` and `local_bytes` are what a forecast is held against.
+`free_bytes`, `resident_bytes` and `local_bytes` are the limits for forecasts.
 
-`own_memory` copies, since Dr.Jit takes up NumPy's memory as it lies, and compiles and records for its alignment, which
-is random: the next array of the same size may lie otherwise, and then all is compiled and recorded once more.
+`own_memory` copies, because Dr.Jit uses NumPy's memory in place, and compiles and records for its random alignment. The
+next array of the same size may have another alignment, and everything would be compiled and recorded again.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ _LANES = (("avx512vl", 16), ("avx", 8))
 
 
 def free_bytes(variant: str) -> int:
-    """Bytes that a process of `variant` can still have: of the GPU's memory, or of the machine's.
+    """Return the bytes that a process of `variant` can still allocate, of the GPU's memory or the machine's.
 
-    Where nothing tells, the whole of it (`device.memory_bytes`). What this process has already counts as taken.
+    If this is unknown, return all memory (`device.memory_bytes`). Memory of this process counts as used.
     """
     if variant.startswith("cuda"):
         return gpu_bytes("memory.free", memory_bytes(variant))
@@ -51,15 +51,15 @@ def free_bytes(variant: str) -> int:
 
 
 def resident_bytes() -> int:
-    """Bytes of memory that this process has had at the most, all that is in it counted."""
+    """Return the maximum memory of this process so far, in bytes."""
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return most if sys.platform == "darwin" else most * 1024
 
 
 def local_bytes() -> int:
-    """Bytes of thread-local memory that a path can have on the CPU: its share of a thread's stack, on which it lies.
+    """Return the thread-local bytes that a path can use on the CPU: its share of a thread's stack.
 
-    A kernel that wants more writes over what lies behind the stack, or ends the process.
+    A kernel that needs more overwrites other memory, or ends the process.
     """
     stack, _ = resource.getrlimit(resource.RLIMIT_STACK)
     stack = _UNLIMITED_STACK if stack == resource.RLIM_INFINITY else stack
@@ -68,7 +68,7 @@ def local_bytes() -> int:
 
 
 def own_memory(kind: type[Any], array: np.ndarray[Any, Any]) -> Any:
-    """`array` (n,) as a flat array of type `kind`, bit by bit, evaluated."""
+    """Return `array` (n,) as a flat array of type `kind`, bit by bit, evaluated."""
     given = kind(np.ascontiguousarray(array))
     copy = dr.empty(kind, dr.width(given))
     # Gathered in its own order, an array would be returned as it is.

@@ -1,6 +1,6 @@
-"""Tries a variant in a process of its own: one kernel compiled and run, one ray traced, both timed.
+"""Trial of a variant in a separate process: one kernel compiled and run, one ray traced, both timed.
 
-A driver or a libLLVM that does not work may end the process instead of raising; only a parent can tell.
+A faulty driver or libLLVM may end the process instead of raising an exception, which only a parent can detect.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ _OURS = "reslrb_cli.errors.BackendError: "
 
 @dataclass(frozen=True)
 class Probe:
-    """What came of trying a variant: `failure` says in one line what went wrong, and is empty where nothing did.
+    """Result of the trial of a variant: `failure` says in one line what went wrong (empty: nothing).
 
     compile_ms: a kernel of a million entries, compiled and run; run_ms: the same kernel again; ray_ms: the first ray
-    through a scene, compilation included.
+    through a scene, including compilation.
     """
 
     failure: str = ""
@@ -67,7 +67,7 @@ class Probe:
 
 @functools.cache
 def probe(variant: str) -> Probe:
-    """Runs the trial for `variant`; never raises."""
+    """Run the trial for `variant`; never raises."""
     command = [*python_command(_SCRIPT), variant]
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=300, check=False)

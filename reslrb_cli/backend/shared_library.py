@@ -1,7 +1,7 @@
-"""Loads a shared library whose own needs may lie beside it; as a script, prints the LLVM version of one.
+"""Load a shared library whose dependencies may lie beside it; as a script, print the LLVM version of one.
 
-Imports nothing of this package, so that it can run by path in a bare interpreter: a library that crashes or aborts when
-it is loaded then takes that interpreter along, not us.
+The module imports nothing of this package, so that it can run by path in a bare interpreter. A library that crashes
+while it is loaded then ends only this interpreter.
 """
 
 from __future__ import annotations
@@ -18,16 +18,18 @@ _MISSING = re.compile(
 
 
 def missing_library(message: str) -> str | None:
-    """The file name of the library that the dynamic loader could not find, by `message`; None if it says none."""
+    """Return the file name of the library that the dynamic loader could not find, from `message`; None if it names
+    none.
+    """
     found = _MISSING.search(message)
     return (found["so"] or Path(found["dylib"]).name) if found else None
 
 
 def load(path: Path, depth: int = 0) -> ctypes.CDLL:
-    """Loads `path`, and whatever it needs that the system lacks and the folder of `path` holds. Raises OSError.
+    """Load `path`, and its dependencies that the system lacks and the folder of `path` contains. Raises OSError.
 
-    The dynamic loader takes a library that is already in the process for one that it is asked for by name, so loading
-    the needs first is enough, without an rpath and without LD_LIBRARY_PATH.
+    The dynamic loader uses libraries that are already in the process, so loading the dependencies first is enough,
+    without an rpath and without LD_LIBRARY_PATH.
     """
     while True:
         try:
@@ -42,7 +44,7 @@ def load(path: Path, depth: int = 0) -> ctypes.CDLL:
 
 
 def llvm_version(library: ctypes.CDLL) -> tuple[int, int, int] | None:
-    """Version of a loaded libLLVM; None before LLVM 16, which cannot say."""
+    """Return the version of a loaded libLLVM; None before LLVM 16, which does not report it."""
     if not hasattr(library, "LLVMGetVersion"):
         return None
     parts = [ctypes.c_uint() for _ in range(3)]

@@ -1,4 +1,4 @@
-"""Chooses and sets the Mitsuba variant: CUDA where Mitsuba can trace rays on it, LLVM elsewhere."""
+"""Choice of the Mitsuba variant: CUDA if Mitsuba can trace rays with it, otherwise LLVM."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ logger = logging.getLogger(__name__)
 
 
 def set_variant(name: str = "auto") -> str:
-    """Sets the variant `name` and returns what was set; `auto` is `cuda_ad_rgb` or else `llvm_ad_rgb`.
+    """Set the variant `name` and return the variant that was set; `auto` is `cuda_ad_rgb` or else `llvm_ad_rgb`.
 
-    Raises BackendError, before Mitsuba is imported, where the backend that `name` needs is missing.
+    Raises BackendError, before Mitsuba is imported, if the backend of `name` is missing.
     """
     chosen, why = choose(name)
     if chosen.startswith("cuda") and name != "auto":
@@ -46,9 +46,9 @@ def set_variant(name: str = "auto") -> str:
 
 
 def keep_variant(name: str, source: object) -> str:
-    """Sets the variant `name` where none is set, and returns what is set; `auto` is content with any that works.
+    """Set the variant `name` if none is set, and return the current one; `auto` accepts any that works.
 
-    Raises ConfigError, located in `source`, where another one is set: what was made under that would be lost.
+    Raises ConfigError, located in `source`, if another variant is set, because objects of this variant would be lost.
     """
     mi = sys.modules.get("mitsuba")
     now: str | None = None if mi is None else mi.variant()
@@ -62,7 +62,7 @@ def keep_variant(name: str, source: object) -> str:
 
 
 def choose(name: str = "auto") -> tuple[str, str]:
-    """The variant that `name` stands for, and what a log line has to add to it."""
+    """Return the variant for `name`, and an addition to the log line."""
     if name != "auto":
         return name, ""
     missing = missing_cuda("cuda_ad_rgb")
@@ -70,13 +70,13 @@ def choose(name: str = "auto") -> tuple[str, str]:
 
 
 def works_under(variant: str) -> bool:
-    """Whether our integrators work under that variant of Mitsuba: with derivatives, by three colours or one."""
+    """Whether the integrators support this variant of Mitsuba: with derivatives, with three colour channels or one."""
     return variant.endswith(("_ad_rgb", "_ad_mono"))
 
 
 @functools.cache
 def check_variant(variant: str | None) -> None:
-    """Raises BackendError where the variant that is set is none under which our integrators work, or none is set."""
+    """Raise BackendError if the current variant is not supported, or none is set."""
     import mitsuba as mi
 
     if variant is None or not works_under(variant):
@@ -88,10 +88,10 @@ def check_variant(variant: str | None) -> None:
 
 
 def missing_cuda(variant: str = "cuda_ad_rgb") -> str:
-    """Why Mitsuba cannot trace rays with the CUDA variant; empty where it can.
+    """Return why Mitsuba cannot trace rays with the CUDA variant; empty if it can.
 
-    A machine without NVIDIA's driver is told at once. With one, a ray is traced in a process of its own, since a GPU
-    in a container often has CUDA but no OptiX.
+    Without NVIDIA's driver the answer is immediate. With the driver, a ray is traced in a separate process, because a
+    GPU in a container often has CUDA but no OptiX.
     """
     try:
         ctypes.CDLL(os.environ.get("DRJIT_LIBCUDA_PATH") or "libcuda.so.1")
@@ -101,7 +101,7 @@ def missing_cuda(variant: str = "cuda_ad_rgb") -> str:
 
 
 def package_version(name: str) -> str | None:
-    """Version of an installed package; None where it is not installed."""
+    """Return the version of an installed package; None if it is not installed."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -109,9 +109,9 @@ def package_version(name: str) -> str | None:
 
 
 def _have_two_threads(dr: ModuleType) -> None:
-    """Gives Dr.Jit two threads where the process has one core.
+    """Give Dr.Jit two threads if the process has one core.
 
-    It would have one, and with one Mitsuba 3.9 never comes to the end of reading or writing an EXR file.
+    With one thread, Mitsuba 3.9 never finishes reading or writing an EXR file.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     if cores == 1 and dr.thread_count() == 1:
@@ -119,7 +119,7 @@ def _have_two_threads(dr: ModuleType) -> None:
 
 
 def _check_loaded_llvm(dr: ModuleType) -> None:
-    """Refuses a libLLVM that a Dr.Jit imported before this package chose for itself."""
+    """Refuse a libLLVM that a previously imported Dr.Jit chose itself."""
     fault = ""
     if not dr.has_backend(dr.JitBackend.LLVM):
         fault = "found no usable libLLVM"

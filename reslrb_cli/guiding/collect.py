@@ -381,7 +381,9 @@ class Said:
 
 
 def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
-    """Return the contributions of guided samples with dL/dI `gradient` (H, W, C), without values that are not finite."""
+    """Return the contributions of guided samples with dL/dI `gradient` (H, W, C), without values that are not
+    finite.
+    """
     plan, adjoint = samples.plan, samples.film.adjoint(gradient)
     assert plan.grid is not None
     loudest = dr.max(dr.abs(dr.select(dr.isfinite(adjoint.image), adjoint.image, 0)))

@@ -1,1 +1,1 @@
-"""Integrators behind one interface: our light tracers as Mitsuba plugins, stock baselines, and the gradient step."""
+"""Integrators behind one interface: light tracers as Mitsuba plugins, stock baselines, and the gradient step."""

@@ -1,7 +1,7 @@
-"""Integrators to compare with: Mitsuba's own, and the walk of `reslrb` differentiated in other ways.
+"""Baselines: Mitsuba's integrators, and the light paths of `reslrb` with other derivatives.
 
-`Replayed`, `Projective` and `NaiveAD` take Mitsuba's own as a gradient step does. `WalkAd` and `Trajectory`
-differentiate the walk by naive AD, and by Dr.Jit's own reversal.
+`Replayed`, `Projective` and `NaiveAD` adapt Mitsuba's integrators to a gradient step. `WalkAd` and `Trajectory`
+differentiate light paths by naive AD, and by Dr.Jit's reversal of loops.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from reslrb_cli.transport.samples import Samples, in_passes
 
 @contextmanager
 def _no_word_of_signals() -> Iterator[None]:
-    """While its own C++ code renders, Mitsuba hears of Ctrl-C, too, and says so on stdout, in red, whatever that is."""
+    """Suppress Mitsuba's message about Ctrl-C, which its C++ code prints to stdout in red while it renders."""
     logger = mi.logger()
     level = logger.log_level()
     logger.set_log_level(mi.LogLevel.Error)
@@ -36,10 +36,10 @@ def _no_word_of_signals() -> Iterator[None]:
 
 
 class Reversed:
-    """An integrator whose gradient is a pass of its own, `backward`."""
+    """Integrator whose gradient is a separate pass, `backward`."""
 
     def image(self, job: Job) -> mi.TensorXf:
-        """The image (H, W, C), without derivatives."""
+        """Return the image (H, W, C), without derivatives."""
         raise NotImplementedError
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
@@ -47,18 +47,20 @@ class Reversed:
         raise NotImplementedError
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """The image, and the gradient of the same samples with the dL/dI that `derivative(image)` returns."""
+        """Return the image, and add the gradient of the same samples with the dL/dI that `derivative(image)`
+        returns.
+        """
         image = self.image(job)
         self.backward(job, derivative(image))
         return image
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
-        """The same where dL/dI is known before the image."""
+        """Return the image, and add the gradient, with dL/dI known before the image."""
         return self.correlated(job, lambda image: gradient)
 
 
 class Replayed(Reversed):
-    """One of Mitsuba's integrators whose gradient is a pass of its own, such as `prb`."""
+    """Mitsuba integrator whose gradient is a separate pass, such as `prb`."""
 
     image_apart = True
 
@@ -68,7 +70,7 @@ class Replayed(Reversed):
         self._surroundings = Surroundings()
 
     def _surround(self, scene: mi.Scene) -> None:
-        """Have the emitters of the scene know its bounds as they are now."""
+        """Update the emitters of the scene to its current bounds."""
         if self._scene is not scene:
             self._scene, self._surroundings = scene, Surroundings()
         self._surroundings.follow(scene)
@@ -86,7 +88,7 @@ class Replayed(Reversed):
 
 
 class Projective(Replayed):
-    """One of Mitsuba's projective integrators, such as `prb_projective`, as a function of the seed alone."""
+    """Mitsuba's projective integrators, such as `prb_projective`, as functions of the seed alone."""
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
         given = {name: getattr(self.plugin, name) for name in ("sppc", "sppp", "sppi")}
@@ -103,7 +105,7 @@ class Projective(Replayed):
                 setattr(self.plugin, name, spp)
 
     def obstacle(self, scene: mi.Scene, sensors: Iterable[mi.Sensor], moved: Iterable[mi.Object]) -> str | None:
-        """Return why Mitsuba 3.9 gets outlines or shadow edges of what is `moved` wrong, or None."""
+        """Return why Mitsuba 3.9 computes silhouettes or shadow edges of the `moved` shapes wrongly, or None."""
         advice = "or set integrator.sppp to 0, which leaves out outlines that the sensor sees"
         for sensor in sensors if self.plugin.sppp != 0 else ():
             if sensor.class_name() != "PerspectiveCamera":
@@ -115,9 +117,9 @@ class Projective(Replayed):
 
 
 class NaiveAD(Replayed):
-    """An integrator that is differentiated with the whole graph of its image, such as `ptracer`: a "sweep".
+    """Integrator that is differentiated with the whole graph of its image, such as `ptracer`.
 
-    Stock light tracing is differentiable in evaluated loops alone.
+    Mitsuba's light tracer is differentiable only in evaluated loops.
     """
 
     image_apart = False
@@ -141,7 +143,7 @@ _MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
 class WalkAd(LightTracer, Reversed):
-    """The same walk under naive AD: for comparisons at equal seeds."""
+    """The same light paths under naive AD, for comparisons at equal seeds."""
 
     OPTIONS: ClassVar[Mapping[str, Any]] = {
         **LightTracer.OPTIONS,
@@ -156,12 +158,12 @@ class WalkAd(LightTracer, Reversed):
         self, attached: bool = False, filter_normalization: str = "attached", paths: str = "light",
         light_share: float = 0.5, **common: Any,
     ) -> None:  # fmt: skip
-        """`attached`: rays and film positions have their derivatives too."""
+        """Make the integrator; with `attached`, rays and film positions have derivatives, too."""
         super().__init__(motion=Motion(attached, filter_normalization), **common)
         self.have_paths(paths, light_share)
 
     def graph(self, job: Job) -> mi.TensorXf:
-        """The image (H, W, C) with its whole graph; to be called where gradients are enabled."""
+        """Return the image (H, W, C) with its whole graph; call with enabled gradients."""
         parts = self.passes(job)
         film = parts[0].film
         block = film.block()
@@ -185,7 +187,7 @@ class WalkAd(LightTracer, Reversed):
 
 
 class Trajectory(LightTracer, Reversed):
-    """The same walk in a loop that Dr.Jit itself reverses, from a record of its state in thread-local memory."""
+    """The same light paths in a loop that Dr.Jit reverses, from a record of its state in thread-local memory."""
 
     def __init__(self, max_depth: int = -1, **common: Any) -> None:
         super().__init__(max_depth, motion=Motion(attached=False), **common)

@@ -1,8 +1,8 @@
-"""Findings about a scene, its sensors and what is differentiated: what a light tracer finds out once, and keeps.
+"""Facts of a scene, its sensors and its differentiated parameters, which a light tracer finds once and keeps.
 
-`Preparation` has the options and the findings about the last scene. Findings about a scene (`AboutScene`) and about a
-set of parameters (`AboutParameters`) are objects of their own. Another scene, or another set, gets new ones, so that a
-tracer that was used before has the results of a new one. `Renewal` brings plans up to date once shapes have moved.
+`Preparation` has the options and the facts of the last scene. Facts of a scene (`AboutScene`) and of a set of
+parameters (`AboutParameters`) are separate objects. Another scene or another set gets new ones, so a reused tracer
+gives the results of a new one. `Renewal` updates plans after shapes have moved.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from reslrb_cli.transport.sobol import make_coordinates
 
 
 def _has_singular(key: str, value: dr.ArrayBase, least: float) -> bool:
-    """Whether a factor of this parameter is `least` or less somewhere: near 0, or at 1 where 1 - x is a factor too."""
+    """Whether a factor of this parameter is at most `least` somewhere: near 0, or at 1 if 1 - x is a factor, too."""
     flat = dr.detach(value.array if dr.is_tensor_v(value) else dr.ravel(value))
     singular = flat <= least
     if {"opacity", "weight"} & set(key.split(".")):
@@ -44,7 +44,7 @@ def _has_singular(key: str, value: dr.ArrayBase, least: float) -> bool:
 
 
 class Renewal:
-    """Brings the plans of one scene up to date, ahead of tracing; no more of them than has changed."""
+    """Updates of the plans of one scene before tracing, limited to what has changed."""
 
     def __init__(self, scene: mi.Scene) -> None:
         graph = SceneGraph.of(scene)
@@ -58,7 +58,7 @@ class Renewal:
         self._bent = False
 
     def renew(self, plan: Plan, scene: mi.Scene) -> Plan:
-        """The plan of `scene`, as it is now."""
+        """Return the current plan of `scene`."""
         for mesh in self._lamps:
             mesh.surface_area()  # else Mitsuba adds up its faces when they are first sampled, in the midst of tracing
         if self._infinite:
@@ -77,7 +77,7 @@ def _vertices(mesh: mi.Mesh) -> tuple[mi.Float, mi.Float]:
 
 
 def resolve_sensor(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:
-    """A sensor of the scene, given as itself or as its index. Raises ValueError for an index of none."""
+    """Return a sensor of the scene, given as itself or as its index. Raises ValueError for an invalid index."""
     if not isinstance(sensor, Integral):
         return sensor
     index, count = int(sensor), len(scene.sensors())
@@ -87,19 +87,19 @@ def resolve_sensor(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:
 
 
 def sensors_in_words(count: int) -> str:
-    """How many sensors a scene has, and their indices."""
+    """Return the number of sensors of a scene, and their indices, in words."""
     return "one sensor, index 0" if count == 1 else f"{count} sensors, indices 0 to {count - 1}"
 
 
 def sensor_number(scene: mi.Scene, sensor: mi.Sensor) -> int:
-    """The number of a sensor among those of a scene; of one that is none of them, the number after theirs."""
+    """Return the number of a sensor of a scene; for any other sensor, the number of sensors."""
     known = [one.ptr for one in scene.sensors()]
     return known.index(sensor.ptr) if sensor.ptr in known else len(known)
 
 
 @dataclass
 class AboutParameters:
-    """Findings about parameters that are differentiated together."""
+    """Facts of parameters that are differentiated together."""
 
     which: Differentiated
     track_zeros: bool = False
@@ -111,7 +111,7 @@ class AboutParameters:
 
 @dataclass
 class AboutScene:
-    """Findings about one scene. Sensors are held, so that no other sensor gets the address of one that is freed."""
+    """Facts of one scene. It holds the sensors, so that no other sensor gets the address of a freed one."""
 
     sensors: list[mi.Sensor]
     #: Plans of images, by sensor and kind of paths.
@@ -131,7 +131,7 @@ class AboutScene:
 
 
 class Preparation:
-    """Options of a light tracer, and findings about one scene: the last that was asked for."""
+    """Options of a light tracer, and facts of one scene: the last one."""
 
     def __init__(
         self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion, guided: bool = False,
@@ -156,7 +156,10 @@ class Preparation:
         return self._found.recordings
 
     def afresh(self, guided: bool | None, images: bool | None, low_discrepancy: bool | None) -> Preparation:
-        """A new one with the same options, guided or not; `images`: samples of images alone, too. None: as this is."""
+        """Return a new object with the same options, with the given changes; None keeps an option.
+
+        `images` says whether samples that serve only an image are guided, too.
+        """
         own = self.guiding
         guided = own is not None if guided is None else guided
         low_discrepancy = self._low_discrepancy if low_discrepancy is None else low_discrepancy
@@ -168,7 +171,7 @@ class Preparation:
         return made
 
     def draw_from(self, guiding: Guiding, scene: mi.Scene) -> None:
-        """Draw guided samples of this scene from tables that others may draw from, too."""
+        """Sample guided paths of this scene from shared tables."""
         self._turn_to(scene)  # at first sight of a scene all is forgotten
         self.guiding = guiding
 
@@ -176,11 +179,11 @@ class Preparation:
         self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None, spp: int | None = None,
         image: bool = False,
     ) -> Plan:  # fmt: skip
-        """Return what a walk of this scene needs to differentiate `params`; None: nothing is differentiated.
+        """Return the plan to differentiate `params` in this scene; None: nothing is differentiated.
 
-        `spp` are the samples per pixel of a pass, if the plan is for one. With `image` the plan is for the image of a
-        step that differentiates `params`: it has the same paths as the gradient, and no derivatives. Raises
-        UnsupportedScene for what cannot work.
+        `spp` is the number of samples per pixel of a pass, if the plan is for one. With `image`, the plan is for the
+        image of a step that differentiates `params`: it has the same paths as the gradient, and no derivatives. Raises
+        UnsupportedScene.
         """
         self._turn_to(scene)
         if self.guiding is not None and spp is not None:
@@ -209,14 +212,19 @@ class Preparation:
         return plan
 
     def noted(self, params: mi.SceneParameters) -> dict[int, NDArray[np.float32]]:
-        """Return how camera paths are to be shared out for the derivatives of `params`, by sensor, to be added to."""
+        """Return the densities of camera paths for the derivatives of `params`, by sensor; the caller may add to
+        them.
+        """
         return self._look_through(params).noted
 
     def shares(
         self, number: int, known: NDArray[np.float32], size: tuple[int, int]
     ) -> Callable[[int], PixelShares | None]:
-        """Return how the camera paths of a sensor with a film (crop window) of this (width, height) are shared out, in
-        proportion to a density that is `known` (H, W)."""
+        """Return a function from a number of camera paths to their distribution, in proportion to the `known` density
+        (H, W).
+
+        The film (crop window) of the sensor has this `size` (width, height).
+        """
         made = self._found.shares
 
         def shares(paths: int) -> PixelShares | None:
@@ -229,8 +237,7 @@ class Preparation:
         return shares
 
     def entries(self, plan: Plan, params: mi.SceneParameters) -> list[int]:
-        """How many numbers are differentiated, of each group of BSDFs (`bsdf_groups`) and of emission, by a plan for
-        `params`."""
+        """Return the number of differentiated entries of each group of BSDFs (`bsdf_groups`) and of emission."""
         which = self._look_through(params).which
         owners = self._found.owners
         nodes = [
@@ -241,7 +248,7 @@ class Preparation:
         return [sum(which.entries[node] for node in each) for each in nodes]
 
     def emitters(self, plan: Plan, scene: mi.Scene) -> EmitterDensities:
-        """Return the densities of the scene's emitters as they are now, for a plan of the scene."""
+        """Return the current densities of the scene's emitters, for a plan of the scene."""
         made, weights = self._found.emitters, tuple(float(emitter.sampling_weight()) for emitter in scene.emitters())
         if (weights, plan.horizon) not in made:
             made.clear()
@@ -249,7 +256,7 @@ class Preparation:
         return made[weights, plan.horizon]
 
     def _first_plan(self, scene: mi.Scene, sensor: mi.Sensor, paths: str, whole: bool) -> Plan:
-        """Return the plan of images for a sensor that is new, or new with these paths."""
+        """Return the plan of images for a new sensor, or for new paths of a sensor."""
         check_paths(scene, sensor, paths, self._hide_emitters)
         needs = scene_needs(scene, sensor)
         renewal = self._found.renewal = self._found.renewal or Renewal(scene)
@@ -264,9 +271,9 @@ class Preparation:
         return self._with_numbers(plan, samples)
 
     def _look_through(self, params: mi.SceneParameters) -> AboutParameters:
-        """Return the findings about those parameters that are differentiated now, and whether zeros have to be tracked.
+        """Return the facts of the currently differentiated parameters, and whether zeros must be tracked.
 
-        What a parameter belongs to does not change. Whether it tracks derivatives, and whether it is zero, does.
+        The owner of a parameter does not change, but whether it tracks derivatives or is zero may change.
         """
         with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
             values = {key: entry_value(params, key) for key in params.properties}
@@ -282,7 +289,7 @@ class Preparation:
         return about
 
     def _with_numbers(self, plan: Plan, samples: Samples) -> Plan:
-        """The plan with what says how the numbers of its paths are drawn."""
+        """Return the plan with the choice of its random numbers."""
         grid, aims = None, False
         if self.guiding is not None:
             spp, sensors = self.expected or self._found.met, samples.scene.sensors()
@@ -298,14 +305,16 @@ class Preparation:
         return replace(plan, grid=grid, sequence=sequence)
 
     def _meet(self, spp: int, differentiated: bool) -> None:
-        """Have cells so fine as passes of so many samples per pixel can tell: those of the first pass, whatever it is
-        for, and of gradients that have more. An image that has more paths teaches the tables nothing."""
+        """Make the cells as fine as passes of `spp` samples per pixel can resolve.
+
+        These are the first pass, and gradients with more samples. Images with more paths teach the tables nothing.
+        """
         if self.expected is None and (self._found.met == 0 or (differentiated and spp > self._found.met)):
             self._found.met = spp
             self._found.plans.clear()  # they have the grid
 
     def _turn_to(self, scene: mi.Scene) -> None:
-        """Have new findings about another scene."""
+        """Start with new facts about another scene."""
         sensors = scene.sensors()
         if self._scene is None or self._scene[0] != scene.ptr or self._found.sensors != sensors:
             # The scene's own integrator does not hold the scene: neither would ever be freed. It holds the scene's
@@ -318,7 +327,7 @@ class Preparation:
                 self.guiding.clear()
 
     def _bsdfs(self, scene: mi.Scene, nodes: tuple[mi.Object, ...]) -> tuple[mi.BSDF, ...]:
-        """The surfaces' BSDFs that use any of these nodes; empty where that is all of them."""
+        """Return the surfaces' BSDFs that use any of these nodes; empty if all of them do."""
         owners = self._found.owners
         if any(node not in owners for node in nodes):
             graph = SceneGraph.of(scene)
@@ -329,10 +338,10 @@ class Preparation:
 
 
 def settle(scene: mi.Scene) -> None:
-    """Have textures and emitters set up now what they set up when they are first used (padded storage, distributions).
+    """Make textures and emitters set up their data (padded storage, distributions) now instead of at their first use.
 
-    In the midst of tracing this would cut the first step's kernels in two, and the second would compile them anew.
-    Raises UnsupportedScene where there is an emitter that Mitsuba cannot sample, such as a spot with a checkerboard.
+    During tracing, this would split the kernels of the first step, and the second step would compile new ones. Raises
+    UnsupportedScene for an emitter that Mitsuba cannot sample, such as a spot with a checkerboard.
     """
     with dr.suspend_grad():
         for texture in SceneGraph.of(scene).of_type(mi.Texture):

@@ -1,8 +1,8 @@
-"""Parameters that are differentiated, and what their derivatives ask of a walk, above all of those that move light.
+"""Differentiated parameters, and the features of a walk that their derivatives need, above all for moving light.
 
-`Motion` says how the latter are taken, `attach` gives a plan with them. `bounces` finds out whether light that moves is
-scattered by a surface that is not specular, and then comes to be seen from another one. Only there do the two ways of
-`attached_sampling`, `follow` and `stay` (`estimators/attached.py`), differ: in a caustic of few segments light ends
+`Motion` has the options of attached derivatives, and `attach` adds them to a plan. `bounces` finds out whether moving
+light is scattered by a surface that is not specular, and then seen from another one. Only there do the two values of
+`attached_sampling`, `follow` and `stay` (`estimators/attached.py`), differ. In a caustic of few segments, light ends
 where it lands first.
 """
 
@@ -36,12 +36,14 @@ FACTORS = ("reflectance", "transmittance", "base_color", "opacity", "weight")
 
 @dataclass(frozen=True)
 class Differentiated:
-    """What tracks derivatives.
+    """Parameters that track derivatives.
 
-    `bsdf_nodes` are the nodes of BSDFs that have such parameters: textures, nested BSDFs, and meshes whose attributes
-    textures read. `emission_nodes` are those of what emitters emit: emitters, and their textures. `shapes` are those
-    that move, `emitters` those whose rays do. `least` are the parameters that are factors of a path, and the value from
-    which on downwards each counts as zero. `entries` are the numbers that track derivatives, by node.
+    - `bsdf_nodes` are the nodes of BSDFs with such parameters: textures, nested BSDFs, and meshes whose attributes are
+      textures.
+    - `emission_nodes` are those of emission: emitters and their textures.
+    - `shapes` are moving shapes, and `emitters` those with moving rays.
+    - `least` maps parameters that are factors of a path to the value up to which they count as zero.
+    - `entries` are the numbers of differentiated entries by node.
     """
 
     bsdf_nodes: tuple[mi.Object, ...]
@@ -53,10 +55,10 @@ class Differentiated:
 
     @staticmethod
     def of(params: mi.SceneParameters, keys: Iterable[str]) -> Differentiated:
-        """That of the parameters `keys`.
+        """Return the differentiated parameters among `keys`.
 
-        Raises UnsupportedScene, with the reason, for one that light tracing has no derivative for, and would silently
-        leave at zero.
+        Raises UnsupportedScene, with the reason, for a parameter whose derivative light tracing would silently leave at
+        zero.
         """
         nodes: dict[mi.Object, None] = {}
         emitting: dict[mi.Object, None] = {}
@@ -91,11 +93,11 @@ class Differentiated:
 
 @dataclass(frozen=True)
 class Motion:
-    """How derivatives of what moves light are taken.
+    """Options of attached derivatives.
 
-    `attached` is `auto` (where a parameter moves anything), or says so; `filter_normalization` is `attached` or
-    `detached`, `sampling` one of `auto`, `follow` and `stay`. Raises ValueError for anything else. `obstacle` is the
-    reason where an integrator has none.
+    `attached` is true, false, or `auto` (if a parameter moves anything). `filter_normalization` is `attached` or
+    `detached`, and `sampling` is `auto`, `follow` or `stay`. Raises ValueError for other values. `obstacle` is the
+    reason if an integrator has no attached derivatives.
     """
 
     attached: bool | str = "auto"
@@ -113,7 +115,7 @@ class Motion:
 
 
 def stays(plan: Plan, sampling: str, bsdfs: Iterable[mi.BSDF]) -> tuple[bool, bool]:
-    """`Plan.stays` and `Plan.glossy_follows`, for the BSDFs of a scene's surfaces."""
+    """Return `Plan.stays` and `Plan.glossy_follows` for the BSDFs of a scene's surfaces."""
     smooth = [bsdf.flags() for bsdf in bsdfs if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)]
     glossy = [mi.has_flag(flags, mi.BSDFFlags.Glossy) for flags in smooth]
     if sampling == "follow" or plan.max_depth <= 2 or not glossy:
@@ -122,7 +124,7 @@ def stays(plan: Plan, sampling: str, bsdfs: Iterable[mi.BSDF]) -> tuple[bool, bo
 
 
 def attach(plan: Plan, which: Differentiated, motion: Motion, scene: mi.Scene, sensor: mi.Sensor) -> Plan:
-    """The plan with attached derivatives, where they are asked for. Raises UnsupportedScene where there are none."""
+    """Return the plan with attached derivatives if requested. Raises UnsupportedScene if they do not exist."""
     moves = bool(which.shapes or which.emitters)
     if motion.attached is False and moves:
         raise UnsupportedScene(
@@ -154,7 +156,7 @@ def attach(plan: Plan, which: Differentiated, motion: Motion, scene: mi.Scene, s
 
 
 def with_shading_normals(plan: Plan) -> Plan:
-    """The plan of a scene whose interpolated normals differ from its geometric ones."""
+    """Return the plan of a scene whose interpolated normals differ from its geometric normals."""
     return replace(plan, needs=replace(plan.needs, has_shading_normals=True))
 
 
@@ -166,7 +168,7 @@ SEED = 0xB0A2CE
 
 
 def bounces(plan: Plan, scene: mi.Scene, sensor: mi.Sensor) -> bool:
-    """Whether any of so many paths is such; `plan` is one with attached derivatives in which vertices stay."""
+    """Whether any of a fixed number of paths bounces; `plan` has attached derivatives with vertices that stay."""
     width, height = sensor.film().size()
     spp = max(PATHS // int(width * height), 1)
     with dr.suspend_grad():
@@ -185,7 +187,7 @@ class Bounced:
 
 
 class BouncedLight(Hooks):
-    """Follow what moves through bounces."""
+    """Hooks that follow moving light through bounces."""
 
     def __init__(self, plan: Plan, emitter: mi.EmitterPtr) -> None:
         self.plan, self.emitter = plan, emitter

@@ -1,8 +1,8 @@
-"""Forward mode and naive AD: hooks of walks that keep nothing of a path.
+"""Forward mode and naive AD: hooks of walks that store nothing of a path.
 
-- `TrackedSplat`, `RecordedObjective`: the image, or the objective, with derivatives tracked (naive AD, and Dr.Jit's own
+- `TrackedSplat`, `RecordedObjective`: the image, or the objective, with tracked derivatives (naive AD, and Dr.Jit's
   reversal).
-- `TangentSplat`, `CameraTangents`: the image's forward-mode derivative, by light paths and by camera paths.
+- `TangentSplat`, `CameraTangents`: the forward-mode derivative of the image, by light paths and by camera paths.
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ from reslrb_cli.transport.walk import Hooks, Splat, Vertex, walk
 
 
 class TrackedSplat(Splat):
-    """Splat every connection, derivatives of its factors tracked, and those of rays and film positions if `attached`
-    (walk_ad)."""
+    """Hooks that splat every connection with tracked derivatives of its factors, and of rays and film positions if
+    `attached`.
+    """
 
     tracked = True
 
@@ -44,9 +45,9 @@ class TrackedSplat(Splat):
 
 
 class RecordedObjective(Hooks):
-    """Sum each path's share of the objective, S = sum_i delta_i C_i, derivatives tracked (trajectory).
+    """Hooks that sum each path's share of the objective, S = sum_i delta_i C_i, with tracked derivatives (trajectory).
 
-    A splat in a loop that is reversed would have no derivative: side effects are none of the loop's state.
+    A splat in a reversed loop would have no derivative, because side effects are not part of the loop's state.
     """
 
     tracked = True
@@ -68,8 +69,11 @@ class RecordedObjective(Hooks):
 
 @dataclass
 class Tangent:
-    """Derivatives along the parameters' tangents: of the product of the factors so far, (C,), and where light moves of
-    the ray's origin and direction. `before` is the vertex before, where vertices stay on their surfaces."""
+    """Derivatives along the parameters' tangents.
+
+    They are those of the product of the factors so far, (C,), and, if light moves, of the ray's origin and direction.
+    `before` is the previous vertex if vertices stay at their places.
+    """
 
     d_product: mi.Spectrum
     d_ray: list[mi.Vector3f]
@@ -77,14 +81,13 @@ class Tangent:
 
 
 class TangentSplat(Hooks):
-    """Splat the derivative of every connection, and of where it lands, along the parameters' tangents; `dE` is that of
-    emission.
+    """Hooks that splat the derivative of every connection along the parameters' tangents; `dE` is that of emission.
 
-    By the product rule along the path nothing is divided, so that zero factors need no care:
+    The product rule along the path needs no division:
 
         d(P s) = dP s + P ds,   dC = dP c + P dc,   d(k_p(u) C) = dk_p/du du C + k_p dC
 
-    with k_p the filter's weight of pixel p. Where light does not move, du is 0.
+    k_p is the filter's weight of pixel p. If light does not move, du is 0.
     """
 
     connects = False  # they evaluate connections themselves, with their derivatives
@@ -120,10 +123,10 @@ class TangentSplat(Hooks):
         return replace(state, d_product=dP * scattering.weight + P * tangent_of_scattering(scattering, df_s))
 
     def _attached(self, state: Tangent, vertex: Vertex, connection: Connection, scattering: Scattering) -> Tangent:
-        """The same where light moves.
+        """Return the tangent behind a vertex if light moves.
 
-        A segment's derivatives are those by its ray, whose tangents are at hand, and by the scene's parameters, in one
-        propagation.
+        The derivatives of a segment with respect to its ray, whose tangents are known, and to the scene's parameters
+        take one propagation.
         """
         s, P, dP, scattered = self.samples, vertex.product.value(), state.d_product, scattering.active
         plan = s.plan
@@ -154,14 +157,14 @@ class TangentSplat(Hooks):
 
 @dataclass
 class CameraTangent:
-    """Derivatives along the parameters' tangents: of the product of the factors so far, and of the radiance, (C,)."""
+    """Derivatives along the parameters' tangents of the product of the factors so far, and of the radiance, (C,)."""
 
     d_product: mi.Spectrum
     d_radiance: mi.Spectrum
 
 
 class CameraTangents(CameraHooks):
-    """The same product rule along camera paths, whose radiance is summed up."""
+    """Hooks with the same product rule for camera paths, whose radiance is summed."""
 
     def __init__(self, samples: Samples) -> None:
         self.samples = samples
@@ -201,7 +204,9 @@ class CameraTangents(CameraHooks):
 def tangent_of_passage(
     samples: Samples, vertex: Vertex, connection: Connection
 ) -> tuple[mi.Bool, mi.Spectrum, mi.Spectrum]:
-    """Where a connection's target is seen, the transmittance (C,) of masks on the way, and its derivative."""
+    """Return the visibility of a connection's target, the transmittance (C,) of masks on the way, and its
+    derivative.
+    """
     plan, active = samples.plan, connection.active
     if not plan.needs.has_null:
         return *passage(plan, samples.scene, vertex.si, vertex.depth, connection), mi.Spectrum(0)
@@ -213,12 +218,12 @@ def tangent_of_passage(
 
 
 def tangent_of_scattering(scattering: Scattering, df: mi.Spectrum) -> mi.Spectrum:
-    """The derivative (C,) of an event's factor, by that of its f."""
+    """Return the derivative (C,) of an event's factor from that of its f."""
     return dr.select(scattering.active, df * (scattering.correction / scattering.pdf), 0)
 
 
 def reverse_recorded(samples: Samples, adjoint: AdjointImage) -> None:
-    """Add the same derivatives by Dr.Jit's own reversal of the walk, which records the loop's state on the way."""
+    """Add the derivatives by Dr.Jit's reversal of the walk, which records the loop's state on the way."""
     differentiate_visible_emission(samples, adjoint)
     with dr.resume_grad():
         S = walk(samples, RecordedObjective(samples, adjoint))
@@ -249,7 +254,7 @@ def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
 
 
 def splat_tracked(samples: Samples, block: mi.ImageBlock) -> None:
-    """Add the contributions with derivatives tracked to the block: naive AD, its memory proportional to depth."""
+    """Add the contributions with tracked derivatives to the block: naive AD, with memory proportional to depth."""
     with dr.resume_grad():
         splat_visible_emission(samples, block, "evaluated")
         for u, C, active in moving_splats(samples):  # twice, so that the image stays as it is

@@ -1,7 +1,7 @@
-"""What a step launches, recorded once and launched again: no Python between a seed and its gradient (`dr.freeze`).
+"""Recordings of the kernel launches of a step: no Python code between a seed and its gradient (`dr.freeze`).
 
-Tracing a step takes milliseconds, however small the image. A recording is made for each kind of call; Dr.Jit makes
-another by itself where inputs change in more than their values.
+Tracing a step takes milliseconds for any image. There is a recording for each kind of call. Dr.Jit makes another one if
+inputs change in more than their values.
 """
 
 from __future__ import annotations
@@ -42,23 +42,22 @@ MOST_CALLS = 256
 
 
 class Recordings:
-    """Calls on the samples of one scene, by kind, plan and sensor."""
+    """Recordings of calls on the samples of one scene, by kind, plan and sensor."""
 
     def __init__(self) -> None:
         self._functions: dict[Any, Any] = {}  # None where a call is not recorded: it cannot be, or gains nothing by it
 
     def clear(self) -> None:
-        """Forget all of them, for a new scene."""
+        """Clear all recordings, for a new scene."""
         self._functions.clear()
 
     def call(self, kind: str, samples: Samples, function: Callable[..., Any], *inputs: Any) -> Any:
-        """`function(samples, *inputs)`, from a recording where there is one; its results are evaluated.
+        """Call `function(samples, *inputs)`, from a recording if there is one; its results are evaluated.
 
-        `function` depends on nothing but its inputs and, of what is no Dr.Jit array, on `kind`; the derivatives that it
-        adds to parameters are proportional to the first of `inputs`. A call that cannot be recorded is made as it is:
-        scenes that live beside this one, for example, take part in its indirect calls, and are none of its inputs. So
-        is one that had to be recorded anew again and again. Raises UnsupportedScene where a recording is there, and no
-        longer fits.
+        `function` depends only on its inputs and, for values that are no Dr.Jit arrays, on `kind`. The derivatives that
+        it adds to parameters are proportional to the first of `inputs`. Calls that cannot be recorded are made
+        directly: for example, other living scenes take part in indirect calls, but are no inputs. So are calls that had
+        to be recorded again and again. Raises UnsupportedScene if a recording exists but does not fit any more.
         """
         s = samples
         # Sensors that share a recording have it made anew whenever another one's turn comes. The key holds its sensor:
@@ -88,7 +87,7 @@ class Recordings:
             ) from error
 
     def counts(self) -> dict[str, int]:
-        """How often each kind of call was recorded."""
+        """Return how often each kind of call was recorded."""
         counts: dict[str, int] = {}
         for (kind, *_), function in self._functions.items():
             if function is not None:
@@ -99,10 +98,11 @@ class Recordings:
 def _record(
     kind: str, plain: Callable[..., Any], common: tuple[Any, ...], inputs: tuple[Any, ...],
 ) -> Any:  # fmt: skip
-    """A recording, or None where there cannot be one.
+    """Return a recording, or None if the call cannot be recorded.
 
-    Dr.Jit finds that out after all has been computed and derivatives were added. So it is tried with a first input of
-    zeros, which adds none, and until it is in use: what follows a step then has the same kernels from the first one on.
+    Dr.Jit detects this after it has computed everything and added derivatives. The recording is therefore tried with a
+    first input of zeros, which adds none, and repeated until it is used, so that later work has the same kernels from
+    the first step on.
     """
     recorded = dr.freeze(plain, limit=KEPT)
     if inputs:
@@ -127,7 +127,7 @@ def _record(
 
 @contextmanager
 def _without_garbage_collection() -> Iterator[None]:
-    """A scene that is freed in the midst of a recording ends the process."""
+    """Suspend garbage collection: freeing a scene during a recording ends the process."""
     collects = gc.isenabled()
     gc.disable()
     try:
@@ -138,7 +138,7 @@ def _without_garbage_collection() -> Iterator[None]:
 
 
 def _on_samples(samples: Samples, function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function` with everything that a recording has to see as an argument of its own."""
+    """Return `function` with every input of a recording as a separate argument."""
     # Only these: arrays would be constants of the recording, and a scene would never be freed.
     sides = [(side.plan, side.spp, side.width) for side in samples.sides()]
 
@@ -156,6 +156,6 @@ def _on_samples(samples: Samples, function: Callable[..., Any]) -> Callable[...,
 
 
 def _arrays(samples: Samples) -> tuple[Any, ...]:
-    """What of samples a recording has to see, in the order of their members."""
+    """Return the arrays of samples that are inputs of a recording, in the order of their members."""
     s = samples
     return s.seed, s.scale, s.fraction, s.guide, s.net, s.ratio, s.emitters, s.shares

@@ -1,7 +1,7 @@
-"""Integrators that users have written: loaded from a file, and kept from ending a command without a word.
+"""Integrators by users, loaded from a file, with errors in one line.
 
-What is asked of one is what Mitsuba asks: `render` and `render_backward`, as `mi.ad.integrators.common.ADIntegrator`
-and `RBIntegrator` have them for whoever writes `sample`.
+They need Mitsuba's `render` and `render_backward`, which `mi.ad.integrators.common.ADIntegrator` and `RBIntegrator`
+provide for classes with `sample`.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from reslrb_cli.integrators.protocol import Job
 
 
 class OwnIntegrator(Reversed):
-    """A user's integrator in a step; what it raises, and what is no image, becomes one line that names the class.
+    """User's integrator in a step; exceptions and wrong images become one line that names the class.
 
-    The file is run when an image or a gradient is first asked for, or `ready` is.
+    The file runs when an image or a gradient is first needed, or in `ready`.
     """
 
     #: Its gradient is a pass of its own; naive AD of one whose `render` alone is differentiable is Mitsuba's affair.
@@ -32,16 +32,21 @@ class OwnIntegrator(Reversed):
         self, file: str, max_depth: int, rr_depth: int, hide_emitters: bool, arguments: dict[str, Any] | None = None,
         paths: str = "camera", allowed: bool = False,
     ) -> None:  # fmt: skip
-        """The class FILE.py:CLASS, to be made of a `mi.Properties` with these options and `arguments`; what of the
-        first three it does not ask for it does not have. `paths` are for those who judge it (`config.Own`). Code is run
-        where that is `allowed`."""
+        """Prepare the class FILE.py:CLASS, to be made from a `mi.Properties` with these options and `arguments`.
+
+        Of the first three options, it receives those that it reads. `paths` are for checks (`config.Own`). Code runs
+        only if `allowed`.
+        """
         self.file, self.name, self.allowed = code_file(file), file.rpartition(":")[2], allowed
         self._options = {"max_depth": max_depth, "rr_depth": rr_depth, "hide_emitters": hide_emitters}
         self._arguments = arguments or {}
 
     def ready(self) -> None:
-        """Run the file and make the integrator. Raises ConfigError, located by the file, where that is not allowed, or
-        cannot be done, or one of the `arguments` is nothing that it asks for."""
+        """Run the file and make the integrator.
+
+        Raises ConfigError, located by the file, if this is not allowed, fails, or if the class does not read one of the
+        `arguments`.
+        """
         _ = self._work
 
     @cached_property
@@ -73,7 +78,7 @@ class OwnIntegrator(Reversed):
             self._work.backward(job, gradient)
 
     def tangent(self, job: Job) -> mi.TensorXf:
-        """The derivative of the image along the tangents of the job's parameters, by its `render_forward`."""
+        """Return the derivative of the image along the tangents of the job's parameters, by its `render_forward`."""
         plugin = self._work.plugin
         with self._guarded("its render_forward"), dr.resume_grad():
             image = plugin.render_forward(job.scene, job.params, job.sensor, job.seed, job.spp)
@@ -83,7 +88,7 @@ class OwnIntegrator(Reversed):
         return Guard(self.file, self.name, self.file, what)
 
     def _checked(self, job: Job, image: Any) -> mi.TensorXf:
-        """The image, of the film's size. Raises ConfigError."""
+        """Return the image if it has the size of the film. Raises ConfigError otherwise."""
         width, height = (int(n) for n in job.sensor.film().crop_size())
         shape = tuple(image.shape) if isinstance(image, mi.TensorXf) else None
         if shape is None:

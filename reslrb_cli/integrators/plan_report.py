@@ -1,4 +1,4 @@
-"""The plan of a step, feature by feature: whether the step has it, and why."""
+"""Plan of a step, feature by feature: whether the step has it, and why."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PIXELS = "camera paths by pixel"
 
 @dataclass(frozen=True)
 class PlanRow:
-    """One feature of a plan: whether the scene and its parameters need it, and why."""
+    """Feature of a plan: whether the scene and its parameters need it, and why."""
 
     feature: str
     needed: bool
@@ -25,7 +25,7 @@ class PlanRow:
 
 
 def plan_rows(plan: Plan) -> list[PlanRow]:
-    """List all features, those that the plan leaves out too."""
+    """List all features, including those that the plan leaves out."""
     needs, camera_alone = plan.needs, plan.paths == "camera"
     no_start = "no path begins at a light" if camera_alone else None
     rows = (

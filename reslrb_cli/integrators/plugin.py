@@ -1,4 +1,4 @@
-"""Our light tracers as Mitsuba plugins: `mi.load_dict({"type": "reslrb", ...})` after `reslrb_cli.register()`."""
+"""Light tracers as Mitsuba plugins: `mi.load_dict({"type": "reslrb", ...})` after `reslrb_cli.register()`."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _registered_with_callback = False
 
 
 def register() -> None:
-    """Make our integrators known to Mitsuba, in the current variant and in any that is set later.
+    """Register the integrators with Mitsuba, for the current variant and for variants that are set later.
 
-    Raises BackendError, with the variants that work, where the current one does not. Under one that is set later and
-    does not, loading one of the integrators says so.
+    Raises BackendError, with the supported variants, if the current variant is not supported. Under an unsupported
+    variant that is set later, loading one of the integrators raises an error.
     """
     global _registered_with_callback
     if not _registered_with_callback:
@@ -35,7 +35,7 @@ def register() -> None:
 
 
 def make_tracer(type: str, options: Mapping[str, Any]) -> Reslrb | WalkAd | Trajectory:
-    """One of our integrators. Raises ValueError where an option is wrong."""
+    """Make one of the light tracers. Raises ValueError if an option is wrong."""
     unknown = [name for name in options if name not in _option_names(type, options.get("estimator"))]
     if unknown:
         raise ValueError(f"{type} has no option {', '.join(unknown)}")
@@ -51,16 +51,16 @@ def _on_variant(old: str | None, new: str) -> None:
 
 
 def _refuse(type: str, props: mi.Properties) -> NoReturn:
-    """In place of a plugin under a variant that has none: that there is no such plugin would be no help."""
+    """Raise an error under a variant without the plugin, because "no such plugin" would be no help."""
     check_variant(mi.variant())
     raise AssertionError("called under such variants only")
 
 
 def _plugin_class() -> type[mi.CppADIntegrator]:
-    """The class of our plugins. It derives from one of the variant's, so that there is one for each variant."""
+    """Return the class of the plugins. It derives from a class of the variant, so there is one for each variant."""
 
     class LightTracerPlugin(mi.CppADIntegrator):
-        """One of our light tracers, under `mi.render`."""
+        """Light tracer under `mi.render`."""
 
         def __init__(self, type: str, props: mi.Properties) -> None:
             # Of all that stays unread Mitsuba says that there is no such option; what is asked for counts as read.
@@ -99,7 +99,7 @@ def _plugin_class() -> type[mi.CppADIntegrator]:
 
 
 def _option_names(type: str, estimator: str | None) -> list[str]:
-    """The names of an integrator's options, those of its estimator among them."""
+    """Return the names of an integrator's options, including those of its estimator."""
     if type != "reslrb":
         return list(WalkAd.OPTIONS if type == "walk_ad" else Trajectory.OPTIONS)
     name = Reslrb.OPTIONS["estimator"] if estimator is None else estimator
@@ -107,6 +107,6 @@ def _option_names(type: str, estimator: str | None) -> list[str]:
 
 
 def _job(scene: mi.Scene, params: Any, sensor: mi.Sensor | int, seed: mi.UInt32 | int, spp: int) -> Job:
-    """A job that differentiates the user's parameters, or all of the scene's."""
+    """Return a job that differentiates the user's parameters, or all parameters of the scene."""
     params = params if isinstance(params, mi.SceneParameters) else mi.traverse(scene)
     return Job(scene, resolve_sensor(scene, sensor), seed, spp, params)

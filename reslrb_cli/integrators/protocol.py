@@ -1,4 +1,4 @@
-"""The interface of an integrator, ours or a stock one, for a step."""
+"""Interface of integrators, own or stock, for a step."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ Derivative: TypeAlias = "Callable[[mi.TensorXf], mi.TensorXf]"  # text: the type
 
 @dataclass(frozen=True)
 class Job:
-    """One set of samples: of which scene, through which sensor, with which random numbers.
+    """One set of samples of a scene, through a sensor, with random numbers.
 
-    `seed` is an opaque UInt32, `spp` are samples per pixel. Those of `params`, the scene's `mi.traverse`, that track
-    derivatives are differentiated; None for an image alone. `plans` is what integrators have found out about scene and
-    parameters for one step; jobs that are made of one another share it.
+    `seed` is an opaque UInt32, and `spp` the number of samples per pixel. Entries of `params`, the scene's
+    `mi.traverse`, that track derivatives are differentiated; None for an image alone. `plans` stores what integrators
+    find out about scene and parameters for one step; jobs that are derived from one another share it.
     """
 
     scene: mi.Scene
@@ -32,13 +32,13 @@ class Job:
 
 
 class StepIntegrator(Protocol):
-    """Images and gradients; images and dL/dI are tensors (H, W, C), gradients are added to the job's parameters."""
+    """Images and gradients; images and dL/dI are tensors (H, W, C), and gradients are added to the job's parameters."""
 
     #: Whether `correlated` has image and dL/dI evaluated before the rest of its work begins; naive AD has not.
     image_apart: bool
 
     def image(self, job: Job) -> mi.TensorXf:
-        """The image, without derivatives."""
+        """Return the image, without derivatives."""
         ...
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
@@ -46,18 +46,20 @@ class StepIntegrator(Protocol):
         ...
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """The image, and the gradient of the same samples with the dL/dI that `derivative(image)` returns."""
+        """Return the image, and add the gradient of the same samples with the dL/dI that `derivative(image)`
+        returns.
+        """
         ...
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
-        """The image, and the gradient of the same samples, where dL/dI is known before either."""
+        """Return the image, and add the gradient of the same samples, with dL/dI known before."""
         ...
 
 
 def first_channels(image: mi.TensorXf, count: int) -> mi.TensorXf:
-    """`image[..., :count]`, whose derivative keeps a NaN.
+    """Return `image[..., :count]`, whose derivative keeps a NaN.
 
-    That of a slice adds up with atomics, which drop it on a CPU (`transport.factors.showing`).
+    The derivative of a slice uses atomic sums, which drop NaN on a CPU (`transport.factors.showing`).
     """
     *pixels, channels = image.shape
     if channels == count:
@@ -69,7 +71,9 @@ def first_channels(image: mi.TensorXf, count: int) -> mi.TensorXf:
 
 
 def halves_of(image: mi.TensorXf) -> tuple[mi.TensorXf, mi.TensorXf]:
-    """The images (H, W, C) of the two halves of a set of samples, (2, H, W, C); of one image that image twice."""
+    """Return the images (H, W, C) of the two halves of a set of samples, (2, H, W, C); for one image, that image
+    twice.
+    """
     if len(image.shape) == 3:
         return image, image
     shape = image.shape[1:]
@@ -82,7 +86,7 @@ def halves_of(image: mi.TensorXf) -> tuple[mi.TensorXf, mi.TensorXf]:
 
 
 def whole_of(image: mi.TensorXf) -> mi.TensorXf:
-    """The image (H, W, C) of a set of samples, the mean of their two halves (2, H, W, C) where it has such."""
+    """Return the image (H, W, C) of a set of samples; the mean of its two halves (2, H, W, C) if it has them."""
     if len(image.shape) == 3:
         return image
     first, second = halves_of(image)

@@ -1,7 +1,7 @@
-"""Light tracers: what ours have in common, reservoir light replay backpropagation, and what is done with samples.
+"""Light tracers: the common base, and reservoir light replay backpropagation.
 
-In common they have `ptracer`'s options, a plan, passes, the image and its tangent (`LightTracer`). `Reslrb` has images
-and gradients by one of the estimators. They know nothing of Mitsuba's plugins; `plugin.py` makes plugins of them.
+`LightTracer` has the options of `ptracer`, a plan, passes, the image and its tangent. `Reslrb` adds gradients by one of
+the estimators. They are independent of Mitsuba's plugins; `plugin.py` makes plugins from them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ PATHS = ("light", "camera", "both")
 
 
 class LightTracer:
-    """A light tracer without derivatives but for forward mode; OPTIONS are names and defaults as `ptracer` has them."""
+    """Light tracer with derivatives in forward mode only; OPTIONS are names and defaults of `ptracer`."""
 
     OPTIONS: ClassVar[Mapping[str, Any]] = {
         "max_depth": -1,
@@ -62,11 +62,11 @@ class LightTracer:
         self, max_depth: int = -1, rr_depth: int = 5, hide_emitters: bool = False, samples_per_pass: int | None = None,
         freeze: bool = False, motion: Motion | None = None, guided: bool = False, low_discrepancy: bool = False,
     ) -> None:  # fmt: skip
-        """Raises ValueError, which names the option, where one has a value that it cannot have.
+        """Make the tracer. Raises ValueError, which names the option, for an invalid value.
 
-        `freeze` says whether launches are recorded (`freezing.py`), `motion` how derivatives of what moves are taken,
-        `guided` whether emission is drawn from what earlier paths said (`tables.py`),
-        `low_discrepancy` whether the numbers of a path's beginning are (`sobol.py`).
+        `freeze` says whether launches are recorded (`freezing.py`), `motion` has the options of attached derivatives,
+        `guided` says whether emission is guided (`tables.py`), and `low_discrepancy` whether the first numbers of a
+        path are of low discrepancy (`sobol.py`).
         """
         if max_depth < -1:
             raise ValueError('"max_depth" must be -1 (no limit) or a value >= 0')
@@ -79,7 +79,7 @@ class LightTracer:
         self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion or Motion(), guided, low_discrepancy)
 
     def with_options(self, *, samples_per_pass: int | None, freeze: bool) -> Self:
-        """The same with other passes, or without recordings; both share what they find out about a scene."""
+        """Return the same tracer with other passes, or without recordings; both share the facts of a scene."""
         other = copy.copy(self)
         other.samples_per_pass, other.freeze = samples_per_pass, freeze
         return other
@@ -88,10 +88,11 @@ class LightTracer:
         self, *, guided: bool | None = None, images: bool | None = None, low_discrepancy: bool | None = None,
         light_share: float | None = None,
     ) -> Self:  # fmt: skip
-        """The same, which knows nothing of any scene yet, with other ways of drawing samples; None: as it has it.
+        """Return the same tracer without facts of any scene, with other ways of sampling; None keeps a value.
 
-        Guided emission or none, `images`: of images too; low-discrepancy numbers or independent ones; paths from both
-        sides, of which `light_share` are light paths: images have the film's border of both, whatever that share is.
+        `guided` and `images` (for images, too) set guiding; low-discrepancy numbers or independent ones; paths from
+        both sides, with a share `light_share` of light paths. Images then have the film border of both kinds, for any
+        share.
         """
         other = copy.copy(self)
         other.preparation = self.preparation.afresh(guided, images, low_discrepancy)
@@ -100,28 +101,35 @@ class LightTracer:
         return other
 
     def shared_out(self, noted: Mapping[str, NDArray[np.float32]]) -> Self:
-        """The same, which knows nothing of any scene yet, with camera paths shared out over the pixels as was noted of
-        them, by the number of the sensor (`note_pixels`)."""
+        """Return the same tracer without facts of any scene, with camera paths distributed by these densities.
+
+        The densities are by the number of the sensor (`note_pixels`).
+        """
         other = self.afresh()
         other.preparation.shares_out = True
         other.preparation.given = {int(number): density for number, density in noted.items()}
         return other
 
     def to_measure(self) -> Self:
-        """This one, or, where it is guided, one with tables of its own: whoever measures steps before a run teaches
-        those of the run nothing, which is then the same whether they were measured now or by an earlier one."""
+        """Return this tracer or, if it is guided, one with its own tables.
+
+        Measurements before a run then do not teach the tables of the run, which are the same whether an earlier run
+        measured or not.
+        """
         return self if self.preparation.guiding is None else self.afresh()
 
     def expect(self, spp: int) -> None:
-        """Be told how many samples per pixel there are in each pass that tables learn from, whatever passes come first.
+        """Set the number of samples per pixel of passes that tables learn from, before the first pass.
 
-        A run says so: it is then the same whether it begins or goes on.
+        A run calls this, so that it has the same cells whether it starts or resumes.
         """
         self.preparation.expected = spp
 
     def have_paths(self, paths: str, light_share: float, whole: bool = False) -> None:
-        """Have light paths, camera paths, or both, `light_share` of the samples being light paths; a share of 0 or 1
-        leaves one kind of them. `whole`: light paths alone, too, have the film's border that the others have."""
+        """Use light paths, camera paths, or both, with a share `light_share` of light paths; 0 or 1 leaves one kind.
+
+        With `whole`, light paths alone have the film border of the other kinds.
+        """
         one_of("paths", paths, PATHS)
         if not 0 <= light_share <= 1:
             raise ValueError(f'"light_share" must lie in [0, 1], not {light_share}')
@@ -133,14 +141,15 @@ class LightTracer:
             self.preparation.guiding = None
 
     def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
-        """What a walk of this scene needs, with derivatives of `params`, if any. Raises UnsupportedScene."""
+        """Return the plan of a walk of this scene, with derivatives of `params`, if any. Raises UnsupportedScene."""
         return self.preparation.plan(scene, sensor, params)
 
     def passes(self, job: Job, purpose: Purpose | None = None, delta: mi.TensorXf | None = None) -> list[Samples]:
-        """The samples of a job; where its `spp` is 0, the sensor's own number of them.
+        """Return the samples of a job; if its `spp` is 0, as many as the sensor has.
 
-        The `purpose` says what guided samples are drawn by; None: for the gradient, or the image where there is none.
-        So does dL/dI `delta` (H, W, C), which the samples have had no part in. Raises ValueError for an `spp` below 0.
+        `purpose` selects the table of guided samples; None: the gradient, or the image if there is no gradient. dL/dI
+        `delta` (H, W, C), which must not come from these samples, guides them as well. Raises ValueError for a negative
+        `spp`.
         """
         if job.spp < 0:
             raise ValueError(f'"spp" must be 0 (the sensor\'s own sample count) or more, not {job.spp}')
@@ -158,13 +167,13 @@ class LightTracer:
         return passes(plan, *given, *self._sides(plan, job.scene), self._shares(job, plan))
 
     def _sides(self, plan: Plan, scene: mi.Scene) -> tuple[float, EmitterDensities | None]:
-        """The share of light paths, and the emitters' densities, where paths from both sides are weighed."""
+        """Return the share of light paths, and the densities of the emitters if paths from both sides are weighted."""
         return self.light_share, self.preparation.emitters(plan, scene) if plan.weighs else None
 
     def _shares(self, job: Job, plan: Plan) -> Callable[[int], PixelShares | None] | None:
-        """Return how the job's camera paths are shared out; None: evenly.
+        """Return the distribution of the job's camera paths; None: evenly.
 
-        Where nobody has said so before, it is found out once for the parameters that are differentiated.
+        If it is not known yet, it is measured once for the differentiated parameters.
         """
         preparation = self.preparation
         if plan.paths == "light" or not preparation.shares_out:
@@ -178,24 +187,27 @@ class LightTracer:
         return preparation.shares(number, known[number], (int(size[0]), int(size[1]))) if number in known else None
 
     def note_pixels(self, job: Job, curvature: NDArray[np.floating] | None = None) -> NDArray[np.float32]:
-        """Return the density of camera paths over the pixels (H, W) of a job's sensor, with mean 1, as the scene is now
-        and for a loss of this `curvature` (H, W) (`pixels.py`). The job's seed and samples play no part."""
+        """Return the density of camera paths over the pixels (H, W) of a job's sensor, with mean 1, for the current
+        scene.
+
+        `curvature` (H, W) is that of the loss (`pixels.py`). The job's seed and samples do not matter.
+        """
         plan = self.preparation.plan(job.scene, job.sensor, job.params)
         entries = self.preparation.entries(plan, job.params)
         with dr.suspend_grad():
             return wanted(plan, job.scene, job.sensor, entries, *self._sides(plan, job.scene), curvature)
 
     def learn(self, job: Job, gradient: mi.TensorXf) -> None:
-        """Have the tables learn, where they are due to, from other samples than those of the job; dL/dI is known.
+        """Let the tables learn, if they are due, from samples other than those of the job; dL/dI is known.
 
-        After a gradient: what has been learned counts from the next one on.
+        Call this after a gradient. The result is used from the next gradient on.
         """
         guiding = self.preparation.guiding
         if guiding is not None and guiding.due(sensor_number(job.scene, job.sensor)):
             self.learn_now(job, gradient)
 
     def learn_now(self, job: Job, gradient: mi.TensorXf) -> None:
-        """Have the tables learn, due or not."""
+        """Let the tables learn, due or not."""
         guiding = self.preparation.guiding
         assert guiding is not None
         with dr.suspend_grad():
@@ -207,7 +219,7 @@ class LightTracer:
             guiding.learn(sensor_number(job.scene, job.sensor), samples.width, said)
 
     def image(self, job: Job, evaluate: bool = True) -> mi.TensorXf:
-        """The image (H, W, C), without derivatives."""
+        """Return the image (H, W, C), without derivatives."""
         with dr.suspend_grad():
             parts = self.passes(job, Purpose.IMAGE)  # an image has no use for what derivatives ask of a walk
             if not evaluate:
@@ -217,7 +229,7 @@ class LightTracer:
             return image
 
     def tangent(self, job: Job) -> mi.TensorXf:
-        """The derivative (H, W, C) of the image along the tangents of the job's parameters (forward mode)."""
+        """Return the derivative (H, W, C) of the image along the tangents of the job's parameters (forward mode)."""
         with dr.suspend_grad():
             parts = self.passes(job)
             if parts[0].plan.moving_emission:
@@ -231,7 +243,7 @@ class LightTracer:
         self, kind: str, parts: list[Samples], work: Callable[..., Any], *inputs: Any,
         params: mi.SceneParameters | None = None,
     ) -> Any:  # fmt: skip
-        """`work(parts, *inputs, params)`, or a recording of that, launched again; one pass need not know `params`."""
+        """Call `work(parts, *inputs, params)`, or launch a recording of it; with one pass, `params` may be None."""
         if self.freezes(parts):
             recordings = self.preparation.recordings
             return recordings.call(kind, parts[0], lambda part, *given: work([part], *given), *inputs)
@@ -243,7 +255,7 @@ class LightTracer:
 
 
 class Reslrb(LightTracer):
-    """Derivatives by a replay of each path; the options beside OPTIONS are those of the estimator."""
+    """Derivatives by a replay of each path; the options besides OPTIONS are those of the estimator."""
 
     OPTIONS: ClassVar[Mapping[str, Any]] = {
         **LightTracer.OPTIONS,
@@ -269,7 +281,7 @@ class Reslrb(LightTracer):
         attached_sampling: str = "auto", guiding: str = "off", sequence: str = "independent", paths: str = "light",
         light_share: float = 0.5, pixels: str = "even", **options: Any,
     ) -> Reslrb:  # fmt: skip
-        """From the estimator's name and all options. Raises ValueError where one is wrong."""
+        """Make the tracer from the estimator's name and all options. Raises ValueError if one is wrong."""
         estimator = estimator or ("stack" if paths == "camera" else cls.OPTIONS["estimator"])
         if estimator == "auto":
             raise ValueError(
@@ -303,20 +315,22 @@ class Reslrb(LightTracer):
         return made
 
     def share_of_light(self, plan: Plan) -> float:
-        """The share of the samples that are light paths."""
+        """Return the share of the samples that are light paths."""
         return {"light": 1.0, "camera": 0.0}.get(plan.paths, self.light_share)
 
     def kept(self, plan: Plan) -> Any:
-        """All that memory holds of a light path at once, as `Estimator.kept` has it; of camera paths it is nothing."""
+        """Return all simultaneously stored data of a light path, as `Estimator.kept`; camera paths store nothing."""
         return [] if plan.paths == "camera" else self.estimator.of(plan).kept(plan)
 
     def scratch_bytes(self, plan: Plan) -> int:
-        """Thread-local bytes of each path that is being traced, of either kind."""
+        """Return the thread-local bytes of each traced path, of either kind."""
         light = 0 if plan.paths == "camera" else self.estimator.of(plan).scratch_bytes(plan)
         return light if plan.paths == "light" else max(light, stack_bytes(plan, self.estimator.stack_size))
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """The image, and the gradient of the same samples with the dL/dI that `derivative(image)` returns."""
+        """Return the image, and add the gradient of the same samples with the dL/dI that `derivative(image)`
+        returns.
+        """
         with dr.suspend_grad():
             parts = self.passes(job, Purpose.BOTH)
             traced = Trace(parts, *self.launch("trace", parts, partial(trace_image, self.estimator)))
@@ -333,9 +347,9 @@ class Reslrb(LightTracer):
         self.learn(job, gradient)
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
-        """The image, and the gradient of the objective with dL/dI `gradient` (H, W, C), known before either.
+        """Return the image, and add the gradient of the objective with dL/dI `gradient` (H, W, C), known before.
 
-        One set of samples, traced once for both where the estimator can.
+        One set of samples is traced once for both if the estimator supports it.
         """
         with dr.suspend_grad():
             parts = self.passes(job, Purpose.BOTH, gradient)
@@ -357,7 +371,7 @@ def _no_attached(estimator: str) -> str:
 
 
 def image_of(samples: list[Samples]) -> mi.TensorXf:
-    """The image of all passes; nothing is kept."""
+    """Return the image of all passes; nothing is stored."""
     film = samples[0].film
     block = film.block()
 
@@ -376,8 +390,11 @@ def image_of(samples: list[Samples]) -> mi.TensorXf:
 def forward(
     samples: Samples, estimator: Estimator, block: mi.ImageBlock | None, adjoint: AdjointImage | None = None
 ) -> Any:
-    """Trace the samples: add their contributions to the block (None: no image). What is kept of each path is returned,
-    and not evaluated."""
+    """Trace the samples: add their contributions to the block (None: no image), and return the stored data of each
+    path.
+
+    The result is not evaluated.
+    """
     if block is not None:
         splat_visible_emission(samples, block)
     state = None
@@ -394,7 +411,7 @@ def forward(
 
 @dataclass
 class Trace:
-    """Samples that have been traced: their image, and what is kept of their paths if they fit in one pass."""
+    """Traced samples: their image, and the stored data of their paths if they fit in one pass."""
 
     samples: list[Samples]
     image: mi.TensorXf | None = None
@@ -402,9 +419,10 @@ class Trace:
 
 
 def trace_image(estimator: Estimator, samples: list[Samples]) -> tuple[mi.TensorXf, Any]:
-    """The image of all passes, and what the estimator keeps of each path.
+    """Return the image of all passes, and the estimator's stored data of each path.
 
-    Several passes keep nothing, which would grow with the number of passes: each is traced again before its replay.
+    Several passes store nothing, because the data would grow with the number of passes. Each is traced again before its
+    replay.
     """
     state = None
     if len(samples) > 1:
@@ -422,8 +440,10 @@ def trace_image(estimator: Estimator, samples: list[Samples]) -> tuple[mi.Tensor
 
 
 def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointImage, done: bool = False) -> None:
-    """Add the derivatives of the objective, whose derivative with respect to the film is `adjoint`; `done`: those of
-    camera paths are there, from their only traversal."""
+    """Add the derivatives of the objective, whose derivative with respect to the film is `adjoint`.
+
+    With `done`, the derivatives of camera paths have been added already, in their only traversal.
+    """
     differentiate_visible_emission(samples, adjoint)
     for side in samples.sides():
         p = Pass(side, None, adjoint)
@@ -437,9 +457,10 @@ def replay_all(
     estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, state: Any = None,
     params: mi.SceneParameters | None = None,
 ) -> None:  # fmt: skip
-    """Add the gradient of the objective with dL/dI `gradient` (H, W, C) to `params`, which one pass need not know.
+    """Add the gradient of the objective with dL/dI `gradient` (H, W, C) to `params`; with one pass, `params` may be
+    None.
 
-    `state` is what is kept of the paths of one pass; None: they are traced anew.
+    `state` is the stored data of the paths of one pass; None: they are traced again.
     """
     adjoint = samples[0].film.adjoint(gradient)
     if state is None:
@@ -454,7 +475,7 @@ def replay_all(
 def fused(
     estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, params: mi.SceneParameters | None = None
 ) -> mi.TensorXf:
-    """The image, and the same gradient, where dL/dI is known before either."""
+    """Return the image, and add the same gradient, with dL/dI known before."""
     film = samples[0].film
     block = film.block()
     differentiate_passes(samples, estimator, block, film.adjoint(gradient), params)
@@ -465,9 +486,9 @@ def differentiate_passes(
     samples: list[Samples], estimator: Estimator, block: mi.ImageBlock | None, adjoint: AdjointImage,
     params: mi.SceneParameters | None,
 ) -> None:  # fmt: skip
-    """Trace samples whose dL/dI is known and add their derivatives, and to the block (None: none) their contributions.
+    """Trace samples with known dL/dI, and add their derivatives, and their contributions to the block (None: none).
 
-    What is kept of a path goes from one to the other within the kernel, and takes no memory.
+    The data of a path stay within the kernel, and take no memory.
     """
 
     def differentiate(part: Samples, own: mi.ImageBlock | None) -> None:

@@ -1,15 +1,15 @@
-"""A step: image, loss, and the gradient of every parameter, by any integrator, with delta from a choice of samples.
+"""Step: image, loss, and the gradient of every parameter, by any integrator, with a choice of samples for delta.
 
-correlated     one set of samples for image and gradient; what naive AD of one render does
-independent    the gradient's samples have a seed of their own; what `mi.render` does
-batched        the samples in batches, each with delta from the image of those before it (`_batched`)
+correlated     one set of samples for image and gradient, as naive AD of one rendering independent    the gradient's
+samples have their own seed, as in `mi.render` batched        the samples in batches, each with delta from the image of
+those before it (`_batched`)
 
-With `halves`, each of these sets of samples is two, of half the samples each, and images are (2, H, W, C): where a loss
-multiplies an image by itself, it takes the two, whose noise is independent (`Halves`).
+With `halves`, each of these sets of samples consists of two with half the samples each, and images are (2, H, W, C). A
+loss that multiplies an image by itself takes both, because their noise is independent (`Halves`).
 
-Derivatives of a loss that are not finite are refused, which is to say taken for 0, and counted (`Refused`). One NaN in
-dL/dI would make a gradient NaN wherever a path of that pixel passes, and some estimators would lose it on the way. Both
-are done in the kernel that computes dL/dI, and nobody waits for the count but who reads it.
+Entries of dL/dI that are not finite are set to 0, and counted (`Refused`). One NaN in dL/dI would make a gradient NaN
+wherever a path of this pixel passes, and some estimators would lose it on the way. Both happen in the kernel that
+computes dL/dI, and only readers of the count wait for it.
 """
 
 from __future__ import annotations
@@ -43,15 +43,18 @@ NONE = 0xFFFFFFFF
 
 @dataclass
 class Refused:
-    """Entries of dL/dI that were not finite: how many, and the first one's flat index, of width 1; the shape of dL/dI,
-    (H, W, C), or of halves (2, H, W, C)."""
+    """Entries of dL/dI that were not finite.
+
+    They are their number, and the flat index of the first one, of width 1; also the shape of dL/dI, (H, W, C), or (2,
+    H, W, C) with halves.
+    """
 
     count: mi.UInt32 = field(default_factory=lambda: dr.zeros(mi.UInt32, 1))
     first: mi.UInt32 = field(default_factory=lambda: dr.full(mi.UInt32, NONE, 1))
     shape: tuple[int, ...] = (0, 0, 0)
 
     def take(self, gradient: mi.TensorXf) -> mi.TensorXf:
-        """dL/dI with 0 for what is not finite, which is added to the count; neither is evaluated here."""
+        """Return dL/dI with 0 for entries that are not finite, and add them to the count; neither is evaluated here."""
         self.shape, flat = gradient.shape, gradient.array
         bad = ~dr.isfinite(flat)
         # Atomics of the lanes that are not finite alone: none where nothing is wrong.
@@ -61,7 +64,7 @@ class Refused:
         return type(gradient)(dr.select(bad, 0, flat), gradient.shape)
 
     def entry(self) -> tuple[int, int, int] | None:
-        """Pixel (x, y) and channel of the first of them; None where there is none. Waits for the step."""
+        """Return pixel (x, y) and channel of the first such entry, or None. Waits for the step."""
         index = int(self.first[0])
         if index == NONE:
             return None
@@ -71,10 +74,10 @@ class Refused:
 
 @dataclass
 class StepResult:
-    """What a step yields besides gradients: the image (H, W, C) and the loss (width 1), both detached.
+    """Result of a step besides gradients: the image (H, W, C) and the loss (width 1), both detached.
 
-    Entries of dL/dI that are not finite count as 0; `refused` says how many there were, and where the first. `seen` is
-    the image as the objective had it, (2, H, W, C) of halves.
+    Entries of dL/dI that are not finite count as 0; `refused` has their number, and the first of them. `seen` is the
+    image that the objective received, (2, H, W, C) with halves.
     """
 
     image: mi.TensorXf
@@ -84,10 +87,11 @@ class StepResult:
 
 
 def make_integrator(type: str, **options: Any) -> StepIntegrator:
-    """An integrator by its plugin's name and options: `reslrb`, `walk_ad`, or a stock one such as `ptracer`, `prb`; or
-    `custom`, a user's own (`OwnIntegrator`).
+    """Make an integrator by its plugin's name and options.
 
-    An option that is None is left out: Mitsuba would end the process. Raises ValueError for one that is unknown.
+    Names are `reslrb`, `walk_ad`, stock ones such as `ptracer` and `prb`, and `custom` for a user's own
+    (`OwnIntegrator`). Options that are None are left out, because Mitsuba would end the process. Raises ValueError for
+    an unknown option.
     """
     given = {name: value for name, value in options.items() if value is not None}
     if type in TRACERS:
@@ -106,7 +110,7 @@ def make_integrator(type: str, **options: Any) -> StepIntegrator:
 
 
 def interface_of(integrator: StepIntegrator | mi.Integrator) -> StepIntegrator:
-    """What a gradient step works with, of a plugin or of what already is that."""
+    """Return the step interface of a plugin, or of an object that already is one."""
     if not isinstance(integrator, mi.Integrator):
         return integrator
     tracer: StepIntegrator | None = getattr(integrator, "tracer", None)  # of the plugins that are made here
@@ -118,17 +122,17 @@ def interface_of(integrator: StepIntegrator | mi.Integrator) -> StepIntegrator:
 
 
 class Halves:
-    """`work` with images (2, H, W, C), of two independent halves of a job's samples, of which the image is the mean.
+    """`work` with images (2, H, W, C) of two independent halves of a job's samples, whose mean is the image.
 
-    A dL/dI of that shape holds the derivatives with respect to each half's image. Raises ValueError for samples per
-    pixel that are not even.
+    A dL/dI of this shape has the derivatives with respect to each half's image. Raises ValueError for an odd number of
+    samples per pixel.
     """
 
     def __init__(self, work: StepIntegrator) -> None:
         self.work, self.image_apart = work, work.image_apart
 
     def image(self, job: Job) -> mi.TensorXf:
-        """The images, without derivatives."""
+        """Return the images, without derivatives."""
         return _both(*(self.work.image(half) for half in half_jobs(job)))
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
@@ -137,7 +141,9 @@ class Halves:
             self.work.backward(half, own)
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """The images, and the gradient of the same samples with the dL/dI that `derivative(images)` returns."""
+        """Return the images, and add the gradient of the same samples with the dL/dI that `derivative(images)`
+        returns.
+        """
         first, second = half_jobs(job)
         images: list[mi.TensorXf] = []
 
@@ -156,13 +162,13 @@ class Halves:
         return images[0]
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
-        """The images, and the gradient of the same samples, where dL/dI is known before either."""
+        """Return the images, and add the gradient of the same samples, with dL/dI known before."""
         parts = zip(half_jobs(job), _apart(gradient), strict=True)
         return _both(*(self.work.known(half, own) for half, own in parts))
 
 
 def half_jobs(job: Job) -> tuple[Job, Job]:
-    """The two halves of a job. Raises ValueError where its samples per pixel are not even."""
+    """Return the two halves of a job. Raises ValueError for an odd number of samples per pixel."""
     if job.spp < 2 or job.spp % 2:
         raise ValueError(f"the samples per pixel of a set ({job.spp}) must be even, where they are halved")
     first, second = (replace(job, seed=seed, spp=job.spp // 2) for seed in half_seeds(job.seed))
@@ -170,14 +176,14 @@ def half_jobs(job: Job) -> tuple[Job, Job]:
 
 
 def half_seeds(seed: mi.UInt32 | int) -> list[mi.UInt32]:
-    """The seeds of the two halves of a set of samples."""
+    """Return the seeds of the two halves of a set of samples."""
     seeds = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(HALF_STREAM + half))[0] for half in (0, 1)]
     dr.make_opaque(seeds)
     return seeds
 
 
 def _both(first: mi.TensorXf, second: mi.TensorXf) -> mi.TensorXf:
-    """Two images (H, W, C) as one tensor (2, H, W, C), detached."""
+    """Return two images (H, W, C) as one tensor (2, H, W, C), detached."""
     flat = dr.concat((dr.detach(first.array), dr.detach(second.array)))
     return type(first)(flat, (2, *first.shape))
 
@@ -190,7 +196,7 @@ def _apart(gradient: mi.TensorXf) -> tuple[mi.TensorXf, mi.TensorXf]:
 
 def render_image(integrator: StepIntegrator, scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int,
                  halves: bool = False) -> mi.TensorXf:  # fmt: skip
-    """The image (H, W, C) without derivatives, or the images (2, H, W, C) of two halves of the samples."""
+    """Return the image (H, W, C) without derivatives, or the images (2, H, W, C) of two halves of the samples."""
     work = Halves(integrator) if halves else integrator
     return work.image(Job(scene, resolve_sensor(scene, sensor), dr.opaque(mi.UInt32, seed), spp))
 
@@ -210,19 +216,22 @@ def gradient_step(
     on_samples: OnSamples | None = None,
     halves: bool = False,
 ) -> StepResult:
-    """Render, evaluate `objective(image)`, and add its gradient to every parameter of the scene that tracks one.
+    """Render, evaluate `objective(image)`, and add its gradient to every parameter of the scene that tracks
+    derivatives.
 
-    `objective` maps the image, a tensor (H, W, C) that tracks derivatives, to a scalar; `sensor` is one of the scene's
-    or its index; `params` are the scene's parameters where the caller has them at hand (`mi.traverse` otherwise).
-    `on_image` is called once the image and the loss are evaluated, where a step has such a moment. `batches` belong to
-    `adjoint="batched"`, whose loss is that of all samples' image. `on_samples` is called with the image of each set of
-    samples that is differentiated, and with the dL/dI that it is differentiated with: what the image alone is
-    multiplied by has its derivative from the same samples. With `halves`, what `objective` and
-    `on_samples` are given are the images (2, H, W, C) of two halves of the samples (`protocol.whole_of`), whose number
-    has to be even in every set.
+    - `objective` maps the image, a tensor (H, W, C) that tracks derivatives, to a scalar.
+    - `sensor` is a sensor of the scene, or its index.
+    - `params` are the scene's parameters, by default `mi.traverse(scene)`.
+    - `spp` of 0 means the sensor's own number.
+    - `batches` belong to `adjoint="batched"`, whose loss is that of the image of all samples.
+    - `on_image` is called once the image and the loss are evaluated, if a step has such a moment.
+    - `on_samples` is called with the image of each differentiated set of samples, and with its dL/dI, so that a factor
+      of the image can be differentiated with the same samples.
+    - With `halves`, `objective` and `on_samples` receive the images (2, H, W, C) of two halves of the samples
+      (`protocol.whole_of`). Every set must then have an even number of samples.
 
-    `spp` of 0 are the sensor's own number. Raises ValueError for numbers out of their range and for words that are
-    none of the above, and BackendError under a variant of Mitsuba that reslrb does not work with.
+    Raises ValueError for numbers out of range and unknown words, and BackendError under an unsupported variant of
+    Mitsuba.
     """
     check_variant(mi.variant())
     one_of("adjoint", adjoint, get_args(Adjoint))
@@ -260,10 +269,10 @@ def known_step(
     integrator: StepIntegrator | mi.Integrator, scene: mi.Scene, sensor: mi.Sensor | int, gradient: mi.TensorXf, *,
     seed: int, spp: int, params: mi.SceneParameters | None = None,
 ) -> StepResult:  # fmt: skip
-    """A step whose dL/dI, `gradient` (H, W, C), is known before its image: the loss is the sum of dL/dI times I.
+    """Make a step whose dL/dI, `gradient` (H, W, C), is known before its image: the loss is the sum of dL/dI times I.
 
-    One set of samples for both; an estimator of `reslrb` that can splats and differentiates in one traversal. The rest
-    is as in `gradient_step`.
+    One set of samples serves both; if the estimator of `reslrb` can, it splats and differentiates in one traversal. The
+    other arguments are those of `gradient_step`.
     """
     refused = Refused()
     gradient = refused.take(dr.detach(gradient))
@@ -276,8 +285,10 @@ def given_step(
     seed: int, spp: int, params: mi.SceneParameters | None = None, on_samples: OnSamples | None = None,
     halves: bool = False,
 ) -> None:  # fmt: skip
-    """Add the gradient by the samples of `seed`, with dL/dI `gradient`, (H, W, C) or of halves (2, H, W, C), which is
-    from other samples, and finite. The rest is as in `gradient_step`."""
+    """Add the gradient by the samples of `seed`, with dL/dI `gradient`, (H, W, C) or (2, H, W, C) with halves.
+
+    `gradient` comes from other samples, and is finite. The other arguments are those of `gradient_step`.
+    """
     work = interface_of(integrator)
     _differentiate(Halves(work) if halves else work, _job(scene, sensor, seed, spp, params), gradient, on_samples)
 
@@ -289,7 +300,7 @@ def _check_number(name: str, value: object, least: int, most: int) -> None:
 
 
 def _differentiate(work: StepIntegrator, job: Job, gradient: mi.TensorXf, on_samples: OnSamples | None) -> None:
-    """Add the gradient of samples with a known dL/dI; their image is made only where somebody wants it."""
+    """Add the gradient of samples with a known dL/dI; their image is rendered only if `on_samples` needs it."""
     if on_samples is None:
         work.backward(job, gradient)
     else:
@@ -307,10 +318,10 @@ def _job(scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int, params: 
 def _batched(
     integrator: StepIntegrator, job: Job, objective: Objective, batches: int, on_samples: OnSamples | None
 ) -> StepResult:
-    """A step in batches (design of Deng et al. 2022's dual buffer): batch b takes delta from the image of those before.
+    """Make a step in batches (dual buffer of Deng et al. 2022): batch b takes delta from the image of those before it.
 
-    No path sees a delta that it helped to make, so that the gradient of an L2 loss is unbiased, as with `independent`,
-    from half the paths. The first batch gives an image alone.
+    No path uses a delta that contains it, so the gradient of an L2 loss is unbiased, as with `independent`, from half
+    the paths. The first batch contributes only to the image.
     """
     if job.spp < 1 or job.spp % batches:
         raise ValueError(f"the samples per pixel ({job.spp}) must be a multiple of the batches ({batches})")
@@ -330,7 +341,7 @@ def _batched(
 def derivative_of(
     objective: Objective, image: mi.TensorXf, refused: Refused, on_image: Callable[[], None] | None = None
 ) -> tuple[mi.Float | mi.TensorXf, mi.TensorXf]:
-    """Loss and dL/dI, evaluated in one go; what of the latter is not finite is refused."""
+    """Return loss and dL/dI, evaluated together; entries of dL/dI that are not finite are refused."""
     with dr.resume_grad(), dr.isolate_grad():
         leaf = type(image)(image)
         dr.enable_grad(leaf)
@@ -345,7 +356,9 @@ def derivative_of(
 
 
 def sample_sets(seed: int, options: dict[str, Any]) -> list[tuple[str, mi.UInt32, int]]:
-    """The sets of samples of a step with these options (`Config.step_options`): name, seed, samples per pixel."""
+    """Return the sets of samples of a step with these options (`Config.step_options`): name, seed, samples per
+    pixel.
+    """
     spp, adjoint = options["spp"], options["adjoint"]
     if options.get("halves"):
         return [
@@ -363,14 +376,14 @@ def sample_sets(seed: int, options: dict[str, Any]) -> list[tuple[str, mi.UInt32
 
 
 def batch_seeds(seed: mi.UInt32 | int, batches: int) -> list[mi.UInt32]:
-    """The seed of each batch."""
+    """Return the seed of each batch."""
     seeds = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(BATCH_STREAM + b))[0] for b in range(batches)]
     dr.make_opaque(seeds)
     return seeds
 
 
 def second_seed(seed: mi.UInt32) -> mi.UInt32:
-    """The seed of the gradient's own samples."""
+    """Return the seed of the gradient's own samples."""
     result = mi.sample_tea_32(seed, mi.UInt32(1))[0]
     dr.make_opaque(result)
     return result

@@ -182,7 +182,9 @@ class CameraPath:
 
 
 def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = True) -> tuple[FilmRay, Any]:
-    """Trace one camera path per lane of `samples`, in `active` lanes; return the rays and the final state of `hooks`."""
+    """Trace one camera path per lane of `samples`, in `active` lanes; return the rays and the final state of
+    `hooks`.
+    """
     plan, scene = samples.plan, samples.scene
     sampler = samples.sampler()
     surrounded = plan.needs.environment is not None

@@ -190,7 +190,9 @@ class Seen:
 
 
 def stand_in(connection: Connection) -> tuple[mi.Float, mi.Spectrum]:
-    """Return replacements for bsdf * cos and for c_i (C,) if they are zero (`Product.times`): those of a white surface."""
+    """Return replacements for bsdf * cos and for c_i (C,) if they are zero (`Product.times`): those of a white
+    surface.
+    """
     f = dr.maximum(dr.abs(mi.Frame3f.cos_theta(connection.wo)), 1e-3) * dr.inv_pi
     return f, connection.weight * f
 

@@ -150,7 +150,9 @@ def _evened(lamp: Lamp, at: Place, active: mi.Bool) -> mi.Float:
 
 
 def _projected(at: Place, active: mi.Bool) -> mi.Float:
-    """Return the density of a projector's directions without the area of its picture; `at.uv` are those of the picture."""
+    """Return the density of a projector's directions without the area of its picture; `at.uv` are those of the
+    picture.
+    """
 
     def density(self: mi.Emitter, uv: mi.Point2f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
         if self.class_name() != "Projector":

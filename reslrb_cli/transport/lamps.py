@@ -72,7 +72,9 @@ def lamp_point(
 def _textured_point(
     mesh: mi.Mesh, texture: mi.Texture, sample: mi.Point2f, active: mi.Bool, evened: bool
 ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
-    """Return a point that Mitsuba samples from a texture, or uniformly; the point keeps its place in its moving face."""
+    """Return a point that Mitsuba samples from a texture, or uniformly; the point keeps its place in its moving
+    face.
+    """
     uv, density = _any_uv(texture, sample, active) if evened else texture.sample_position(sample, active)
     active = active & (density != 0)
     there = mesh.eval_parameterization(uv, mi.RayFlags.All | mi.RayFlags.FollowShape, active)

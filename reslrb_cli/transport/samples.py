@@ -205,7 +205,9 @@ class Samples:
         return mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))
 
     def emission_numbers(self, sampler: mi.Sampler) -> tuple[mi.Float, mi.Point2f, mi.Point2f]:
-        """Return the numbers of emission in the order of `ptracer`: the choice of an emitter, the place, the direction."""
+        """Return the numbers of emission in the order of `ptracer`: the choice of an emitter, the place, the
+        direction.
+        """
         choice, place, direction = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
         if self.net is None:
             return choice, place, direction

@@ -45,7 +45,9 @@ BOUNCES = 2
 
 @cache
 def directions(coordinate: int) -> tuple[int, ...]:
-    """Return the number that each binary digit of an index, the lowest first, adds (modulo 2) to the point's 32 digits."""
+    """Return the number that each binary digit of an index, the lowest first, adds (modulo 2) to the point's 32
+    digits.
+    """
     if coordinate == 0:
         return tuple(1 << k for k in range(DIGITS))
     inner, numbers = JOE_KUO[coordinate - 1]
@@ -98,7 +100,9 @@ class Coordinates:
 
 
 def make_coordinates(used: Sequence[bool], emitters: int, max_depth: int) -> Coordinates:
-    """Return the coordinates for this number of emitters, which use these of the four numbers of place and direction."""
+    """Return the coordinates for this number of emitters, which use these of the four numbers of place and
+    direction.
+    """
     bounces = min(max(max_depth - 2, 0), BOUNCES)
     return Coordinates(emitters > 1, (used[0], used[1]), (used[2], used[3]), bounces)
 

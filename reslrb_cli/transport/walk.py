@@ -90,7 +90,9 @@ class Hooks:
         return state
 
     def survived(self, state: Any, weight: mi.Float) -> Any:
-        """Return the state after roulette has multiplied the path's product by `weight`, which is 1 without roulette."""
+        """Return the state after roulette has multiplied the path's product by `weight`, which is 1 without
+        roulette.
+        """
         return state
 
     def aimed(self, state: Any, factor: mi.Float) -> Any:
