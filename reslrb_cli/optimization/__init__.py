@@ -1,1 +1,1 @@
-"""Losses, optimisers, constraints, schedules, and the loop that joins them; nothing here opens a file to write."""
+"""Losses, optimisers, constraints, schedules, and the loop that combines them; nothing here writes files."""

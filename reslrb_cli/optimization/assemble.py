@@ -1,5 +1,6 @@
-"""From a configuration to the problem that it states: loaded, checked, targets made, what is measured settled; and from
-that to the coarser one of a stage of its run."""
+"""From a configuration to its problem, loaded and checked, with targets and decisions, and to the coarser problem of a
+stage.
+"""
 
 from __future__ import annotations
 
@@ -54,12 +55,13 @@ def assemble(
     to_run: bool = False,
     settled: Stored | None = None,
 ) -> Problem:
-    """Load and check what `config` names, make the targets, and settle the integrator; a variant must be set.
+    """Load and check the experiment of `config`, make the targets, and decide open settings; a variant must be set.
 
-    Everything that can be checked is, before anything is rendered. `say` is told what takes long, `cache` holds what
-    earlier runs measured (None: nothing is kept). With `to_run` all that an optimisation needs is there: exposures
-    are checked, and what light and sensor reach is known. With `settled` nothing is measured anew: it is the problem of
-    a run that goes on, as it was before its first iteration. Raises ConfigError and UnsupportedScene.
+    All checks happen before anything is rendered. `say` is called with lines about slow work, and `cache` has
+    measurements of earlier runs (None: nothing is stored). With `to_run`, everything for an optimisation is prepared:
+    exposures are checked, and the entries that light and sensor reach are known. With `settled`, nothing is measured
+    again: the result is the problem of a resumed run before its first iteration. Raises ConfigError and
+    UnsupportedScene.
     """
     if to_run:
         check_code(config)
@@ -88,9 +90,9 @@ def assemble(
 def load_for_rendering(
     config: Config, initial: bool, values: Mapping[str, Any] | None = None
 ) -> tuple[Any, list[int], Any, int | None]:
-    """Load the scene (with the parameters' initial values, if `initial`, or `values`), and make the integrator.
+    """Load the scene (with the parameters' initial values, if `initial`, or with `values`), and make the integrator.
 
-    Returns both, between them the indices of the sensors in use, and the integrator's `samples_per_pass`.
+    Returns the scene, the indices of the used sensors, the integrator, and its `samples_per_pass`.
     """
     if initial:
         problem = assemble_scene(config)
@@ -105,7 +107,7 @@ def load_for_rendering(
 
 
 def check_passes(source: str, spp: int, multiple: int | None) -> None:
-    """Raise ConfigError, located by `source`, where passes of `multiple` samples do not make `spp` of them."""
+    """Raise ConfigError, located by `source`, if passes of `multiple` samples do not divide `spp`."""
     if spp < 1:
         raise ConfigError(source, "", f"is {spp}; at least 1 is needed")
     if multiple is not None and spp % min(multiple, spp):
@@ -113,8 +115,10 @@ def check_passes(source: str, spp: int, multiple: int | None) -> None:
 
 
 def set_values(problem: Problem, values: Mapping[str, Any]) -> Problem:
-    """The same before its first iteration, with `values` of some parameters: arrays of their shape, or what NumPy makes
-    such of. Raises ConfigError, located by `values` and the key."""
+    """Return the problem before its first iteration, with `values` of some parameters: arrays of their shape.
+
+    Raises ConfigError, located by `values` and the key.
+    """
     found = {}
     for key, value in values.items():
         if key not in problem.selection.keys:
@@ -133,10 +137,10 @@ def set_values(problem: Problem, values: Mapping[str, Any]) -> Problem:
 
 
 def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array] | None = None) -> Problem:
-    """Load and check what `config` names, targets left out.
+    """Load and check the experiment of `config` without its targets.
 
-    `scene` is used in place of `scene.file`, `values` in place of the parameters' initial ones. Raises ValueError where
-    `values` are not one finite array for each parameter, of its shape.
+    `scene` replaces `scene.file`, and `values` replace the initial values of the parameters. Raises ValueError if
+    `values` are not one finite array of the right shape for each parameter.
     """
     check_announced(config)
     scene = load_configured(config, functools.partial(check_described, config)) if scene is None else scene
@@ -180,7 +184,7 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
 
 
 def _check_plates(problem: Problem) -> None:
-    """Raise ConfigError where two free faces begin nearer to each other than they are held apart."""
+    """Raise ConfigError if two free faces start nearer to each other than their minimum distance."""
     for key, plate in problem.plates.items():
         thin = float(plate.thickness(*(problem.selection.array(each).astype(np.float64) for each in (key, plate.other)))
                      .min())  # fmt: skip
@@ -208,11 +212,10 @@ def _check_values(selection: Selection, values: Mapping[str, Array]) -> None:
 
 
 def at_stage(problem: Problem, number: int, values: Mapping[str, Array] | None = None) -> Problem:
-    """What the run of `problem` works on in a stage that has a resolution or a film of its own: another scene, with
-    coarser maps and targets, drawn from as `problem` is; what was learned of that is forgotten.
+    """Return the problem of a stage with its own resolution or film: another scene with coarser maps and targets.
 
-    `values` are those of its parameters, in its resolution; None: those that `problem` has now, resampled. Raises
-    ValueError where they are not of its shapes.
+    It samples like `problem`, but what was learned is cleared. `values` are those of its parameters, in its resolution;
+    None: the current values of `problem`, resampled. Raises ValueError for wrong shapes.
     """
     config, film = problem.config.without_stages(), _film_at(problem, number)
     scene = config.scene if film is None else config.scene.model_copy(update={"size": film})
@@ -242,7 +245,7 @@ def at_stage(problem: Problem, number: int, values: Mapping[str, Array] | None =
 
 
 def _film_at(problem: Problem, number: int) -> tuple[int, int] | None:
-    """The (width, height) of all films in a stage; None where it has the scene's. Raises ConfigError."""
+    """Return the (width, height) of all films in a stage; None if it uses those of the scene. Raises ConfigError."""
     config, share, key = problem.config, problem.config.stage(number).film, f"run.stages[{number}].film"
     if share == 1:
         return None
@@ -262,8 +265,10 @@ def _film_at(problem: Problem, number: int) -> tuple[int, int] | None:
 
 
 def _specs_at(problem: Problem, number: int) -> list[ParameterSpec]:
-    """The parameters as a stage has them, a glob as the keys that it selects. Raises ConfigError where it is to make
-    some coarser, and there are none."""
+    """Return the parameters of a stage, with globs replaced by the keys that they select.
+
+    Raises ConfigError if the stage should make some parameters coarser, and there are none.
+    """
     config, selection, share = problem.config, problem.selection, problem.config.stage(number).resolution
     specs: list[ParameterSpec] = []
     coarser = share == 1
@@ -309,10 +314,10 @@ def _is_grid(problem: Problem, key: str, spec: ParameterSpec) -> bool:
 
 
 def resized(problem: Problem, key: str, value: Array) -> Array:
-    """Another problem's value of a parameter, or a change of it, in the resolution that `problem` has it in.
+    """Return another problem's value of a parameter, or a change of it, in the resolution of `problem`.
 
-    Heights by cubic splines, at the places in space where they are: from edge to edge of a grid that has a vertex for
-    each; textures bilinearly, smoothed first where they shrink.
+    Heights are resampled by cubic splines at their places in space, from edge to edge of a grid with a vertex for each
+    height. Textures are resampled bilinearly, and smoothed first if they shrink.
     """
     shape, selection = problem.selection.array(key).shape, problem.selection
     if value.shape == shape:
@@ -328,20 +333,20 @@ def resized(problem: Problem, key: str, value: Array) -> Array:
 
 
 def bounded(problem: Problem, key: str, value: Array) -> Array:
-    """A value of a parameter within its bounds."""
+    """Return the value of a parameter, clamped to its bounds."""
     low, high = problem.selection.spec(key).bounds or (-np.inf, np.inf)
     return np.clip(value, np.float32(low), np.float32(high))
 
 
 def _places(new: int, old: int, edge_to_edge: bool) -> Array:
-    """Where `new` nodes lie among `old` ones, in steps of these."""
+    """Return the positions of `new` nodes among `old` nodes, in units of the distance of old nodes."""
     if edge_to_edge:
         return np.linspace(0, old - 1, new)
     return np.clip((np.arange(new) + 0.5) * old / new - 0.5, 0, old - 1)
 
 
 def _see_coarsely(view: View, whole: View, film: mi.Film) -> None:
-    """Give a view of a smaller film the target of the whole one: means over pixels, by what they weigh."""
+    """Give a view of a smaller film the target of the full film: weighted means over pixels."""
     target, weights = np.array(whole.target, dtype=np.float64), whole.fixed
     if weights is None:
         weights = np.ones(target.shape[:2]) if whole.weights is None else np.array(whole.weights)[:, :, 0]

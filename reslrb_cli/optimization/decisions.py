@@ -1,4 +1,4 @@
-"""What is found out about a run before its first iteration, and goes into its record."""
+"""Data found before the first iteration of a run, for its record."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from reslrb_cli.records.decisions import Jsonable
 
 @dataclass(frozen=True)
 class Estimate:
-    """Bytes that a step is expected to take: what stands before it, with the targets (`fixed`), its images and
-    parameters (`images`), thread-local memory (`scratch`), and what is kept of the paths of one pass (`paths`)."""
+    """Expected bytes of a step: data before the step and targets (`fixed`), images and parameters (`images`),
+    thread-local memory (`scratch`), and stored data of the paths of one pass (`paths`).
+    """
 
     fixed: int
     images: int
@@ -23,13 +24,13 @@ class Estimate:
 
     @property
     def total(self) -> int:
-        """All of it."""
+        """Sum of all parts."""
         return self.fixed + self.images + self.scratch + self.paths
 
 
 @dataclass
 class MemoryPlan(Jsonable):
-    """How a budget is kept: the samples of a pass, what is expected, and, after the first iterations, what was used."""
+    """Memory budget: samples per pass, expected bytes, and, after the first iterations, the peak."""
 
     budget_bytes: int
     samples_per_pass: int
@@ -39,7 +40,7 @@ class MemoryPlan(Jsonable):
     exceeded: bool = False
 
     def check(self, peak: float) -> str | None:
-        """Take note of the allocator's peak in MiB; the warning, the first time that it is above the budget."""
+        """Record the allocator's peak in MiB; return a warning the first time that it exceeds the budget."""
         self.peak_mib = peak
         used, before = peak * MIB + self.expected_bytes.scratch, self.exceeded
         self.exceeded = used > self.budget_bytes
@@ -55,10 +56,10 @@ Need = tuple[float, float]
 
 @dataclass
 class Allowance:
-    """Seconds that all measuring before the first iteration may take: a share of what the run itself will, `run_s`.
+    """Seconds that all measurements before the first iteration may take: a share of `run_s`, the time of the run.
 
-    That is kernels compiled (`compile_s`, what those of one step took), and iterations of `iteration_s` each, by two
-    first steps of few samples, which the run would take as well, and which are no part of `spent_s`.
+    The run consists of the compilation of kernels (`compile_s`, for one step) and iterations of `iteration_s`, from two
+    first steps of few samples. The run would take these steps as well, so they do not count as `spent_s`.
     """
 
     share: float
@@ -71,7 +72,7 @@ class Allowance:
 
     @property
     def left_s(self) -> float:
-        """What has not been spent, up to now, nor is kept aside."""
+        """Seconds that are neither spent nor reserved."""
         running = 0.0 if self.since_s is None else time.perf_counter() - self.since_s
         return max(self.share * self.run_s - self.spent_s - self.aside_s - running, 0.0)
 
@@ -84,33 +85,33 @@ class Allowance:
 
     @contextmanager
     def spending(self, later: Sequence[Need]) -> Iterator[None]:
-        """Count the block's time as spent; what is measured `later` has its time kept aside until the block ends."""
+        """Count the block's time as spent, and reserve time for `later` measurements until the block ends."""
         self.aside_s, self.since_s = self._seconds(later), time.perf_counter()
         yield
         self.spent_s += time.perf_counter() - self.since_s
         self.aside_s, self.since_s = 0.0, None
 
     def iterations_left(self, kernels: float) -> float:
-        """The iterations' worth of work that there is time for, once the kernels of so many steps are compiled."""
+        """Return the remaining time in iterations, after the kernels of this number of steps are compiled."""
         return max(self.left_s - kernels * self.compile_s, 0.0) / max(self.iteration_s, 1e-9)
 
     def note(self) -> str:
-        """The words for what there was no time to measure."""
+        """Return a note for measurements without time."""
         return f"not measured (over {100 * self.share:.3g} % of this run)"
 
     def line(self) -> str:
-        """The words for what was spent."""
+        """Return a line about the time that was spent."""
         part = 100 * self.spent_s / max(self.run_s, 1e-9)
         return f"measuring took {self.spent_s:.1f} s, {part:.2g} % of what this run is expected to take"
 
 
 @dataclass(frozen=True)
 class Sensitivity(Jsonable):
-    """What was measured of one parameter of `entries` numbers, in the scene's units.
+    """Measured sensitivity of a parameter of `entries` numbers, in the scene's units.
 
-    `value`, `gradient` and `noise` are root mean squares over the entries: of the values, of the gradient (0 where the
-    samples do not tell it from noise), of the standard deviation of one sample (one step's gradient). `change` is
-    relative, per unit; it, `curvature` (loss per unit²) and `length` are None where no change of the image was seen.
+    `value`, `gradient` and `noise` are root mean squares over the entries: of the values, of the gradient (0 if it
+    cannot be distinguished from noise), and of the standard deviation of one step's gradient. `change` is relative, per
+    unit. `change`, `curvature` (loss per unit²) and `length` are None if the image did not change.
     """
 
     key: str
@@ -125,10 +126,10 @@ class Sensitivity(Jsonable):
 
 @dataclass(frozen=True)
 class Scaled(Sensitivity):
-    """What was measured of a parameter, and what was made of it.
+    """Sensitivity of a parameter, and the resulting scale.
 
-    `own_length` is `length` in what the optimiser moves, its variable, and `first_step`, in the scene's units, how far
-    one learning rate of that moves the value where it starts; both are None where the parameter was not scaled.
+    `own_length` is `length` in the optimiser's variable, and `first_step` is the initial movement of the value by one
+    learning rate, in the scene's units. Both are None if the parameter was not scaled.
     """
 
     own_length: float | None = None

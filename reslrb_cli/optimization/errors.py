@@ -1,7 +1,7 @@
-"""How far parameters are from their true values: root mean square errors, each in its parameter's unit.
+"""Errors of parameters relative to true values: root mean square errors, each in the unit of its parameter.
 
-Only what has one unit can be added up: reflectance and roughness have none, but a lamp's intensity is in W/sr, and the
-radiance of an area light in W/(m² sr). Where units differ, errors are compared as shares of the truth instead.
+Only errors with a common unit can be combined. Reflectance and roughness have no unit, but the intensity of a lamp is
+in W/sr, and the radiance of an area light in W/(m² sr). If units differ, errors are divided by the true values.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ _EMITTED = {
 
 
 def quantity(params: Any, key: str) -> str:
-    """What a `mi.traverse` entry is in units of: `radiance`, `irradiance`, `intensity`, `length`, or "", without one.
+    """Return the quantity of a `mi.traverse` entry: `radiance`, `irradiance`, `intensity`, `length`, or "" without a
+    unit.
 
-    Without a unit are all parameters of BSDFs, mesh attributes, and factors (`scale`, a spot's `texture`).
+    Parameters of BSDFs, mesh attributes, and factors (`scale`, a spot's `texture`) have no unit.
     """
     if key.endswith((".vertex_positions", ".position")):
         return "length"
@@ -45,12 +46,12 @@ def quantity(params: Any, key: str) -> str:
 
 
 class ErrorMeter:
-    """Measures parameters against their true values, over the entries that light and sensor reach.
+    """Errors of parameters relative to true values, over the entries that light and sensor reach.
 
-    `truth` and `masks` are those of a `Problem`, `quantities` the parameters' (`quantity`). A texture whose resolution
-    is not the truth's is compared on the finer grid of the two: each is resampled to it bilinearly, as textures are
-    before the start, and a texel of it counts where the parameter's own texel at its centre does. So the error of a
-    coarse texture holds what it cannot show, and that of a fine one its noise.
+    `truth` and `masks` are those of a `Problem`, and `quantities` those of the parameters (`quantity`). If the
+    resolutions of a texture and its true value differ, both are resampled bilinearly to the finer grid, and a cell
+    counts if the texel of the parameter at its centre counts. The error of a coarse texture therefore includes detail
+    that it cannot show, and that of a fine one includes its noise.
     """
 
     def __init__(
@@ -70,7 +71,7 @@ class ErrorMeter:
         self.one_unit = len({(quantities or {}).get(key, "") for key in self._truth}) <= 1
 
     def errors(self, value: Callable[[str], Array]) -> dict[str, float]:
-        """The root mean square error of each parameter that has a truth; `value` yields its current value."""
+        """Return the root mean square error of each parameter with a true value; `value` returns a current value."""
         found = {}
         for key, true in self._truth.items():
             mask, array = self._masks[key], value(key)
@@ -79,9 +80,10 @@ class ErrorMeter:
         return found
 
     def total(self, errors: Mapping[str, float]) -> float | None:
-        """The root mean square error over the entries of all parameters; None where units differ, or nothing is known.
+        """Return the root mean square error over the entries of all parameters; None if units differ, or nothing is
+        known.
 
-        `errors` is what the method of that name returned.
+        `errors` is the result of the method `errors`.
         """
         count = sum(self._truth[key].size for key in errors)
         if not count or not self.one_unit:
@@ -89,24 +91,26 @@ class ErrorMeter:
         return float(np.sqrt(sum(self._truth[key].size * error**2 for key, error in errors.items()) / count))
 
     def relative(self, errors: Mapping[str, float]) -> dict[str, float]:
-        """Errors over the root mean square of the truth, where that is not 0."""
+        """Return the errors divided by the root mean square of the true values, if that is not 0."""
         return {key: error / self.scales[key] for key, error in errors.items() if key in self.scales}
 
 
 def comparison_grid(shape: tuple[int, ...], true_shape: tuple[int, ...]) -> tuple[int, int] | None:
-    """The (height, width) on which a texture and its truth are compared; None where they have the same, or none."""
+    """Return the (height, width) for comparing a texture with its true value; None if the shapes are equal or not
+    textures.
+    """
     if len(true_shape) != 3 or shape[:2] == true_shape[:2]:
         return None
     return max(shape[0], true_shape[0]), max(shape[1], true_shape[1])
 
 
 def on_grid(array: Array, grid: tuple[int, ...] | None) -> Array:
-    """A texture resampled bilinearly to `grid`, (height, width); as it is where that is None."""
+    """Return a texture resampled bilinearly to `grid`, (height, width); unchanged if `grid` is None."""
     return array if grid is None or array.shape[:2] == grid else resample(array, (grid[1], grid[0]))
 
 
 def nearest(mask: Array, grid: tuple[int, int]) -> Array:
-    """A mask (H, W) on a finer grid: each cell of that has what the mask has at its centre."""
+    """Return a mask (H, W) on a finer grid; each cell has the value of the mask at its centre."""
     rows, columns = (
         ((np.arange(size) + 0.5) * own / size).astype(int) for size, own in zip(grid, mask.shape, strict=True)
     )

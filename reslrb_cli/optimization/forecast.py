@@ -1,8 +1,8 @@
-"""The forecast of a run, its memory and its time: measured on a few of its own steps, with a target of few samples.
+"""Forecast of the memory and time of a run, measured with a few of its steps, with a target of few samples.
 
-Where a step takes long, steps of fewer samples per pixel stand for it: time and memory are a constant and a part that
-is proportional to the samples, which two sizes tell apart. Memory is given out in powers of two, which such a line
-misses; so where two whole steps are no long wait, they say what the memory is.
+If a step takes long, steps with fewer samples per pixel are used: time and memory are a constant plus a part
+proportional to the samples, which two sizes determine. Memory is allocated in powers of two, which such a line misses,
+so two full steps measure the memory if they do not take long.
 """
 
 from __future__ import annotations
@@ -45,9 +45,11 @@ WARM_UP, LEAST, MOST, SECONDS = 5, 4, 40, 5.0
 
 @dataclass(frozen=True)
 class Steps:
-    """Steps of `spp` samples per pixel, one an iteration: seconds of one (`iteration_s`), what the first take longer
-    when all kernels are there (`start_s`), what compiling them took now, and bytes of the allocator at the most, as
-    `peak_mib` in `metrics.jsonl` has them."""
+    """Steps of `spp` samples per pixel, one per iteration.
+
+    `iteration_s` is the time of one, `start_s` the additional time of the first ones with cached kernels, and there is
+    the current time for compiling. The peak is in bytes, as `peak_mib` in `metrics.jsonl`.
+    """
 
     spp: int
     iteration_s: float
@@ -57,8 +59,9 @@ class Steps:
 
 
 def measure_steps(problem: Problem) -> Steps:
-    """What a step of the run takes; of one with stages, the mean over its iterations, and all that their first ones
-    take longer."""
+    """Measure the steps of the run; for a run with stages, return the mean over its iterations, and the sum of all
+    starts.
+    """
     config, stages = problem.config, Stages(problem)
     numbers = [config.stage_number(each / config.run.iterations) for each in range(config.run.iterations)]
     found = {number: _measure_stage(stages.at(number)) for number in sorted({*numbers, stages.last})}
@@ -73,7 +76,7 @@ def measure_steps(problem: Problem) -> Steps:
 
 
 def _measure_stage(problem: Problem) -> Steps:
-    """What a step of `problem` takes, measured or by two smaller ones."""
+    """Measure a step of `problem`, or extrapolate from two smaller ones."""
     config = problem.config
     unit, whole = sets_of(config) * (problem.samples_per_pass or 1), config.run.spp
     if unit >= whole:
@@ -91,14 +94,16 @@ def _measure_stage(problem: Problem) -> Steps:
 
 
 def _peak(problem: Problem, spp: int) -> int:
-    """Bytes that two iterations of `spp` samples per pixel take: the second is one that was recorded."""
+    """Return the peak bytes of two iterations of `spp` samples per pixel; the second one is recorded."""
     with trial(problem, spp) as tried:
         return _highest(problem, list(islice(optimize(tried), 2)))
 
 
 @contextmanager
 def trial(problem: Problem, spp: int) -> Iterator[Problem]:
-    """The problem before its first iteration, of `spp` samples per pixel; then the scene is as it was."""
+    """Provide the problem before its first iteration with `spp` samples per pixel; afterwards, the scene is as
+    before.
+    """
     run = problem.config.run
     enough = {"spp": spp, "iterations": max(run.iterations, WARM_UP + MOST), "stages": [], "max_seconds": None}
     config = problem.config.model_copy(update={"run": run.model_copy(update=enough)})
@@ -109,12 +114,12 @@ def trial(problem: Problem, spp: int) -> Iterator[Problem]:
 
 
 def _highest(problem: Problem, records: Sequence[Record]) -> int:
-    """The peak in bytes of those that the run has, too: kernels may become others as values move, to 0 for example."""
+    """Return the peak in bytes, without kernels that occur only as values change, for example to 0."""
     return int(records[: problem.config.run.iterations][-1].peak_mib * MIB)
 
 
 def _measure(problem: Problem, spp: int) -> Steps:
-    """A few iterations of `spp` samples per pixel."""
+    """Measure a few iterations of `spp` samples per pixel."""
     records: list[Record] = []
     taught: list[int] = []  # how often tables had learned after each
     begin = time.perf_counter()
@@ -139,8 +144,10 @@ def _measure(problem: Problem, spp: int) -> Steps:
 
 
 def _with_learning(times: Sequence[float], learned: Sequence[int], mean: float) -> float:
-    """Seconds of an iteration in which tables learn `mean` times, from some in which they learned as often as `learned`
-    says: oftener than later on, since these are early ones."""
+    """Return the seconds of an iteration in which tables learn `mean` times.
+
+    `times` are those of early iterations, in which tables learned as often as `learned` says, more often than later.
+    """
     plain = [seconds for seconds, count in zip(times, learned, strict=True) if count == 0]
     if not plain or sum(learned) == 0:
         return statistics.fmean(times)
@@ -154,9 +161,12 @@ VERDICTS = 30
 
 @dataclass(frozen=True)
 class Forecast(Steps):
-    """Steps that were measured, and what they say of the run: bytes by part (`parts` add up to `peak`), and beside
-    them `scratch`, thread-local, and what is `free`; seconds of what comes before and after its `iterations`. `kept`: a
-    run finds the decisions by measurement, which took `measuring_s` now."""
+    """Measured steps, and the resulting forecast of the run.
+
+    It has bytes by part (`parts`, which sum to `peak`), thread-local memory `scratch`, `free` memory, and seconds
+    before and after its iterations. `kept` says whether a run finds the decisions in the cache, which took
+    `measuring_s` now.
+    """
 
     parts: dict[str, int]
     scratch: int
@@ -171,12 +181,12 @@ class Forecast(Steps):
 
     @property
     def elapsed_s(self) -> float:
-        """Seconds of the iterations, as `elapsed_s` in `metrics.jsonl` counts them, with all kernels there."""
+        """Seconds of the iterations, as `elapsed_s` in `metrics.jsonl`, with cached kernels."""
         return self.iterations * self.iteration_s + self.start_s
 
     @property
     def whole_s(self) -> float:
-        """Seconds of the whole run, with kernels and decisions as they are kept now."""
+        """Seconds of the whole run, with the current caches of kernels and decisions."""
         again = 0.0 if self.kept else self.measuring_s
         return self.elapsed_s + self.before_s + again + self.target_s + self.images_s + self.verdicts_s
 
@@ -187,10 +197,10 @@ def make_forecast(
     cache: PilotCache | None = None,
     before: Callable[[Problem], object] = lambda problem: None,
 ) -> Forecast:
-    """Measure a few steps of the run that `config` describes; a variant must be set.
+    """Measure a few steps of the run of `config`; a variant must be set.
 
-    `say` is told what takes long. Decisions by measurement go to `cache`, for the run. `before` is called with the
-    problem as it is before its first iteration, for measurements that no cache keeps. Raises ConfigError and
+    `say` is called with lines about slow work. Decisions are stored in `cache`, for the run. `before` is called with
+    the problem before its first iteration, for measurements that no cache stores. Raises ConfigError and
     UnsupportedScene as the run would, and the errors of its steps.
     """
     # Errors are no part of a step.
@@ -230,7 +240,7 @@ def make_forecast(
 
 
 def with_short_target(config: Config) -> Config:
-    """The experiment with a target of no more samples than tell its noise from a step's: four steps' worth."""
+    """Return the experiment with a target of at most four steps' samples."""
     render = config.target.render
     if render is None:
         return config
@@ -241,7 +251,7 @@ def with_short_target(config: Config) -> Config:
 
 
 def _image_seconds(problem: Problem) -> float:
-    """Seconds that a sample per pixel of a saved image takes, of the first view."""
+    """Return the seconds per sample per pixel of a saved image, of the first view."""
     view, spp = problem.views[0], saved_spp(problem, between=True)
     problem.render(view.sensor, spp, 0, "forecast")  # compiles, and records what is small: several times as long
     begin = time.perf_counter()
@@ -250,7 +260,7 @@ def _image_seconds(problem: Problem) -> float:
 
 
 def _parts(problem: Problem) -> dict[str, int]:
-    """Bytes that stand beside a step: the scene's values that a script can reach, targets, the optimiser's state."""
+    """Return the bytes beside a step: accessible values of the scene, targets, the optimiser's state."""
     geometry = values = 0
     params = problem.selection.params
     for key in params.properties:
@@ -272,5 +282,5 @@ def _parts(problem: Problem) -> dict[str, int]:
 
 
 def _bytes(value: dr.ArrayBase) -> int:
-    """Bytes of an array of Dr.Jit."""
+    """Return the bytes of a Dr.Jit array."""
     return int(dr.prod(dr.shape(value))) * int(dr.itemsize_v(value))

@@ -1,16 +1,16 @@
-"""The identifiability of parameters: what the images tell of them, asked before the first iteration.
+"""Identifiability of parameters, checked before the first iteration.
 
-Two things are asked: which entries of a parameter the images tell something about (`find_reached`), and whether they
-tell exposures from parameters (`check_exposures`).
+There are two checks: which entries of a parameter affect the images (`find_reached`), and whether the images
+distinguish exposures from parameters (`check_exposures`).
 
-For the second let D_k be how all views' images, exposed and without what their masks leave out, change with the
-logarithm of parameter k, all its entries at once: (J((1 + h) x_k) - J(x_k)) / h, at common random numbers. An
-exposure's own is its views' images themselves. With all emission unknown, for example, the sum over the lamps is the
-exposure's. In general there are combinations without an effect where the matrix of cosines
+For the second, let D_k be the change of all views' images, with exposure and without masked pixels, with the logarithm
+of parameter k, all its entries together: (J((1 + h) x_k) - J(x_k)) / h, at common random numbers. For an exposure, it
+is the images of its views themselves. If all emission is unknown, for example, the sum over the lamps equals the
+exposure's. In general, there are combinations without effect if the matrix of cosines
 
     G_kl = <D_k, D_l> / (|D_k| |D_l|)
 
-has an eigenvalue near 0; its eigenvector says which values are in the combination.
+has an eigenvalue near 0; its eigenvector gives the values in the combination.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ PART = 0.1
 
 
 def find_reached(problem: Problem) -> Problem:
-    """The problem with its `masks`, of the parameters whose true value is known.
+    """Return the problem with its `masks`, for parameters with known true values.
 
-    An entry counts as reached where light reaches it (the gradient of the image's sum with respect to it, over
-    `REACH_SPP` samples per pixel, is not 0 in some channel) and, for a texel, where some sensor also sees its
-    centre: a texel that only lights others is held by interreflection alone.
+    An entry counts as reached if light reaches it (the gradient of the image's sum with respect to it, over `REACH_SPP`
+    samples per pixel, is not 0 in some channel) and, for a texel, if some sensor also sees its centre. A texel that
+    only illuminates others is determined by interreflection alone.
     """
     if not problem.truth:
         return problem
@@ -71,8 +71,9 @@ def find_reached(problem: Problem) -> Problem:
 
 
 def shown_texels(problem: Problem, key: str) -> Array | None:
-    """Which texels (H, W) of a texture some view that is trained on shows in pixels that count; None of what is no
-    texture to be seen."""
+    """Return the texels (H, W) of a texture that some training view shows in unmasked pixels; None for other
+    parameters.
+    """
     if key not in problem.selection.params or problem.selection.array(key).ndim != 3:
         return None
     weights = [view.weights for view in problem.trained]
@@ -80,7 +81,7 @@ def shown_texels(problem: Problem, key: str) -> Array | None:
 
 
 def _visible(problem: Problem, key: str, pixels: Sequence[Array | None] = ()) -> Array:
-    """The texels that views that are trained on show, in these pixels, or in any."""
+    """Return the texels that training views show, in these pixels, or in any."""
     sensors = [problem.scene.sensors()[view.sensor] for view in problem.trained]
     seen, halo = (
         visible_texels(problem.scene, sensors, key, pixels, problem.paths != "light"),
@@ -90,7 +91,7 @@ def _visible(problem: Problem, key: str, pixels: Sequence[Array | None] = ()) ->
 
 
 def sensitivity(problem: Problem) -> dict[str, Array]:
-    """For each parameter whether the mean image depends on an entry, boolean, of the parameter's shape."""
+    """Return for each parameter which of its entries affect the mean image: booleans of the parameter's shape."""
     run, integrator, multiple = problem.config.run, unrecorded(problem.integrator), samples_per_pass(problem.config)
     # A recording takes as long as some passes, of which there is mostly one.
     paths_per_pass = MOST_PATHS if isinstance(integrator, LightTracer) else PATHS_PER_PASS
@@ -112,10 +113,10 @@ def sensitivity(problem: Problem) -> dict[str, Array]:
 
 
 def check_exposures(problem: Problem) -> None:
-    """Raise ConfigError where the images cannot tell an exposure from parameters, which it names.
+    """Raise ConfigError if the images cannot distinguish an exposure from parameters, with their names.
 
-    Takes one image of each view for every parameter; nothing where no exposure is recovered. The problem has its
-    targets, and is left as it was.
+    Takes one image of each view for every parameter; nothing if no exposure is recovered. The problem must have its
+    targets, and is not changed.
     """
     found = find_ambiguous(problem) if problem.selection.factors else None
     if found is None:
@@ -131,7 +132,7 @@ def check_exposures(problem: Problem) -> None:
 
 
 def find_ambiguous(problem: Problem) -> tuple[list[str], list[str]] | None:
-    """The first combination of exposures and parameters that the images do not show; None where there is none."""
+    """Return the first combination of exposures and parameters that has no effect on the images, or None."""
     problem.apply()
     base = _row(problem)
     factors, rows, keys = problem.selection.factors, [], []
@@ -158,6 +159,6 @@ def find_ambiguous(problem: Problem) -> tuple[list[str], list[str]] | None:
 
 
 def _row(problem: Problem) -> Array:
-    """The images of all views in a row, each by the root of its share of the loss."""
+    """Return the images of all views in a row, each multiplied by the root of its share of the loss."""
     pairs = zip(problem.trained, see_images(problem), strict=True)
     return np.concatenate([np.sqrt(view.share) * image.ravel() for view, image in pairs])

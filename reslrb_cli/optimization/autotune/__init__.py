@@ -1,1 +1,1 @@
-"""What is measured of a run before its first iteration: estimator, paths, guiding, sequence."""
+"""Measurements before the first iteration of a run: estimator, paths, guiding, sequence."""

@@ -1,20 +1,20 @@
-"""Races of candidates before a run's first iteration: what they may cost, how they compare, what is kept of them.
+"""Comparisons of candidates before the first iteration: their cost, their evaluation, and their storage.
 
-- `Tuner.decide`: one decision, which is what an earlier run kept, or what is measured now, in a run long enough.
-- `compare`: how much more efficient one way of sampling a gradient is than another, by steps of both, and how sure:
+- `Tuner.decide`: one decision, from an earlier run, or measured now if the run is long enough.
+- `compare`: the gain in efficiency of one way of sampling a gradient over another, by steps of both, with its interval:
 
       gain = (variance * time of the one) / (variance * time of the other)
 
-  Variance is summed over the parameters, each over its gradient's mean square. The interval is that of the logarithm of
-  the variances' quotient by the jackknife over the steps, and of times by what a single one may be off.
-- `Turns`: whether another way of taking steps pays, by steps of both in turns, whose gradients estimate the same. Times
-  are those of kernels, and, alike for both, what goes on beside them in a run for as many samples, which counts where
-  iterations take milliseconds. A table that steps draw from is learned first, of other paths than theirs, and held.
+  Variance is summed over the parameters, each divided by the mean square of its gradient. The interval is that of the
+logarithm of the quotient of variances by the jackknife over the steps, plus the error of single times. - `Turns`:
+whether another way of taking steps pays, by alternating steps whose gradients estimate the same. Times are those of
+kernels, plus, equally for both, the work beside them in a run, which counts if iterations take milliseconds. A table
+that steps sample from is learned first, from other paths, and then kept.
 
-For another option of which two ways are compared: its record in `records/decisions.py` (a `PaidRecord`); its row in
-`LATER`; in `sampling.py` a `Turns` that makes the record (`SequencePilot`), a function beside `_sequence` that has
-`Tuner.decide` find it, by a `StepTrial` of two integrators, and lines in `settle_sampling` that take it. If an option
-has more than two values, each takes turns with the best so far.
+To add an option with two alternatives: its record in `records/decisions.py` (a `PaidRecord`); its row in `LATER`; in
+`sampling.py` a `Turns` that makes the record (`SequencePilot`), a function beside `_sequence` that calls `Tuner.decide`
+with a `StepTrial` of two integrators, and lines in `settle_sampling` that use it. If an option has more than two
+values, each competes with the best so far.
 """
 
 from __future__ import annotations
@@ -80,20 +80,20 @@ logger = logging.getLogger(__name__)
 
 
 class Tuner:
-    """Decides; `problem` is the one that was given, with what has been decided since.
+    """Decisions before a run; `problem` is the given one, with the decisions so far.
 
-    `say` is told what is decided, and once that something is measured; `cache` holds what earlier runs measured.
+    `say` is called with the decisions, and once before a measurement; `cache` has measurements of earlier runs.
     """
 
     def __init__(self, problem: Problem, say: Say, cache: PilotCache | None = None) -> None:
         self.problem, self.say, self._cache = problem, say, cache
 
     def take(self, **decided: Any) -> None:
-        """Have fields of `problem` from now on."""
+        """Change fields of `problem` from now on."""
         self.problem = replace(self.problem, **decided)
 
     def set_aside(self, size: int) -> None:
-        """Expect so many more bytes in all steps, where a memory budget is kept."""
+        """Add `size` bytes to the expected memory of all steps, if there is a memory budget."""
         if (memory := self.problem.memory) is not None:
             expected = replace(memory.expected_bytes, fixed=memory.expected_bytes.fixed + size)
             self.take(memory=replace(memory, expected_bytes=expected))
@@ -121,11 +121,11 @@ class Tuner:
         fits: Callable[[Record], bool] = lambda record: True,
         later: Sequence[Need] = (),
     ) -> Record:
-        """What an earlier run measured and kept, if it `fits`; else what `measure` finds now, which is kept.
+        """Return the decision of an earlier run if it `fits`; otherwise measure it now with `measure`, and store it.
 
-        `of` is what that depends on besides the situation, `needs` what measuring by steps of `integrator` and others
-        takes at least that says anything (`Allowance.affords`), `unmeasured` the decision without, with a note. What is
-        to be measured `later` has its time kept aside, where there is enough for both.
+        `of` is what the decision depends on besides the situation. `needs` are the minimum costs of a useful
+        measurement by steps of `integrator` and others (`Allowance.affords`). `unmeasured` returns the decision without
+        measuring, from a note. Time for `later` measurements is reserved if there is enough for both.
         """
         key = ""
         if self._cache is not None:
@@ -149,7 +149,9 @@ class Tuner:
         return record
 
     def allowance(self, integrator: Tracer) -> Allowance:
-        """What may be spent: as begun before, or by two first steps of `integrator` now, of few samples."""
+        """Return the time that may be spent: known already, or from two first steps of `integrator` with few
+        samples.
+        """
         problem, run = self.problem, self.problem.config.run
         if problem.allowance is not None:
             return problem.allowance
@@ -175,12 +177,12 @@ def is_auto(config: Config, option: str) -> bool:
 
 
 def sets_of(config: Config) -> int:
-    """The sets that a step's samples are traced in: those that have one dL/dI each, or the halves of these."""
+    """Return the number of sets that a step's samples are traced in: those with one dL/dI each, or their halves."""
     return (config.run.batches if config.adjoint == "batched" else 1) * config.halves * config.shares
 
 
 def situation(problem: Problem) -> dict[str, Any]:
-    """Return all that a decision depends on, as plain values: settings, and the contents of the files they name."""
+    """Return everything that a decision depends on, as plain values: settings, and the contents of their files."""
     config = problem.config
     settings = config.model_dump(mode="json", include={"scene", "target", "views", "parameters", "integrator", "loss"})
     for spec in settings["parameters"]:
@@ -203,9 +205,11 @@ def situation(problem: Problem) -> dict[str, Any]:
 
 @dataclass
 class Step:
-    """A step, or a walk that was learned from: its gradients, its image by view, and milliseconds: of the kernels, of
-    those of an image that has samples of its own, and all that was waited for but for `compile_ms`, in which kernels
-    were generated and compiled."""
+    """Step or learning walk: its gradients, its image by view, and milliseconds.
+
+    The times are those of the kernels, of the kernels of an image with its own samples, and of everything except
+    `compile_ms`, in which kernels were generated and compiled.
+    """
 
     gradients: Gradients = field(default_factory=dict)
     images: Gradients = field(default_factory=dict)
@@ -216,19 +220,19 @@ class Step:
 
     @property
     def beside_ms(self) -> float:
-        """What was waited for beside the kernels."""
+        """Time beside the kernels."""
         return max(self.wall_ms - self.kernel_ms - self.image_ms, 0.0)
 
 
 def timed(times: StepTimes, wall_ms: float | None = None) -> Step:
-    """A step that took so long; `wall_ms` where more was waited for than the clock saw."""
+    """Return a step with these times; `wall_ms` replaces the time of the clock if more was waited for."""
     # Kernels are compiled side by side: their times can add up to more than was waited for.
     waited_ms = max((times.wall_ms if wall_ms is None else wall_ms) - times.codegen_ms, times.kernel_ms)
     return Step(kernel_ms=times.kernel_ms, wall_ms=waited_ms, compile_ms=times.codegen_ms)
 
 
 def measured_step(problem: Problem, integrator: Any, clock: StepClock, round: int, spp: int) -> Step:
-    """Take one step of all views, with seeds of its own; leave neither gradient nor change behind."""
+    """Take one step of all views with its own seeds; leave neither a gradient nor a change."""
     start = time.perf_counter()
     problem.apply()
     with clock.step() as times:
@@ -244,9 +248,9 @@ def compare(
     other_ms: Sequence[float],
     confidence: float = CONFIDENCE,
 ) -> Gain:
-    """The efficiency of the other over that of the own, and its interval; nothing where one has no noise.
+    """Return the efficiency of the other way over that of the own way, with its interval; NOTHING if one has no noise.
 
-    Gradients are those of each step by parameter (three steps or more), times those of steps in any unit.
+    Gradients are those of each step by parameter (at least three steps), and times are those of steps in any unit.
     """
     units = scales([*own, *other])
     found = [_log_variances(gradients, units) for gradients in (own, other)] if units else [None]  # of no light, say
@@ -264,13 +268,13 @@ def compare(
 
 
 def scales(gradients: Sequence[Gradients]) -> dict[str, float]:
-    """The mean square norm of each parameter's gradient, of those that have any."""
+    """Return the mean square norm of each parameter's gradient, if it has a gradient."""
     found = {key: float(np.mean([sum_of_squares(g[key]) for g in gradients])) for key in gradients[0]}
     return {key: scale for key, scale in found.items() if scale > 0}
 
 
 def _log_variances(gradients: Sequence[Gradients], scales: dict[str, float]) -> tuple[float, Array] | None:
-    """The logarithm of the variance of all parameters, and that without each of the rounds in turn."""
+    """Return the logarithm of the variance of all parameters, and the same without each of the rounds in turn."""
     rows = np.array([
         np.concatenate([g[key].astype(np.float64) / math.sqrt(scale) for key, scale in scales.items()])
         for g in gradients
@@ -302,7 +306,7 @@ LEARNING_SHARE, LEARNINGS = 0.4, 2
 
 
 def lessons(problem: Problem) -> float:
-    """How often tables of guided emission learn in an iteration of the run, in the mean over all of it."""
+    """Return how often tables of guided emission learn per iteration, on average over the run."""
     run, sensors = problem.config.run, len(problem.trained)
     each = run.batches - 1 if problem.config.adjoint == "batched" else 1
     each = each * problem.config.halves if problem.config.shards == 1 else 1  # of shards, once a step
@@ -312,10 +316,13 @@ def lessons(problem: Problem) -> float:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Samples per pixel: of a step of the run (`step`), of each set of its samples that has one dL/dI (`call`), and of
-    a pass of these (`part`). `alone`: images have samples of their own. `rounds` are planned for. `lessons` says how
-    often tables of guided emission learn for each such set, in the mean over the run. A step of the other kind may take
-    `longer` times as long as one of this; `planned` are PLANNED, or less."""
+    """Samples per pixel: of a step of the run (`step`), of each set with one dL/dI (`call`), and of a pass of these
+    (`part`).
+
+    `alone` says whether images have their own samples. `rounds` is the planned number of rounds, and `lessons` how
+    often tables of guided emission learn for each set, on average over the run. A step of the other kind may take
+    `longer` times as long; `planned` is PLANNED or less.
+    """
 
     step: int
     call: int
@@ -328,12 +335,12 @@ class Sizes:
 
     @property
     def trial(self) -> int:
-        """Samples of each step that is taken here."""
+        """Samples of each measured step."""
         return max(min(int(self.planned * self.step / ((1 + self.longer) * self.rounds)), self.part), 1)
 
     @property
     def learning(self) -> int:
-        """Samples of each walk that is learned from here."""
+        """Samples of each learning walk."""
         return max(min(int(LEARNING_SHARE * self.step), self.part), 1)
 
 
@@ -345,9 +352,11 @@ Learn = Callable[[int, int], Step]
 
 
 class Turns(Generic[Record]):
-    """One decision, by steps that `take` takes, and walks that `learn` does, where a table has yet to learn. `views` is
-    how many times the views of an iteration are those of a step here, `share` what of ITERATIONS this may cost, and
-    `most` what of them the least number of rounds may, where that is more."""
+    """One decision, by steps of `take` and learning walks of `learn` if a table must learn.
+
+    `views` is the number of views of an iteration divided by that of a step here, `share` the part of ITERATIONS that
+    the decision may cost, and `most` the part that the minimum number of rounds may cost, if that is more.
+    """
 
     LEAST, LOOKS = LEAST_ROUNDS, LOOKS
     #: Whether it is decided apart for images that have samples of their own.
@@ -387,7 +396,9 @@ class Turns(Generic[Record]):
         return self._decided()
 
     def _learned(self, round_ms: float) -> bool:
-        """Have the table learn, if it has not; False where that, and rounds of so long, cannot be afforded."""
+        """Let the table learn if necessary; return False if there is no time for this and for rounds of this
+        duration.
+        """
         if self._learn is None:
             return self._affords(self.LEAST * round_ms)
         walk = self._learn(0, self._sizes.learning)
@@ -404,13 +415,15 @@ class Turns(Generic[Record]):
 
     @property
     def _iteration_ms(self) -> float:
-        """Of the run: kernels of all its samples, and what goes on beside them for each set that has one dL/dI."""
+        """Time of an iteration of the run: kernels of all its samples, and the work beside them for each set with one
+        dL/dI.
+        """
         kernels = statistics.median(step.kernel_ms + step.image_ms for step in self._plain)
         return self._views * (kernels + self._python_ms) * self._sizes.step / self._sizes.trial
 
     @property
     def _python_ms(self) -> float:
-        """What goes on beside the kernels of `trial` samples in a run, which has it once for each `call`."""
+        """Time beside the kernels for `trial` samples in a run, which occurs once for each `call`."""
         beside = statistics.median(step.beside_ms for step in self._plain)
         return beside * self._sizes.trial / self._sizes.call
 
@@ -419,27 +432,31 @@ class Turns(Generic[Record]):
         return self._spent_ms + more_ms <= share * ITERATIONS * self._iteration_ms
 
     def _more_ms(self) -> float:
-        """What a step of the other kind, of `trial` samples, takes in a run beside its own kernels."""
+        """Return the additional time of a step of the other kind, with `trial` samples, in a run beside its own
+        kernels.
+        """
         return 0.0
 
     def _decide(self, other: bool, images: bool, found: dict[str, Any]) -> Record:
-        """The record of a decision, `found` what all of them hold."""
+        """Return the record of a decision; `found` has its common fields."""
         raise NotImplementedError
 
     def _times(self, other: bool, images: bool) -> list[float]:
-        """Of steps of one kind, whose images, where they have samples of their own, are drawn the other way or not."""
+        """Return the times of steps of one kind, whose images with their own samples are drawn the other way or not."""
         beside = self._python_ms + (self._more_ms() if other else 0.0)
         if self._sizes.alone:
             beside += statistics.median(step.image_ms for step in self._steps[other and images])
         return [step.kernel_ms + beside for step in self._steps[other]]
 
     def _gain(self, images: bool, confidence: float = CONFIDENCE) -> Gain:
-        """Of the gradient, as part of steps whose images are drawn the other way or not."""
+        """Return the gain of the gradient in steps whose images are drawn the other way or not."""
         own, other = ([step.gradients for step in steps] for steps in self._steps)
         return compare(own, self._times(False, images), other, self._times(True, images), confidence)
 
     def _image_gain(self) -> Gain:
-        """Of the image: of samples of its own, where it has them, else of those that serve the gradient too."""
+        """Return the gain of the image: of its own samples if it has them, otherwise of those that serve the gradient,
+        too.
+        """
         own, other = ([step.images for step in steps] for steps in self._steps)
         times = [self._times(each, False) for each in (False, True)]
         if self._sizes.alone:  # what goes on beside kernels counts once, with the gradient
@@ -447,12 +464,14 @@ class Turns(Generic[Record]):
         return compare(own, times[0], other, times[1])
 
     def _is_clear(self) -> bool:
-        """Whether no more steps are needed: it is not on by accident, or off at all events."""
+        """Whether no more steps are needed: the alternative is clearly on, or off."""
         _, low, high = self._gain(not self._apart or self._images(self._image_gain()), CLEAR)
         return low is None or high is None or low > 1 or high < 1
 
     def _images(self, gain: Gain) -> bool:
-        """Whether images are to be drawn so too; where that is not decided apart, whether no harm to them is seen."""
+        """Whether images use the alternative as well; if this is not decided separately, whether they are not
+        harmed.
+        """
         if self._apart:
             return gain[1] is not None and gain[1] > 1
         return gain[2] is None or gain[2] >= LEAST_IMAGE
@@ -480,12 +499,12 @@ class Turns(Generic[Record]):
         return self._decide(other, images, found | {"share": self._spent_ms / (ITERATIONS * self._iteration_ms)})
 
     def _found(self, note: str) -> dict[str, Any]:
-        """Return the fields that all records of decisions by turns have."""
+        """Return the fields that all records of such decisions have."""
         cost = {"measure_s": self._spent_ms / 1e3, "compile_s": self._compile_ms / 1e3}
         return {"rounds": len(self._steps[True]), "spp": self._sizes.trial, "note": note, **cost}
 
     def _spend(self, step: Step, first: bool = False) -> Step:
-        """Count the time of a step. A `first` step compiles kernels, so all of its time counts as compilation."""
+        """Add the time of a step. A `first` step compiles kernels, so all of its time counts as compilation."""
         self._spent_ms += 0.0 if first else step.wall_ms
         self._compile_ms += step.compile_ms + (step.wall_ms if first else 0.0)
         return step

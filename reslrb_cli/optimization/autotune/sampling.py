@@ -1,23 +1,21 @@
-"""The sampling of a run, settled before its first iteration: guided emission, and the sequence of numbers.
+"""Sampling of a run, decided before its first iteration: paths, pixels, guided emission, and the sequence of numbers.
 
-Each is settled where it is left to measurement: which paths there are, guiding, and then the sequence; and before
-guiding, without steps, how camera paths are shared out over the pixels (`guiding/pixels.py`). Steps drawn one way take
-turns with steps drawn the other (`race.Turns`), with dL/dI held at one image's (`StepTrial`):
+Settings that are left to measurement are decided in this order: paths, distribution of camera paths over the pixels
+without steps (`guiding/pixels.py`), guiding, sequence. Alternating steps (`race.Turns`) compare two ways of sampling,
+with dL/dI fixed at one image (`StepTrial`):
 
-- `PathsPilot`: another share of light paths, or paths of one side alone where that finds all light, unguided. One share
-  after the other takes its turns with the best so far, from one half on to the side that was found to be the better, as
-  long as one is. Camera paths alone come first where they find all: they may have a thousand times the efficiency, so
-  that a run of a second is worth it, and a few small steps tell (`CameraPilot`), with kernels that the run needs anyway
-  if they win.
-- `GuidingPilot`: guided emission, from a table that is learned first, and held. To a guided step's time is added its
-  part of what a run of that length learns: each time one more walk of one pass, with what Python does for a new table,
-  often at first and then rarely. Short steps make the table less worth than a run's, which has learned from more, and
-  draws more paths from each of its cells: what pays here pays there. Where light paths alone find all light they are
-  what is guided: weights know nothing of guiding, and take from guided paths what camera paths might have found.
-- `SequencePilot`: low-discrepancy numbers, guided if the run is; then both draw from one table. What a run goes on
-  learning takes both the same time; it is left out, which makes more of the time that such numbers take. Noise of
-  evenly spread numbers falls faster than with one over the samples, or as fast, so that short steps find less of the
-  gain than whole ones have. Where guiding pays, they are tried in place of it first.
+- `PathsPilot`: another share of light paths, or paths of one side alone if it finds all light, unguided. Shares compete
+  with the best so far, from one half on towards the better side, as long as they win. Camera paths alone come first if
+  they find all light: they may have a thousand times the efficiency, so that even a run of a second gains, and a few
+  small steps decide (`CameraPilot`), with kernels that the run needs anyway if they win.
+- `GuidingPilot`: guided emission, from a table that learns first, and is then kept. The time of a guided step includes
+  its share of the run's learning: one more walk per lesson, and the Python code for a new table, often at first and
+  then rarely. Short steps underestimate the table of a run, which has learned from more paths, and has more paths per
+  cell. If light paths alone find all light, they compete when guided, because weights ignore guiding and take away most
+  of its benefit.
+- `SequencePilot`: low-discrepancy numbers, guided if the run is; both then sample from one table. Later learning costs
+  both the same, and is left out. The noise of low-discrepancy numbers falls at least as fast as with one over the
+  samples, so short steps underestimate the gain. If guiding pays, low-discrepancy numbers compete with it first.
 """
 
 from __future__ import annotations
@@ -69,10 +67,10 @@ IMAGE_SHARE = 0.25
 
 
 def settle(problem: Problem, say: race.Say, cache: PilotCache | None = None) -> Problem:
-    """Return `problem` with an integrator that draws samples as pays here, where that is left to measurement.
+    """Return `problem` with an integrator whose open sampling options have been decided.
 
-    Needs the targets. Fields of the problem hold the measurements; `say` is given a line of each, and `cache` holds the
-    measurements of earlier runs.
+    Needs the targets. Fields of the problem hold the measurements, `say` is called with a line for them, and `cache`
+    has the measurements of earlier runs.
     """
     tuner = race.Tuner(problem, say, cache)
     settle_paths(tuner)
@@ -83,8 +81,7 @@ def settle(problem: Problem, say: race.Say, cache: PilotCache | None = None) -> 
 
 
 def settle_paths(tuner: race.Tuner) -> None:
-    """Have the integrator trace the paths that pay here, as far as that is left to
-    measurement, and both kinds can render the scene."""
+    """Decide the paths of the integrator, if open and if both kinds can render the scene."""
     problem = tuner.problem
     if not race.is_auto(problem.config, "paths") or problem.paths != "both":
         return
@@ -93,9 +90,10 @@ def settle_paths(tuner: race.Tuner) -> None:
 
 
 def settle_pixels(tuner: race.Tuner) -> None:
-    """Share the camera paths of the problem's integrator out over the pixels, by the parameters' values at the start.
+    """Distribute the camera paths of the problem's integrator over the pixels, for the initial values of the
+    parameters.
 
-    The configuration asks for it, or leaves it to `_whether_pixels`. The kinds of paths have to be settled.
+    The configuration asks for it, or leaves it to `_whether_pixels`. The kinds of paths must be decided first.
     """
     problem = tuner.problem
     tracer, asked = problem.integrator, problem.config.integrator.options().get("pixels", "even")
@@ -117,10 +115,11 @@ def settle_pixels(tuner: race.Tuner) -> None:
 
 
 def _whether_pixels(problem: Problem) -> PixelsRecord:
-    """Decide whether `auto` shares camera paths out: the loss is l2 alone, and the run has so many paths that the noted
-    ones, and their kernel, take a small part of it.
+    """Decide whether `auto` distributes camera paths: only with the loss l2, and if the measurement is a small part of
+    the run.
 
-    A mirror room by relative_l2 has twice the variance with shares in some of its colours (docs/method.md).
+    A mirror room with relative_l2 has twice the variance with measured shares in some of its colours
+    (docs/notes/method.md).
     """
     if any(loss.type != "l2" for loss in problem.config.losses):
         return PixelsRecord(measured=False, note="left alone where the loss is not l2 alone")
@@ -133,14 +132,12 @@ def _whether_pixels(problem: Problem) -> PixelsRecord:
 
 
 def with_sides(integrator: Any, sides: PathsRecord | None) -> Any:
-    """An integrator that traces the paths that were decided on, where they were."""
+    """Return an integrator with the decided paths."""
     return integrator if sides is None else integrator.afresh(light_share=sides.light_share)
 
 
 def settle_sampling(tuner: race.Tuner) -> None:
-    """Have the integrator draw samples as pays here, as far as that is left to
-    measurement: guided or not; then from which sequence, in place of being guided, or else as the integrator is then.
-    """
+    """Decide open options of sampling: guided or not; then the sequence, instead of guiding or in addition."""
     config, plain, memory = tuner.problem.config, tuner.problem.integrator, tuner.problem.memory
     trials: list[StepTrial] = []  # what was measured on so far
     if race.is_auto(config, "guiding") and (guided := _guided(tuner, trials)) is not None:
@@ -163,7 +160,7 @@ def settle_sampling(tuner: race.Tuner) -> None:
 
 
 def as_decided(integrator: Any, guided: GuidedRecord | None, sequence: SequenceRecord | None) -> Any:
-    """Return `integrator` with the ways of drawing samples that were decided."""
+    """Return `integrator` with the decided ways of sampling."""
     if guided is not None and guided.guided:
         integrator = integrator.afresh(guided=True, images=guided.images)
     if sequence is not None and sequence.low_discrepancy:
@@ -172,7 +169,7 @@ def as_decided(integrator: Any, guided: GuidedRecord | None, sequence: SequenceR
 
 
 def table_bytes(problem: Problem) -> int:
-    """Bytes of the tables of all sensors, if `problem.integrator` is guided, or were."""
+    """Return the bytes of the tables of all sensors if `problem.integrator` is, or would be, guided."""
     made = problem.integrator.afresh(guided=True, light_share=1.0 if guides_light_alone(problem) else None)
     if made.paths == "camera":
         return 0
@@ -181,8 +178,7 @@ def table_bytes(problem: Problem) -> int:
 
 
 def guides_light_alone(problem: Problem) -> bool:
-    """Whether it is light paths alone that guiding is tried with, where there are camera paths beside or in place of
-    them, of a share that was left to measurement."""
+    """Whether guiding is tried with light paths alone, instead of a measured share of camera paths."""
     return problem.sides is not None and problem.sides.light_share < 1 and _light_finds_all(problem)
 
 
@@ -192,15 +188,16 @@ def _light_finds_all(problem: Problem) -> bool:
 
 
 def _light_alone(sides: PathsRecord | None, guided: GuidedRecord) -> PathsRecord:
-    """What `sides` becomes where guided light paths alone do better."""
+    """Return `sides` for guided light paths alone, if they are better."""
     assert sides is not None
     note = f"guided, they have {guided.gain:.2g} times the efficiency of {100 * sides.light_share:g} %"
     return replace(sides, paths="both", light_share=1.0, gain=None, low=None, high=None, note=note)
 
 
 def suits_even_numbers(problem: Problem) -> str | None:
-    """Why evenly spread numbers are likely to do better here than guided paths, by what the scene has; None where it is
-    not known. docs/sequences.md has what this was seen on."""
+    """Return why low-discrepancy numbers are likely better than guiding in this scene; None if unknown
+    (docs/sequences.md).
+    """
     if is_attached(problem):
         return "of what moves light, evenly spread numbers say most"
     for emitter in problem.scene.emitters():
@@ -210,7 +207,7 @@ def suits_even_numbers(problem: Problem) -> str | None:
 
 
 def sizes(problem: Problem, longer: float, planned: float = race.PLANNED) -> race.Sizes:
-    """The samples of the run's steps, and what is planned of those that are taken here."""
+    """Return the samples of the run's steps and of the planned measured steps."""
     run, adjoint = problem.config.run, problem.config.adjoint
     call = run.spp // race.sets_of(problem.config)
     part = min(problem.samples_per_pass or call, call)
@@ -221,13 +218,15 @@ def sizes(problem: Problem, longer: float, planned: float = race.PLANNED) -> rac
 
 
 def planned(share: float) -> float:
-    """Steps' worth of time that the sequence's rounds are planned for: the longer, the more of the gain is seen."""
+    """Return the time, in steps, of the sequence's planned rounds; longer steps see more of the gain."""
     return min(ROUNDS_SHARE * share * race.ITERATIONS, race.PLANNED)
 
 
 def share_left(problem: Problem, allowance: Allowance, reserved: float = 0.0, kernels: float = 0.0) -> float:
-    """What earlier measurements left of the share of 200 iterations that all of them may cost, but for what is
-    `reserved`, and no more than there is time for in a run as short as this, with `kernels` to compile."""
+    """Return the remaining share of 200 iterations that measurements may cost.
+
+    `reserved` is kept for others. In a short run, there may be less time, with `kernels` to compile.
+    """
     spent = sum(each.share for each in (problem.sides, problem.guided) if each is not None)
     return max(min(race.SHARE - spent - reserved, allowance.iterations_left(kernels) / race.ITERATIONS), 0.0)
 
@@ -236,12 +235,12 @@ def share_left(problem: Problem, allowance: Allowance, reserved: float = 0.0, ke
 
 
 class GuidingPilot(race.Turns[GuidedRecord]):
-    """One decision: guided, or not."""
+    """Decision: guided, or not."""
 
     APART = True
 
     def _more_ms(self) -> float:
-        """What learning adds, in the mean over the run."""
+        """Return the additional time of learning, on average over the run."""
         sizes = self._sizes
         kernel = self._walk.kernel_ms * sizes.part / sizes.learning
         return (kernel + self._walk.beside_ms) * sizes.lessons * sizes.trial / sizes.call
@@ -251,24 +250,24 @@ class GuidingPilot(race.Turns[GuidedRecord]):
 
 
 class SequencePilot(race.Turns[SequenceRecord]):
-    """One decision: low-discrepancy numbers, or independent ones."""
+    """Decision: low-discrepancy numbers, or independent ones."""
 
     def _decide(self, other: bool, images: bool, found: dict[str, Any]) -> SequenceRecord:
         return SequenceRecord(low_discrepancy=other, **found)
 
 
 class PathsPilot(race.Turns[PathsRecord]):
-    """One decision: other paths, or those that there are."""
+    """Decision: other paths, or the current ones."""
 
     def _decide(self, other: bool, images: bool, found: dict[str, Any]) -> PathsRecord:
         return PathsRecord(paths="other" if other else "both", **found)
 
 
 class CameraPilot(PathsPilot):
-    """The same, of camera paths alone, in a run however short.
+    """Decision: camera paths alone, in a run of any length.
 
-    As many rounds are taken as are planned for, or as there are samples for in what that may cost at least, whatever
-    Python takes: of steps of milliseconds times are not to decide whether anything is measured.
+    It takes the planned rounds, or as many as there are samples for at the minimum cost, regardless of Python's time:
+    with steps of milliseconds, times must not decide whether anything is measured.
     """
 
     def __init__(self, take: race.Take, sizes: race.Sizes, *rest: Any, **more: Any) -> None:
@@ -281,7 +280,7 @@ class CameraPilot(PathsPilot):
 
 
 def _paths(tuner: race.Tuner) -> PathsRecord:
-    """Which share of the paths are to be light paths."""
+    """Decide the share of light paths."""
     problem = tuner.problem
     alone = camera_finds_all(problem.scene, problem.integrator.max_depth)
     needs = race.CAMERA_NEEDS if alone else race.PATHS_NEEDS
@@ -291,7 +290,7 @@ def _paths(tuner: race.Tuner) -> PathsRecord:
         left = min(race.PATHS_SHARE, allowance.iterations_left(needs[0]) / race.ITERATIONS)
 
         def climb(shares: Sequence[float]) -> None:
-            """Take these shares in turn, as long as each is better than what there is."""
+            """Try these shares in turn, as long as each is better than the best so far."""
             nonlocal best
             for share in shares:
                 part = (left - sum(record.share for record in records)) / 2
@@ -330,14 +329,16 @@ def _paths(tuner: race.Tuner) -> PathsRecord:
 
 
 def _of_share(problem: Problem, share: float) -> Tracer:
-    """The problem's integrator with this share of light paths; none of them leaves camera paths alone."""
+    """Return the problem's integrator with this share of light paths; a share of 0 leaves camera paths alone."""
     tracer: Tracer = problem.integrator.afresh(light_share=share)
     return tracer
 
 
 def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord | None:
-    """Whether the problem's integrator is to be guided, or light paths in place of it;
-    `trials` gets the steps of it. None where nothing begins at the emitters."""
+    """Decide whether the problem's integrator is guided, or replaced by guided light paths.
+
+    `trials` receives the steps. None if nothing starts at emitters.
+    """
     problem = tuner.problem
     alone = guides_light_alone(problem)
     if isinstance(problem.integrator, Tracer) and problem.integrator.paths == "camera" and not alone:
@@ -374,18 +375,18 @@ def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord | None:
 
 
 def _sides(problem: Problem) -> dict[str, Any]:
-    """Of what the integrator traces, what a decision depends on."""
+    """Return the settings of the traced paths that a decision depends on."""
     sides = problem.sides
     return {} if sides is None else {"sides": [sides.paths, sides.light_share]}
 
 
 def _sequence(tuner: race.Tuner, trials: list[StepTrial]) -> SequenceRecord:
-    """Which sequence the problem's integrator, guided or not, is to have; `trials`: what guiding was measured on."""
+    """Decide the sequence of the problem's integrator; `trials` are those of the decision on guiding."""
     problem, found = tuner.problem, tuner.problem.guided
     plain, is_guided = problem.integrator, problem.integrator.preparation.guiding is not None
 
     def pilot(name: str, guided: bool | None, share: float) -> SequenceRecord:
-        """What is found in that share of the run; `guided`: with the other numbers, None: as the run is."""
+        """Return the result for this share of the run; `guided` overrides the guiding of the run."""
         even = plain.afresh(guided=guided, low_discrepancy=True)
         trials.append(StepTrial(problem, name, plain.afresh(low_discrepancy=False), even, *trials[-1:]))
         return trials[-1].turns(SequencePilot, sizes(problem, SEQUENCE_LONGER, planned(share)), share)
@@ -417,11 +418,11 @@ def _sequence(tuner: race.Tuner, trials: list[StepTrial]) -> SequenceRecord:
 
 
 class StepTrial:
-    """Steps of a problem by `plain`, or by `other`; they leave neither gradient nor change behind.
+    """Steps of a problem by `plain`, or by `other`, that leave neither a gradient nor a change.
 
-    `views` are those that are looked at. Where either is guided, both that are draw from one table: that of `earlier`,
-    if it has learned, else one that `learn` has learn. `what` is decided here, and `earlier` what was before, with the
-    same estimator; dL/dI is held where it was held there.
+    `views` are the used views. If either integrator is guided, both sample from one table: that of `earlier` if it has
+    learned, otherwise a new one. `what` is the current decision, and `earlier` the trial of the previous one, with the
+    same estimator; dL/dI is fixed as it was there.
     """
 
     def __init__(
@@ -452,26 +453,26 @@ class StepTrial:
         take_gradient(problem)  # recovered exposures have some of these
 
     def turns(self, kind: type[race.Turns[race.Record]], sizes: race.Sizes, share: float) -> race.Record:
-        """What is found by these steps in turns."""
+        """Return the result of alternating steps."""
         part_of_views = len(self._problem.drawn(0)) / len(self.views)
         return kind(self.take, sizes, part_of_views, share, learn=self.learn if self._learns else None).run()
 
     @property
     def _learns(self) -> bool:
-        """Whether there is a table that has yet to learn."""
+        """Whether a table must still learn."""
         return self.table is not None and not self.table.learned
 
     def _slope(self, view: View) -> mi.TensorXf:
-        """dL/dI, which is held; 0 where it is not finite."""
+        """Return the fixed dL/dI; 0 where it is not finite."""
         spp = max(int(IMAGE_SHARE * self._problem.config.run.spp), 1)
         image = render_image(self._tracers[False], self._problem.scene, view.sensor, self._seed(0, view, "image"), spp)
         return to_tensor(finite(slope(view.objective, np.array(image))))
 
     def learn(self, round: int, spp: int) -> race.Step:
-        """Have the table learn, and be ready to be drawn from, as it is from then on.
+        """Let the table learn, and prepare it for sampling; it stays the same from then on.
 
-        The first time all of it is done before as well, and forgotten: what that compiles and records is no part of the
-        time.
+        The first time, everything is done twice and the first result is dropped, so that compilation and recording do
+        not count.
         """
         jobs = [self._job(view, self._seed(round, view, "learned from"), spp) for view in self.views]
         compile_ms = 0.0
@@ -492,7 +493,7 @@ class StepTrial:
         return times
 
     def take(self, other: bool, round: int, spp: int) -> race.Step:
-        """One step of all views."""
+        """Take one step of all views."""
         problem, images = self._problem, {}
         tracer, name = self._tracers[other], "on" if other else "off"
         problem.apply()
@@ -517,7 +518,7 @@ class StepTrial:
         return taken
 
     def _differentiate(self, tracer: Tracer, view: View, job: Job, gradient: mi.TensorXf) -> mi.TensorXf | None:
-        """Add the gradient of a job's samples, as a step of the run does; their image, where there is one."""
+        """Add the gradient of a job's samples as a step of the run does; return their image if there is one."""
         on_samples = self._problem.on_samples(view)
         if self._adjoint == "correlated":
             image = tracer.correlated(job, lambda image: gradient)
@@ -540,6 +541,6 @@ class StepTrial:
 
 
 def _few(image: mi.TensorXf) -> Array:
-    """Values of an image, spread over it, 0 where they are not finite."""
+    """Return some values of an image, distributed over it, 0 where they are not finite."""
     values = np.array(image, dtype=np.float32).ravel()
     return finite(values[:: -(-values.size // MOST_VALUES)])
