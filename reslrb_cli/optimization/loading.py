@@ -1,6 +1,6 @@
-"""Scene, sensors and integrator of an experiment, loaded and checked; images of many samples, in passes.
+"""Loading and checking of scene, sensors and integrator of an experiment; images of many samples, in passes.
 
-A pass is so small that it fits into memory.
+A pass is small enough to fit into memory.
 """
 
 from __future__ import annotations
@@ -46,8 +46,7 @@ BETWEEN_SPP = 64
 def passes(spp: int, pixels: int, multiple: int | None, paths_per_pass: int = PATHS_PER_PASS) -> Iterator[int]:
     """Yield the samples per pixel of each pass; they sum to `spp`.
 
-    `multiple` is the integrator's `samples_per_pass`, which must divide the samples of every pass (None: no matter);
-    it divides `spp`.
+    `multiple` is the integrator's `samples_per_pass`, which divides `spp` and the samples of every pass (None: any).
     """
     unit = multiple or 1
     most = max(paths_per_pass // (pixels * unit), 1) * unit
@@ -68,8 +67,8 @@ def render_in_passes(
 ) -> np.ndarray[Any, Any]:
     """Render `sensor` with `spp` samples per pixel; return the image, (H, W, C) float32.
 
-    Each pass has its own seed, from `run_seed`, `iteration`, `sensor`, `purpose` and the number of the pass; the mean
-    is taken in double precision.
+    Each pass has its own seed, from `run_seed`, `iteration`, `sensor`, `purpose` and the number of the pass. The mean
+    is computed in double precision.
     """
     width, height = scene.sensors()[sensor].film().crop_size()
     pixels = int(width) * int(height)
@@ -95,10 +94,10 @@ def load_configured(
     selects: bool = True,
     warn: bool = True,
 ) -> mi.Scene:
-    """Load the scene that `config` names; `look` sees its description before it is built. Raises ConfigError.
+    """Load the scene of `config`; `look` is called with its description before it is built. Raises ConfigError.
 
-    Textures of 8 or 16 bits that its parameters select are read as floating point, unless nothing is to be selected.
-    What is doubtful in the scene is warned of, or not.
+    With `selects`, textures of 8 or 16 bits that the parameters select are read as floating point. With `warn`,
+    doubtful parts of the scene cause warnings.
     """
     scene = config.scene
     keys = selected_keys(config) if selects else []
@@ -116,13 +115,13 @@ def load_configured(
 
 
 def selected_keys(config: Config) -> list[str]:
-    """The keys and globs of what `config` recovers, or gives true values."""
+    """Return the keys and globs of parameters that `config` recovers, or gives true values."""
     render = config.target.render
     return [*(key for spec in config.parameters for key in spec.keys), *(render.parameters if render else ())]
 
 
 def choose_sensors(config: Config, scene: mi.Scene) -> list[int]:
-    """Return the index of each view's sensor. Raises ConfigError for one that is not there."""
+    """Return the index of each view's sensor. Raises ConfigError for an index that does not exist."""
     count = len(scene.sensors())
     if config.views is not None:
         named = {f"views[{place}].sensor": view.sensor for place, view in enumerate(config.views)}
@@ -135,19 +134,18 @@ def choose_sensors(config: Config, scene: mi.Scene) -> list[int]:
 
 
 def are_upright(config: Config) -> bool:
-    """Whether images of views are turned as their EXIF orientation says.
+    """Whether images of views are rotated by their EXIF orientation.
 
-    Cameras of a file were found for pixels as they lie in theirs: COLMAP leaves orientations aside on purpose, since
-    all images of one camera are to have one projection.
+    Cameras of a file refer to pixels as they are stored: COLMAP ignores orientations on purpose, because all images of
+    one camera must have one projection.
     """
     return config.scene.cameras is None
 
 
 def paths_of(integrator: Integrator, scene: mi.Scene, sensors: list[int], moves: bool = False) -> str:
-    """Which paths make the images of `integrator`: `light`, `camera`, or `both`; of what `moves` light, `light`.
+    """Return which paths render the images of `integrator`: `light`, `camera`, or `both`; `light` if `moves`.
 
-    Where that is left to measurement it is `both`, of which that makes `camera` or another share, or what can render
-    the scene at all.
+    If this is left to measurement, it is `both`, or the only kind that can render the scene.
     """
     if isinstance(integrator, Own):
         return integrator.paths
@@ -171,7 +169,7 @@ def paths_of(integrator: Integrator, scene: mi.Scene, sensors: list[int], moves:
 def check_integrator(
     config: Config, integrator: Integrator, scene: mi.Scene, sensors: list[int], moves: bool = False
 ) -> None:
-    """Raise ConfigError, located in the scene's file, where `integrator` cannot render `scene` through `sensors`."""
+    """Raise ConfigError, located in the scene's file, if `integrator` cannot render `scene` through `sensors`."""
     try:
         paths = paths_of(integrator, scene, sensors, moves)
         for sensor in sensors:
@@ -209,12 +207,14 @@ def make_configured(config: Config, integrator: Integrator, paths: str) -> StepI
 
 
 def pass_spp(config: Config) -> int:
-    """Samples per pixel of each pass of a step's gradient; where passes are chosen by `run.memory_budget`, at most."""
+    """Return the samples per pixel of each pass of a step's gradient; the maximum if `run.memory_budget` chooses
+    passes.
+    """
     call = config.set_spp
     return min(samples_per_pass(config) or call, call)
 
 
 def samples_per_pass(config: Config) -> int | None:
-    """The integrator's own bound on the samples of a pass."""
+    """Return the integrator's own limit for the samples of a pass."""
     value = config.integrator.options().get("samples_per_pass")
     return None if value is None else int(value)

@@ -51,7 +51,7 @@ def learning_rate_factor(
 ) -> float:
     """Return the factor of `iteration` (0-based) of `iterations`. Raises KeyError for an unknown schedule.
 
-    `least` (0 to 1) is how far a run is at least, of which less than all iterations will be made.
+    `least` (0 to 1) is the minimum progress of a run that ends before its last iteration.
     """
     if schedule == "plateau":  # which goes by losses (`stopping.lowered`)
         return 1.0
@@ -66,13 +66,13 @@ Told = Callable[[Findings], None]
 
 
 def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None) -> tuple[State, Record]:
-    """Make the iteration that follows `state`; return the state that it leaves, and its record.
+    """Make the iteration after `state`; return the new state and the record.
 
-    It is a step (image, loss and gradient of every sensor; the loss is the mean over the sensors) and an update. From
-    equal states equal ones follow: a problem that stands elsewhere is brought to `state` first, and stands at what is
-    returned afterwards. What is not finite reaches no parameter; what happens instead, and when a run is to end
-    (`State.end`), is in `nonfinite`. `on_nonfinite` is told of it before the update, while the scene is as it was in
-    the step. `optimizer.scale: auto` measures before the first iteration, and `elapsed_s` counts that. The schedule
+    It consists of a step (image, loss and gradient of every sensor; the loss is the mean over the sensors) and an
+    update. Equal states lead to equal states: a problem with other values is first set to `state`, and has the values
+    of the returned state afterwards. Values that are not finite reach no parameter; `nonfinite` describes the reaction,
+    and when a run ends (`State.end`). `on_nonfinite` is called before the update, while the scene is unchanged.
+    `optimizer.scale: auto` measures before the first iteration, and `elapsed_s` includes this time. The schedule
     follows the iterations or the time (`run.max_seconds`), whichever is further.
     """
     config, optimizer, iteration = problem.config, problem.optimizer, state.iteration
@@ -151,10 +151,10 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
 def iterate(
     stages: Stages, state: State, on_nonfinite: Told = lambda found: None, watch: Watch | None = None
 ) -> Iterator[tuple[State, Record]]:
-    """Make the iterations from `state` to the last of the run, each as `step` does, of the problem of its stage.
+    """Make the iterations from `state` to the last of the run, each by `step` with the problem of its stage.
 
-    `watch` knows of those until then, and says which is the last; None where there are none. Raises NonFinite where the
-    run fails.
+    `watch` has seen the iterations before, and says which is the last; None without such a test. Raises NonFinite if
+    the run fails.
     """
     reset_peak()
     watch = Watch(stages.whole.config) if watch is None else watch
@@ -168,8 +168,9 @@ def iterate(
 
 
 def optimize(problem: Problem, on_nonfinite: Told = lambda found: None) -> Iterator[Record]:
-    """The records of all iterations of `problem` from where it stands; the parameters are updated when one is
-    yielded."""
+    """Yield the records of all iterations of `problem` from its current values; parameters are updated before each
+    record.
+    """
     stages = Stages(problem)
     for state, record in iterate(stages, standing(problem), on_nonfinite):
         stages.bring(state)
@@ -179,7 +180,7 @@ def optimize(problem: Problem, on_nonfinite: Told = lambda found: None) -> Itera
 def _findings(
     problem: Problem, iteration: int, loss: float, counts: dict[str, Any], refused: list[tuple[int, Refused]]
 ) -> Findings:
-    """What of a step was not finite; `refused` are the steps' counts, by sensor."""
+    """Return the values of a step that were not finite; `refused` are the counts by sensor."""
     found = Findings(iteration, loss=not math.isfinite(loss), own=own_losses(problem.config))
     found.gradients = {key: int(count[0]) for key, count in counts.items() if count[0]}
     found.lost = [key for key, bad in found.gradients.items() if bad == dr.prod(dr.shape(problem.optimizer[key]))]
@@ -191,27 +192,27 @@ def _findings(
 
 
 class Split:
-    """Tells the time of a step up to its image and loss, where the integrator has a moment in which both are there."""
+    """Clock for the time of a step up to image and loss, if the integrator has a moment in which both are known."""
 
     def __init__(self) -> None:
         self.primal_ms: float | None = 0.0
         self._start: float | None = None
 
     def start(self) -> None:
-        """A view begins."""
+        """Start a view."""
         if self._start is not None:  # the view before never came to `image`
             self.primal_ms = None
         self._start = time.perf_counter()
 
     def image(self) -> None:
-        """Its image and loss are evaluated, or launched."""
+        """Record that image and loss of the view are evaluated, or launched."""
         dr.sync_thread()
         if self.primal_ms is not None and self._start is not None:
             self.primal_ms += 1e3 * (time.perf_counter() - self._start)
         self._start = None
 
     def end(self) -> None:
-        """No view is left."""
+        """End the last view."""
         if self._start is not None:
             self.primal_ms = None
 
@@ -221,9 +222,9 @@ def gradient(
 ) -> tuple[Any, dict[str, Any], dict[str, Any], list[tuple[int, Refused]], dict[str, dict[str, float]] | None]:
     """Accumulate the gradient of the loss into the parameters.
 
-    `split` is told of each view's parts. Returns width-1 arrays: the loss, for each parameter the gradient's sum
-    of squares (of its finite entries) and the number of entries that are not finite, by sensor what was refused, and
-    by key and type what regularizers cost, None without any.
+    `split` is called for each part of a view. Returns width-1 arrays: the loss, for each parameter the sum of squares
+    of the gradient's finite entries and the number of other entries, the refused entries by sensor, and the costs of
+    regularizers by key and type (None without any).
     """
     config = problem.config
     total: Any = 0.0

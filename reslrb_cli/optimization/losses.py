@@ -1,11 +1,10 @@
-"""How an image is compared with its target, by functions that Dr.Jit differentiates.
+"""Losses between an image and its target, by functions that Dr.Jit differentiates.
 
-Each takes the image I, (H, W, C) and attached to the AD graph, the target T of the same shape, both in linear radiance,
-and what each entry weighs, of that shape too with a mean of 1 (None: all the same). It returns a width-1 array: a mean
-over pixels and channels, so that it depends neither on the resolution nor on how many pixels are left out.
+Each takes the image I, (H, W, C), attached to the AD graph, and the target T of the same shape, both in linear
+radiance, and the weights of that shape with a mean of 1 (None: all equal). It returns a width-1 array: a mean over
+pixels and channels, so that it depends neither on the resolution nor on the number of masked pixels.
 
-`weighted` and `fitted` make others of them: a sum of several, and the loss of the image multiplied by the factor that
-suits the target best.
+`weighted` and `fitted` modify losses: a weighted sum, and the loss of the image multiplied by the best factor.
 """
 
 from __future__ import annotations
@@ -28,22 +27,22 @@ def _mean(values: mi.TensorXf, weights: mi.TensorXf | None) -> mi.Float:
 
 
 def l1(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float:
-    """mean |I - T|. Its gradient is 0 where I = T."""
+    """Return mean |I - T|. Its gradient is 0 where I = T."""
     return _mean(dr.abs(image - target), weights)
 
 
 def l2(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float:
-    """mean (I - T)²."""
+    """Return mean (I - T)²."""
     return _mean(dr.square(image - target), weights)
 
 
 def relative_l2(
     image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /, epsilon: float = 1e-2
 ) -> mi.Float:
-    """mean (I - T)² / (T² + ε), ε in squared units of radiance.
+    """Return mean (I - T)² / (T² + ε), ε in squared units of radiance.
 
-    The denominator holds the target, not the image: a constant, so the gradient is that of the loss itself. With the
-    (detached) noisy image in its place the noise of one pixel would stand in numerator and denominator at once.
+    The denominator uses the target, a constant, so the gradient is that of the loss itself. With the (detached) noisy
+    image in its place, the noise of a pixel would be in numerator and denominator at once.
     """
     return _mean(dr.square(image - target) / (dr.square(target) + epsilon), weights)
 
@@ -53,15 +52,15 @@ SSIM_SIGMA, SSIM_SIDE, SSIM_K = 1.5, 11, (0.01, 0.03)
 
 
 def ssim(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float:
-    """1 - mean SSIM (Wang, Bovik, Sheikh and Simoncelli 2004, equation 13), of images of 11x11 pixels or more.
+    """Return 1 - mean SSIM (Wang, Bovik, Sheikh and Simoncelli 2004, equation 13), for images of at least 11x11 pixels.
 
         SSIM = (2 μ_I μ_T + C_1) (2 σ_IT + C_2) / ((μ_I² + μ_T² + C_1) (σ_I² + σ_T² + C_2)),  C_k = (K_k L)²
 
-    in each channel and window, of a Gaussian with a standard deviation of 1.5 pixels, 11 pixels wide; the variances are
-    those of the window itself. It is what scikit-image has with `gaussian_weights=True, use_sample_covariance=False`:
-    the mean is over the windows that lie within the image. Each weighs as much as the pixel at its centre; a pixel that
-    is left out has to be the same in both images, as `View.judge` has it. L is the target's largest value. Raises
-    ValueError for smaller images.
+    per channel and window, a Gaussian with a standard deviation of 1.5 pixels, 11 pixels wide; the variances are those
+    of the window itself. It equals scikit-image's with `gaussian_weights=True, use_sample_covariance=False`: the mean
+    is over the windows that lie within the image. Each has the weight of its central pixel; a masked pixel must be the
+    same in both images, which `View.judge` ensures. L is the largest value of the target. Raises ValueError for smaller
+    images.
     """
     if min(image.shape[:2]) < SSIM_SIDE:
         raise ValueError(f"SSIM needs images of {SSIM_SIDE}x{SSIM_SIDE} pixels, not {image.shape[1]}x{image.shape[0]}")
@@ -85,7 +84,7 @@ def ssim(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = 
 
 
 def _windows(image: mi.TensorXf) -> mi.TensorXf:
-    """The means over SSIM's windows of an image (H, W, C), (H - 10, W - 10, C), attached."""
+    """Return the means over SSIM's windows of an image (H, W, C), (H - 10, W - 10, C), attached."""
     margin = SSIM_SIDE // 2
     raw = [math.exp(-0.5 * (place / SSIM_SIGMA) ** 2) for place in range(-margin, margin + 1)]
     factors = [each / sum(raw) for each in raw]
@@ -112,7 +111,7 @@ QUADRATIC = ("l2", "relative_l2")
 
 
 def make_loss(type: str, **options: float) -> Loss:
-    """Return the loss of that name with its options bound. Raises KeyError for an unknown name."""
+    """Return the loss of this name with its options. Raises KeyError for an unknown name."""
     return functools.partial(LOSSES[type], **options)
 
 
@@ -123,7 +122,7 @@ def weighted(
     weights: mi.TensorXf | None = None,
     /,
 ) -> mi.Float:
-    """The sum of losses, each multiplied by the number before it."""
+    """Return the sum of losses, each multiplied by its weight."""
     first, *others = (factor * loss(image, target, weights) for factor, loss in losses)
     return sum(others, first)
 
@@ -138,11 +137,12 @@ def best_scale(
     weights: mi.TensorXf | None = None,
     across: bool = False,
 ) -> mi.Float:
-    """s = <I, T> / <I, I>, of width 1, attached, I the mean of two images of one expectation (H, W, C); 1, without a
-    derivative, where not both products are positive, as of black images.
+    """Return s = <I, T> / <I, I>, of width 1, attached; I is the mean of two images with the same expected value (H, W,
+    C).
 
-    The value of <I, I> is that of the two, whose noise is independent, times each other; its derivative is 2 <I, dI>,
-    which noise of I leaves unbiased where dI has other samples, or `across`, <I_a, dI_b> + <I_b, dI_a>.
+    If one of the products is not positive, as for black images, s is 1, without a derivative. <I, I> is computed as the
+    product of the two images, whose noise is independent. Its derivative is 2 <I, dI>, which the noise of I does not
+    bias if dI has other samples; with `across`, it is <I_a, dI_b> + <I_b, dI_a>.
     """
     image, square = 0.5 * (halves[0] + halves[1]), _product(*halves, weights)
     if not across:
@@ -161,13 +161,14 @@ def fitted(
     /,
     across: bool = False,
 ) -> mi.Float:
-    """The loss of s I, with s = <I, T> / <I, I> (`best_scale`), of an image (H, W, C) or of two halves (2, H, W, C).
+    """Return the loss of s I, with s = <I, T> / <I, I> (`best_scale`), for an image (H, W, C) or two halves (2, H, W,
+    C).
 
-    Its derivative is  s l(s I) + L_s ds/dI,  with l the derivative of the loss. L_s = <l(s I), I> has the image twice:
-    it is taken as the mean of <l(s I_a), I_b> and <l(s I_b), I_a>. So every product of noise with itself is gone from
-    the derivative of a loss that is quadratic in the image; that of one image given twice is the exact derivative.
-    `across`: the derivative with respect to I_a has I_b in place of I, and the other way round: no path of a half sees
-    a delta that it helped to make.
+    Its derivative is  s l(s I) + L_s ds/dI,  with l the derivative of the loss. L_s = <l(s I), I> contains the image
+    twice, and is computed as the mean of <l(s I_a), I_b> and <l(s I_b), I_a>. The derivative of a quadratic loss then
+    contains no product of noise with itself. For one image given twice, it is the exact derivative. With `across`, the
+    derivative with respect to I_a uses I_b in place of I, and vice versa, so that no path of a half uses a delta that
+    contains it.
     """
     first, second = halves_of(image)
     factor = best_scale((first, second), target, weights, across)

@@ -1,8 +1,8 @@
-"""The memory of a run: what a step takes, the passes that keep it within a budget, and whether there is room.
+"""Memory of a run: the needs of a step, passes that keep a budget, and limits.
 
-What configuration and scene file say of sizes is checked before anything is built (`check_announced`,
-`check_described`): films and textures of a hundred million entries take a minute to make. Held against what is free are
-lower bounds, so that nothing is refused that the machine can hold.
+Sizes in the configuration and the scene file are checked before anything is built (`check_announced`,
+`check_described`), because films and textures of a hundred million entries take a minute to make. The estimates are
+lower bounds, so that nothing is refused that fits into the machine.
 """
 
 from __future__ import annotations
@@ -70,26 +70,26 @@ COARSER = "take a smaller film or coarser textures"
 
 
 def pixels_of(scene: mi.Scene, sensors: Sequence[int]) -> list[int]:
-    """The pixels of each film, by which light paths are counted: without its crop window."""
+    """Return the pixels of each film without its crop window, which determine the number of light paths."""
     return [int(dr.prod(scene.sensors()[index].film().size())) for index in sensors]
 
 
 def plans(problem: Problem, integrator: LightTracer) -> list[Plan]:
-    """What a step has to do, by view."""
+    """Return the plan of each view."""
     sensors, params = problem.scene.sensors(), problem.selection.params
     return [integrator.plan(problem.scene, sensors[index], params) for index in problem.sensors]
 
 
 def standing() -> int:
-    """Bytes that are allocated now."""
+    """Return the currently allocated bytes."""
     reset_peak()
     return int(peak_mib(dr.backend_v(mi.Float)) * MIB)
 
 
 def estimate(problem: Problem, integrator: Reslrb, samples: int, fixed: int) -> Estimate:
-    """What a step takes whose passes have `samples` samples per pixel; `fixed` stands before it.
+    """Estimate the memory of a step whose passes have `samples` samples per pixel; `fixed` is allocated before it.
 
-    The targets, which may not be there yet, are not part of `fixed`, but of the result's.
+    The targets, which may not exist yet, are not part of `fixed`, but of the result's.
     """
     paths = images = targets = scratch = 0
     pixels = pixels_of(problem.scene, problem.sensors)
@@ -113,7 +113,8 @@ def estimate(problem: Problem, integrator: Reslrb, samples: int, fixed: int) -> 
 
 
 def choose_samples(problem: Problem, integrator: Reslrb, samples: int, budget: int, fixed: int) -> tuple[int, Estimate]:
-    """The largest divisor of `samples` that fits into the budget, and what it takes; 0 and the least where none does.
+    """Return the largest divisor of `samples` that fits into the budget, and its estimate; 0 and the smallest if none
+    does.
 
     `samples` are those of a batch, or of a step.
     """
@@ -126,10 +127,10 @@ def choose_samples(problem: Problem, integrator: Reslrb, samples: int, budget: i
 
 
 def fit_memory(problem: Problem) -> Problem:
-    """Return `problem` with the passes that keep `run.memory_budget`, if there is one.
+    """Return `problem` with passes that keep `run.memory_budget`, if there is one.
 
     Needs no targets. Raises ConfigError if one sample per pixel exceeds the budget, or, without a budget, if a step
-    exceeds the memory that is free.
+    exceeds the free memory.
     """
     config, integrator, budget = problem.config, problem.integrator, problem.config.run.budget_bytes
     if not isinstance(integrator, Reslrb):
@@ -158,12 +159,12 @@ def in_passes(problem: Problem, memory: MemoryPlan) -> Problem:
 
 
 def allocated(size: int) -> int:
-    """Bytes that the allocator takes for an array: a power of two."""
+    """Return the bytes that the allocator uses for an array: a power of two."""
     return max(1 << (size - 1).bit_length(), 64) if size else 0
 
 
 def _replicas(entries: int) -> int:
-    """What scattering into an array takes: on a CPU each thread has a copy of a small one."""
+    """Return the number of copies for scattering into an array: on a CPU, each thread has a copy of a small array."""
     threads = dr.thread_count() + 1
     if dr.backend_v(mi.Float) != dr.JitBackend.LLVM or entries * threads > dr.expand_threshold():
         return 0
@@ -174,7 +175,7 @@ def _replicas(entries: int) -> int:
 
 
 def check_announced(config: Config) -> None:
-    """Raise ConfigError where film or parameters, as the configuration has them, need more memory than is free."""
+    """Raise ConfigError if film or parameters of the configuration need more memory than is free."""
     if config.scene.size is not None:
         _check_film(config, "scene.size", config.scene.size)
     for key, size in _textures(config).items():
@@ -182,10 +183,9 @@ def check_announced(config: Config) -> None:
 
 
 def check_described(config: Config, description: Description) -> None:
-    """Raise ConfigError where the scene's film is too large for the samples of a step, or a step for what is free.
+    """Raise ConfigError if the scene's film is too large for the samples of a step, or a step for the free memory.
 
-    Which of the scene's sensors are in use is not known yet, so that it is the least of their films that counts. Of
-    steps that are large and fit, the log has a line.
+    The used sensors are not known yet, so the smallest film counts. The log has a line about large steps that fit.
     """
     film = min(film_sizes(description), key=lambda size: size.cropped, default=None)
     if film is None or not film.cropped:
@@ -218,7 +218,7 @@ def check_described(config: Config, description: Description) -> None:
 
 
 def _textures(config: Config) -> dict[str, tuple[int, int]]:
-    """The (width, height) of parameters whose size the configuration names, by the key that does."""
+    """Return the (width, height) of parameters whose size the configuration names, by the key of this setting."""
     found = {}
     for place, spec in enumerate(config.parameters):
         at, size = ("resolution", spec.resolution)
@@ -230,7 +230,7 @@ def _textures(config: Config) -> dict[str, tuple[int, int]]:
 
 
 def check_films(config: Config, scene: mi.Scene, sensors: Sequence[int]) -> None:
-    """Raise ConfigError where a film is too large, or the samples of a step are too many for it."""
+    """Raise ConfigError if a film is too large, or has too many samples for a step."""
     for index, pixels in zip(sensors, pixels_of(scene, sensors), strict=True):
         width, height = (int(n) for n in scene.sensors()[index].film().crop_size())
         _check_film(config, "scene.file", (width, height))
@@ -238,13 +238,15 @@ def check_films(config: Config, scene: mi.Scene, sensors: Sequence[int]) -> None
 
 
 def _check_film(config: Config, key: str, size: tuple[int, int]) -> None:
-    """Raise ConfigError at `key` where the images of a film of this (width, height) need more memory than is free."""
+    """Raise ConfigError at `key` if the images of a film of this (width, height) need more memory than is free."""
     _check_size(config, key, f"a film of {size[0]}x{size[1]} pixels", size, PIXEL_BYTES)
 
 
 def _check_size(config: Config, key: str, what: str, size: tuple[int, int], each: int) -> None:
-    """Raise ConfigError at `key` where `what`, so many entries (width, height) of `each` bytes, is more than is free;
-    with the largest of its shape that fits."""
+    """Raise ConfigError at `key` if an array of (width, height) entries of `each` bytes needs more memory than is free.
+
+    The error names the largest size of the same shape that fits.
+    """
     needed = size[0] * size[1] * each
     free = free_for(needed)
     if needed > free:
@@ -260,14 +262,14 @@ def _check_samples(config: Config, pixels: int) -> None:
 
 
 def free_for(needed: int) -> int:
-    """Bytes that are free; of what is small nobody asks, since to ask a GPU's driver takes a while."""
+    """Return the free bytes; for small needs this is not queried, because a GPU's driver takes a while."""
     return needed if needed < SMALL else free_bytes(mi.variant())
 
 
 def check_memory(problem: Problem, integrator: Reslrb) -> None:
-    """Raise ConfigError where a step takes more memory than is free.
+    """Raise ConfigError if a step takes more memory than is free.
 
-    With a `memory_budget` passes are chosen that keep it, and nothing is said of the first.
+    With a `memory_budget`, passes are chosen to keep it, and only they are checked.
     """
     config = problem.config
     if config.run.memory_budget is not None:
@@ -290,7 +292,7 @@ def check_memory(problem: Problem, integrator: Reslrb) -> None:
 
 
 def check_baseline(problem: Problem) -> None:
-    """Raise ConfigError where an integrator other than `reslrb` keeps more of its paths than there is room for."""
+    """Raise ConfigError if an integrator other than `reslrb` stores more of its paths than fits into memory."""
     config = problem.config
     kind, depth = config.integrator.type, config.integrator.max_depth
     most = local_bytes() // RECORD_BYTES
@@ -311,10 +313,7 @@ def check_baseline(problem: Problem) -> None:
 
 
 def outlook(config: Config, scene: mi.Scene, sensors: Sequence[int]) -> str | None:
-    """A line on a run whose light paths are so many that it takes hours or more; None of others.
-
-    It is legal, and may be what is wanted.
-    """
+    """Return a line about a run whose light paths take hours or more; None for others. Such a run is allowed."""
     run = config.run
     each = run.spp * sum(pixels_of(scene, sensors)) * (2 if config.adjoint == "independent" else 1)
     paths = each * run.iterations

@@ -1,8 +1,8 @@
-"""Experiments whose parameters move light: what the film's border cuts off, and checks of what cannot be followed.
+"""Experiments whose parameters move light: losses at the film's border, and checks of unsupported parameters.
 
-A splat that moves across the film's border leaves the film, or enters it: no sample knows of that, since what lies
-outside is not traced. How much of the derivative is missing goes with how much of what moves lands there
-(`border_share`); where that is much, a word is said before the optimisation (`warn_of_border`).
+A splat that moves across the film's border leaves or enters the film. No sample sees this, because nothing outside is
+traced. The missing part of the derivative depends on the share of moving light that lands at the border
+(`border_share`). If it is large, a warning is printed before the optimisation (`warn_of_border`).
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
 
 def border_share(tracer: LightTracer, job: Job) -> float:
-    """Of the light that a job's parameters move, the share that lands at the film's border: 0 to 1.
+    """Return the share of the light that a job's parameters move that lands at the film's border, from 0 to 1.
 
-    At the border is what the reconstruction filter spreads beyond it. 0 where nothing moves.
+    The border is as wide as the reconstruction filter. 0 if nothing moves.
     """
     at_border, total = 0.0, 0.0
     with dr.suspend_grad():
@@ -52,20 +52,20 @@ def border_share(tracer: LightTracer, job: Job) -> float:
 
 @dataclass
 class Sums:
-    """Loop state: whether the path has met anything that moves, and what it has added, at the border and in all."""
+    """Loop state: whether the path has met anything that moves, and its contributions at the border and in total."""
 
     moved: mi.Bool
     at_border: mi.Float
     total: mi.Float
 
     def plus(self, samples: Samples, u: mi.Point2f, C: mi.Spectrum, active: mi.Bool) -> Sums:
-        """The sums with one more contribution (C,) at film position `u`."""
+        """Return the sums with one more contribution (C,) at film position `u`."""
         light = dr.select(active, dr.sum(dr.abs(C)), 0)
         return Sums(self.moved, self.at_border + dr.select(is_at_border(samples, u), light, 0), self.total + light)
 
 
 class BorderLight(Hooks):
-    """Sum the contributions behind anything that moves."""
+    """Hooks that sum the contributions behind anything that moves."""
 
     def __init__(self, samples: Samples) -> None:
         self.samples, self.plan = samples, samples.plan
@@ -88,9 +88,10 @@ class BorderLight(Hooks):
 
 
 def is_at_border(samples: Samples, u: mi.Point2f) -> mi.Bool:
-    """Whether film position `u` (pixels, relative to the crop window) is within the filter's radius of the border.
+    """Return whether film position `u` (pixels, relative to the crop window) is within the filter's radius of the
+    border.
 
-    That is the border of the crop window: sensors see no light beyond it.
+    This is the border of the crop window: sensors see no light beyond it.
     """
     radius, size = samples.film.film.rfilter().radius(), samples.film.size
     inside = dr.minimum(dr.minimum(u.x, int(size.x) - u.x), dr.minimum(u.y, int(size.y) - u.y))
@@ -105,7 +106,7 @@ SPP = 8
 
 
 def warn_of_border(problem: Problem, warn: Callable[[str], None]) -> None:
-    """Call `warn` with a line for each view in which more than NOTICED of the light that moves lands at the border."""
+    """Call `warn` with a line for each view in which more than NOTICED of the moving light lands at the border."""
     if not isinstance(problem.integrator, LightTracer):
         return
     tracer = problem.integrator.with_options(samples_per_pass=None, freeze=False)
@@ -121,18 +122,18 @@ def warn_of_border(problem: Problem, warn: Callable[[str], None]) -> None:
 
 
 def is_attached(problem: Problem) -> bool:
-    """Whether the parameters of `problem` move anything that light leaves from or meets, or are to be taken so."""
+    """Whether the parameters of `problem` move surfaces or lights, or are treated as such."""
     return moves_anything(problem.config, problem.selection)
 
 
 def moves_anything(config: Config, selection: Selection) -> bool:
-    """Whether the selected parameters move anything that light leaves from or meets, or are to be taken so."""
+    """Whether the selected parameters move surfaces or lights, or are treated as such."""
     attached = config.integrator.options().get("attached", "auto")
     return attached is True or bool(where_moved(selection.params, selection.scene_keys))
 
 
 def check_moving(problem: Problem) -> None:
-    """Raise ConfigError, located, where the integrator cannot differentiate what moves."""
+    """Raise ConfigError, located, if the integrator cannot differentiate a moving parameter."""
     if not is_attached(problem):
         return
     config, moved = problem.config, where_moved(problem.selection.params, problem.selection.scene_keys)

@@ -357,13 +357,13 @@ class Optimizer:
 
 
 def _entries(own: Any, key: str) -> tuple[Any, ...]:
-    """What one of Dr.Jit's optimisers keeps for its parameter beside the value."""
+    """Return the data that one of Dr.Jit's optimisers stores for its parameter besides the value."""
     extra = own.state[key][3]
     return extra if isinstance(extra, tuple) else (extra,)
 
 
 def _leaf(value: Any) -> Any:
-    """A copy that receives gradients."""
+    """Return a copy that receives gradients."""
     copy = type(value)(value)
     dr.make_opaque(copy)
     dr.enable_grad(copy)
@@ -386,10 +386,10 @@ SUMS = ("usual", "removed", "total")
 def clamp_gradients(
     factor: float, parameters: Mapping[str, Any], iterations: Mapping[str, int], known: Mapping[str, Mapping[str, Any]]
 ) -> tuple[Clamped, dict[str, int], dict[str, dict[str, Any]]]:
-    """Clamp the gradients of these parameters, which are finite, in place at `factor` (k) times what is usual for them.
+    """Clamp the finite gradients of these parameters in place at `factor` (k) times their usual size.
 
-    `iterations` and `known` (SUMS) are what there is of each parameter from iterations before; the first is only looked
-    at. Returns what was done, with its bias so far, and both anew.
+    `iterations` and `known` (SUMS) are those of each parameter before; `iterations` is only read. Returns the effect
+    with its bias so far, and both updated.
     """
     after, sums = dict(iterations), {key: dict(each) for key, each in known.items()}
     counts, sizes = {}, {}

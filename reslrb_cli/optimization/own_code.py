@@ -1,4 +1,4 @@
-"""A loss of a user's own (`loss.type: custom`), in a file, named as FILE.py:NAME, or handed over."""
+"""A user's loss (`loss.type: custom`), from a file FILE.py:NAME, or from Python."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from reslrb_cli.errors import ConfigError
 
 
 class OwnLoss:
-    """A loss that a user has written: `loss(image, target)`, or `loss(image, target, weights)`.
+    """A user's loss: `loss(image, target)`, or `loss(image, target, weights)`.
 
-    Both images are (H, W, C), `weights` None or of that shape with a mean of 1. Without `weights` pixels that are left
-    out are the same in both images, and what is left has to weigh the same. It returns the loss, as an array of width 1
-    or as a tensor of one entry. Code is run when it is first called, or tried: before that nothing is loaded.
-    Faults of a function that was handed over are located by its name.
+    Both images are (H, W, C); `weights` is None or of that shape with a mean of 1. Without a parameter `weights`,
+    masked pixels are the same in both images, and the other weights must be equal. The function returns an array of
+    width 1, or a tensor of one entry. The file is loaded when the loss is first called or tried. Errors of a function
+    that was passed in Python are located by its name.
     """
 
     def __init__(self, config: Config, key: str, spec: Custom) -> None:
@@ -43,7 +43,7 @@ class OwnLoss:
         self._even: mi.TensorXf | None = None
 
     def function(self) -> Callable[..., Any]:
-        """The user's function, loaded. Raises ConfigError."""
+        """Return the user's function, loaded. Raises ConfigError."""
         if self._takes_weights is None:
             check_code(self._config, {self._place: self.spec})
             if self.spec.path is not None:
@@ -53,7 +53,7 @@ class OwnLoss:
         return self._function  # type: ignore[return-value]
 
     def __call__(self, image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float:
-        """The loss, of width 1, attached. Raises ConfigError for what is none."""
+        """Return the loss, of width 1, attached. Raises ConfigError for an invalid result."""
         function, what = self.function(), "it"
         # copies: what a function changes in place is its own
         given = [None if each is None else mi.TensorXf(each) for each in (image, target, weights)]
@@ -75,9 +75,10 @@ class OwnLoss:
         return value
 
     def attempt(self, target: mi.TensorXf, weights: mi.TensorXf | None) -> None:
-        """Call it once, of an image that is not the target; raise ConfigError where loss or derivative are not finite.
+        """Call the loss once, with an image other than the target; raise ConfigError if loss or derivative are not
+        finite.
 
-        Later ones are a run's own affair (`run.on_nonfinite`).
+        `run.on_nonfinite` handles later values.
         """
         values = np.array(target)
         pattern = 0.5 + 0.3 * np.cos(np.arange(values.size)).reshape(values.shape)
@@ -106,7 +107,7 @@ class OwnLoss:
 
 
 def own_losses(config: Config) -> str:
-    """The losses of an experiment that its user has written, in words; "" without any."""
+    """Return the user's losses of an experiment in words; "" if there are none."""
     own = dict.fromkeys(one.file for one in config.losses if isinstance(one, Custom))
     handed = "function" if config.own_loss is None else _name_of(config.own_loss)
     return ", ".join(f"`{file or handed}`" for file in own)
@@ -117,7 +118,7 @@ def _name_of(function: Callable[..., Any]) -> str:
 
 
 def _takes(function: Callable[..., Any], count: int) -> bool:
-    """Whether so many arguments can be given by their place."""
+    """Whether this number of positional arguments is accepted."""
     try:
         inspect.signature(function).bind(*range(count))
     except (TypeError, ValueError):

@@ -1,11 +1,11 @@
-"""Smooth steps: what the optimiser moves is rougher than the parameter by a Laplacian ("large steps").
+"""Smooth steps: the optimiser's variable is rougher than the parameter by a Laplacian ("large steps").
 
     x = S v,   S = (1 - l^2 Δ)^-1,   dL/dv = S dL/dx            Nicolet, Jacobson and Jakob 2021, eq. 9 to 12
 
-S is symmetric. A step of gradient descent is S^2 dL/dx: what is finer than l goes by the fourth power of its fineness
-less far. That is what a surface that refracts light needs: light that it throws changes with the surface's second
-derivatives, so that the curvature of a loss grows with the fourth power, and without S the finest ripple that the map
-can hold decides how far a step may go. l is a share of the longer side, so that it means the same on a finer map.
+S is symmetric. A step of gradient descent is S^2 dL/dx: details finer than l move less by the fourth power of their
+fineness. Refracting surfaces need this: their light changes with the surface's second derivatives, so that the
+curvature of a loss grows with the fourth power, and without S the finest ripple of the map limits the step. l is a
+share of the longer side, so that it is independent of the resolution.
 
     maps, textures      Δ by differences of neighbours, no flow through the edges: diagonal in the cosine transform
     vertices of a mesh  Δ of its graph, in units of its mean edge: a sparse LU decomposition, made once
@@ -28,28 +28,28 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Smoother:
-    """S of one parameter and its inverse, on arrays of Dr.Jit's of the parameter's type.
+    """S of one parameter and its inverse, on Dr.Jit arrays of the parameter's type.
 
-    `gain` is the mean over the entries of what S^2 makes of a gradient of one entry alone, at that entry.
+    `gain` is the mean over the entries of the response of S^2 to a gradient of one entry, at this entry.
     """
 
     operator: MapOperator | MeshOperator
 
     @property
     def gain(self) -> float:
-        """The mean of the diagonal of S^2."""
+        """Mean of the diagonal of S^2."""
         return self.operator.gain
 
     def smooth(self, value: Any) -> Any:
-        """S `value`, evaluated."""
+        """Return S `value`, evaluated."""
         return self._through(self.operator.smooth, value)
 
     def roughen(self, value: Any) -> Any:
-        """The inverse of `smooth`."""
+        """Return the inverse of `smooth`."""
         return self._through(self.operator.roughen, value)
 
     def adjoint(self, gradient: Any) -> Any:
-        """The gradient by v, of that by S v."""
+        """Return the gradient with respect to v from that with respect to S v."""
         return self._through(self.operator.adjoint, gradient)
 
     def _through(self, function: Any, value: Any) -> Any:
@@ -68,13 +68,13 @@ class MapOperator:
         self.gain = float(np.mean(self.eigenvalues**-2.0))
 
     def smooth(self, value: Array) -> Array:
-        """S `value`."""
+        """Return S `value`."""
         return self._scaled(value, 1 / self.eigenvalues)
 
     adjoint = smooth  # S is symmetric
 
     def roughen(self, value: Array) -> Array:
-        """The inverse of `smooth`."""
+        """Return the inverse of `smooth`."""
         return self._scaled(value, self.eigenvalues)
 
     def _scaled(self, value: Array, factors: Array) -> Array:
@@ -85,7 +85,7 @@ class MapOperator:
 class MeshOperator:
     """S on the vertices' positions (3 n) of a mesh with `faces` (3 m indices), by its graph; `length` is l.
 
-    Vertices that share a place but not an index, as along the seams of textures, are one.
+    Vertices with the same position but different indices, as along the seams of textures, count as one.
     """
 
     def __init__(self, positions: Array, faces: NDArray[Any], length: float) -> None:
@@ -110,19 +110,19 @@ class MeshOperator:
         self.gain = self._mean_square()
 
     def smooth(self, value: Array) -> Array:
-        """S `value`."""
+        """Return S `value`."""
         return self._spread(self._solve.solve(self._gathered(value) / self._sizes[:, None]), value)
 
     def adjoint(self, gradient: Array) -> Array:
-        """The gradient by v: each of the vertices at a place has its part."""
+        """Return the gradient with respect to v, distributed over the vertices of each position."""
         return self._spread(self._solve.solve(self._gathered(gradient)) / self._sizes[:, None], gradient)
 
     def roughen(self, value: Array) -> Array:
-        """The inverse of `smooth`."""
+        """Return the inverse of `smooth`."""
         return self._spread(self._matrix @ (self._gathered(value) / self._sizes[:, None]), value)
 
     def _gathered(self, value: Array) -> Array:
-        """By place, the sum over the vertices that share it."""
+        """Return the sums over the vertices of each position."""
         total = np.zeros((len(self._sizes), 3))
         np.add.at(total, self._one, value.reshape(-1, 3))
         return total
@@ -131,11 +131,11 @@ class MeshOperator:
         return np.asarray(value[self._one]).reshape(like.shape)
 
     def _mean_square(self) -> float:
-        """The mean of the diagonal of S^2, by Hutchinson's estimate from 8 fixed vectors of signs."""
+        """Return the mean of the diagonal of S^2, by Hutchinson's estimate from 8 fixed vectors of signs."""
         signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(len(self._sizes), 8))
         return float(np.mean(self._solve.solve(signs) ** 2))
 
 
 def make_smoother(value: NDArray[Any], faces: NDArray[Any] | None, length: float) -> Smoother:
-    """S for a map (height, width, channels), or for vertices' positions (3 n) of a mesh with `faces`."""
+    """Return S for a map (height, width, channels), or for vertices' positions (3 n) of a mesh with `faces`."""
     return Smoother(MapOperator(value.shape, length) if faces is None else MeshOperator(value, faces, length))

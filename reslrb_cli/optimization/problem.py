@@ -1,4 +1,4 @@
-"""An optimisation problem: everything that a config names, loaded and checked."""
+"""Optimisation problem: everything that a configuration names, loaded and checked."""
 
 from __future__ import annotations
 
@@ -34,9 +34,10 @@ from reslrb_cli.seeds import seed
 
 
 def saved_spp(problem: Problem, between: bool) -> int:
-    """Samples per pixel of the initial and the final image, `run.final_spp` or the next more that passes divide.
+    """Return the samples per pixel of the initial and the final image: `run.final_spp`, or the next number that passes
+    divide.
 
-    Of images `between`, which only show how far a run is, a multiple of the run's own.
+    For images `between`, which only show progress, a multiple of the run's own number.
     """
     run, unit = problem.config.run, problem.samples_per_pass or 1
     if between:
@@ -49,12 +50,11 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class Problem:
-    """What `optimize` works on, as `assemble` has finished it.
+    """Complete problem of `optimize`, as `assemble` makes it.
 
-    `truth` holds the true value of every parameter for which it is known, textures in the resolution of the scene
-    file, and `masks` the entries of those that light and sensor reach (boolean; (H, W) for textures, else of the
-    parameter's shape).
-    `quantities` are the parameters' (`errors.quantity`).
+    `truth` has the known true values, textures in the resolution of the scene file. `masks` has the entries of these
+    parameters that light and sensor reach (boolean; (H, W) for textures, else of the parameter's shape). `quantities`
+    are those of the parameters (`errors.quantity`).
     """
 
     config: Config
@@ -86,22 +86,27 @@ class Problem:
     engine: Callable[..., Any] | None = None
 
     def decisions(self) -> dict[str, dict[str, Any] | None]:
-        """What was measured and planned before the first iteration, as manifests and checkpoints have it, by name."""
+        """Return the measurements and plans before the first iteration by name, for manifests and checkpoints."""
         made: dict[str, Jsonable | None] = {"guided": self.guided, "sequence": self.sequence}
         made["memory"] = self.memory
         made |= {name: own for name, own in (("paths", self.sides), ("pixels", self.pixels)) if own is not None}
         return {name: None if each is None else each.to_json() for name, each in made.items()}
 
     def apply(self, others: Mapping[str, Any] | None = None) -> None:
-        """Hand the optimiser's values to the scene, or, of the keys in `others`, those; masks follow what moves."""
+        """Write the optimiser's values to the scene, or only those of the keys in `others`; update masks of moving
+        shapes.
+        """
         values = {key: self.optimizer[key] for key in self.selection.keys}
         self.selection.hand_over({**values, **(others or {})})
         for view in self.views:
             view.follow(self.scene)
 
     def afresh(self, values: Mapping[str, Array]) -> Problem:
-        """The same as before the first iteration, with these values, as `values` has them; what was learned is
-        forgotten. Both share a scene, which has these values now."""
+        """Return the problem before its first iteration with these values, in the form of `values`; what was learned is
+        cleared.
+
+        Both share a scene, which now has these values.
+        """
         self.selection.set_arrays(values)
         integrator = self.integrator
         if isinstance(integrator, LightTracer):
@@ -113,12 +118,12 @@ class Problem:
         return fresh
 
     def gradients(self) -> dict[str, Any]:
-        """The gradient of each parameter that steps have added up since it was last handed over or cleared."""
+        """Return the gradient of each parameter that steps have accumulated since it was last cleared."""
         self.selection.collect()
         return {key: self.optimizer.gradient(key) for key in self.selection.keys}
 
     def regularize(self) -> dict[str, dict[str, float]]:
-        """Add what values cost by themselves to the gradients, once a step; return that, by key and type."""
+        """Add the gradients of regularizers, once per step; return their costs by key and type."""
         told, gradients = self.costs(self._heights())
         for key, gradient in gradients.items():
             value = self.optimizer[key]
@@ -126,8 +131,10 @@ class Problem:
         return told
 
     def costs(self, values: Mapping[str, Array]) -> tuple[dict[str, dict[str, float]], dict[str, Array]]:
-        """What these values (by key, of all that `regularizers` are about) cost by themselves, by key and type, and the
-        gradient of the sum of that, by key."""
+        """Return the costs of regularizers at these values, by key and type, and the gradient of their sum by key.
+
+        `values` has all parameters with `regularizers`, by key.
+        """
         told: dict[str, dict[str, float]] = {}
         gradients: dict[str, Array] = {}
         for key, costs in self.regularizers.items():
@@ -142,8 +149,11 @@ class Problem:
         return told, gradients
 
     def stiffness(self, key: str, direction: Array) -> Array:
-        """What the gradient of regularizers by `key` changes by along a direction, both in a row: their curvature times
-        that; zeros where they are not about `key`."""
+        """Return the change of the regularizers' gradient for `key` along a direction, both flat: curvature times
+        direction.
+
+        Zeros if there are no regularizers for `key`.
+        """
         values, size = self._heights(), float(np.abs(direction).max(initial=0.0))
         if key not in values or size == 0:
             return np.zeros_like(direction)
@@ -154,7 +164,7 @@ class Problem:
         return np.asarray((ends[0] - ends[1]) / (2 * step))
 
     def _heights(self) -> dict[str, Array]:
-        """The values that regularizers are about, by key."""
+        """Return the values of parameters with regularizers, by key."""
         others = [cost.other for costs in self.regularizers.values() for cost in costs.values()
                   if isinstance(cost, Plate)]  # fmt: skip
         return {key: np.array(dr.detach(self.optimizer[key]), dtype=np.float64)
@@ -162,12 +172,12 @@ class Problem:
 
     @property
     def plates(self) -> dict[str, Plate]:
-        """What is between two free faces, by the key of the one that says so."""
+        """Plates between two free faces, by the key of the parameter that defines them."""
         found = {key: costs.get("thickness") for key, costs in self.regularizers.items()}
         return {key: each for key, each in found.items() if isinstance(each, Plate)}
 
     def hold_apart(self) -> None:
-        """Hold free faces apart, at a tenth of the least thickness; what has a flat back is held by its bounds."""
+        """Hold free faces apart, at a tenth of the minimum thickness; bounds do this for a flat back."""
         for key, plate in self.plates.items():
             before = {each: np.array(dr.detach(self.optimizer[each])) for each in (key, plate.other)}
             after = plate.held(*(each.astype(np.float64) for each in before.values()))
@@ -177,7 +187,7 @@ class Problem:
                     self.optimizer.move(each, _handed(self.optimizer[each], np.clip(new, low, high)))
 
     def held(self) -> dict[str, int]:
-        """How many heights are held at the least thickness, by key, of the heightmaps that have one."""
+        """Return the number of heights at the minimum thickness, by key, for heightmaps that have one."""
         counts = {}
         for key, costs in self.regularizers.items():
             plate = costs.get("thickness")
@@ -197,7 +207,7 @@ class Problem:
 
     @property
     def measured_s(self) -> float:
-        """Seconds that this run has spent on decisions by measurement; those of an earlier run do not count."""
+        """Seconds that this run has spent on decisions by measurement, without those of earlier runs."""
         made = (self.sides, self.guided, self.sequence, self.pixels)
         return sum(each.measure_s + each.compile_s for each in made if each is not None and not each.cached)
 
@@ -209,16 +219,16 @@ class Problem:
 
     @property
     def sensors(self) -> list[int]:
-        """The index of each view's sensor."""
+        """Index of each view's sensor."""
         return [view.sensor for view in self.views]
 
     @property
     def trained(self) -> list[View]:
-        """The views that are not held out."""
+        """Views that are not held out."""
         return [view for view in self.views if not view.held_out]
 
     def drawn(self, iteration: int) -> list[tuple[View, float]]:
-        """The views of an iteration, by `run.views_per_iteration`, each with what its loss is to be scaled by."""
+        """Return the views of an iteration (`run.views_per_iteration`), each with the factor of its loss."""
         trained, count = self.trained, self.config.run.views_per_iteration
         if count is None or count >= len(trained):
             return [(view, 1.0) for view in trained]
@@ -227,7 +237,7 @@ class Problem:
         return [(trained[number], len(trained) / count) for number in chosen]
 
     def held_out_loss(self) -> float | None:
-        """The loss of the views that are held out, the mean over them, always of the same samples; None without any."""
+        """Return the mean loss of the held-out views, always with the same samples; None without such views."""
         views = [view for view in self.views if view.held_out]
         if not views:
             return None
@@ -237,30 +247,33 @@ class Problem:
         return float(np.mean(losses))
 
     def on_samples(self, view: View) -> OnSamples | None:
-        """What has to see the samples of a view's step: a recovered exposure, which has its gradient from them."""
+        """Return a callback for the samples of a view's step: a recovered exposure gets its gradient from them."""
         key = view.exposure.key
         if not key:
             return None
         return functools.partial(view.exposure.add_gradient, self.optimizer[key], view.target.shape[2])
 
     def image_gradient(self, view: View, image: Array) -> Array:
-        """The derivative dL/dI of a view's loss at an image (H, W, C), in the target's channels; finite or not."""
+        """Return the derivative dL/dI of a view's loss at an image (H, W, C), in the target's channels; finite
+        or not.
+        """
         return slope(view.compare, image[:, :, : view.target.shape[2]])
 
     def values(self) -> dict[str, Array]:
-        """The parameters' current values."""
+        """Return the parameters' current values."""
         return {key: self.selection.array(key) for key in self.selection.keys}
 
     def render(self, sensor: int, spp: int, iteration: int, purpose: str) -> Array:
-        """Render the scene as it stands with the experiment's integrator; (H, W, C) float32."""
+        """Render the current scene with the experiment's integrator; (H, W, C) float32."""
         config = self.config
         return render_in_passes(
             self.integrator, self.scene, sensor, spp, config.run.seed, iteration, purpose, self.samples_per_pass
         )
 
     def see(self, view: View, spp: int, iteration: int, purpose: str) -> mi.TensorXf:
-        """The same of a view, as its loss takes it: (H, W, C), or the images (2, H, W, C) of two halves of the samples
-        where they tell its scale."""
+        """Render a view as its loss needs it: (H, W, C), or two halves of the samples (2, H, W, C) if the loss fits a
+        scale.
+        """
         if not view.fits:
             return to_tensor(self.render(view.sensor, spp, iteration, purpose))
         unit = self.samples_per_pass or 1
@@ -270,12 +283,12 @@ class Problem:
 
     @functools.cached_property
     def meter(self) -> ErrorMeter:
-        """What measures the parameters against `truth`."""
+        """Meter of the errors of parameters relative to `truth`."""
         return ErrorMeter(self.truth, self.masks, self.quantities)
 
 
 def make_optimizer(config: Config, selection: Selection) -> Optimizer:
-    """An optimiser that has done nothing yet, of the values that the parameters have now."""
+    """Return a new optimiser for the current values of the parameters."""
     specs = {key: selection.spec(key) for key in selection.keys}
     return Optimizer(
         config.optimizer.type,
@@ -294,12 +307,14 @@ def make_optimizer(config: Config, selection: Selection) -> Optimizer:
 
 
 def _handed(value: Any, array: Array) -> Any:
-    """An array as Dr.Jit has `value`: a sum, since NumPy's own memory has an alignment on which kernels depend."""
+    """Return an array as a Dr.Jit array like `value`: a sum, because kernels depend on the alignment of NumPy's
+    memory.
+    """
     return type(value)(np.ascontiguousarray(array, dtype=np.float32)) + dr.opaque(mi.Float, 0)
 
 
 def make_regularizers(selection: Selection) -> dict[str, dict[str, Cost | Plate]]:
-    """Return what the values of `selection` cost by themselves, by key and type; empty where nothing does."""
+    """Return the regularizers of `selection`, by key and type."""
     found: dict[str, dict[str, Cost | Plate]] = {}
     for key in selection.keys:
         for each in selection.spec(key).regularizers:

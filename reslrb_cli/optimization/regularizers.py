@@ -1,8 +1,8 @@
-"""Regularizers: what the value of a parameter costs by itself, and its gradient, in double precision.
+"""Regularizers: costs of a parameter's value, and their gradients, in double precision.
 
-Integrals over the surface, in the scene's unit, so that they hardly change with the resolution. A map h (H, W, C) has
-texels of dx by dy; its mesh reaches from one texture coordinate to another, wherever the texels lie. Differences are
-taken between neighbours, and what they stand for is shared out so that the weights add up to the whole surface:
+They are integrals over the surface, in the scene's unit, so that they hardly depend on the resolution. A map h (H, W,
+C) has texels of dx by dy; its mesh covers a range of texture coordinates, independent of the texels. Differences are
+between neighbours, and weights are chosen so that they sum to the whole surface:
 
     curvature        k = Hm + sqrt(Hm² - K) in the inner texels, by central differences; positive in hollows
                      2 Hm = ((1 + hy²) hxx - 2 hx hy hxy + (1 + hx²) hyy) / w³,  K = (hxx hyy - hxy²) / w⁴,
@@ -37,20 +37,23 @@ Map = tuple[Array, Array, tuple[int, ...]]
 
 @dataclass(frozen=True)
 class Span:
-    """One axis of a map: how long a unit of its texture coordinate is, and between which coordinates the surface is."""
+    """One axis of a map: the length of a unit of its texture coordinate, and the range of coordinates of the
+    surface.
+    """
 
     unit: float = 1.0
     low: float = 0.0
     high: float = 1.0
 
     def pitch(self, count: int) -> float:
-        """The distance of two texels of `count`."""
+        """Return the distance of two of `count` texels."""
         return self.unit / count
 
     def weights(self, count: int, first: float, last: float) -> Array:
-        """What each of the nodes at first, first + 1, ..., last (in texels of `count`) stands for, a length.
+        """Return the length that each of the nodes first, first + 1, ..., last (in texels of `count`) represents.
 
-        Nodes share the way between them evenly; the outermost have all that lies beyond. The sum is the surface's.
+        Neighbouring nodes share the distance between them evenly; the outermost nodes have the rest. The sum is the
+        length of the surface.
         """
         nodes = np.arange(first, last + 0.5) / count
         middles = (nodes[:-1] + nodes[1:]) / 2
@@ -63,7 +66,9 @@ Spans = tuple[Span, Span]
 
 
 def make_cost(regularizer: Regularizer, spans: Spans) -> Cost:
-    """The cost of a map (H, W, C), `weight` times the integral. Raises TypeError for what is none of a map."""
+    """Return the cost of a map (H, W, C), `weight` times the integral. Raises TypeError for a regularizer of other
+    parameters.
+    """
     if isinstance(regularizer, Curvature):
         limit = 1 / regularizer.radius
         function = _inner(lambda d: _hollow(d, limit), spans)
@@ -83,9 +88,9 @@ def make_cost(regularizer: Regularizer, spans: Spans) -> Cost:
 
 @dataclass(frozen=True)
 class Plate:
-    """The thickness between two free faces: maps h and g of heights outwards, g that of the parameter `other`.
+    """Plate between two free faces: maps h and g of heights outwards, g that of the parameter `other`.
 
-    `across` (texels of h, texels of g) has g where the texels of h stand, `back` h where those of g do.
+    `across` (texels of h, texels of g) interpolates g at the texels of h, and `back` interpolates h at those of g.
     """
 
     settings: Thickness
@@ -95,19 +100,21 @@ class Plate:
     back: csr_matrix
 
     def cost(self, h: Array, g: Array) -> tuple[float, Array, Array]:
-        """What h and g cost, weight included, and the derivatives by both, of their shapes."""
+        """Return the cost of h and g, including the weight, and the derivatives with respect to both, of their
+        shapes.
+        """
         value, slope = _hinge(-self.thickness(h, g), -self.settings.least)
         area = self.settings.weight * _area(self.spans, h.shape, 0.5)
         by_h = -area * slope
         return float(np.sum(area * value)), by_h, (self.across.T @ by_h.ravel()).reshape(g.shape)
 
     def thickness(self, h: Array, g: Array) -> Array:
-        """That of the plate at each texel of h."""
+        """Return the thickness of the plate at each texel of h."""
         there = self.across @ np.asarray(g, np.float64).ravel()
         return np.asarray(self.settings.thickness + h + there.reshape(h.shape))
 
     def held(self, h: Array, g: Array) -> tuple[Array, Array]:
-        """h and g no lower than where the plate has `thinnest`, at the texels of both: they give way alike."""
+        """Return h and g, raised equally where the plate is thinner than `thinnest`, at the texels of both."""
         least, thickness = self.settings.thinnest, self.settings.thickness
         h = h + np.maximum(least - self.thickness(h, g), 0) / 2
         between = thickness + g + (self.back @ h.ravel()).reshape(g.shape)
@@ -116,12 +123,12 @@ class Plate:
 
 
 def make_plate(settings: Thickness, own: Map, other: Map, key: str) -> Plate:
-    """The plate between two maps, of which `other` is the parameter `key`'s."""
+    """Return the plate between two maps, of which `other` belongs to the parameter `key`."""
     return Plate(settings, spans_of(*own[:2]), key, _sampling(own, other), _sampling(other, own))
 
 
 def _sampling(own: Map, other: Map) -> csr_matrix:
-    """What makes of the texels of `other` (in a row) its heights, bilinearly, where the texels of `own` stand."""
+    """Return the matrix that interpolates the texels of `other` (flat) bilinearly at the texels of `own`."""
     (slopes, origin), (slopes_there, origin_there) = _laid(*own[:2]), _laid(*other[:2])
     height, width = own[2][:2]
     u, v = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
@@ -170,13 +177,13 @@ def _thin(lowest: float, spans: Spans) -> Cost:
 
 
 def _area(spans: Spans, shape: tuple[int, ...], first: float) -> Array:
-    """What each node of a map of this shape stands for, (h, w, 1); they begin at `first` texels from its edge."""
+    """Return the area of each node of a map of this shape, (h, w, 1); nodes start at `first` texels from its edge."""
     wide, high = (span.weights(n, first, n - first) for span, n in zip(spans, (shape[1], shape[0]), strict=True))
     return np.asarray(high[:, None, None] * wide[None, :, None])
 
 
 def _between(of_norm: Callable[[Array], tuple[Array, Array]], spans: Spans) -> Cost:
-    """The integral of a function of the gradient's norm, all channels together."""
+    """Return the integral of a function of the gradient's norm, all channels together."""
 
     def cost(h: Array) -> tuple[float, Array]:
         dx, dy = spans[0].pitch(h.shape[1]), spans[1].pitch(h.shape[0])
@@ -211,7 +218,7 @@ _STENCILS: tuple[tuple[dict[tuple[int, int], float], int, int], ...] = (
 
 
 def _inner(function: Callable[[list[Array]], tuple[Array, list[Array]]], spans: Spans) -> Cost:
-    """The integral of a function of hx, hy, hxx, hxy and hyy, which returns its derivatives by these besides."""
+    """Return the integral of a function of hx, hy, hxx, hxy and hyy, which also returns its derivatives."""
 
     def cost(h: Array) -> tuple[float, Array]:
         gradient = np.zeros_like(h)
@@ -245,7 +252,7 @@ def _flatness(d: list[Array]) -> tuple[Array, list[Array]]:
 
 
 def _hollow(d: list[Array], limit: float) -> tuple[Array, list[Array]]:
-    """max(0, k - limit)² and its derivatives."""
+    """Return max(0, k - limit)² and its derivatives."""
     hx, hy, hxx, hxy, hyy = d
     w = np.sqrt(1 + hx**2 + hy**2)
     sum_ = (1 + hy**2) * hxx - 2 * hx * hy * hxy + (1 + hx**2) * hyy
@@ -271,10 +278,11 @@ def _hollow(d: list[Array], limit: float) -> tuple[Array, list[Array]]:
 
 
 def mesh_laplacian(positions: Array, faces: Array) -> tuple[csr_matrix, Array]:
-    """L and 1/A of a mesh with these positions (N, 3) and faces (M, 3); 1/A is 0 at its rim, and where it has no area.
+    """Return L and 1/A of a mesh with these positions (N, 3) and faces (M, 3); 1/A is 0 at its rim, and without an
+    area.
 
-    Vertices at one place are one, so that a mesh cut open along its texture's seams has no rim there: rows and columns
-    are those of the first.
+    Vertices at the same position count as one, so a mesh that is cut open along texture seams has no rim there; rows
+    and columns are those of the first vertex.
     """
     _, first, same = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     joined = first[same.ravel()][faces]
@@ -300,7 +308,7 @@ def mesh_laplacian(positions: Array, faces: Array) -> tuple[csr_matrix, Array]:
 
 
 def mesh_cost(weight: float, positions: Array, faces: Array) -> Cost:
-    """The cost of vertex positions, a buffer (3 N,): `weight` times the integral of |L p / A|²."""
+    """Return the cost of vertex positions, a buffer (3 N,): `weight` times the integral of |L p / A|²."""
     laplacian, inverse = mesh_laplacian(np.asarray(positions, np.float64).reshape(-1, 3), faces.reshape(-1, 3))
 
     def cost(value: Array) -> tuple[float, Array]:
@@ -312,7 +320,7 @@ def mesh_cost(weight: float, positions: Array, faces: Array) -> Cost:
 
 
 def spans_of(positions: Array, texcoords: Array) -> Spans:
-    """The axes of a map over a mesh with vertices at these positions (N, 3) and texture coordinates (N, 2).
+    """Return the axes of a map over a mesh with these vertex positions (N, 3) and texture coordinates (N, 2).
 
     Units are those of the plane map from texture coordinates to positions that fits best.
     """
@@ -323,7 +331,7 @@ def spans_of(positions: Array, texcoords: Array) -> Spans:
 
 
 def _laid(positions: Array, texcoords: Array) -> tuple[Array, Array]:
-    """The plane map from texture coordinates to positions that fits best: uv @ slopes (2, 3) + origin (3,)."""
+    """Return the plane map from texture coordinates to positions that fits best: uv @ slopes (2, 3) + origin (3,)."""
     matrix = np.column_stack([texcoords, np.ones(len(texcoords))]).astype(np.float64)
     found = np.linalg.lstsq(matrix, positions.astype(np.float64), rcond=None)[0]
     return found[:2], found[2]

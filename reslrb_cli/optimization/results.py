@@ -1,13 +1,13 @@
-"""The results of a run: its best parameters, whether its loss fell, and values and errors at its start and its end.
+"""Results of a run: its best parameters, whether its loss fell, and values and errors at start and end.
 
-`Best`, the best parameters that a run has had, beside the last: the loss of an iteration is noise for the most part, so
-that the least of all would be the luckiest. Where views are held out, the best parameters are those of the least loss
-of these, which always has the same samples; otherwise those at the end of the WINDOW iterations whose losses have the
-least mean.
+`Best` has the best parameters besides the last. The loss of an iteration is mostly noise, so the smallest loss would be
+the luckiest. If views are held out, the best parameters are those with the smallest held-out loss, which always uses
+the same samples. Otherwise they are those at the end of the WINDOW iterations whose losses have the smallest mean.
 
-`got_worse`: whether an error, which is known exactly, ended above its start. `find_trend` says the same of the loss.
+`got_worse` says whether an error, which is known exactly, ended above its start. `find_trend` does the same for the
+loss.
 
-`Results` puts these together with the parameters' values and errors at the start and at the end.
+`Results` combines these with the parameters' values and errors.
 """
 
 from __future__ import annotations
@@ -33,14 +33,16 @@ WINDOW = 10
 
 @dataclass(frozen=True)
 class Least:
-    """The least loss so far, and after how many updates it was."""
+    """Smallest loss so far, and the number of updates before it."""
 
     iteration: int
     loss: float
 
 
 class Best:
-    """The best so far: its loss (None where there is none yet), the values, and the last WINDOW losses (`recent`)."""
+    """Best parameters so far: their loss (None if there is none yet), the values, and the last WINDOW losses
+    (`recent`).
+    """
 
     def __init__(self, held_out: bool) -> None:
         self.held_out = held_out
@@ -49,7 +51,7 @@ class Best:
         self.recent: deque[float] = deque(maxlen=WINDOW)
 
     def see(self, record: Record, values: Mapping[str, Any]) -> None:
-        """Take one iteration, and the values that it began with, by key; they are kept, not copied."""
+        """Record one iteration, and the values that it started with, by key; they are stored, not copied."""
         self.recent.append(record.loss)
         if self.held_out:
             loss = math.inf if record.held_out is None else record.held_out
@@ -59,7 +61,7 @@ class Best:
             self.least, self.values = Least(record.iteration, loss), dict(values)
 
     def to_json(self) -> dict[str, Any] | None:
-        """For the manifest; None where there is none."""
+        """Return the content for the manifest, or None."""
         kind = "held_out" if self.held_out else f"mean of {WINDOW} iterations"
         return None if self.least is None else {**asdict(self.least), "loss_is": kind}
 
@@ -73,7 +75,8 @@ WORSE, WORSE_IF_SHORT = 0.01, 0.1
 def got_worse(errors: Sequence[float], final: float) -> bool:
     """Whether an error ended above its start: the last one, `final`, and all of the last tenth before it.
 
-    Errors are known exactly, but wander with the noise of the gradients: a short run has to end well above its start.
+    Errors are known exactly, but fluctuate with the noise of the gradients, so a short run must end well above its
+    start.
     """
     if not errors:
         return False
@@ -89,17 +92,16 @@ MOST_NUMBERS = 4
 
 @dataclass
 class Images:
-    """The losses of the saved images of views, of those that are trained on, and of those held out."""
+    """Losses of the saved images of training views and held-out views."""
 
     trained: list[Figure] = field(default_factory=list)
     held_out: list[Figure] = field(default_factory=list)
 
 
 class Results:
-    """Collects the results of one run of `problem`, whose parameters stand at their initial values when this is made:
-    `add` each iteration, `end` after all.
+    """Results of one run of `problem`, whose parameters must have their initial values at construction.
 
-    `to_json` can be asked for at any time; what is not known yet is null there.
+    Call `add` for each iteration, and `end` afterwards. `to_json` works at any time, with null for unknown values.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -117,7 +119,7 @@ class Results:
             self._values[key]["true"] = summary(true, problem.masks.get(key))
 
     def add(self, record: Record) -> None:
-        """Take one iteration. The losses that are judged are those of whole films."""
+        """Record one iteration. Only losses of full films are judged."""
         self._iterations += 1
         config = self.problem.config
         stage = config.stage(config.stage_number(record.iteration / config.run.iterations))
