@@ -1,11 +1,11 @@
-"""What a run does about values that are not finite (`run.on_nonfinite`). None of them ever reaches a parameter.
+"""Reaction of a run to values that are not finite (`run.on_nonfinite`). They never reach a parameter.
 
-stop    the first iteration that has any ends the run, and updates nothing
-skip    a parameter whose gradient has any sits the iteration out; after a loss, or a derivative of the loss, all do
-zero    entries of gradients and of the loss's derivative that are not finite count as 0, and the update goes on; a
-        parameter of whose gradient nothing is left sits it out, and after a loss all do
+stop    the first iteration with such a value ends the run, and updates nothing
+skip    a parameter whose gradient has any is not updated; after a loss, or a derivative of the loss, no parameter is
+zero    such entries of gradients and of the loss's derivative count as 0, and the update continues; a parameter with no
+        finite gradient entry is not updated, and after a loss no parameter is
 
-A run in which something sits out `PATIENCE` iterations in a row has come to a standstill, and ends.
+If something is skipped in `PATIENCE` iterations in a row, the run ends.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PATIENCE = 10
 
 @dataclass
 class RefusedAt:
-    """Entries of one view's dL/dI that were not finite: how many, and the first, as (x, y, channel)."""
+    """Entries of one view's dL/dI that were not finite: their number, and the first, as (x, y, channel)."""
 
     count: int
     first: tuple[int, int, int]
@@ -31,9 +31,11 @@ class RefusedAt:
 
 @dataclass
 class Findings:
-    """What of one iteration was not finite: its loss, entries of dL/dI by sensor, and entries of gradients and of
-    updates by parameter, of those that had any. `lost` are the gradients without one finite entry, `own` the losses
-    that the user has written."""
+    """Values of one iteration that were not finite: its loss, entries of dL/dI by sensor, and entries of gradients and
+    updates by parameter.
+
+    `lost` are the gradients without any finite entry, and `own` the user's losses.
+    """
 
     iteration: int
     loss: bool = False
@@ -48,17 +50,17 @@ class Findings:
 
     @property
     def total(self) -> int:
-        """All of it, a loss counting as one."""
+        """Number of all such values; a loss counts as one."""
         return int(self.loss) + sum(at.count for at in self.refused.values()) + sum(self.by_parameter.values())
 
     @property
     def by_parameter(self) -> dict[str, int]:
-        """What belongs to a parameter: its gradient's entries, or its update's."""
+        """Number of entries of gradients and updates by parameter."""
         return {**self.gradients, **self.updates}  # what has no finite gradient is not updated
 
     @property
     def whose_loss(self) -> str:
-        """The loss in words, by the user's own name."""
+        """Loss in words, by the user's name for it."""
         return f"the loss (your own {self.own})" if self.own else "the loss"
 
     def __str__(self) -> str:
@@ -77,15 +79,17 @@ def _entries(count: int) -> str:
 
 
 def held_back(kind: OnNonFinite, found: Findings, keys: list[str]) -> list[str]:
-    """Of all parameters, `keys`, those that are not to be updated."""
+    """Return the parameters among `keys` that are not updated."""
     if found.loss or (found and kind == "stop") or (found.refused and kind == "skip"):
         return keys
     return found.lost if kind == "zero" else list(found.gradients)
 
 
 def why_end(kind: OnNonFinite, found: Findings, standstill: int) -> str:
-    """Why a run is to end after an iteration, the last of `standstill` in a row in which something sat out; "" where it
-    goes on."""
+    """Return why a run ends after an iteration, or "" if it continues.
+
+    `standstill` is the number of iterations in a row in which something was skipped.
+    """
     if found and kind == "stop":
         return f"{found}; run.on_nonfinite: stop"
     if standstill < PATIENCE:
@@ -104,16 +108,16 @@ def zero_nonfinite(parameter: Any) -> None:
 
 
 def flat(value: Any) -> Any:
-    """All entries of a tensor or a (nested) array in a row."""
+    """Return all entries of a tensor or a (nested) array as a flat array."""
     return value.array if dr.is_tensor_v(value) else dr.ravel(value)
 
 
 def count_nonfinite(value: Any) -> Any:
-    """The number of NaN and infinite entries of a tensor or a (nested) array, as a width-1 array."""
+    """Return the number of NaN and infinite entries of a tensor or a (nested) array, as a width-1 array."""
     return dr.count(~dr.isfinite(flat(value)))
 
 
 def finite_square_norm(value: Any) -> Any:
-    """The sum of squares of the finite entries, as a width-1 array."""
+    """Return the sum of squares of the finite entries, as a width-1 array."""
     entries = flat(value)
     return dr.sum(dr.select(dr.isfinite(entries), dr.square(entries), 0.0))

@@ -1,36 +1,37 @@
 """Optimisers behind one interface: Dr.Jit's, one for each parameter, with reparameterisations, bounds and a clamp.
 
-Reparameterisations (`Transform`, `Variable`): the optimiser moves an unconstrained variable u, the scene gets x = T(u).
+Reparameterisations (`Transform`, `Variable`): the optimiser moves an unconstrained variable u, and the scene gets x =
+T(u).
 
     none      x = u
     sigmoid   x = low + (high - low) / (1 + exp(-u))     between the bounds, which it never reaches
     log       x = exp(u)                                 positive; a step is a relative change
     softplus  x = log(1 + exp(u))                        positive; relative well below 1, absolute well above
 
-By the chain rule dL/du = dL/dx T'(u), which is applied to the gradient once it is there: a step's kernels know nothing
-of it. T is increasing, entry by entry. Smooth steps (`precondition`) come before it: x = T(S v).
+By the chain rule dL/du = dL/dx T'(u). The factor is applied to the accumulated gradient, so the kernels of a step do
+not depend on it. T is increasing, entry by entry. Smooth steps (`precondition`) come before it: x = T(S v).
 
-Updates (`Optimizer`): one optimiser for each parameter rather than one for all, so that a parameter whose gradient is
-not finite can sit an iteration out with its moments and its count of steps as they were.
+Updates (`Optimizer`): each parameter has its own optimiser, so that a parameter whose gradient is not finite can keep
+its moments and its number of steps.
 
     adam      m, v running means of g and g²; p -= lr · √(1-β₂ᵗ)/(1-β₁ᵗ) · m / (√v + ε)    Kingma and Ba 2015
     sgd       v = momentum · v + g; p -= lr · v
 
-What a parameter must satisfy: finite values, within its bounds (`clamp`, `count_nonfinite`).
+Parameters must be finite and within their bounds (`clamp`, `count_nonfinite`).
 
-A clamp against outliers in gradients (`clamp_gradients`): less variance, at the price of a bias, which is measured.
+A clamp for outliers in gradients (`clamp_gradients`) reduces variance, and adds a bias, which is measured.
 
     m_e  running mean of |g_e| over the iterations before (of clamped gradients), decay DECAY
     r_e = max(m_e, mean of m over the parameter's entries)
-    g_e  is brought into [-k r_e, k r_e]
+    g_e  is clamped to [-k r_e, k r_e]
 
-Rare large values of a Monte Carlo gradient are part of its mean. What the clamp takes of them, R = g - clamped g, is a
-bias as far as it does not cancel over iterations:
+Rare large values of a Monte Carlo gradient belong to its mean. The removed part R = g - clamped g is a bias unless it
+cancels over iterations:
 
     bias = sum_e |sum of R_e| / sum_e |sum of g_e|      inner sums over the iterations so far
 
-The entries' mean stands beside m_e since an entry that few paths reach may have had nothing but zeros. Absolute values
-rather than squares: those of large gradients overflow.
+r_e includes the mean over the entries, because an entry that few paths reach may have had only zeros. Absolute values
+are used, because squares of large gradients overflow.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ SIGMOID_END, EXPONENT_END = 16.0, 80.0
 
 @dataclass(frozen=True)
 class Transform:
-    """T, its inverse and its derivative T'(u), on arrays of any Dr.Jit type, and the least and greatest u."""
+    """T, its inverse and its derivative T'(u), on arrays of any Dr.Jit type, and the smallest and largest u."""
 
     forward: Callable[[Any], Any]
     inverse: Callable[[Any], Any]
@@ -67,7 +68,9 @@ class Transform:
 
 
 def make_transform(name: str, bounds: Bounds) -> Transform | None:
-    """The transform of that name; None for `none`. `bounds` are those of x. Raises KeyError for an unknown name."""
+    """Return the transform of this name; None for `none`. `bounds` are those of x. Raises KeyError for an
+    unknown name.
+    """
     low, high = bounds or (-math.inf, math.inf)
     if name == "none":
         return None
@@ -103,9 +106,9 @@ def _inverse_softplus(x: Any) -> Any:
 
 @dataclass
 class Variable:
-    """What the optimiser moves in place of a parameter x: v, with x = T(length * S v), x within its bounds.
+    """Variable v of the optimiser for a parameter x: x = T(length * S v), with x within its bounds.
 
-    S is 1, or a `Smoother`. The gradient that it is given is `gain` times dL/dv. Both numbers are 1 until they are
+    S is 1, or a `Smoother`. The optimiser receives the gradient `gain` times dL/dv. Both numbers are 1 until they are
     measured (`sensitivity.py`), and reach kernels as data, so that their values compile nothing.
     """
 
@@ -116,20 +119,20 @@ class Variable:
     smoother: Smoother | None = None
 
     def to_scene(self, v: Any) -> Any:
-        """x of v."""
+        """Return x for v."""
         u = self._u(v)
         x = u if self.transform is None else self.transform.forward(u)
         return x if self.bounds is None else dr.clip(x, self.bounds[0], self.bounds[1])  # rounding may have left them
 
     def from_scene(self, x: Any) -> Any:
-        """v of x."""
+        """Return v for x."""
         u = x if self.transform is None else self.transform.inverse(x)
         if self.smoother is not None:
             u = self.smoother.roughen(u)
         return self.clamp(u * _opaque(x, 1 / self.length))
 
     def clamp(self, v: Any) -> Any:
-        """v where its x is within the bounds, else the nearest that is."""
+        """Return v if its x is within the bounds, otherwise the nearest allowed value."""
         ends = self.bounds if self.transform is None else (self.transform.low, self.transform.high)
         if ends is None:
             return v
@@ -141,7 +144,7 @@ class Variable:
         return self.smoother.roughen(dr.clip(u, *ends)) * _opaque(v, 1 / self.length)
 
     def chain(self, v: Any, gradient: Any) -> Any:
-        """`gain` times dL/dv, of dL/dx."""
+        """Return `gain` times dL/dv from dL/dx."""
         result = gradient * _opaque(v, self.length) * _opaque(v, self.gain)
         if self.transform is not None:
             result = result * self.transform.derivative(self._u(v))
@@ -163,11 +166,11 @@ OPTIMIZERS: dict[str, Callable[..., Any]] = {
 
 
 class Optimizer:
-    """Holds the parameters and updates them; values it hands out receive gradients.
+    """Optimiser that holds and updates the parameters; the values that it returns receive gradients.
 
-    `rates`, `bounds`, `transforms` and `smoothers` are per key: a rate of None is `learning_rate`, bounds of None are
-    none, and so are a transform and a smoother that are left out. What it hands out, and the gradients that it takes,
-    are the scene's; a parameter with a `Variable` is moved by way of that. Raises KeyError for an unknown `type`.
+    `rates`, `bounds`, `transforms` and `smoothers` are by key: a rate of None is `learning_rate`, bounds of None are no
+    bounds, and transforms and smoothers may be missing. Values and gradients are those of the scene; a parameter with a
+    `Variable` is moved through it. Raises KeyError for an unknown `type`.
     """
 
     def __init__(
@@ -197,24 +200,24 @@ class Optimizer:
                 self.set_variable(key, Variable(transform, bounds[key], smoother=smoother))
 
     def keys(self) -> list[str]:
-        """The keys of the parameters."""
+        """Return the keys of the parameters."""
         return list(self._own)
 
     def __getitem__(self, key: str) -> Any:
-        """The value of a parameter, gradients enabled."""
+        """Return the value of a parameter, with enabled gradients."""
         return self._scene[key] if key in self._scene else self._own[key][key]
 
     def variable(self, key: str) -> Variable:
-        """How a parameter is moved."""
+        """Return the variable of a parameter."""
         return self._variables.get(key) or Variable(None, self._bounds[key])
 
     def set_value(self, key: str, value: Any) -> None:
-        """Begin at another value of the scene's; to be called before the first step."""
+        """Set another initial value of the scene; call before the first step."""
         self.stands_at = None
         self.move(key, value)
 
     def move(self, key: str, value: Any) -> None:
-        """Go on from another value of the scene's, between two steps; moments stay."""
+        """Set another value of the scene between two steps; moments stay."""
         variable = self._variables.get(key)
         if variable is None:
             self._own[key][key] = value
@@ -223,24 +226,24 @@ class Optimizer:
             self._own[key][key] = variable.from_scene(value)
 
     def set_variable(self, key: str, variable: Variable) -> None:
-        """Move a parameter by way of `variable` from now on; to be called before the first step."""
+        """Move a parameter through `variable` from now on; call before the first step."""
         self.stands_at, value = None, dr.detach(self[key])
         self._variables[key], self._scene[key] = variable, _leaf(value)
         self._own[key][key] = variable.from_scene(value)
 
     def gradient(self, key: str) -> Any:
-        """The gradient that has been accumulated into `self[key]`."""
+        """Return the gradient that has been accumulated into `self[key]`."""
         return dr.grad(self[key])
 
     def clear_gradient(self, key: str) -> None:
-        """Forget the gradient accumulated into `self[key]`."""
+        """Clear the gradient accumulated into `self[key]`."""
         dr.clear_grad(self[key])
 
     def step(self, factor: float, skip: Collection[str] = ()) -> dict[str, int]:
-        """Update all parameters but those in `skip`, with learning rates times `factor`, and clamp them.
+        """Update all parameters except those in `skip`, with learning rates times `factor`, and clamp them.
 
-        Returns the number of non-finite entries that the update made, by key, where there were any: even a finite
-        gradient can, by overflow. Such a parameter keeps its old value and state.
+        Returns the number of non-finite entries of the update by key, if there are any: even a finite gradient can
+        overflow. Such a parameter keeps its old value and state.
         """
         self.stands_at = None
         # Dr.Jit makes the rate opaque, so that one that changes compiles no new kernel.
@@ -275,10 +278,11 @@ class Optimizer:
         self._scene[key] = _leaf(variable.to_scene(dr.detach(own[key])))
 
     def response(self, key: str) -> np.ndarray[Any, Any]:
-        """How far a step with a rate of 1 moves each entry of the scene's value, in a row, per unit of its gradient.
+        """Return the movement of each entry of the scene's value per unit of its gradient, for a step with a rate of 1,
+        flat.
 
-        As its moments are now, and over many steps, so that momentum shows as what it adds up to; the schedule's
-        factor times this and the parameter's rate (`rate`) is the next step. 0 where no step was taken.
+        It uses the current moments, over many steps, so that momentum counts with its sum. The next step is this, times
+        the schedule's factor and the parameter's rate (`rate`). 0 if no step was taken.
         """
         own, extra = self._own[key], self._own[key].state[key][3]
         value = np.array(dr.detach(own[key]), dtype=np.float64).ravel()
@@ -295,25 +299,28 @@ class Optimizer:
         return result if variable.smoother is None else result * variable.smoother.gain
 
     def squares(self, key: str) -> tuple[Any, float] | None:
-        """The running mean of the squares of what the optimiser is handed, as it keeps it, and its decay; None of one
-        that keeps none."""
+        """Return the running mean of the squared gradients, as the optimiser stores it, and its decay; None if it has
+        none.
+        """
         own, extra = self._own[key], self._own[key].state[key][3]
         return (extra[2], own.beta_2) if isinstance(own, dropt.Adam) else None
 
     def slope(self, key: str) -> np.ndarray[Any, Any]:
-        """What the optimiser is handed per unit of gradient of the scene's value, in a row."""
+        """Return the optimiser's gradient per unit of gradient of the scene's value, flat."""
         variable, moved = self.variable(key), dr.detach(self._own[key][key])
         if key not in self._variables:
             return np.ones(int(np.array(moved).size))
         return np.array(variable.chain(moved, dr.zeros(type(moved), dr.shape(moved)) + 1), dtype=np.float64).ravel()
 
     def rate(self, key: str) -> float:
-        """The learning rate of a parameter, before any schedule."""
+        """Return the learning rate of a parameter, before any schedule."""
         return self._rates[key]
 
     def first_step(self, key: str) -> float | None:
-        """How far a step of the parameter's rate moves the scene's value where it is, upwards or downwards, whichever
-        is farther, as a root mean square; None where that depends on the gradient."""
+        """Return the root mean square movement of the scene's current value by a step of the parameter's rate.
+
+        The larger of the movements upwards and downwards counts. None if it depends on the gradient.
+        """
         if isinstance(self._own[key], dropt.SGD):
             return None
         if key not in self._variables:
@@ -324,12 +331,14 @@ class Optimizer:
         return float(np.sqrt(np.mean(np.square(np.maximum(*map(np.abs, ways)), dtype=np.float64))))
 
     def units(self) -> dict[str, tuple[float, float]]:
-        """Length and gain of each parameter that is moved by way of a `Variable`."""
+        """Return length and gain of each parameter that is moved through a `Variable`."""
         return {key: (variable.length, variable.gain) for key, variable in self._variables.items()}
 
     def moments(self) -> dict[str, dict[str, Any]]:
-        """What it keeps for each parameter beside its value, arrays by their place in Dr.Jit's order, and as `variable`
-        what it moves in place of the value, where it does. No step changes these arrays: to ask for them costs nothing.
+        """Return the optimiser's data for each parameter besides its value.
+
+        They are arrays in Dr.Jit's order, and the variable as `variable` if there is one. No step changes these arrays,
+        so they are not copied.
         """
         found = {}
         for key, own in self._own.items():
@@ -341,7 +350,7 @@ class Optimizer:
     def restore(
         self, values: Mapping[str, Any], units: Mapping[str, tuple[float, float]], moments: Mapping[str, Any]
     ) -> None:
-        """Go on from the scene's `values`, and from what `units` and `moments` said."""
+        """Continue from the scene's `values`, and from the results of `units` and `moments`."""
         for key, own in self._own.items():
             kept = moments[key]
             if key in units:

@@ -129,13 +129,16 @@ class Results:
             self._errors.setdefault(key, []).append(error)
 
     def end(self) -> None:
-        """Take the parameters as they are for those of the end."""
+        """Record the current parameters as the final ones."""
         self._last = self.meter.errors(self.problem.selection.array)
         self._take("final")
 
     def see(self, moment: str, view: View, image: Array, scale: float = 1.0) -> None:
-        """Take the saved image of a view, as its loss takes it (`Problem.see`), at `initial` or `final`, and the
-        `scale` that suits the target; every view in turn."""
+        """Record the saved image of a view at `initial` or `final`, as its loss takes it (`Problem.see`), and its
+        fitted `scale`.
+
+        Call for every view in order.
+        """
         if (images := self.images.get(moment)) is not None:
             loss = view.objective(mi.TensorXf(np.ascontiguousarray(image, dtype=np.float32)))
             if view.fits and moment == "final":
@@ -147,16 +150,19 @@ class Results:
             self._values[key][moment] = summary(value, self.problem.masks.get(key))
 
     def to_json(self) -> dict[str, Any]:
-        """For the manifest.
+        """Return the content for the manifest.
 
-        `parameter_rmse` and `relative_error` (over the root mean square of the truth) are errors by key, initial and
-        final; `rmse` is that of all parameters together, null where their units differ. `parameters` are, by key,
-        quantity and shape, the share of entries that light and sensor reach, the root mean square of the truth over
-        those (`scale`), and `initial`, `final` and `true` values (`summary`). `loss_trend` says how loss and noise were
-        at the start and the end, null for a short run; `image_loss` is that of the saved images, which have less noise,
-        of views that are trained on (`fitted_scale`: what the final ones are multiplied by, by sensor, with
-        `loss.scale: fitted` alone), and `held_out` the mean of those that are not; `worse` are the keys whose error
-        ended above its start. `samples` are those of a step and of a rendered target, null without one.
+        - `parameter_rmse` and `relative_error` (divided by the root mean square of the true value): errors by key,
+          initial and final.
+        - `rmse`: the error of all parameters together, null if their units differ.
+        - `parameters`, by key: quantity and shape, the share of entries that light and sensor reach, the root mean
+          square of the true value over those (`scale`), and `initial`, `final` and `true` values (`summary`).
+        - `loss_trend`: loss and noise at the start and the end, null for a short run.
+        - `image_loss`: the loss of the saved images of training views, which have less noise. `fitted_scale`: the
+          factor of the final images by sensor, only with `loss.scale: fitted`.
+        - `held_out`: the mean loss of the held-out views.
+        - `worse`: the keys whose error ended above its start.
+        - `samples`: those of a step and of a rendered target, null without one.
         """
         trend = find_trend(self._losses)
         run, render = self.problem.config.run, self.problem.config.target.render
@@ -197,10 +203,11 @@ class Results:
 
 
 def summary(value: Array, mask: Array | None = None) -> dict[str, Any]:
-    """A parameter in a few numbers: all of them as `value`, or, over the entries in `mask`, `mean`, `min` and `max`.
+    """Return a parameter in a few numbers: all of them as `value`, or, over the entries in `mask`, `mean`, `min` and
+    `max`.
 
-    The mean of a texture (H, W, C) has a number for each channel. A mask of another resolution is read where the
-    texels' centres are; one that is empty counts for nothing.
+    The mean of a texture (H, W, C) has a number for each channel. A mask of another resolution is read at the centres
+    of the texels; an empty mask is ignored.
     """
     if value.ndim < 3 and value.size <= MOST_NUMBERS:
         return {"value": value.tolist()}

@@ -1,33 +1,32 @@
-"""The sensitivity of image and loss to each parameter, from samples, and the units that it gives (`scale: auto`).
+"""Sensitivity of image and loss to each parameter, from samples, and the resulting units (`scale: auto`).
 
-Gradient samples are steps that measure, and leave the parameters as they are (`sample_gradient`).
+Gradient samples are steps that leave the parameters unchanged (`sample_gradient`).
 
 Sensitivities (`measure_sensitivities`): let g be the mean of some gradient samples, and z = -sign(g), the direction of
-Adam's first step, in one parameter x alone, all its entries at once. With I(x) the image at common random numbers and T
-the target,
+Adam's first step, in one parameter x alone, all its entries together. With the image I(x) at common random numbers and
+the target T,
 
     D = I(x + h z) - I(x)
     change = |D| / (h |M|),   length = h sum |D| M / sum D²,   M = max(|I|, |T|)
     curvature = (L(I + D) - 2 L(I) + L(I - D)) / h²,           L the loss of an image
 
-`change` is the relative change of the image per unit of the parameter, `curvature` the Gauss-Newton one (with D scaled
-up to what single precision resolves). `length` is how far the parameter would have to go to make up what image or
-target hold, by least squares over those pixels that it changes at all: for a light alone in its scene its own
-intensity, for a wall its own albedo, whatever share of the picture they have. h is chosen so that the image changes by
-about 3 %, so that neither rounding nor curvature decides.
+`change` is the relative change of the image per unit of the parameter, and `curvature` the Gauss-Newton curvature (with
+D scaled up to the resolution of single precision). `length` is the movement of the parameter that would explain image
+or target, by least squares over the pixels that it changes: its intensity for the only light of a scene, its albedo for
+a wall, independent of their share of the picture. h is chosen so that the image changes by about 3 %, so that neither
+rounding nor curvature dominates.
 
-Units in which one learning rate serves parameters of any sensitivity (`rescale`): step lengths from
-`Sensitivity.length` make all parameters equally fast, and dividing gradients by the root mean square of a sample keeps
-an absolute epsilon, as Adam has it, out of the matter.
+Units for one common learning rate (`rescale`): step lengths from `Sensitivity.length` make all parameters equally fast.
+Gradients are divided by the root mean square of a sample, so that Adam's absolute epsilon has no effect.
 
-Units for gradient descent (`measure_curvatures`, `scale: curvature`): the largest curvature lambda of the loss in what
-the optimiser moves, v, by power iteration on differences of gradients at common random numbers,
+Units for gradient descent (`measure_curvatures`, `scale: curvature`): the largest curvature lambda of the loss in the
+optimiser's variable v, by power iteration on differences of gradients at common random numbers,
 
     H d = (g(v + h d) - g(v - h d)) / (2 h),   d <- H d / |H d|,   lambda = |H d|,
 
-h such that the image changes by about 3 %. The gradient is then divided by lambda, and by the number of parameters:
-blocks whose norm is 1 leave that of a positive matrix at most at their number. A rate of 1 is Newton's step along the
-steepest direction; descent converges below a rate of 2, while the curvature is the start's.
+with h such that the image changes by about 3 %. The gradient is then divided by lambda, and by the number of
+parameters: if blocks have norm 1, the norm of a positive matrix is at most their number. A rate of 1 is Newton's step
+along the steepest direction; descent converges below a rate of 2, as long as the curvature is that of the start.
 """
 
 from __future__ import annotations
@@ -52,9 +51,9 @@ from reslrb_cli.statistics import Array, rms
 
 
 def sample_gradient(problem: Problem, integrator: Any, round: int, purpose: str, spp: int) -> dict[str, Any]:
-    """One step of all views, evaluated, with the seeds of `round` and `purpose`.
+    """Take one step of all views, evaluated, with the seeds of `round` and `purpose`.
 
-    Returns the gradient of each parameter as it is accumulated in `problem.optimizer`; `take_gradient` has to follow.
+    The gradients are accumulated in `problem.optimizer`; `take_gradient` must follow.
     """
     run = problem.config.run
     for view in problem.trained:
@@ -69,7 +68,7 @@ def sample_gradient(problem: Problem, integrator: Any, round: int, purpose: str,
 
 
 def take_gradient(problem: Problem) -> dict[str, Array]:
-    """The gradients that have been accumulated, each in a row, 0 where they are not finite; they are cleared."""
+    """Return the accumulated gradients, flat, 0 where they are not finite, and clear them."""
     taken = {}
     for key, value in problem.gradients().items():
         taken[key] = finite(np.array(value, dtype=np.float32)).ravel()
@@ -78,12 +77,12 @@ def take_gradient(problem: Problem) -> dict[str, Array]:
 
 
 def finite(values: Array) -> Array:
-    """The values, 0 where they are not finite."""
+    """Return the values, 0 where they are not finite."""
     return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def unrecorded(integrator: Any) -> Any:
-    """The integrator without recordings of its steps, which would cost more than a few of these save."""
+    """Return the integrator without recordings of its steps, which do not pay for a few steps."""
     if not isinstance(integrator, LightTracer):
         return integrator
     return integrator.with_options(samples_per_pass=integrator.samples_per_pass, freeze=False)
@@ -112,7 +111,9 @@ QUANTITIES = ("gradient", "change", "curvature", "length")
 
 @dataclass(frozen=True)
 class Conditioning:
-    """What was measured of each parameter, from `samples` gradients of `spp` samples per pixel, of the run's `seed`."""
+    """Measured sensitivities of all parameters, from `samples` gradients of `spp` samples per pixel, with the run's
+    `seed`.
+    """
 
     rows: list[Sensitivity]
     samples: int
@@ -120,30 +121,35 @@ class Conditioning:
     seed: int
 
     def spread(self, quantity: str) -> float | None:
-        """The largest value of one of QUANTITIES over its smallest, of those above 0; None of fewer than two.
+        """Return the largest value of one of QUANTITIES divided by its smallest, of those above 0; None for fewer than
+        two.
 
-        That of `curvature` is the condition number of the Gauss-Newton matrix's diagonal, by parameters.
+        For `curvature`, this is the condition number of the diagonal of the Gauss-Newton matrix, by parameters.
         """
         values = [getattr(row, quantity) for row in self.rows]
         positive = [value for value in values if value is not None and value > 0]
         return max(positive) / min(positive) if len(positive) > 1 else None
 
     def to_json(self) -> dict[str, Any]:
-        """As a mapping for JSON."""
+        """Return the content as a mapping for JSON."""
         values = asdict(self)
         rows, spread = values.pop("rows"), map(self.spread, QUANTITIES)
         return values | {"parameters": rows, "spread": dict(zip(QUANTITIES, spread, strict=True))}
 
 
 def measure_conditioning(problem: Problem, samples: int) -> Conditioning:
-    """Measure every parameter of `problem`, which has its targets, where it stands; at least 2 `samples`."""
+    """Measure every parameter of `problem` at its current value; the problem needs its targets, and `samples` is at
+    least 2.
+    """
     run = problem.config.run
     return Conditioning(measure_sensitivities(problem, samples), samples, run.spp, run.seed)
 
 
 def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
-    """Measure every parameter of `problem` where it stands, by `samples` gradients, at least 2, and a few images, each
-    with the run's samples per pixel."""
+    """Measure every parameter of `problem` at its current value, by `samples` gradients (at least 2) and a few images.
+
+    Each has the run's samples per pixel.
+    """
     problem.apply()
     rows: dict[str, list[Array]] = {key: [] for key in problem.selection.keys}
     total: dict[str, Any] = {}
@@ -172,7 +178,7 @@ def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
 def _probe(
     problem: Problem, row: Sensitivity, direction: Any, base: Sequence[Array], reference: Sequence[Array]
 ) -> Sensitivity:
-    """`row` with what the image tells, along `direction`, where it does."""
+    """Return `row` with the sensitivity of the image along `direction`, if it changes."""
     key, value = row.key, dr.detach(problem.optimizer[row.key])
     low, high = problem.selection.spec(key).bounds or (-math.inf, math.inf)
     # 1 % of the parameter, whatever its unit; of its range where it is 0; a guess where it has none.
@@ -204,7 +210,7 @@ def _probe(
 
 
 def _second_difference(problem: Problem, base: Sequence[Array], difference: Sequence[Array], factor: float) -> float:
-    """L(I + D) - 2 L(I) + L(I - D), over the views by their shares, D `factor` times the difference."""
+    """Return L(I + D) - 2 L(I) + L(I - D), over the views by their shares; D is `factor` times the difference."""
     total = 0.0
     for image, change, view in zip(base, difference, problem.trained, strict=True):
         for side, times in ((1, 1), (0, -2), (-1, 1)):
@@ -214,8 +220,10 @@ def _second_difference(problem: Problem, base: Sequence[Array], difference: Sequ
 
 
 def see_images(problem: Problem, spp: int | None = None, round: int = 0, purpose: str = _PURPOSE) -> list[Array]:
-    """Every view that is trained on, exposed, without alpha, 0 where it is left out, always from the same seeds; by
-    `spp` samples per pixel, or the run's."""
+    """Render every training view, exposed, without alpha, 0 in masked pixels, always from the same seeds.
+
+    With `spp` samples per pixel, or the run's.
+    """
     run, images = problem.config.run, []
     for view in problem.trained:
         at = seed(run.seed, round, view.sensor, purpose)
@@ -226,9 +234,9 @@ def see_images(problem: Problem, spp: int | None = None, round: int = 0, purpose
 
 
 def rescale(problem: Problem) -> list[Scaled]:
-    """Measure, and let the optimiser move each parameter in units of what was found; return that.
+    """Measure, let the optimiser move each parameter in units of the result, and return it.
 
-    A parameter without an effect on the image stays as it is.
+    A parameter without an effect on the image keeps its units.
     """
     optimizer = problem.optimizer
     measured = [Scaled(**row.to_json()) for row in measure_sensitivities(problem, SAMPLES)]
@@ -256,9 +264,9 @@ POWER_ITERATIONS = 8
 
 
 def measure_curvatures(problem: Problem) -> list[Scaled]:
-    """Measure, and let gradient descent move each parameter in units of its steepest curvature; return that.
+    """Measure, let gradient descent move each parameter in units of its steepest curvature, and return the result.
 
-    A parameter without an effect on the image stays as it is.
+    A parameter without an effect on the image keeps its units.
     """
     optimizer, measured = problem.optimizer, []
     starts = {key: dr.detach(optimizer[key]) for key in problem.selection.keys}
@@ -284,7 +292,7 @@ def measure_curvatures(problem: Problem) -> list[Scaled]:
 
 
 def _steepest(problem: Problem, key: str, v: Any, gradient: Array, base: Sequence[Array]) -> float:
-    """The largest curvature of the loss in `v`, what the optimiser moves of `key`; 0 where nothing is seen of it."""
+    """Return the largest curvature of the loss in `v`, the optimiser's variable of `key`; 0 if it is not visible."""
     size = math.sqrt(sum(float(np.square(image).sum()) for image in base))
     direction = gradient / (np.linalg.norm(gradient) or 1.0)
     step = 0.01 * (rms(np.array(v)) or 1.0) * math.sqrt(gradient.size)
@@ -315,7 +323,7 @@ def _steepest(problem: Problem, key: str, v: Any, gradient: Array, base: Sequenc
 
 
 def _gradient_at(problem: Problem, key: str, v: Any) -> Array:
-    """dL/dv in a row where the optimiser has `v` of `key`, always from the same samples."""
+    """Return dL/dv, flat, with the optimiser's variable `v` of `key`, always from the same samples."""
     optimizer = problem.optimizer
     variable = optimizer.variable(key)
     optimizer.set_value(key, variable.to_scene(v))
@@ -328,12 +336,12 @@ def _gradient_at(problem: Problem, key: str, v: Any) -> Array:
 
 
 def _like(value: Any, row: Array) -> Any:
-    """The numbers of `row` as an array of the type and shape of `value`."""
+    """Return the numbers of `row` as an array of the type and shape of `value`."""
     return type(value)(row.reshape(np.array(value).shape).astype(np.float32))
 
 
 def own_length(transform: Transform | None, bounds: Bounds, value: Any, length: float) -> float:
-    """What `length`, of the scene's `value`, is in the optimiser's variable: a mean over the entries."""
+    """Return `length`, of the scene's `value`, in the optimiser's variable: a mean over the entries."""
     if transform is None:
         return length
     low, high = bounds or (-math.inf, math.inf)
@@ -347,9 +355,9 @@ def own_length(transform: Transform | None, bounds: Bounds, value: Any, length: 
 
 
 def step_line(row: Scaled, transform: str, learning_rate: float) -> str:
-    """What the user is told of one parameter; `transform` and `learning_rate` are those of its configuration.
+    """Return a line for the user about one parameter; `transform` and `learning_rate` are those of its configuration.
 
-    A step is in units of what the optimiser moves; what that is of the parameter itself is told for the first one.
+    A step is in units of the optimiser's variable; for the first step, the line also has the movement of the parameter.
     """
     if row.own_length is None:
         lacks = "no effect on the image" if row.length is None else "no gradient"
@@ -362,7 +370,7 @@ def step_line(row: Scaled, transform: str, learning_rate: float) -> str:
 
 
 def curvature_line(row: Scaled, learning_rate: float) -> str:
-    """What the user is told of one parameter in units of its curvature."""
+    """Return a line for the user about one parameter in units of its curvature."""
     if row.own_length is None:
         return f"{row.key} has no effect on the image where it starts; it is not scaled"
     return f"{row.key} moves by {row.first_step or 0.0:.3g} at first, at {learning_rate:g} of what its steepness bears"

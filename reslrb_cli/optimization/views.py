@@ -1,12 +1,11 @@
-"""A view: one sensor, the image that it is to see, and how the two are compared.
+"""View: one sensor, its target image, and their comparison.
 
-- `Exposure`: what a view's image is multiplied by before it is compared: a number, or one that is recovered with the
-  rest. The model is  target = exposure * image,  with one exposure E for all channels or one for each. The derivative
-  of a loss L(E I) with respect to E is the sum over pixels of dL/dI I / E: it takes the samples that the other
-  parameters' derivatives are made of, and no more. Where dL/dI comes from other samples than I, it is as unbiased as
-  those are.
-- `Wanted`: what an experiment says of its views, in `views` or, of one alone, in `target`.
-- `Masked`, the pixels of a view that are left out, and `View` itself.
+- `Exposure`: factor of a view's image before the comparison: a number, or a recovered parameter. The model is  target =
+  exposure * image,  with one exposure E for all channels or one for each. The derivative of a loss L(E I) with respect
+  to E is the sum over pixels of dL/dI I / E. It uses the samples of the other derivatives. If dL/dI comes from other
+  samples than I, it is as unbiased as these.
+- `Wanted`: settings of the views, from `views` or, for a single view, from `target`.
+- `Masked`, the masked pixels of a view, and `View` itself.
 """
 
 from __future__ import annotations
@@ -45,18 +44,18 @@ SHARED = "exposure"
 
 @dataclass
 class Exposure:
-    """The exposure of one view: `fixed`, or where `key` is not empty the value of that key in `values`."""
+    """Exposure of one view: `fixed`, or the value of `key` in `values` if `key` is not empty."""
 
     fixed: float = 1.0
     key: str = ""
     values: Mapping[str, Any] = field(default_factory=dict)
 
     def now(self) -> mi.Float | mi.Color3f | float:
-        """The exposure as it stands, without derivatives: of width 1, one for each channel, or the fixed number."""
+        """Return the current exposure, without derivatives: of width 1, one per channel, or the fixed number."""
         return dr.detach(self.values[self.key]) if self.key else self.fixed
 
     def applied(self, image: mi.TensorXf) -> mi.TensorXf:
-        """E I of an image (H, W, C), attached to what the image is attached to."""
+        """Return E I for an image (H, W, C), attached as the image is."""
         value = self.now()
         if isinstance(value, (int, float)):
             return image if value == 1 else image * value
@@ -67,13 +66,13 @@ class Exposure:
         return mi.TensorXf(image.array * value, image.shape)
 
     def of_array(self, image: Array) -> Array:
-        """E I of an image (H, W, C or more), its alpha as it is."""
+        """Return E I for an image (H, W, C or more), without changing its alpha."""
         factor = np.ones(image.shape[2], np.float32)
         factor[: 1 if image.shape[2] <= 2 else 3] = np.array(self.now(), np.float32).ravel()
         return image * factor
 
     def add_gradient(self, leaf: Any, channels: int, image: mi.TensorXf, gradient: mi.TensorXf) -> None:
-        """Add dL/dE to the gradient of `leaf`, of an image (H, W, `channels` or more) and its dL/dI."""
+        """Add dL/dE to the gradient of `leaf`, for an image (H, W, `channels` or more) and its dL/dI."""
         product = first_channels(image, channels) * first_channels(gradient, channels)
         # A pixel that is left out may hold anything, and has no derivative.
         each = dr.select(first_channels(gradient, channels).array != 0, product.array, 0)
@@ -87,10 +86,10 @@ class Exposure:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What an experiment says of the view through `sensor`: its target's file, None of a rendered one, and its mask.
+    """Settings of the view through `sensor`: the file of its target (None for a rendered one), and its mask.
 
-    `file_key` and `mask_key` are where they stand in the configuration. `exposure` is a number, or how it is recovered,
-    by which key; `part` is the view's part of the loss, relative to the others'.
+    `file_key` and `mask_key` are their places in the configuration. `exposure` is a number, or the settings of its
+    recovery, with its key; `part` is the view's weight in the loss, relative to the others.
     """
 
     sensor: int = 0
@@ -105,7 +104,7 @@ class Wanted:
 
 
 def wanted_views(config: Config, scene: mi.Scene) -> list[Wanted]:
-    """What is wanted of every view. Raises ConfigError for a sensor that is not there, or cannot be held out."""
+    """Return the settings of every view. Raises ConfigError for a sensor that does not exist, or cannot be held out."""
     sensors, target, images = choose_sensors(config, scene), config.target, {}
     if config.scene.cameras is not None and target.render is None:
         images = {sensor: camera.image for sensor, camera in enumerate(read_cameras(config.scene.cameras))}
@@ -149,7 +148,7 @@ def wanted_views(config: Config, scene: mi.Scene) -> list[Wanted]:
 
 
 def _held_out(config: Config, scene: mi.Scene, sensors: list[int]) -> set[int]:
-    """The indices of the sensors that `run.held_out` names. Raises ConfigError for one that has no view."""
+    """Return the indices of the sensors in `run.held_out`. Raises ConfigError for a sensor without a view."""
     names, found = {scene.sensors()[sensor].id(): sensor for sensor in sensors}, set()
     for place, given in enumerate(config.run.held_out):
         sensor = names.get(given, -1) if isinstance(given, str) else given
@@ -160,7 +159,7 @@ def _held_out(config: Config, scene: mi.Scene, sensors: list[int]) -> set[int]:
 
 
 def _view_specs(config: Config, sensors: list[int]) -> list[ViewSpec]:
-    """Return what is said of each view: `views`, or what `target` says of the scene's sensor or cameras."""
+    """Return the settings of each view: `views`, or those of `target` for the scene's sensor or cameras."""
     if config.views is not None:
         return config.views
     return [ViewSpec.model_construct(sensor=sensor, target=config.target.file) for sensor in sensors]
@@ -168,9 +167,9 @@ def _view_specs(config: Config, sensors: list[int]) -> list[ViewSpec]:
 
 @dataclass
 class Masked:
-    """The pixels of one view, boolean (H, W) by kind, that `left_out` leaves out; a pixel may be of several kinds.
+    """Masked pixels of one view, boolean (H, W) by kind, that `left_out` excludes; a pixel may have several kinds.
 
-    `weights` (H, W) are what the file gives, None without one; `stay` are the pixels of a kind that was only counted.
+    `weights` (H, W) come from a file, None without one; `stay` are the pixels of a kind that is only counted.
     """
 
     left_out: dict[str, Array] = field(default_factory=dict)
@@ -178,26 +177,28 @@ class Masked:
     weights: Array | None = None
 
     def total(self, shape: tuple[int, int]) -> Array:
-        """What each pixel weighs, float32 (H, W): 0 where it is left out, and 1 elsewhere without a file."""
+        """Return the weight of each pixel, float32 (H, W): 0 if it is excluded, and 1 elsewhere without a file."""
         total = np.ones(shape, np.float32) if self.weights is None else self.weights.astype(np.float32)
         for pixels in self.left_out.values():
             total = np.where(pixels, np.float32(0), total)
         return total
 
     def counts(self) -> dict[str, int]:
-        """How many pixels each kind leaves out, of those that leave out any."""
+        """Return the number of pixels that each kind excludes, without zeros."""
         return {kind: count for kind, pixels in self.left_out.items() if (count := int(pixels.sum()))}
 
 
 @dataclass
 class View:
-    """What the scene's sensor of index `sensor` is to see, of which `share` (those trained on sum to 1) is the loss.
+    """View through the scene's sensor of index `sensor`; `share` is its weight in the loss (those of training views sum
+    to 1).
 
-    `made` is the target (H, W, C), without alpha; None until there is one, which `target` raises LookupError for.
-    `weights`, of the same shape with a mean of 1, say what its entries count, 0 of those that `masked` leaves out;
-    None where all are the same. `fits`: the image is scaled to suit the target (`fitted`, `across` as there). What is
-    `held_out` is not trained on, and has a loss of its own. `codes` are what of the loss users have written. `fixed`
-    are the weights (H, W) without the mask of glass and mirrors, where that moves (`follow`); None where it does not.
+    - `made` is the target (H, W, C), without alpha; None until it exists, and `target` then raises LookupError.
+    - `weights`, of the same shape with a mean of 1, are 0 for entries that `masked` excludes; None if all are equal.
+    - `fits`: the image is scaled to fit the target (`fitted`, with `across`).
+    - A `held_out` view is not trained on, and has its own loss.
+    - `codes` are the user's losses.
+    - `fixed` are the weights (H, W) without the mask of moving glass and mirrors (`follow`); None without one.
     """
 
     sensor: int
@@ -216,27 +217,27 @@ class View:
 
     @property
     def target(self) -> mi.TensorXf:
-        """The target (H, W, C), without alpha. Raises LookupError before it was made."""
+        """The target (H, W, C), without alpha. Raises LookupError before it exists."""
         if self.made is None:
             raise LookupError(f"view {self.sensor} has no target yet")
         return self.made
 
     def see(self, target: Array, weights: Array | None = None) -> None:
-        """Take a target (H, W, C), finite where its weights (H, W) are not 0: what they leave out is 0 otherwise."""
+        """Set a target (H, W, C), finite where its weights (H, W) are not 0; excluded entries become 0."""
         if weights is not None and not np.all(weights == 1):
             target = np.where(np.isfinite(target), target, 0)
         self.made = to_tensor(target)
         self.weigh(weights)
 
     def weigh(self, weights: Array | None) -> None:
-        """Take weights (H, W) for the target that there is; None weighs all pixels alike."""
+        """Set weights (H, W) for the current target; None weights all pixels equally."""
         self.weights = None
         if weights is not None and not np.all(weights == 1):
             share = weights / weights.mean(dtype=np.float64)
             self.weights = to_tensor(np.broadcast_to(share[:, :, None], self.target.shape))
 
     def follow(self, scene: mi.Scene) -> None:
-        """Leave out the pixels that see glass or mirrors where these are now."""
+        """Exclude the pixels that currently show glass or mirrors."""
         if self.fixed is None:
             return
         seen = sees_specular(scene, scene.sensors()[self.sensor])
@@ -245,14 +246,14 @@ class View:
             self.weigh(weights)
 
     def compare(self, image: mi.TensorXf) -> mi.Float:
-        """The loss of an image, of width 1, attached; alpha is left out, the view's exposure applied.
+        """Return the loss of an image, of width 1, attached; without alpha, with the view's exposure.
 
-        The image is (H, W, C), or (2, H, W, C) of two halves of its samples, which `fitted` makes use of.
+        The image is (H, W, C), or (2, H, W, C) with two halves of its samples, which `fitted` uses.
         """
         return self.judge(self.exposure.applied(first_channels(image, self.target.shape[2])))
 
     def judge(self, image: mi.TensorXf) -> mi.Float:
-        """The same of an image that has its exposure, and the target's channels."""
+        """Return the loss of an image with its exposure applied, and the target's channels."""
         target = self.target
         loss = functools.partial(fitted, self.loss, across=self.across) if self.fits else self.loss
         if not self.fits:
@@ -263,9 +264,9 @@ class View:
         return loss(dr.select(self.weights > 0, image, target), target, self.weights)
 
     def curvature(self, known: bool) -> Array:
-        """Return the curvature (H, W) of the loss in each pixel, with a mean of 1; where it is not `known`, that of l2.
+        """Return the curvature (H, W) of the loss in each pixel, with a mean of 1; that of l2 if it is not `known`.
 
-        Pixels that are left out have 0. Noise is taken to be as large in each channel as the target is.
+        Excluded pixels have 0. The noise of each channel is assumed to be proportional to the target.
         """
         target, loss = np.array(self.target), self.loss if known else l2
         change = np.abs(target) + 1e-3
@@ -274,7 +275,7 @@ class View:
         return np.asarray(curvature / curvature.mean())
 
     def scale(self, image: mi.TensorXf) -> float:
-        """What an image as in `compare` is multiplied by, beside the exposure: 1, unless it is `fitted`."""
+        """Return the factor of an image as in `compare`, besides the exposure: 1 unless it is `fitted`."""
         if not self.fits:
             return 1.0
         exposed = self.exposure.applied(first_channels(image, self.target.shape[2]))
@@ -283,22 +284,22 @@ class View:
         return float(best_scale(halves_of(exposed), self.target, self.weights)[0])
 
     def exposed(self, seen: mi.TensorXf) -> tuple[Array, Array, float]:
-        """An image as in `compare`, itself (H, W, C) and as its target is exposed, and what `scale` says of it."""
+        """Return an image as in `compare` (H, W, C), the same with the exposure of its target, and its `scale`."""
         image, scale = np.array(whole_of(seen)), self.scale(seen)
         exposure = Exposure(self.exposure.fixed * scale) if self.fits else self.exposure
         return image, exposure.of_array(image), scale
 
     def kept(self, image: Array) -> Array:
-        """An image of the target's shape, 0 where pixels are left out."""
+        """Return an image of the target's shape, 0 in excluded pixels."""
         return image if self.weights is None else np.where(np.array(self.weights) > 0, image, 0)
 
     def objective(self, image: mi.TensorXf) -> mi.Float:
-        """What the view adds to the loss of all views."""
+        """Return the view's term in the loss of all views."""
         return self.compare(image) * self.share
 
 
 def slope(loss: Callable[[mi.TensorXf], mi.Float], image: Array) -> Array:
-    """The derivative of a loss of images, of width 1, at one of them (H, W, C); finite or not."""
+    """Return the derivative of a loss of images, of width 1, at an image (H, W, C); finite or not."""
     leaf = mi.TensorXf(np.ascontiguousarray(image, dtype=np.float32))
     dr.enable_grad(leaf)
     dr.backward(loss(leaf))
@@ -306,7 +307,7 @@ def slope(loss: Callable[[mi.TensorXf], mi.Float], image: Array) -> Array:
 
 
 def view_records(views: list[View]) -> list[dict[str, Any]]:
-    """What a run's manifest says of its views: share of the loss, pixels, how many are left out, and of which kinds."""
+    """Return the views for a run's manifest: share of the loss, pixels, number and kinds of excluded pixels."""
     return [
         {
             "sensor": view.sensor,
@@ -323,8 +324,10 @@ def view_records(views: list[View]) -> list[dict[str, Any]]:
 
 
 def make_views(config: Config, scene: mi.Scene) -> list[View]:
-    """Return the views of an experiment, without their targets. Raises ConfigError as `wanted_views`, and for images
-    that are too small for a loss."""
+    """Return the views of an experiment, without their targets.
+
+    Raises ConfigError as `wanted_views`, and for images that are too small for a loss.
+    """
     wanted = wanted_views(config, scene)
     views: list[View] = []
     total = sum(one.part for one in wanted if not one.held_out)
@@ -350,7 +353,7 @@ def make_views(config: Config, scene: mi.Scene) -> list[View]:
 
 
 def expose(views: list[View], scene: mi.Scene, selection: Selection) -> None:
-    """Give views their exposures, and have `selection` recover those that are not known."""
+    """Give views their exposures, and let `selection` recover the unknown ones."""
     for view in views:
         kind, key = view.wanted.exposure, view.wanted.exposure_key
         if not isinstance(kind, str):
@@ -364,17 +367,17 @@ def expose(views: list[View], scene: mi.Scene, selection: Selection) -> None:
 
 
 def color_channels(film: mi.Film) -> int:
-    """How many channels an image of `film` has without alpha."""
+    """Return the number of channels of an image of `film` without alpha."""
     return 1 if int(film.base_channels_count()) <= 2 else 3
 
 
 def to_tensor(array: Array) -> mi.TensorXf:
-    """An image (H, W, C) in Dr.Jit's own memory."""
+    """Return an image (H, W, C) in Dr.Jit's own memory."""
     return mi.TensorXf(own_memory(mi.Float, np.ravel(array).astype(np.float32, copy=False)), array.shape)
 
 
 def target_arrays(views: list[View]) -> dict[str, Array]:
-    """The views' targets and weights, to be handed to another process, which `set_targets` sets them in."""
+    """Return the views' targets and weights, to send to another process, where `set_targets` sets them."""
     arrays = {}
     for number, view in enumerate(views):
         arrays[f"target-{number}"] = np.array(view.target)
@@ -386,7 +389,7 @@ def target_arrays(views: list[View]) -> dict[str, Array]:
 
 
 def set_targets(views: list[View], arrays: Mapping[str, Array]) -> None:
-    """Give views the targets and weights of `target_arrays`."""
+    """Set the targets and weights of views from the result of `target_arrays`."""
     for number, view in enumerate(views):
         view.made = to_tensor(arrays[f"target-{number}"])
         weights = f"weights-{number}"

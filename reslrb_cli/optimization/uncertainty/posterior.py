@@ -113,26 +113,28 @@ class Measured:
 
     @property
     def prior(self) -> float:
-        """The standard deviation of the offset of an entry at the start: between bounds, at most that of any place."""
+        """Standard deviation of the offset of an entry at the start: between bounds, at most that of a uniform
+        distribution.
+        """
         low, high = self.bounds
         return min(self.scale, (high - low) / np.sqrt(12))
 
     @property
     def steps(self) -> Array:
-        """The eta of all iterations: the schedule's factors, by the pace."""
+        """The eta of all iterations: the schedule's factors times the pace."""
         rates = np.asarray(self.rates, dtype=np.float64)
         return rates if self.pace is None else rates * self.pace
 
     @property
     def touched(self) -> Array:
-        """Which entries any gradient sample was not 0 of, (N,)."""
+        """Entries for which any gradient sample was not 0, (N,)."""
         return np.any(self.gradients, axis=0)
 
     @property
     def at_bound(self) -> Array:
-        """Which entries stand at a bound, (N,): within a step of it, where the gradient does not pull them back.
+        """Entries at a bound, (N,): within a step of it, if the gradient does not pull them back.
 
-        The gradient of the loss points upwards: at the lower bound one above 0 holds the value there.
+        The gradient of the loss points upwards: at the lower bound, a positive gradient holds the value there.
         """
         low, high = (np.float32(bound) for bound in self.bounds)
         step = self.response * self.rates[-1] * np.sqrt(self.noise)  # by which noise moved it in the last iteration
@@ -144,19 +146,22 @@ class Measured:
 
     @property
     def driven(self) -> Array:
-        """Which entries the run has moved to a bound, (N,): they had gradients, though they may have none there."""
+        """Entries that the run has moved to a bound, (N,): they had gradients, though they may have none there."""
         return np.asarray(self.at_bound & (False if self.start is None else self.value != self.start))
 
     def within(self, to_go: Array) -> Array:
-        """Ways to the optimum, cut off at the bounds: what is far off is not as the curvature here has it."""
+        """Return movements to the optimum, clipped at the bounds, because the curvature does not hold far away."""
         low, high = self.bounds
         return np.clip(to_go, np.minimum(self.value - high, 0), np.maximum(self.value - low, 0)).astype(np.float64)
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """The offset of each of M entries from the optimum, as estimated: its mean (`to_go`, M), its `variance` (M,), what
-    of its spread is the target's (`of_target`, M), and where entries were judged together its covariance (M, M)."""
+    """Estimated offset of each of M entries from the optimum.
+
+    It has the mean (`to_go`, M), the `variance` (M,), the part of the spread from the target (`of_target`, M), and, if
+    entries were judged together, the covariance (M, M).
+    """
 
     to_go: Array
     variance: Array
@@ -165,12 +170,12 @@ class Posterior:
 
     @property
     def error(self) -> Array:
-        """The standard error of `to_go`, (M,)."""
+        """Standard error of `to_go`, (M,)."""
         return np.sqrt(np.maximum(self.variance, 0.0))
 
     @property
     def spread(self) -> Array:
-        """The root mean square of the offset, (M,): one standard deviation of a final value about the optimum."""
+        """Root mean square of the offset, (M,): one standard deviation of a final value around the optimum."""
         return np.hypot(self.to_go, self.error)
 
 
@@ -178,13 +183,14 @@ def joint(
     curvature: Array, response: Array, scale: Array, noise: Array, gradient: Array, samples: int | Array,
     rates: Sequence[float] | Array, fixed: Array | None = None, came: Array | float = 0.0,
 ) -> Posterior:  # fmt: skip
-    """The offset of M entries together.
+    """Return the joint offset of M entries.
 
-    `curvature` is H (M, M), `noise` the covariance of one gradient (M, M), `gradient` the mean of `samples` of them,
-    for all or for each of the M, where the fewer are among the more. `response` is the diagonal of P, `scale` the
-    standard deviation of the offset at the start, all (M,), `rates` the eta of all iterations, `fixed` the B (M, M) of
-    what all gradients share; None: nothing. `came` is the known way (M,) that they came after these iterations. Each
-    entry is taken in units of its scale, so that those of different units have well-conditioned matrices.
+    `curvature` is H (M, M), `noise` the covariance of one gradient (M, M), and `gradient` the mean of `samples` of
+    them, one number for all or one for each of the M entries, where the fewer samples are among the more. `response` is
+    the diagonal of P, `scale` the standard deviation of the offset at the start, all (M,), `rates` the eta of all
+    iterations, and `fixed` the B (M, M) of the noise that all gradients share (None: nothing). `came` is the known
+    movement (M,) after these iterations. Each entry is in units of its scale, so that matrices of different units are
+    well-conditioned.
     """
     units = np.outer(scale, scale)
     H, Sigma = _positive(curvature * units), _positive(noise * units)
@@ -206,10 +212,10 @@ def joint(
 
 
 def _unforeseen(H: Array, E: Array, beside: Array, surprise: Array) -> Array:
-    """What is to be added to the covariance E of offsets, in units of the start, where gradients contradict it.
+    """Return the addition to the covariance E of offsets, in units of the start, if gradients contradict it.
 
-    `surprise` is by how much they differ from what was to be expected, and `beside` the part of that difference's
-    covariance that does not come from E.
+    `surprise` is the difference from the expected gradients, and `beside` the part of its covariance that does not come
+    from E.
     """
     values, vectors = np.linalg.eigh(H)
     c, s = (np.einsum("me,mn,ne->e", vectors, each, vectors) for each in (E, beside))
@@ -223,7 +229,9 @@ def alone(
     curvature: Array, response: Array, scale: Array, noise: Array, gradient: Array, samples: int | Array,
     rates: Sequence[float] | Array, fixed: Array | float = 0.0, came: Array | float = 0.0,
 ) -> Posterior:  # fmt: skip
-    """The offset of each entry as if all others were known; everything is (M,), as in `joint`, and C the model's."""
+    """Return the offset of each entry as if all others were known; all arrays are (M,), as in `joint`, and C is the
+    model's.
+    """
     h = np.maximum(curvature, 0.0)
     C, D = scale**2, np.zeros_like(h)
     for rate in rates:
@@ -238,12 +246,14 @@ def alone(
 
 
 def _driven(step: Array, curvature: Array) -> Array:
-    """How far one step goes per unit of a constant gradient: not beyond where curvature makes up for that."""
+    """Return the movement by one step per unit of a constant gradient, at most to where curvature compensates
+    for it.
+    """
     return np.asarray(np.minimum(step, 1 / np.maximum(curvature, 1e-300)))
 
 
 def _after(H: Array, response: Array, noise: Array, rates: Sequence[float] | Array) -> tuple[Array, Array]:
-    """The covariance after all steps from a start of unit variances, and how far a constant gradient has driven them.
+    """Return the covariance after all steps from a start of unit variances, and the movement by a constant gradient.
 
     An entry that no step moves stays where it was.
     """
@@ -266,6 +276,6 @@ def _after(H: Array, response: Array, noise: Array, rates: Sequence[float] | Arr
 
 
 def _positive(matrix: Array) -> Array:
-    """The nearest symmetric matrix without negative eigenvalues: what noise made negative is nothing."""
+    """Return the nearest symmetric matrix without negative eigenvalues, which come from noise."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

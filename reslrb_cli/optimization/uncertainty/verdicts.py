@@ -1,30 +1,30 @@
-"""Verdicts on final values, by rules on what was measured, and their record. Nothing here knows of scenes.
+"""Verdicts on final values, by rules on measurements, and their record. Nothing here depends on scenes.
 
 - `weigh`: from gradients and curvature to spreads and verdicts, in a `CertaintyRecord`
-- `judge_together`: all directions judged together, and which of them make up for each other
-- `Verdict`, `judge`, `summarise`: what can be said of a final value, by the rules below
+- `judge_together`: all directions judged together, and which of them compensate for each other
+- `Verdict`, `judge`, `summarise`: verdicts by the rules below
 
-The first rule that holds of an entry decides; `spread` is the standard deviation of its final value about the optimum,
-`alone` the same with all other parameters known, `to_go` the estimated way to the optimum, and tau `TOLERANCE` of the
-entry's scale. All but `spread` are of the optimum of the loss with the target as it is, noise and all.
+The first rule that applies to an entry decides. `spread` is the standard deviation of its final value around the
+optimum, `alone` the same with all other parameters known, `to_go` the estimated distance to the optimum, and tau is
+`TOLERANCE` of the entry's scale. All but `spread` refer to the optimum of the loss with the noisy target.
 
-| verdict          | holds where |
+| verdict          | condition |
 |---|---|
-| `not seen`       | it is a texel that no view shows, whatever light by way of it reaches the images |
+| `not seen`       | a texel that no view shows, even if its light reaches the images |
 | `no effect`      | every gradient sample was exactly 0, and the run has not driven it to a bound |
 | `at its bound`   | the value is within a step of a bound, and the gradient does not pull it back |
 | `settled`        | spread <= tau |
-| `still moving`   | `to_go` is told from its error (`SURE` of them), and spread > tau without the target's noise |
-| `not determined` | `alone` <= `OTHERS` of `spread`: others make up for it; the most correlated one is named |
-| `below the noise`| otherwise: the gradients do not tell within tau where the value should be |
+| `still moving`   | `to_go` differs from 0 by `SURE` of its errors, and spread > tau without the target's noise |
+| `not determined` | `alone` <= `OTHERS` of `spread`: others compensate for it; the most correlated one is named |
+| `below the noise`| otherwise: the gradients do not determine the value to tau |
 
-A parameter whose most correlated partner is `still moving` is not `settled`: it will move with that one.
+A parameter whose most correlated partner is `still moving` is not `settled`, because it will move with it.
 
-`derivative incomplete` replaces the verdict of a parameter whose derivative lacks a significant share: a run measures
-that before its first iteration (`measure/missing.py`).
+`derivative incomplete` replaces the verdict of a parameter whose derivative lacks a significant share. A run measures
+this before its first iteration (`measure/missing.py`).
 
-A parameter of several entries is what `SETTLED_SHARE` of those that are seen and have an effect are, if that is
-`settled`; otherwise what most of the others are.
+A parameter of several entries is `settled` if `SETTLED_SHARE` of its visible entries with an effect are; otherwise its
+verdict is that of most of the other entries.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ Values = list[float | None] | None
 
 
 class Verdict(str, enum.Enum):
-    """What is known of a final value; of equally many entries the first one here names the parameter."""
+    """Verdict on a final value; if several verdicts have equally many entries, the first one here counts."""
 
     STILL_MOVING = "still moving"
     AT_BOUND = "at its bound"
@@ -69,8 +69,10 @@ class Verdict(str, enum.Enum):
 
 
 def judge(own: Measured, spread: Array, of_run: Array, alone: Array, to_go: Array, error: Array) -> list[Verdict]:
-    """The verdict of each entry of a parameter, by arrays (N,) in its unit: `of_run` is the spread without the target's
-    noise, `error` that of `to_go`."""
+    """Return the verdict of each entry of a parameter, from arrays (N,) in its unit.
+
+    `of_run` is the spread without the target's noise, and `error` that of `to_go`.
+    """
     tolerance = TOLERANCE * own.scale
     rules = [
         (~own.touched & ~own.driven, Verdict.NO_EFFECT),
@@ -85,12 +87,12 @@ def judge(own: Measured, spread: Array, of_run: Array, alone: Array, to_go: Arra
 
 
 def shares(verdicts: Sequence[Verdict]) -> dict[Verdict, float]:
-    """The share of the entries that each verdict has, of those that occur."""
+    """Return the share of the entries with each verdict that occurs."""
     return {verdict: verdicts.count(verdict) / len(verdicts) for verdict in Verdict if verdict in verdicts}
 
 
 def summarise(found: Mapping[Verdict, float]) -> Verdict:
-    """The verdict of a parameter whose entries have these shares."""
+    """Return the verdict of a parameter from the shares of its entries."""
     without = (Verdict.NO_EFFECT, Verdict.NOT_SEEN)
     effective = {verdict: share for verdict, share in found.items() if verdict not in without}
     if not effective:
@@ -103,16 +105,16 @@ def summarise(found: Mapping[Verdict, float]) -> Verdict:
 
 @dataclass(frozen=True)
 class ParameterCertainty:
-    """Of one parameter: its verdict, and the share of its entries that each verdict has.
+    """Verdict on one parameter, and the share of its entries with each verdict.
 
-    `spread` is one standard deviation of the final value about the optimum, `of_target` what the noise of rendered
-    targets makes of that, and `to_go` the estimated way there, in the parameter's unit: one number for each entry of a
-    small parameter, else one, the root mean square over the entries that have an effect; None where none was measured,
-    and of entries at their bounds. `partner` is the parameter that makes up for this one, where one does.
+    `spread` is one standard deviation of the final value around the optimum, `of_target` the part from the noise of
+    rendered targets, and `to_go` the estimated distance, in the parameter's unit: one number for each entry of a small
+    parameter, otherwise the root mean square over the entries with an effect. They are None if nothing was measured,
+    and for entries at their bounds. `partner` is the parameter that compensates for this one, if any.
 
-    `moved` is the root mean square of how far the entries went since the start, and `reach` of how far all steps would
-    have taken them one way, None where their length depends on the gradient (`sgd`); `rate` is the learning rate.
-    `seen` is the share of a texture's texels that some view shows, None where that is not asked.
+    `moved` is the root mean square movement of the entries since the start, and `reach` the distance of all steps in
+    one direction, None if the step length depends on the gradient (`sgd`); `rate` is the learning rate. `seen` is the
+    share of a texture's texels that some view shows, None for other parameters.
     """
 
     verdict: str
@@ -129,12 +131,12 @@ class ParameterCertainty:
 
 @dataclass(frozen=True)
 class CertaintyRecord(Jsonable):
-    """All parameters, by key, and what it took: so many gradients, renderings along directions and random probes, in
-    `measure_s` seconds, compilation (`compile_s`) apart, and that over the time of the run's iterations (`share`).
+    """Certainty of all parameters, by key, and the costs of the estimate.
 
-    `iterations`, `scale` and `learning_rate` (those of `optimizer`) and `target_spp` are the run's. `target_noise` says
-    whether the noise of the targets is in the spreads: `measured` where all of them were rendered, `in part` where some
-    were, else `left out`.
+    The costs are numbers of gradients, renderings along directions and random probes, `measure_s` seconds without
+    compilation (`compile_s`), and `share`, their ratio to the time of the run's iterations. `iterations`, `scale`,
+    `learning_rate` (of `optimizer`) and `target_spp` are the run's. `target_noise` says whether the spreads include the
+    noise of the targets: `measured` if all of them were rendered, `in part` if some were, else `left out`.
     """
 
     parameters: dict[str, ParameterCertainty]
@@ -151,7 +153,7 @@ class CertaintyRecord(Jsonable):
     target_spp: int | None = None
 
     def without_derivatives(self, keys: Collection[str]) -> CertaintyRecord:
-        """Return the record with `derivative incomplete` for these parameters, whatever the derivatives say."""
+        """Return the record with `derivative incomplete` for these parameters, for any derivatives."""
         verdict = Verdict.INCOMPLETE.value
         judged = {key: replace(about, verdict=verdict, shares={verdict: 1.0}, partner=None) if key in keys else about
                   for key, about in self.parameters.items()}  # fmt: skip
@@ -160,8 +162,10 @@ class CertaintyRecord(Jsonable):
 
 @dataclass
 class Coordinates:
-    """The joint posterior of all directions that are free, by place: spread, and what of it is the target's; without
-    that the way to go and its error; and partners."""
+    """Joint posterior of all free directions, by place.
+
+    It has the spread and the part from the target; without the target, the distance to go and its error; and partners.
+    """
 
     spread: Array
     of_target: Array
@@ -174,9 +178,9 @@ class Coordinates:
 def judge_together(
     measured: Mapping[str, Measured], directions: Sequence[Direction], curvature: Array, fixed: Array
 ) -> Coordinates:
-    """All directions, of curvature H and target's noise B (M, M), in one posterior.
+    """Judge all directions, with curvature H and target noise B (M, M), in one posterior.
 
-    What stands at its bound, or has no effect, is taken for known: the others are judged without it.
+    Entries at their bounds, or without effect, count as known.
     """
     count, iterations = len(directions), len(next(iter(measured.values())).rates)
     scale = np.array([1.0 if d.entry is None else measured[d.key].prior for d in directions])
@@ -220,18 +224,18 @@ def judge_together(
 
 
 def _eta(measured: Mapping[str, Measured], keys: Collection[str]) -> Array:
-    """The eta of all iterations of these parameters together: the geometric mean of theirs."""
+    """Return the eta of all iterations of these parameters together: the geometric mean of theirs."""
     first, paces = next(iter(measured.values())), [measured[key].pace for key in keys]
     found = [np.log(np.maximum(pace, 1e-300)) for pace in paces if pace is not None]
     return np.asarray(first.rates, dtype=np.float64) * np.exp(np.sum(found, axis=0) / len(paces) if found else 0.0)
 
 
 def noise_covariance(samples: Array, variance: Array, curvature: Array) -> Array:
-    """The covariance (M, M) of the noise of one gradient, of (M, K) samples, M variances, and H (M, M).
+    """Return the covariance (M, M) of the noise of one gradient, from (M, K) samples, M variances, and H (M, M).
 
-    Far fewer samples than entries tell no covariance. But noise that comes from dL/dI reaches the parameters through
-    the same J as the curvature: its correlations are taken for those of H, times one factor in [0, LIKE] that fits the
-    samples best.
+    Far fewer samples than entries do not determine a covariance. But noise from dL/dI reaches the parameters through
+    the same J as the curvature, so its correlations are those of H times one factor in [0, LIKE] that fits the samples
+    best.
     """
     size = np.sqrt(np.maximum(np.diag(curvature), 0.0))
     alike = np.clip(curvature / np.maximum(np.outer(size, size), 1e-300), -1, 1) * np.outer(size > 0, size > 0)
@@ -245,7 +249,7 @@ def noise_covariance(samples: Array, variance: Array, curvature: Array) -> Array
 
 
 def _partner(row: Array, place: int, chosen: Array, directions: Sequence[Direction]) -> str | None:
-    """The parameter whose offset is the most correlated with that at `place`; another one, if any is."""
+    """Return the parameter whose offset is most correlated with that at `place`, if there is another one."""
     others = {other: value for other, value in zip(chosen.tolist(), row, strict=True) if other != place}
     likely = {other: value for other, value in others.items() if value >= LEAST_CORRELATION}
     foreign = {other: value for other, value in likely.items() if directions[other].key != directions[place].key}
@@ -262,10 +266,10 @@ def weigh(
     fixed: Array,
     fixed_diagonal: Gradients,
 ) -> dict[str, ParameterCertainty]:
-    """The certainty of each parameter, from the curvature along directions, and by entry for those of many entries.
+    """Return the certainty of each parameter, from the curvature along directions, and by entry for large parameters.
 
-    `pixels` is by how many values of images a texture is seen, where that is known: they tell no more entries. `fixed`
-    and `fixed_diagonal` are of the noise of the targets what `curvature` and `diagonal` are of the curvature.
+    `pixels` is the number of image values that show a texture, if known; they determine at most as many entries.
+    `fixed` and `fixed_diagonal` are, for the noise of the targets, the same as `curvature` and `diagonal`.
     """
     found, result = judge_together(measured, directions, curvature, fixed), {}
     for key, own in measured.items():
@@ -302,7 +306,9 @@ def _large(
     own: Measured, diagonal: Array | None, fixed: Array | None, at: Sequence[int], found: Coordinates,
     pixels: int | None,
 ) -> ParameterCertainty:  # fmt: skip
-    """By entry as if the others were known; all of it together may still be what another parameter makes up for."""
+    """Judge a large parameter by entry as if the others were known; another parameter may still compensate for all of
+    it.
+    """
     touched, shape = own.touched, own.value.shape
     prior = np.full(shape, own.prior)
     spread, of_run, to_go, error, of_target = prior, prior, np.zeros(shape), prior, np.zeros(shape)
@@ -341,5 +347,5 @@ def _certainty(
 
 
 def _numbers(values: Array) -> Values:
-    """As JSON has them; nothing where none is known."""
+    """Return numbers for JSON; None if nothing is known."""
     return None if np.isnan(values).all() else [None if np.isnan(value) else float(value) for value in values]
