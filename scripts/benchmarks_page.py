@@ -302,13 +302,13 @@ def page(blocks: Blocks) -> str:
 
 
 def gallery(blocks: Blocks) -> str:
-    """Return docs/gallery.md: for each recorded experiment a picture, its errors, what the run took and its command."""
+    """Return docs/gallery.md: the picture, errors, costs and command of each experiment that has a picture."""
     parts = [
         "# Gallery\n\n"
         "Every experiment of `configs/`, as it is shipped. Each picture shows the target image, the image at the start "
         "of\nthe run, and the image at its end. Copy an experiment with `reslrb example NAME`.\n"
     ]
-    found = blocks.recorded({experiment_record(name): name for name in EXPERIMENTS})
+    found = blocks.recorded({experiment_record(name): name for name in EXPERIMENTS if gallery_picture(name).exists()})
     for name, record in found.values():
         row, picture = record.rows[0], gallery_picture(name)
         start, end = (run_errors(record, moment) for moment in ("initial", "final"))

@@ -87,8 +87,8 @@ def blocks(name: str) -> list[str]:
 
 
 #: Pages with Python, and their blocks, each of which a test runs: here, or tests/conformance/test_plugin.py.
-PYTHON = {"README.md": 1, "docs/python.md": 7, "docs/integrator.md": 2, "docs/steps.md": 1, "docs/losses.md": 1, "docs/benchmarks.md": 1,
-          "docs/benchmarks/page.md": 1, "docs/your_integrator.md": 1}  # fmt: skip
+PYTHON = {"README.md": 1, "docs/python.md": 7, "docs/integrator.md": 2, "docs/steps.md": 1, "docs/losses.md": 1,
+          "docs/benchmarks.md": 1, "docs/benchmarks/page.md": 1, "docs/your_integrator.md": 1}  # fmt: skip
 
 
 def test_no_page_has_python_that_no_test_runs() -> None:
