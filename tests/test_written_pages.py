@@ -65,7 +65,7 @@ def test_every_table_of_records_says_at_which_commit_it_was_measured(folder: Pat
         file.write_text(f"{json.dumps(origin)}\n{rest}", encoding="utf-8")
     blocks = pages.Blocks(folder)
     assert {f"{number:012x}" for number in range(len(list(folder.glob("*.jsonl"))))} <= set(
-        re.findall(r"\b[0-9a-f]{12}\b", pages.page(blocks) + blocks.experiments())
+        re.findall(r"\b[0-9a-f]{12}\b", pages.page(blocks) + blocks.experiments() + blocks.extreme())
     )
     for name in blocks.makers.keys() - {"machine", "gpu", "extreme"}:
         assert re.search(r"at commit `[0-9a-f]{12}`", blocks.make(name)), name
