@@ -69,7 +69,7 @@ def test_every_table_of_records_says_at_which_commit_it_was_measured(folder: Pat
     )
     for name in blocks.makers.keys() - {"machine", "gpu", "extreme"}:
         assert re.search(r"at commit `[0-9a-f]{12}`", blocks.make(name)), name
-    assert "000000000001` with changes that were not committed" in " ".join(pages.page(blocks).split())
+    assert "000000000003` with changes that were not committed" in " ".join(pages.page(blocks).split())
     assert paper_page.page().count("at commit `") == 3
 
 
