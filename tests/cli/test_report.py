@@ -162,14 +162,14 @@ def test_the_page_says_how_the_run_goes_and_is_whole_at_every_moment(optimize, m
     assert len(between) == 3
     for page in (first, *between):
         assert REFRESH in page
-        assert '<span class="status running">running</span>' in page
+        assert '<span class="status open">running</span>' in page
     for page in between:
         assert f'alt="now: {KEY}"' in page
         assert '<th scope="col">now</th>' in page
     assert "No iteration has been completed yet" in first
     assert "2 iterations in" in between[1]
     assert REFRESH not in last
-    assert '<span class="status finished">finished</span>' in last
+    assert '<span class="status open">finished</span>' in last
     assert f'alt="end: {KEY}"' in last
 
 
