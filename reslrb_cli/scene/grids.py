@@ -1,4 +1,4 @@
-"""A rectangle as a grid of vertices, so that a heightmap can displace it (`heightmap.grid`)."""
+"""Rectangles as grids of vertices that a heightmap can displace (`heightmap.grid`)."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from reslrb_cli.scene.xml.read import Description, Element
 
 
 def make_grid(description: Description, id: str, size: tuple[int, int], place: Place) -> None:
-    """Make a mesh with `size` vertices along its edges of the rectangle `id` of a description, before it is built.
+    """Replace the rectangle `id` of a description by a mesh with `size` vertices along its edges, before it is built.
 
-    That is a `rectangle`, a mesh of four vertices that are a parallelogram's, or one that is a flat grid over one
-    already; its place and its material stay. Raises ConfigError at `place` for any other shape.
+    The shape is a `rectangle`, a mesh of four vertices that form a parallelogram, or a mesh that is a flat grid over
+    one already. Its place and its material stay. Raises ConfigError at `place` for any other shape.
     """
     element = description.root.by_id().get(id)
     if element is None or element.tag != "shape":
@@ -54,10 +54,10 @@ Corners = tuple[np.ndarray, np.ndarray, np.ndarray, bool]
 
 
 def _corners_of(element: Element, description: Description) -> Corners | None:
-    """A corner of a parallelogram in a mesh's file, the ends of its edges along u and along v, and whether v is to the
-    right of u, seen from outside; None of anything else.
+    """Return the parallelogram of a mesh's file; None for anything else.
 
-    Of four vertices without texture coordinates u is what has the mesh to its left.
+    It is given by a corner, the ends of its edges along u and along v, and whether v is to the right of u, seen from
+    outside. For four vertices without texture coordinates, u has the mesh to its left.
     """
     name = element.find("filename")
     path = None if name is None else description.find_file(name.value)
