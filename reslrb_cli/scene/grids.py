@@ -83,8 +83,11 @@ def _corners_of(element: Element, description: Description) -> Corners | None:
 
 
 def _corners_of_grid(mesh: mi.Mesh) -> Corners | None:
-    """The same of a mesh of more vertices, whose texture coordinates are proportional to their places, and which covers
-    all of a parallelogram."""
+    """Return the parallelogram of a mesh with more vertices, whose texture coordinates are proportional to their
+    places.
+
+    The mesh must cover all of it; otherwise None.
+    """
     if mesh.vertex_count() < 4 or not mesh.has_vertex_texcoords():
         return None
     points = np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
@@ -106,7 +109,9 @@ def _corners_of_grid(mesh: mi.Mesh) -> Corners | None:
 
 @functools.cache
 def _grid_file(width: int, height: int, inside_out: bool) -> Path:
-    """A file with a grid over [-1, 1] x [-1, 1], its outside up, or down; it is there as long as this process."""
+    """Return a temporary file with a grid over [-1, 1] x [-1, 1], facing up or down, which exists as long as this
+    process.
+    """
     path = Path(_grid_folder().name) / f"grid_{width}x{height}{'_down' * inside_out}.ply"
     path.write_bytes(face_ply(Setting(size=(2.0, 2.0), thickness=0.0), width, height, back=inside_out))
     return path
