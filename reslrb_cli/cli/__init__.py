@@ -115,10 +115,10 @@ def _set_debug(ctx: click.Context, _parameter: click.Parameter, value: bool) -> 
 )
 @click.version_option(__version__, prog_name="reslrb")
 @click.option(
-    "--debug", is_flag=True, expose_value=False, callback=_set_debug, help="Show the traceback of an error as well."
+    "--debug", is_flag=True, expose_value=False, callback=_set_debug, help="Also show the traceback of an error."
 )
 def main() -> None:
-    """Recover scene parameters from images of what light paths carry, with Mitsuba 3."""
+    """Recover scene parameters from images by gradients through light paths, with Mitsuba 3."""
     logger = logging.getLogger("reslrb_cli")
     if not logger.handlers:
         logger.addHandler(LogLines())

@@ -43,37 +43,42 @@ INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,
 @optional_experiment_arguments
 @click.option("--sweep", "swept", type=click.Choice(["depth", "spp", "film", "texture"]), default="depth",
               show_default=True,
-              help="What is varied: path depth, samples per pixel, or the width of the film or of textures that are "
-                   "parameters; path depth is CONFIG's where another one is.")  # fmt: skip
+              help=
+        "Quantity to vary: path depth, samples per pixel, or the width of the film or of recovered textures. "
+        "The path depth is that of CONFIG unless it is varied.")  # fmt: skip
 @click.option("--values", type=Counts(), metavar="LIST",
-              help="What it is varied over, e.g. 4,16,64. Default: depths by --max-depth, a quarter to four times "
-                   "run.spp, film widths 32 to 256, texture widths 16 to 1024.")  # fmt: skip
+              help=
+        "Values to measure, e.g. 4,16,64. Default: depths by --max-depth, a quarter to four times run.spp, "
+        "film widths 32 to 256, texture widths 16 to 1024.")  # fmt: skip
 @click.option("--max-depth", type=click.IntRange(min=2, max=COUNT.max), default=32, show_default=True,
-              help="Greatest path depth; measured are 2, 4, 8, ... and this one.")  # fmt: skip
+              help="Greatest path depth; the measured depths are 2, 4, 8, ... and this one.")  # fmt: skip
 @click.option("--integrators", metavar="LIST",
-              help="What to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)], separated by commas; OPTION is one of the "
-                   "integrator's, or adjoint; or FILE.py:CLASS, one of your own. Default: those of "
-                   f"{INTEGRATORS} that can do CONFIG. Times are divided by those of ptracer, or else of the "
+              help="Integrators to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)] or your own "
+                   "FILE.py:CLASS, separated by "
+                   "commas; OPTION is one of the integrator's, or adjoint. Default: those of "
+                   f"{INTEGRATORS} that support CONFIG. Times are divided by those of ptracer, or else of the "
                    "first.")  # fmt: skip
 @click.option("--objective", type=click.Choice(["fixed", "l2"]), default="fixed", show_default=True,
-              help="fixed: dL/dI is given before the image; l2: it comes from the image, by run.adjoint.")  # fmt: skip
+              help="fixed: dL/dI is known before the image; l2: it comes from the image, as "
+                   "run.adjoint says.")  # fmt: skip
 @allow_code_option
 @memory_limit_option
 @budget_option
 @click.option("--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
-              help="Number of steps of each, with those in the file of --json, whatever time they take.")  # fmt: skip
+              help="Number of steps of each integrator, including those in the file of --json, for "
+                   "any time.")  # fmt: skip
 @json_option
 def command(
     config_file: Path | None, overrides: tuple[str, ...], swept: str, values: tuple[int, ...] | None, max_depth: int,
     integrators: str | None, objective: str, allow_code: bool, memory_limit: int | None,
     budget: float, rounds: int | None, json_file: Path | None,
 ) -> int:  # fmt: skip
-    """Measure time and peak memory of gradient steps against path depth, or what else --sweep names.
+    """Measure time and peak memory of gradient steps against path depth, or another quantity (--sweep).
 
-    A step is image, loss and gradient of every parameter of CONFIG, seen through its first sensor. Without CONFIG the
-    scene is a Cornell box (--set scene.options.size=64, run.spp=4, ...). Each integrator runs in processes of its own;
-    one that runs out of memory is recorded as out_of_memory, and the rest goes on. Ctrl-C keeps what is done. The same
-    command again goes on from what --json has written, however the process ended.
+    A step consists of image, loss and gradient of every parameter of CONFIG, through its first sensor. Without CONFIG,
+    the scene is a Cornell box (--set scene.options.size=64, run.spp=4, ...). Each integrator runs in its own processes;
+    if one runs out of memory, this is recorded as out_of_memory, and the others continue. Ctrl-C keeps finished
+    results. The same command again continues from the file of --json, however the process ended.
     """
     began = time.monotonic()
     from reslrb_cli.backend.installation import load_packages

@@ -37,22 +37,27 @@ if TYPE_CHECKING:
 @click.command("convergence")
 @experiment_arguments
 @click.option("--integrators", metavar="LIST",
-              help="What to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)], separated by commas; OPTION is one of the "
-                   "integrator's, or, with --objective loss, adjoint. Default: ptracer, prb, the estimators, "
-                   "stack guided, and its camera paths, alone and beside light paths, as far as they can do CONFIG; "
-                   "with loss the ways to take adjoint.")  # fmt: skip
+              help=
+        "Methods to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)], separated by commas; OPTION is one of the "
+        "integrator's, or, with --objective loss, adjoint. Default: ptracer, prb, the estimators, stack with "
+        "guiding, and its camera paths alone and beside light paths, if they support CONFIG; with loss, the "
+        "choices of adjoint.")  # fmt: skip
 @click.option("--objective", type=click.Choice(["fixed", "loss", "image"]), default="fixed", show_default=True,
-              help="fixed: the gradient with dL/dI held at that of a reference image; loss: the gradient of CONFIG's "
-                   "loss, by run.adjoint; image: the image.")  # fmt: skip
+              help=
+        "fixed: the gradient with dL/dI of a reference image; loss: the gradient of CONFIG's loss, as "
+        "run.adjoint says; image: the image.")  # fmt: skip
 @budget_option
 @click.option("--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
-              help="Number of turns of each, whatever time they take, those in the file of --json included: the same "
-                   "steps on every machine.")  # fmt: skip
+              help=
+        "Number of turns of each method, including those in the file of --json, for any time: the same steps "
+        "on every machine.")  # fmt: skip
 @click.option("--spp", "spps", type=Counts(), metavar="LIST",
-              help="Samples per pixel of a step, several to compare, e.g. 4,16,64; default: run.spp.")  # fmt: skip
+              help="Samples per pixel of a step; several values are compared, e.g. 4,16,64. Default: "
+                   "run.spp.")  # fmt: skip
 @click.option("--reference", metavar="METHOD",
-              help="What errors are taken from: the mean of many steps of this one. Default: reslrb:stack with paths "
-                   "from both sides, half of each, where CONFIG allows that.")  # fmt: skip
+              help=
+        "Method whose mean over many steps is the reference for errors. Default: reslrb:stack with half light "
+        "paths and half camera paths, if CONFIG allows it.")  # fmt: skip
 @allow_code_option
 @memory_limit_option
 @json_option
@@ -61,12 +66,12 @@ def command(
     rounds: int | None, spps: tuple[int, ...] | None, reference: str | None, allow_code: bool,
     memory_limit: int | None, json_file: Path | None,
 ) -> int:  # fmt: skip
-    """Measure how fast the error of each method falls on CONFIG, at its initial values, seen through its first sensor.
+    """Measure how fast the error of each method falls on CONFIG, at its initial values, through its first sensor.
 
-    Each method takes steps of run.spp samples per pixel in a process of its own, all in turn. Errors are relative to
-    the size of what is estimated; a slope of -1/2 is what independent samples have. Efficiency is 1 / (relative
-    variance * seconds). Ctrl-C keeps what is done. The same command again goes on from what --json has written, however
-    the process ended. docs/convergence.md explains the columns.
+    Each method takes steps of run.spp samples per pixel in its own process, in turn. Errors are relative to the size of
+    the estimated quantity; independent samples have a slope of -1/2. Efficiency is 1 / (relative variance * seconds).
+    Ctrl-C keeps finished results. The same command again continues from the file of --json, however the process ended.
+    docs/convergence.md explains the columns.
     """
     began = time.monotonic()
     from reslrb_cli.backend.installation import load_packages

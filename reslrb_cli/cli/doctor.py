@@ -15,9 +15,9 @@ from reslrb_cli.errors import BackendError
 @click.command("doctor")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of lines.")
 def command(as_json: bool) -> None:
-    """Say which variant, device, libLLVM and versions are in use, and try them.
+    """Show the variant, device, libLLVM and versions in use, and test them.
 
-    Each backend compiles and runs one kernel and traces one ray. Exit code 3 if none of them works.
+    Each backend compiles and runs one kernel and traces one ray. The exit code is 3 if none of them works.
     """
     report = examine()
     if as_json:

@@ -49,11 +49,11 @@ def _about(path: Path) -> str:
 @click.command("example")
 @click.argument("name", required=False, shell_complete=_complete)
 @click.option("-o", "--output", "folder", type=click.Path(path_type=Path, file_okay=False), metavar="FOLDER",
-              help="Where to copy it to. Default: a folder of its name.")  # fmt: skip
+              help="Folder to copy to. Default: a folder with the name of the experiment.")  # fmt: skip
 def command(name: str | None, folder: Path | None) -> int:
-    """Copy the experiment NAME, its configuration and its scene, to a folder of your own; without NAME, list them.
+    """Copy the experiment NAME, its configuration and its scene, to a folder; without NAME, list the experiments.
 
-    Nothing that is there already is replaced.
+    Existing files are never replaced.
     """
     known = examples()
     if not known:

@@ -15,18 +15,19 @@ from reslrb_cli.cli.terminal import echo
 @overrides_option
 @click.option(
     "-o", "--output", required=True, type=click.Path(path_type=Path),
-    help="Folder to make, which must not exist yet; or a file, .stl, .3mf, .obj or .ply, of the solid alone.",
+    help="Folder to create, which must not exist yet; or a file .stl, .3mf, .obj or .ply for the solid alone.",
 )  # fmt: skip
-@click.option("--tolerances", is_flag=True, help="Of a lens or a mirror also render what it throws where light, "
-              "distance, index and tool are not as planned; takes about 15 images of run.final_spp.")  # fmt: skip
+@click.option("--tolerances", is_flag=True, help=
+        "For a lens or a mirror, also render its image with errors of light, distance, index and tool; takes "
+        "about 15 images of run.final_spp.")  # fmt: skip
 def command(run: Path, overrides: tuple[str, ...], output: Path, tolerances: bool) -> None:
-    """Write the scene of the run in the folder RUN with the values that it recovered.
+    """Write the scene of the run in the folder RUN with its recovered values.
 
-    FOLDER/scene.xml and what lies beside it are all that Mitsuba needs: `mi.load_file("FOLDER/scene.xml")`. Variables
-    and includes are put in, what was mended is written as Mitsuba 3 has it, textures and meshes are copied, those that
-    were recovered are in FOLDER/recovered.
+    Mitsuba needs only FOLDER/scene.xml and the files beside it: `mi.load_file("FOLDER/scene.xml")`. Variables and
+    includes are resolved, repaired elements are written for Mitsuba 3, and textures and meshes are copied; recovered
+    ones are in FOLDER/recovered.
 
-    Where the configuration has a section `fabrication`, as that of `reslrb lens`, the folder also holds the closed
+    If the configuration has a section `fabrication`, as that of `reslrb lens`, the folder also contains the closed
     solid in millimetres (lens.stl, .3mf, .obj, .ply), its heights (heights.png, .exr) and fabrication.json.
     """
     from reslrb_cli.runs.export import check_export, write_export

@@ -168,33 +168,41 @@ logger = logging.getLogger(__name__)
 @click.command("gradcheck")
 @optional_experiment_arguments
 @click.option("--suite", type=click.Choice(["extreme"]),
-              help="Run scenes of its own in place of CONFIG: extreme, those in which gradients break.")  # fmt: skip
-@click.option("--case", "cases", multiple=True, metavar="NAME", help="Run this case of the suite; may be repeated.")
+              help="Run the scenes of a suite in place of CONFIG. extreme: scenes in which gradients "
+                   "often fail.")  # fmt: skip
+@click.option(
+    "--case", "cases", multiple=True, metavar="NAME", help="Run only this case of the suite. May be repeated."
+)
 @click.option("--estimators", metavar="LIST",
-              help="What to check: ESTIMATOR[(OPTION=VALUE,...)], separated by commas. Default: all four, with the "
-                   "options of CONFIG, and stack(paths=both) where CONFIG leaves the paths open and the scene allows "
-                   "both.")  # fmt: skip
+              help=
+        "Estimators to check: ESTIMATOR[(OPTION=VALUE,...)], separated by commas. Default: all four, with the "
+        "options of CONFIG, and stack(paths=both) if CONFIG leaves the paths open and the scene "
+             "allows both.")  # fmt: skip
 @click.option("--integrators", metavar="LIST",
-              help="Check Mitsuba integrators of your own, FILE.py:CLASS[(OPTION=VALUE,...)], separated by commas, in "
-                   "place of ours, and say where to look if one is wrong; with --allow-code.")  # fmt: skip
+              help=
+        "Check your own Mitsuba integrators, FILE.py:CLASS[(OPTION=VALUE,...)], separated by commas, and say "
+        "where to look if one is wrong. Needs --allow-code.")  # fmt: skip
 @click.option("--budget", type=click.FloatRange(min=0), default=45.0, show_default=True, metavar="SECONDS",
-              help="Time for the whole, loading and compiling included; it decides how many seeds there are. What it "
-                   "does not suffice for is named, with what it would take.")  # fmt: skip
+              help=
+        "Time limit, including loading and compiling; it determines the number of seeds. Comparisons without "
+        "time are named, with the time that they need.")  # fmt: skip
 @click.option("--seeds", type=click.IntRange(min=3, max=COUNT.max), metavar="N",
-              help="Number of seeds, whatever time they take, those in the file of --json included.")  # fmt: skip
+              help="Number of seeds, including those in the file of --json, for any time.")  # fmt: skip
 @allow_code_option
-@cluster_option("Have samples, or the cases of a suite, taken by others", "the result is that of one process")
+@cluster_option("Distribute samples, or the cases of a suite, to workers", "the result is that of one process")
 @json_option
 @click.option("--spp", type=COUNT,
-              help="Samples per pixel of one gradient. Default: 65536 light paths, no more than run.spp.")  # fmt: skip
+              help="Samples per pixel of one gradient. Default: 65536 light paths, at most run.spp.")  # fmt: skip
 @click.option("--missing", is_flag=True,
-              help="Measure instead what no gradient of this kind has: the share of each parameter's derivative that "
-                   "silhouettes, edges of shadows and light that leaves the film make up.")  # fmt: skip
+              help=
+        "Instead, measure the share of each parameter's derivative that silhouettes, shadow edges and light "
+        "that leaves the film make up, which no gradient here includes.")  # fmt: skip
 @click.option("--directions", type=click.IntRange(min=1, max=64), metavar="N",
-              help="With --missing: along how many directions of each parameter. Default: 3.")  # fmt: skip
+              help="With --missing: number of directions of each parameter. Default: 3.")  # fmt: skip
 @click.option("--images", "folder", type=click.Path(path_type=Path, file_okay=False),
-              help="Write maps of the gradients of textures, their references and z into this folder, as PNG and as "
-                   "layers of EXR files.")  # fmt: skip
+              help=
+        "Write maps of the gradients of textures, their references and z to this folder, as PNG and as layers "
+        "of EXR files.")  # fmt: skip
 def command(
     config_file: Path | None, overrides: tuple[str, ...], suite: str | None, cases: tuple[str, ...],
     estimators: str | None, integrators: str | None, budget: float, seeds: int | None, allow_code: bool,
@@ -203,10 +211,10 @@ def command(
 ) -> int:  # fmt: skip
     """Compare the gradients of every parameter of CONFIG with references, at its initial values.
 
-    Each estimator is compared with naive AD of the same paths (walk_ad), with a stock integrator where one counts as a
-    reference (ptracer, else prb), with finite differences, with forward mode, and with the exact value where the scene
-    is known to have one. Without CONFIG the scene is a Cornell box (--set scene.options.size=64, ...). The exit code is
-    1 where a comparison fails; the last lines say which, and by how much. docs/gradcheck.md explains the columns.
+    Each estimator is compared with naive AD of the same paths (walk_ad), with a valid stock integrator (ptracer, else
+    prb), with finite differences, with forward mode, and with the exact value if it is known. Without CONFIG, the scene
+    is a Cornell box (--set scene.options.size=64, ...). The exit code is 1 if a comparison fails; the last lines
+    describe the failures. docs/gradcheck.md explains the columns.
     """
     began = time.monotonic()
     load_packages()  # before what follows asks for them

@@ -140,12 +140,14 @@ _RATIO = 0.01
 
 @click.command("init")
 @click.argument("scene_file", metavar="SCENE", type=click.Path(path_type=Path))
-@click.option("--target", type=click.Path(path_type=Path), help="Photograph to recover the scene's parameters from.")
+@click.option(
+    "--target", type=click.Path(path_type=Path), help="Photograph from which the parameters of the scene are recovered."
+)
 @click.option(
     "-o",
     "--output",
     type=click.Path(path_type=Path),
-    help="Configuration to write; default: the scene's name with .yaml, in the working directory.",
+    help="Configuration to write. Default: the scene's name with .yaml, in the working directory.",
 )
 @click.option(
     "--sensor",
@@ -153,24 +155,24 @@ _RATIO = 0.01
     type=click.IntRange(min=0),
     default=0,
     show_default=True,
-    help="Index of the sensor that sees what the photograph shows.",
+    help="Index of the sensor of the photograph.",
 )
 @click.option(
     "--set",
     "overrides",
     multiple=True,
     metavar="scene.options.NAME=VALUE",
-    help="Value of a $NAME of the scene file, in place of its own; stands in the configuration, too. May be repeated.",
+    help="Value of a $NAME of the scene file; also written to the configuration. May be repeated.",
 )
 @click.option(
     "--recover",
     "wanted",
     multiple=True,
     metavar="KEY",
-    help="What to recover, in place of what is large in view: a key as `reslrb inspect` lists it, or a glob such as "
+    help="Parameter to recover, in place of the default choice: a key of `reslrb inspect`, or a glob such as "
     "'*.radiance.value'. May be repeated.",
 )
-@click.option("--force", is_flag=True, help="Replace files that exist.")
+@click.option("--force", is_flag=True, help="Replace existing files.")
 def command(
     scene_file: Path,
     target: Path | None,
@@ -180,14 +182,14 @@ def command(
     wanted: tuple[str, ...],
     force: bool,
 ) -> None:
-    """Write a commented configuration for the scene in the file SCENE, which `reslrb optimize` takes.
+    """Write a commented configuration for the scene in the file SCENE, to use with `reslrb optimize`.
 
-    It recovers the colours of the materials that are largest in view, the roughness of metals, and how bright lamps
-    are that are in view themselves (not from a photograph of 8 or 16 bits, where they are clipped); what else can be
-    recovered stands there as comments, with bounds and present values, and --recover takes other parameters. With
-    --target the film gets the photograph's ratio of sides, at a size with which a run takes minutes, and a copy of the
-    photograph of that size is written beside the configuration. Of several sensors it is the first that saw the
-    photograph, unless --sensor names another.
+    It recovers the colours of the materials that are largest in view, the roughness of metals, and the brightness of
+    lamps in view (not from a photograph of 8 or 16 bits, in which they are clipped). Other parameters that can be
+    recovered are comments, with bounds and current values; --recover selects other parameters. With --target, the film
+    gets the ratio of sides of the photograph, at a size for a run of minutes, and a copy of the photograph of this size
+    is written beside the configuration. If there are several sensors, the first one is used, unless --sensor names
+    another.
     """
     from reslrb_cli.backend.variant import set_variant
 

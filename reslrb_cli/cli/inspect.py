@@ -200,15 +200,15 @@ SAMPLES = 8
 @click.command("inspect")
 @click.argument("path", metavar="PATH", type=click.Path(path_type=Path))
 @overrides_option
-@click.option("--all", "everything", is_flag=True, help="List what cannot be recovered, too.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, with everything, instead of lines.")
+@click.option("--all", "everything", is_flag=True, help="Also list parameters that cannot be recovered.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object with all data instead of lines.")
 @click.option(
     "--nonfinite",
     is_flag=True,
-    help="Say where the run in whose folder PATH is first met a value that is not finite: trace that step again.",
+    help="Find the first value that was not finite in the run in folder PATH: trace that step again.",
 )
 @click.option(
-    "--conditioning", is_flag=True, help="Measure how sensitive image and loss are to each parameter (renders)."
+    "--conditioning", is_flag=True, help="Measure the sensitivity of image and loss to each parameter (renders)."
 )
 @click.option(
     "--samples",
@@ -224,16 +224,16 @@ def command(
     conditioning: bool,
     samples: int | None,
 ) -> int | None:
-    """List what of a scene can be recovered, with its current value, and what the scene contains.
+    """List the parameters of a scene that can be recovered, with their current values, and the contents of the scene.
 
-    PATH is a scene file (XML), a configuration, which need not be complete, or the folder of a run. The keys that are
-    listed first may stand in `parameters` of a configuration; of the others the reasons are given. If the configuration
-    has `parameters`, the plan of a step lists the features that its kernels contain or leave out, and why.
+    PATH is a scene file (XML), a configuration, complete or not, or the folder of a run. The first keys may be used in
+    `parameters` of a configuration; for the others, the reasons are given. If the configuration has `parameters`, the
+    plan of a step lists the features that its kernels contain or leave out, and why.
 
-    --conditioning says how far apart the parameters' sensitivities lie, where they start: of each the root mean square
-    of its values, its gradient and the noise of one step's gradient, the relative change of the image and the curvature
-    of the loss per unit of the parameter, and the length by which it would have to change to make up the image where it
-    has an effect. `optimizer.scale: auto` makes up for what it shows.
+    --conditioning measures how different the sensitivities of the parameters are at their initial values: for each
+    parameter the root mean square of its values, its gradient and the noise of one step's gradient, the relative change
+    of the image and the curvature of the loss per unit, and the length by which it would have to change to explain the
+    image. `optimizer.scale: auto` compensates for the differences.
     """
     if samples is not None and not conditioning:
         raise click.UsageError("--samples has no effect without --conditioning")

@@ -49,31 +49,48 @@ def read_luminance(path: Path) -> np.ndarray:
 @click.command("lens")
 @click.argument("picture", metavar="PICTURE", type=click.Path(path_type=Path))
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), default=Path("lens"), show_default=True, help="Folder."
+    "-o", "--output", type=click.Path(path_type=Path), default=Path("lens"), show_default=True, help="Folder to write."
 )
 @click.option("--size", type=float, default=100.0, show_default=True, help="Longer side of the face, in mm.")
-@click.option("--distance", type=float, default=200.0, show_default=True, help="From face to receiver, in mm.")
-@click.option("--picture-size", type=float, help="Longer side of the picture on the receiver, in mm; default: --size.")
-@click.option("--ior", type=float, default=1.49, show_default=True, help="Index of refraction.")
-@click.option("--thickness", type=float, help="Of the lens at its flat face, in mm; default: a quarter of --size.")
-@click.option("--mirror", is_flag=True, help="A mirror in place of a lens.")
-@click.option("--incidence", type=float, help="Between light and a mirror's normal, in degrees.  [default: 30]")
-@click.option("--outline", type=click.Choice(["rectangle", "round"]), default="rectangle", show_default=True,
-              help="Of the face; round is the ellipse in it.")  # fmt: skip
-@click.option("--tilt", type=float, nargs=2, default=(0.0, 0.0), metavar="NOD TURN",
-              help="Of the receiver about its horizontal and its vertical axis, in degrees.")  # fmt: skip
-@click.option("--light-distance", type=float, help="Of a point light from the face, in mm; default: parallel light.")
 @click.option(
-    "--sun", type=float, default=0.0, metavar="DEGREES", help="Angular diameter of parallel light: 0.53 of the sun."
+    "--distance", type=float, default=200.0, show_default=True, help="Distance from the face to the receiver, in mm."
 )
-@click.option("--both", is_flag=True, help="Both faces of a lens are free; the second one begins flat.")
+@click.option("--picture-size", type=float, help="Longer side of the picture on the receiver, in mm. Default: --size.")
+@click.option("--ior", type=float, default=1.49, show_default=True, help="Index of refraction.")
+@click.option(
+    "--thickness", type=float, help="Thickness of the lens at its flat face, in mm. Default: a quarter of --size."
+)
+@click.option("--mirror", is_flag=True, help="Make a mirror instead of a lens.")
+@click.option(
+    "--incidence", type=float, help="Angle between the light and a mirror's normal, in degrees.  [default: 30]"
+)
+@click.option("--outline", type=click.Choice(["rectangle", "round"]), default="rectangle", show_default=True,
+              help="Outline of the face; round is the ellipse inside the rectangle.")  # fmt: skip
+@click.option("--tilt", type=float, nargs=2, default=(0.0, 0.0), metavar="NOD TURN",
+              help="Rotation of the receiver about its horizontal and its vertical axis, in degrees.")  # fmt: skip
+@click.option(
+    "--light-distance", type=float, help="Distance of a point light from the face, in mm. Default: parallel light."
+)
+@click.option(
+    "--sun",
+    type=float,
+    default=0.0,
+    metavar="DEGREES",
+    help="Angular diameter of parallel light; that of the sun is 0.53.",
+)
+@click.option("--both", is_flag=True, help="Make both faces of a lens free; the second one starts flat.")
 @click.option("--margin", type=float, default=MARGIN, show_default=True,
-              help="What the film sees about the picture, of its longer side: light there counts as lost.")  # fmt: skip
-@click.option("--through", is_flag=True, help="The picture is looked at through the receiver, from behind.")
-@click.option("--floor", type=float, help="Fraction of the maximum to which darker parts are lifted; default: found.")
+              help="Margin around the picture on the film, as a fraction of its longer side; light "
+                   "in it counts as lost.")  # fmt: skip
+@click.option("--through", is_flag=True, help="View the picture through the receiver, from behind.")
+@click.option(
+    "--floor",
+    type=float,
+    help="Minimum brightness, as a fraction of the maximum, to which darker parts are raised. Default: chosen.",
+)
 @click.option("--pixels", type=click.IntRange(16, 1024), default=PIXELS, show_default=True,
-              help="Of the picture's longer side, and texels of the face's.")  # fmt: skip
-@click.option("--force", is_flag=True, help="Replace files that exist.")
+              help="Pixels of the picture's longer side, and texels of the face's longer side.")  # fmt: skip
+@click.option("--force", is_flag=True, help="Replace existing files.")
 def command(
     picture: Path,
     output: Path,
@@ -95,10 +112,10 @@ def command(
     pixels: int,
     force: bool,
 ) -> None:
-    """Write an experiment that shapes a lens, or a mirror, which throws PICTURE in parallel light.
+    """Write an experiment that shapes a lens, or a mirror, whose caustic shows PICTURE in parallel light.
 
-    `reslrb optimize FOLDER/lens.yaml` takes it. The face begins where a transport of light has it throw the picture
-    already; how deep it is, and how deep at twice the distance, is told before anything is rendered.
+    Run it with `reslrb optimize FOLDER/lens.yaml`. The initial face already shows the picture, by a transport of light.
+    The depth of its relief, and that at twice the distance, is printed before anything is rendered.
     """
     import numpy as np
 

@@ -62,24 +62,24 @@ logger = logging.getLogger(__name__)
 
 @click.command("optimize")
 @optional_experiment_arguments
-@click.option("--force", is_flag=True, help="Replace the run folder of that name instead of making a numbered one.")
+@click.option("--force", is_flag=True, help="Replace the run folder of this name instead of creating a numbered one.")
 @click.option(
     "--dry-run",
     is_flag=True,
-    help="Print what the run will take, memory and time, by a few small steps, and stop; no run folder is written.",
+    help="Measure a few small steps, print the memory and time that the run will take, and stop. Writes no run folder.",
 )
 @click.option(
     "--resume",
     "resumed",
     type=FOLDER,
     metavar="RUN",
-    help="Go on with the run in this folder where it was. CONFIG may be left out, else it has to be that of the run; "
-    "--set may change iterations, learning rates, and with run.output or run.name the folder.",
+    help="Continue the run in this folder. CONFIG may be left out; otherwise it must be that of the run. --set "
+    "may change iterations, learning rates, and, with run.output or run.name, the folder.",
 )
 @allow_code_option
-@cluster_option("Have the shards of each step (run.shards) computed by others", "the result is that of one process")
-@click.option("--quiet", is_flag=True, help="Print the last line only.")
-@click.option("-v", "--verbose", is_flag=True, help="Say more of what is measured before the first iteration.")
+@cluster_option("Distribute the shards of each step (run.shards) to workers", "the result is that of one process")
+@click.option("--quiet", is_flag=True, help="Print only the last line.")
+@click.option("-v", "--verbose", is_flag=True, help="Print details of the measurements before the first iteration.")
 def command(
     config_file: Path | None,
     overrides: tuple[str, ...],
@@ -91,10 +91,10 @@ def command(
     quiet: bool,
     verbose: bool,
 ) -> int:
-    """Recover the parameters that CONFIG names from its target images.
+    """Recover the parameters of CONFIG from its target images.
 
-    Writes a run folder; the last line says where it is. Ctrl-C, SIGTERM and SIGHUP end the run after the current
-    iteration, with its folder complete; a second signal ends it at once. However it ended, --resume RUN goes on.
+    Writes a run folder, which the last line names. Ctrl-C, SIGTERM and SIGHUP end the run after the current iteration,
+    with a complete folder; a second signal ends it at once. --resume RUN continues any run that has ended.
     """
     if quiet or verbose:
         logging.getLogger("reslrb_cli").setLevel(logging.WARNING if quiet else logging.DEBUG)

@@ -240,13 +240,14 @@ REMOVED = {
 
 budget_option = click.option(
     "--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
-    help="Time for the whole, loading and compiling included; what it does not suffice for is named, with what it "
-         "would take.",
+    help=
+        "Time limit, including loading and compiling. Measurements without time are named, with the time that "
+        "they need.",
 )  # fmt: skip
 
 memory_limit_option = click.option(
     "--memory-limit", type=Size(),
-    help="Address space of each process, e.g. 2GiB (CPU only); default: the machine's memory.",
+    help="Address space of each process, e.g. 2GiB (CPU only). Default: the machine's memory.",
 )  # fmt: skip
 
 
@@ -269,14 +270,14 @@ def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
         "json_file",
         type=click.Path(path_type=Path, dir_okay=False),
         metavar="FILE",
-        help="Write one object a line, as results come, and the samples beside it. What FILE has of the same "
-        "measurement is not measured again.",
+        help="Write one JSON object per line as results come, and the samples beside the file. Results of the same "
+        "measurement in FILE are kept and not measured again.",
     )(function)
 
 
 def cluster_option(what: str, result: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Add `--cluster` (`cluster`) to a command; `what` it has others do, and what comes of it, in its help."""
-    where = "local:N, N processes on this machine, or tls://HOST:PORT, the workers of a scheduler of dask's"
+    """Add `--cluster` (`cluster`) to a command, with `what` workers do and the `result` in its help."""
+    where = "local:N, N processes on this machine, or tls://HOST:PORT, the workers of a dask scheduler"
     return click.option(
         "--cluster", metavar="WHERE", help=f"{what}: {where}; {result}. Needs `pip install reslrb[cluster]`."
     )

@@ -59,30 +59,32 @@ class Exposure(click.ParamType):
     "--output",
     required=True,
     type=click.Path(path_type=Path),
-    help="Image file to write; EXR, HDR and PFM are linear, PNG and JPG 8-bit sRGB.",
+    help="Image file to write. EXR, HDR and PFM are linear, PNG and JPG are 8-bit sRGB.",
 )
 @click.option(
     "--run",
     metavar="RUN",
     type=FOLDER,
-    help="Render the scene of the run in this folder with the values that it recovered, in place of CONFIG.",
+    help="Render the scene of the run in this folder with its recovered values, in place of CONFIG.",
 )
 @allow_code_option
-@click.option("--spp", type=COUNT, help="Samples per pixel; default: run.spp.")
-@click.option("--sensor", type=click.IntRange(min=0), help="Index of the sensor; default: the experiment's first.")
+@click.option("--spp", type=COUNT, help="Samples per pixel. Default: run.spp.")
+@click.option(
+    "--sensor", type=click.IntRange(min=0), help="Index of the sensor. Default: the first one of the experiment."
+)
 @click.option(
     "--exposure",
     type=Exposure(),
     default="1",
     show_default=True,
-    help="What a PNG or JPG shows the image times: a number, or auto, which suits what is in view but lamps. "
-    "With --run the default is the run's exposure, in EXR, HDR and PFM as well; 1 leaves it out.",
+    help="Factor of the image in a PNG or JPG: a number, or auto, which suits everything in view except lamps. "
+    "With --run, the default is the run's exposure, also in EXR, HDR and PFM; 1 ignores it.",
 )
 @click.option(
     "--initial/--scene",
     "initial",
     default=True,
-    help="Give the parameters their initial values (default), or take the scene as it stands.",
+    help="Use the initial values of the parameters (default), or those of the scene file.",
 )
 def command(
     config_file: Path | None,

@@ -19,14 +19,14 @@ MOST_SOURCES = 100
 @click.command("report")
 @click.argument("paths", metavar="RUN...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("-o", "--output", type=click.Path(path_type=Path), metavar="PAGE",
-              help="The page to write, an HTML file. Default, of one run or sweep: its own page.")  # fmt: skip
+              help="HTML file to write. Default for one run or sweep: its own page.")  # fmt: skip
 def command(paths: tuple[Path, ...], output: Path | None) -> int:
-    """Write one page about runs and measurements, complete in itself, to be looked at or sent around.
+    """Write one self-contained page about runs and measurements.
 
     RUN is the folder of a run of `optimize`, or of a `sweep`; a file that `bench`, `gradcheck` or `convergence` wrote
-    with --json; or a folder of maps that `gradcheck` wrote with --images. Several runs have their losses and errors in
-    one picture, and their images, times and memory beside each other. A run that is still at work, or was killed, is
-    shown as far as it came.
+    with --json; or a folder of maps that `gradcheck` wrote with --images. The page shows losses and errors of several
+    runs in one picture, and their images, times and memory side by side. Running and killed runs are shown as far as
+    they came.
     """
     from reslrb_cli.backend.installation import load_packages
 

@@ -73,14 +73,14 @@ _PROGRAM = "sys.argv[0] = 'reslrb'; from reslrb_cli.cli.sweep import follow; fol
     multiple=True,
     metavar="KEY=[VALUE, ...]",
     shell_complete=complete_setting,
-    help="A setting, as of --set, and its values, a list in YAML. May be repeated: all combinations are run. A value "
-    "of `integrator` may be TYPE[:ESTIMATOR][(OPTION=VALUE,...)].",
+    help="Setting to vary, as for --set, and a list of its values in YAML. If repeated, all combinations are "
+    "run. A value of `integrator` may be TYPE[:ESTIMATOR][(OPTION=VALUE,...)].",
 )
 @click.option(
     "--seeds",
     type=COUNT,
     metavar="N",
-    help="Runs of each combination, of seeds from run.seed on. Default: 1, or what the sweep has.",
+    help="Number of runs of each combination, with seeds from run.seed on. Default: 1, or that of the sweep.",
 )
 @click.option(
     "-o",
@@ -88,31 +88,31 @@ _PROGRAM = "sys.argv[0] = 'reslrb'; from reslrb_cli.cli.sweep import follow; fol
     "folder",
     type=FOLDER,
     metavar="FOLDER",
-    help="The folder of the sweep. Default: that of a run, with -sweep behind its name.",
+    help="Folder of the sweep. Default: that of a run, with -sweep after its name.",
 )
 @click.option(
     "--resume",
     "resumed",
     type=FOLDER,
     metavar="FOLDER",
-    help="Go on with the sweep in this folder, in place of CONFIG; so does the same command again.",
+    help="Continue the sweep in this folder, in place of CONFIG; the same command again does this, too.",
 )
-@click.option("--retry", is_flag=True, help="Try the runs again that failed.")
+@click.option("--retry", is_flag=True, help="Repeat failed runs.")
 @allow_code_option
 @click.option(
     "--dry-run",
     is_flag=True,
-    help="Print how many runs there are and what they will take, by a few small steps of each combination.",
+    help="Measure a few small steps of each combination, and print the number of runs and their time and memory.",
 )
 @click.option(
     "--json",
     "json_file",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Write what every run and combination came to, one object a line.",
+    help="Write the results of every run and combination, one object per line.",
 )
-@click.option("--quiet", is_flag=True, help="Print the table and the last line only.")
-@click.option("-v", "--verbose", is_flag=True, help="Show what each run says.")
+@click.option("--quiet", is_flag=True, help="Print only the table and the last line.")
+@click.option("-v", "--verbose", is_flag=True, help="Show the output of each run.")
 def command(
     config_file: Path | None,
     overrides: tuple[str, ...],
@@ -127,11 +127,11 @@ def command(
     quiet: bool,
     verbose: bool,
 ) -> int:
-    """Run the experiment of CONFIG at every combination of settings, with several seeds, one run after the other.
+    """Run the experiment of CONFIG with every combination of settings, with several seeds, one run after the other.
 
     Each run has its folder in FOLDER, named by its settings; sweep.html there has the table, curves and pictures. All
-    combinations are checked before the first run begins. A run that fails is told in its row, and the others go on.
-    Ctrl-C ends the sweep after the current iteration; the same command again, or --resume FOLDER, goes on with it,
+    combinations are checked before the first run starts. The row of a failed run says so, and the others continue.
+    Ctrl-C ends the sweep after the current iteration. The same command again, or --resume FOLDER, continues the sweep,
     also after a kill.
     """
     from reslrb_cli.runs.sweep import make_plan, opened

@@ -1,21 +1,23 @@
-"""A step in shards: sets of whole views, or shares of the samples of one view, each computed by itself.
+"""Step in shards: sets of whole views, or shares of the samples of one view, computed separately.
 
-A `Task` is all that a shard needs beside the problem; `shard_image` and `shard_gradient` are functions of both to
-NumPy arrays, which leave nothing behind: whatever computes them, in whatever order, the sums are the same.
+A `Task` is all data that a shard needs besides the problem. `shard_image` and `shard_gradient` are functions of both
+that return NumPy arrays and leave no changes, so the sums do not depend on where and in which order shards are
+computed.
 
 With S shares of a view, I_s the image of share s and w_s its part of the samples (1 / S),
 
     I = sum of w_s I_s,    gradient = sum over s of w_s J_s^T dL/dI      J_s: the derivative of I_s by the parameters
 
-In one round each share takes dL/dI from its own samples, as `run.adjoint` says. In two (`others`) it is that at
+In one round, each share takes dL/dI from its own samples, as `run.adjoint` says. In two rounds (`others`), dL/dI is
+that at
 
     (I - w_s I_s) / (1 - w_s),    the mean image of the other shares
 
-so that no path sees a delta that it helped to make; of an L2 loss that is the sum over all pairs of different shares,
-and unbiased. Images and gradients are added up in the order of the shards, in double precision.
+so that no path uses a delta that contains it. For an L2 loss, this is the sum over all pairs of different shares, and
+unbiased. Images and gradients are added in the order of the shards, in double precision.
 
-Tables of guided emission are held while shards are computed, and learn once a step, where they are due to, from samples
-beside them, with dL/dI at the mean image of all.
+Tables of guided emission do not change while shards are computed. They learn once per step if due, from separate
+samples, with dL/dI at the mean image of all shards.
 """
 
 from __future__ import annotations
@@ -50,7 +52,7 @@ Engine = Callable[[Problem, Callable[..., Any], Sequence[tuple[Any, ...]]], Iter
 
 
 class Part(NamedTuple):
-    """One view's samples in a shard: its sensor, what its loss is scaled by, and the samples' seed."""
+    """Samples of one view in a shard: its sensor, the factor of its loss, and the seed."""
 
     sensor: int
     scale: float
@@ -59,9 +61,9 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Task:
-    """One shard of a step, of `spp` samples per pixel: whole views, or of one view `weight` of its samples.
+    """Shard of a step, of `spp` samples per pixel: whole views, or a part `weight` of the samples of one view.
 
-    With `images` those of the samples come back beside the gradient.
+    With `images`, the images of the samples are returned with the gradient.
     """
 
     iteration: int
@@ -74,9 +76,11 @@ class Task:
 
 @dataclass(frozen=True)
 class ShardGradient:
-    """What a shard says: the gradient of each parameter (float32, not finite where it is not), and of each part its
-    loss, what of dL/dI was refused (count, flat index of the first, shape), and the image, (H, W, C) or of halves
-    (2, H, W, C), where it was asked for."""
+    """Result of a shard.
+
+    It has the gradient of each parameter (float32), and for each part its loss, the refused entries of dL/dI (count,
+    flat index of the first, shape), and, if requested, the image, (H, W, C) or (2, H, W, C) with halves.
+    """
 
     gradients: dict[str, Array]
     losses: tuple[float, ...] = ()
@@ -88,7 +92,7 @@ class ShardGradient:
 
 
 def make_tasks(problem: Problem, iteration: int, images: bool = False) -> list[Task]:
-    """The shards of an iteration, in their order; `images`: of whole views, too, images come back."""
+    """Return the shards of an iteration in order; with `images`, whole views return images, too."""
     config, drawn = problem.config, problem.drawn(iteration)
     shares, count = config.shares, min(config.shards, len(drawn))
     if shares > 1:
@@ -110,12 +114,12 @@ def make_tasks(problem: Problem, iteration: int, images: bool = False) -> list[T
 
 
 def shard_seed(config: Config, iteration: int, sensor: int, shard: int) -> int:
-    """The seed of the samples that a shard has of a view."""
+    """Return the seed of the samples of a view in a shard."""
     return seed(config.run.seed, iteration, sensor, f"image, shard {shard}")
 
 
 def shard_image(problem: Problem, task: Task) -> Array:
-    """The image of a shard of one view, (H, W, C) or of halves (2, H, W, C), float32."""
+    """Return the image of a shard of one view, (H, W, C) or (2, H, W, C) with halves, float32."""
     [part] = task.parts
     with _held(problem):
         image = render_image(
@@ -125,9 +129,9 @@ def shard_image(problem: Problem, task: Task) -> Array:
 
 
 def shard_gradient(problem: Problem, task: Task, delta: Array | None = None) -> ShardGradient:
-    """The gradient of a shard: by its own dL/dI, or of one view by `delta`, in the shape of `shard_image`.
+    """Return the gradient of a shard: with its own dL/dI, or, for one view, with `delta` in the shape of `shard_image`.
 
-    Gradients that had been accumulated before are lost.
+    Previously accumulated gradients are lost.
     """
     config = problem.config
     found: list[tuple[float, tuple[int, int, tuple[int, ...]], Array | None]] = []
@@ -155,7 +159,7 @@ def shard_gradient(problem: Problem, task: Task, delta: Array | None = None) -> 
 
 
 def scaled(view: View, scale: float) -> Callable[[mi.TensorXf], mi.Float]:
-    """A view's part of the loss, `scale` times."""
+    """Return a view's term in the loss, times `scale`."""
     return view.objective if scale == 1 else lambda image: view.objective(image) * scale
 
 
@@ -170,7 +174,7 @@ def _clear(problem: Problem) -> None:
 
 @contextmanager
 def _held(problem: Problem) -> Iterator[None]:
-    """Have tables learn nothing."""
+    """Keep tables from learning."""
     guiding = guiding_of(problem)
     before = guiding is not None and guiding.held
     if guiding is not None:
@@ -186,13 +190,13 @@ def _held(problem: Problem) -> Iterator[None]:
 
 
 def serially(state: S, function: Callable[..., T], work: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, T]]:
-    """Compute one after the other, in this process (`Engine`, of whatever `state`)."""
+    """Compute shards one after the other in this process (an `Engine` of any `state`)."""
     for place, given in enumerate(work):
         yield place, function(state, *given)
 
 
 def in_order(found: Iterable[tuple[int, T]]) -> Iterator[T]:
-    """The results by their places, from 0 on; those that come too early are kept until it is their turn."""
+    """Yield results in the order of their places, from 0 on; early results wait for their turn."""
     early: dict[int, T] = {}
     place = 0
     for at, result in found:
@@ -203,19 +207,19 @@ def in_order(found: Iterable[tuple[int, T]]) -> Iterator[T]:
 
 
 class Sum:
-    """A weighted sum of arrays, in double precision, in the order in which they are added."""
+    """Weighted sum of arrays, in double precision, in the order of the additions."""
 
     def __init__(self) -> None:
         self.total: Array | None = None
 
     def add(self, array: Array, weight: float) -> None:
-        """Add `weight` times an array; what is not finite in it is so in the sum."""
+        """Add `weight` times an array; values that are not finite remain so in the sum."""
         with np.errstate(invalid="ignore", over="ignore"):
             own = array.astype(np.float64) * weight
             self.total = own if self.total is None else self.total + own
 
     def without(self, array: Array, weight: float) -> Array:
-        """What is left without one of them, whose weight of 1 in all that is, as a mean; float32."""
+        """Return the mean without one of the arrays, whose weight is `weight`, of a total weight of 1; float32."""
         assert self.total is not None
         with np.errstate(invalid="ignore", over="ignore"):
             return np.asarray((self.total - array.astype(np.float64) * weight) / (1 - weight), dtype=np.float32)
@@ -224,10 +228,10 @@ class Sum:
 def add_gradient(
     problem: Problem, iteration: int, on_start: Callable[[], None], on_image: Callable[[], None]
 ) -> tuple[float, list[tuple[int, Refused]]]:
-    """Have the gradient of an iteration's shards be that of the parameters; returns the loss, and by sensor what of
-    dL/dI was refused.
+    """Set the parameters' gradients to the sum over an iteration's shards.
 
-    `on_start` is called when a step of two rounds begins, `on_image` when its images and losses are there.
+    Returns the loss, and the refused entries of dL/dI by sensor. `on_start` is called when a step of two rounds starts,
+    and `on_image` when its images and losses are known.
     """
     engine, guiding = problem.engine or serially, guiding_of(problem)
     due = [] if guiding is None else _due(problem, guiding, iteration)
@@ -274,7 +278,7 @@ def _mean(found: Sum) -> mi.TensorXf:
 
 
 def _delta(problem: Problem, task: Task, image: Array, means: dict[int, Sum], refused: dict[int, Refused]) -> Array:
-    """dL/dI for a share of a view, at the mean image of the others."""
+    """Return dL/dI for a share of a view, at the mean image of the others."""
     [part] = task.parts
     view = next(view for view in problem.views if view.sensor == part.sensor)
     others = _tensor(means[part.sensor].without(image, task.weight))
@@ -283,7 +287,7 @@ def _delta(problem: Problem, task: Task, image: Array, means: dict[int, Sum], re
 
 
 def _count(refused: Refused, count: int, first: int, shape: tuple[int, ...]) -> None:
-    """Add what a shard refused, of which the first is that of the first shard that has any."""
+    """Add the refused entries of a shard; the first entry is that of the first shard that has any."""
     if count and int(refused.first[0]) == NONE:
         refused.first, refused.shape = dr.opaque(mi.UInt32, first), shape
     refused.count = dr.opaque(mi.UInt32, int(refused.count[0]) + count)
@@ -293,14 +297,14 @@ def _count(refused: Refused, count: int, first: int, shape: tuple[int, ...]) -> 
 
 
 def _due(problem: Problem, guiding: Guiding, iteration: int) -> list[int]:
-    """The sensors whose tables are to learn in this iteration; it is counted."""
+    """Count the iteration, and return the sensors whose tables learn in it."""
     sensors = [view.sensor for view, _ in problem.drawn(iteration)]
     problem.integrator.plan(problem.scene, problem.scene.sensors()[sensors[0]])  # makes the grid
     return [sensor for sensor in sensors if guiding.due(sensor)]
 
 
 def _teach(problem: Problem, iteration: int, view: View, image: Sum) -> None:
-    """Have the tables of a view learn, with dL/dI at its mean image."""
+    """Let the tables of a view learn, with dL/dI at its mean image."""
     config = problem.config
     _, gradient = derivative_of(view.objective, _mean(image), Refused())
     sensor, own = problem.scene.sensors()[view.sensor], seed(config.run.seed, iteration, view.sensor, "image")

@@ -1,15 +1,14 @@
-"""The stages of a run (`run.stages`): which problem its iterations work on, and what goes from one to the next.
+"""Stages of a run (`run.stages`): the problem of each iteration, and the transition from one stage to the next.
 
-A stage that has a resolution or a film of its own works on a problem of its own, made of the run's (`at_stage`), in
-which the run's values stand resampled. The last one, the run as it is configured, works on the run's own problem.
-Where the problem changes, the optimiser begins anew: its moments are of other maps, and what a step may be depends on
-how fine they are.
+A stage with its own resolution or film has its own problem, made from that of the run (`at_stage`), with the run's
+values resampled. The last stage is the run as configured, with the run's own problem. When the problem changes, the
+optimiser starts anew, because its moments belong to other maps, and the suitable step length depends on the resolution.
 
-What a coarse stage does to the run's values x is the change of its own ones c, with R and P between the two maps:
+A coarse stage changes the run's values x by the change of its own values c, with R and P between the two maps:
 
     x = x0 + P (c - R x0)      x0 the run's values when the stage began
 
-so that what is too fine for the stage stays as it was (Brandt 1977, the full approximation scheme).
+so that details too fine for the stage stay as they were (Brandt 1977, the full approximation scheme).
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ Array = np.ndarray[Any, Any]
 
 
 class Stages:
-    """The problems of one run's stages, one of which is kept at a time beside the run's own, `whole`.
+    """Problems of one run's stages; besides the run's own problem `whole`, one is kept at a time.
 
-    `State.stage` says of which stage a state is; before the first iteration it is of the run's own problem.
+    `State.stage` is the stage of a state. Before the first iteration, a state belongs to the run's own problem.
     """
 
     def __init__(self, whole: Problem) -> None:
@@ -51,20 +50,20 @@ class Stages:
 
     @property
     def now(self) -> Problem:
-        """The problem that is at work."""
+        """Current problem."""
         return self._now
 
     @property
     def last(self) -> int:
-        """The number of the stage in which the run is as it is configured."""
+        """Number of the last stage, which is the run as configured."""
         return len(self.whole.config.run.stages)
 
     def is_whole(self, number: int) -> bool:
-        """Whether a stage works on the run's own problem."""
+        """Whether a stage uses the run's own problem."""
         return self.whole.config.stage(number).grain == self.whole.config.stage(self.last).grain
 
     def at(self, number: int) -> Problem:
-        """The problem of a stage; one that was not at work just before has the values that `whole` has."""
+        """Return the problem of a stage; if it was not the current one, it has the values of `whole`."""
         if number == self._number:
             return self._now
         if self.is_whole(number):
@@ -77,7 +76,7 @@ class Stages:
         return self._now
 
     def enter(self, state: State) -> tuple[Problem, State]:
-        """The problem that the iteration after `state` works on, and the state as that begins with it."""
+        """Return the problem of the iteration after `state`, and the state at its start."""
         problem, self.begun = self._entered(state)
         return problem, self.begun
 
@@ -102,7 +101,7 @@ class Stages:
         return problem, began
 
     def values(self, state: State) -> dict[str, Array]:
-        """The values of a state as the run has them, as `Problem.values` does."""
+        """Return the values of a state in the resolution of the run, as `Problem.values` does."""
         whole, now = self.whole, self.at(state.stage)
         shown = {key: now.selection.shown(key, value) for key, value in state.values.items()}
         for key, before in state.base.items():
@@ -111,7 +110,7 @@ class Stages:
         return shown
 
     def bring(self, state: State) -> None:
-        """Have the run's own problem stand at the values of a state, which is the newest."""
+        """Set the run's own problem to the values of the newest state."""
         if self.is_whole(state.stage) or self._brought is state:
             return
         self.whole.selection.set_arrays(self.values(state))

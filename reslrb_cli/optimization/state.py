@@ -1,13 +1,13 @@
-"""The state of a run's iterations, all that one of them hands on to the next, and what was settled before the first.
+"""State of a run's iterations, and the decisions before the first iteration.
 
-- `State`: the tree; nothing else decides what the next iteration does: from equal states equal ones follow.
-- `standing`, `put`: the state at which a problem stands, and a problem brought to a state.
-- `load`: the state that was stored, where it fits the problem.
-- `Settled`: what every process of a run has alike: where it began, estimator, passes, masks, how samples are drawn;
-  with `begin_as`, `decide_as` and `reach_as`, by which a problem is assembled again.
+- `State`: everything that determines the next iteration; equal states lead to equal states.
+- `standing`, `put`: the current state of a problem, and a problem set to a state.
+- `load`: a stored state, if it fits the problem.
+- `Settled`: the data common to all processes of a run: initial values, estimator, passes, masks, ways of sampling;
+  `begin_as`, `decide_as` and `reach_as` assemble a problem from it.
 
-Outside of a `State` is what Dr.Jit and Mitsuba change in place: the parameters of the scene, the optimiser's leaves,
-which receive gradients, and the tables of guided emission. They follow from a state, and `put` writes them.
+Dr.Jit and Mitsuba change some data in place: the parameters of the scene, the optimiser's leaves, which receive
+gradients, and the tables of guided emission. They follow from a state, and `put` writes them.
 """
 
 from __future__ import annotations
@@ -34,19 +34,23 @@ from reslrb_cli.records.tree import PASSING, Array, Arrays, Stored, entry, expec
 
 @dataclass(frozen=True)
 class State:
-    """What an iteration begins with; of a run before its first, with `standing`, the default.
+    """State at the start of an iteration; for a new run, the default with `standing`.
 
-    `iteration` is the number of those done, and `standstill` of those in a row, up to the last, in which something sat
-    out; `peak_mib` is the allocator's high-water mark, `scaling` what `scale: auto` has measured. By parameter: `units`
-    are length and gain of what is moved in its place (`Variable`), where anything is, `clamp` the iterations that the
-    clamp knows; `moments` are the optimiser's and `clamp_sums` the clamp's. `guiding` are the gradients that guided
-    emission had by sensor, `learned` its arrays by `<sensor>/<what>`. `values` are the scene's, as the optimiser has
-    them; in a file as they are shown, and as `halo` where that is less. `stage` is the number of the stage whose
-    problem it is a state of, and `base` the run's values when that began, of one with a problem of its own (`stages`).
-    `drops` are those of a rate that a plateau has lowered, `since` the iterations before the last of them; `stopped`
-    says why the run ends with it as finished, and `end` why it fails, "" where it does not. `first_s` is `elapsed_s`
-    after the first iteration. `gradients` are those of the step that led to it, as `values` are, for whoever looks at
-    them.
+    - `iteration` is the number of finished iterations, and `standstill` the number of the last ones in a row in which
+      something was skipped.
+    - `peak_mib` is the allocator's maximum, and `scaling` the result of `scale: auto`.
+    - `units` are length and gain of variables by parameter (`Variable`), `moments` are the optimiser's, `clamp` the
+      iterations that the clamp knows, and `clamp_sums` its sums.
+    - `guiding` are the numbers of gradients of guided emission by sensor, and `learned` its arrays by
+      `<sensor>/<what>`.
+    - `values` are the scene's, in the optimiser's form; in a file, they are in their displayed form, with `halo` for
+      the rest.
+    - `stage` is the number of the state's stage, and `base` the run's values at its start, for a stage with its own
+      problem (`stages`).
+    - `drops` are the reductions of the rate by a plateau, and `since` the iterations before the last of them.
+    - `stopped` says why the run ends as finished, and `end` why it fails; "" otherwise.
+    - `first_s` is `elapsed_s` after the first iteration.
+    - `gradients` are those of the step before, in the form of `values`.
     """
 
     iteration: int
@@ -72,15 +76,16 @@ class State:
     gradients: dict[str, Any] = field(default_factory=dict, metadata=PASSING)
 
     def on_file(self, problem: Problem) -> State:
-        """The same with the values as a file has them."""
+        """Return the state with the values in the form of a file."""
         values, halo = on_file(problem, self.values)
         return replace(self, values=values, halo=halo)
 
 
 def standing(problem: Problem, state: State | None = None) -> State:
-    """The state at which `problem` stands now, with the plain values of `state`; without one it has done nothing.
+    """Return the current state of `problem`, with the plain values of `state`; without `state`, the problem has done
+    nothing.
 
-    It costs nothing, since no iteration changes the arrays of one before it.
+    It copies nothing, because no iteration changes the arrays of an earlier one.
     """
     state = State(0, 0.0, 0.0, 0, {}, {}, stage=len(problem.config.run.stages)) if state is None else state
     optimizer, guiding = problem.optimizer, guiding_of(problem)
@@ -93,7 +98,9 @@ def standing(problem: Problem, state: State | None = None) -> State:
 
 
 def put(problem: Problem, state: State) -> str | None:
-    """Bring optimiser, guided emission and scene to `state`; what was not learned of this scene (`restore_tables`)."""
+    """Set optimiser, guided emission and scene to `state`; return the name of a table that does not fit
+    (`restore_tables`).
+    """
     problem.optimizer.restore(state.values, state.units, state.moments)
     wrong = restore_tables(problem, state.guiding or {}, state.learned)
     problem.apply()
@@ -102,9 +109,9 @@ def put(problem: Problem, state: State) -> str | None:
 
 
 def load(problem: Problem, stored: Stored, whole: Problem) -> State:
-    """The state that was stored, to which `problem`, that of its stage, is brought; `whole` is the run's own.
+    """Return the stored state, after setting `problem`, that of its stage, to it; `whole` is the run's own problem.
 
-    Raises ConfigError where it is another experiment's.
+    Raises ConfigError if it belongs to another experiment.
     """
     told, optimizer, keys = stored.read(State), problem.optimizer, problem.selection.keys
     for key, (length, _) in told.units.items():
@@ -122,21 +129,23 @@ def load(problem: Problem, stored: Stored, whole: Problem) -> State:
 
 
 def guiding_of(problem: Problem) -> Guiding | None:
-    """What the run's integrator has learned of where light paths are to start; None where it does not."""
+    """Return the tables of guided emission of the run's integrator, or None."""
     return problem.integrator.preparation.guiding if isinstance(problem.integrator, Reslrb) else None
 
 
 def noted_of(problem: Problem) -> dict[str, Array]:
-    """How the run's camera paths are shared out over the pixels, by the number of their sensor, (H, W), where that was
-    noted before the first iteration; as `LightTracer.shared_out` takes it."""
+    """Return the recorded densities of camera paths over the pixels, (H, W), by the number of the sensor.
+
+    They are the argument of `LightTracer.shared_out`.
+    """
     given = problem.integrator.preparation.given if isinstance(problem.integrator, Reslrb) else {}
     return {str(number): density for number, density in given.items()}
 
 
 def restore_tables(problem: Problem, calls: Mapping[str, int], learned: Mapping[str, Array]) -> str | None:
-    """Have the tables of the run's integrator, where it has any, go on from what is stored (`State`).
+    """Restore the tables of the run's integrator, if it has any, from stored data (`State`).
 
-    Returns the name of what is not of this scene, and then nothing has changed.
+    Returns the name of an array that does not fit this scene; then nothing has changed.
     """
     guiding = guiding_of(problem)
     if guiding is None:
@@ -153,14 +162,17 @@ def restore_tables(problem: Problem, calls: Mapping[str, int], learned: Mapping[
 
 
 def on_file(problem: Problem, values: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Values of parameters, as the optimiser has them, as they are shown, and those of which that is not all: of an
-    environment map, whose halo it leaves out."""
+    """Return values of parameters from the optimiser's form in their displayed form, and the complete arrays of those
+    that lose data.
+
+    An environment map loses its halo.
+    """
     shown = {key: problem.selection.shown(key, value) for key, value in values.items()}
     return shown, {key: own for key, value in values.items() if (own := to_array(value)).size != shown[key].size}
 
 
 def _stored_values(problem: Problem, stored: Stored, prefix: str) -> dict[str, Any]:
-    """What `on_file` made of values, as the optimiser has them; `prefix` is that of their entries."""
+    """Return values in the optimiser's form from the result of `on_file`; `prefix` is that of their entries."""
     found = {}
     for key in problem.selection.keys:
         now, name, shape = dr.detach(problem.optimizer[key]), f"{prefix}/{key}", problem.selection.array(key).shape
@@ -175,9 +187,11 @@ def _stored_values(problem: Problem, stored: Stored, prefix: str) -> dict[str, A
 
 @dataclass(frozen=True)
 class Settled:
-    """What every process of a run has alike: its settings, in a file's words, and `variant`, the digests of the `files`
-    that they name, what was decided by measurement, the parameters' values at the start, and `masks` as a `Problem`
-    has them."""
+    """Data common to all processes of a run.
+
+    They are its settings in the form of a file, `variant`, the digests of the `files`, the decisions by measurement,
+    the initial values of the parameters, and the `masks` of a `Problem`.
+    """
 
     config: str
     variant: str
@@ -195,7 +209,7 @@ class Settled:
 
 
 def begin_as(problem: Problem, stored: Stored) -> None:
-    """Give the parameters the values that the run began with."""
+    """Set the parameters to the initial values of the run."""
     values = _stored_values(problem, stored, "initial")
     problem.selection.set_arrays({key: problem.selection.shown(key, value) for key, value in values.items()})
     for key, value in values.items():
@@ -204,7 +218,7 @@ def begin_as(problem: Problem, stored: Stored) -> None:
 
 
 def decide_as(problem: Problem, stored: Stored) -> Problem:
-    """Return `problem` with the decisions of the run: the samples of a pass, and how samples are drawn."""
+    """Return `problem` with the decisions of the run: the samples of a pass, and the ways of sampling."""
     settled = stored.read(Settled)
     guided = settled.guided if is_auto(problem.config, "guiding") else None
     sequence = settled.sequence if is_auto(problem.config, "sequence") else None
@@ -221,7 +235,7 @@ def decide_as(problem: Problem, stored: Stored) -> Problem:
 
 
 def reach_as(problem: Problem, stored: Stored) -> Problem:
-    """Take up what light and sensor reach, of the parameters whose true value is known."""
+    """Restore the entries that light and sensor reach, for parameters with known true values."""
     shapes = {key: problem.selection.array(key).shape for key in problem.truth}
     asked = {key: expected(shape[:2] if len(shape) == 3 else shape) for key, shape in shapes.items()}
     return replace(problem, masks={key: stored.take(f"mask/{key}", mask) for key, mask in asked.items()})

@@ -1,10 +1,10 @@
-"""When a loss stands: what ends a run early (`run.stop`), and lowers its rate (`optimizer.schedule: plateau`); and the
-time of a run (`run.max_seconds`).
+"""Detection of a loss that stands, which ends a run early (`run.stop`) or lowers its rate (`optimizer.schedule:
+plateau`); and the time of a run (`run.max_seconds`).
 
-A loss has windows of `patience` iterations, one after another, and is tested at the end of each: it stands where it is
-shown to fall by less than `relative` a window (`trend.stands`). Where views are held out, the test takes their loss,
-which has fewer values, always of the same samples. Windows begin once the run is as it is configured (`run.stages`),
-and anew where the rate is lowered. A run with a plateau ends only at its least rate.
+The losses are divided into windows of `patience` iterations, and tested at the end of each. A loss stands if the test
+shows that it falls by less than `relative` per window (`trend.stands`). If views are held out, their loss is tested,
+which has fewer values, always of the same samples. Windows start after the stages of `run.stages`, and again after the
+rate has been lowered. A run with a plateau ends only at its lowest rate.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FACTOR = 0.5
 
 
 def lowered(optimizer: AnyOptimizer, drops: int) -> float:
-    """Return the factor of the rate after so many drops of a plateau; 1 with other schedules."""
+    """Return the factor of the rate after this number of drops of a plateau; 1 with other schedules."""
     if optimizer.schedule != "plateau":
         return 1.0
     return max(FACTOR**drops, optimizer.final_fraction)
@@ -43,7 +43,9 @@ def time_share(limit_s: float | None, state: State) -> float:
 
 
 def out_of_time(limit_s: float | None, state: State) -> str:
-    """Say that an iteration as long as the mean of those after the first would exceed the limit; "" if it would not."""
+    """Return a message if an iteration of the mean duration (without the first) would exceed the limit;
+    otherwise "".
+    """
     mean_s = (state.elapsed_s - state.first_s) / max(state.iteration - 1, 1)
     if limit_s is None or state.elapsed_s + mean_s <= limit_s:
         return ""
@@ -51,20 +53,20 @@ def out_of_time(limit_s: float | None, state: State) -> str:
 
 
 class Watch:
-    """The losses of a run so far, which is told of each iteration in turn; from equal ones equal decisions follow."""
+    """Losses of a run so far, iteration by iteration; equal losses lead to equal decisions."""
 
     def __init__(self, config: Config) -> None:
         self.config, self.held_out = config, bool(config.run.held_out)
         self._values: dict[int, float] = {}
 
     def add(self, record: Record) -> None:
-        """Take an iteration, of a run that goes on as well."""
+        """Add an iteration, also that of a resumed run."""
         loss = record.held_out if self.held_out else record.loss
         if loss is not None and math.isfinite(loss):
             self._values[record.iteration] = loss
 
     def after(self, state: State, record: Record) -> State:
-        """The state that an iteration leaves, with what is decided after it. Takes the record."""
+        """Add the record, and return the state after the iteration with the decisions made now."""
         self.add(record)
         stop, optimizer, done = self.config.run.stop, self.config.optimizer, state.iteration
         began = max(self._first, state.since)
@@ -77,12 +79,14 @@ class Watch:
 
     @property
     def _first(self) -> int:
-        """The first iteration of the run as it is configured."""
+        """First iteration of the run as configured."""
         stages, iterations = self.config.run.stages, self.config.run.iterations
         return math.ceil(stages[-1].until * iterations) + 1 if stages else 0
 
     def _stands(self, asked: StopRule, began: int, done: int) -> str:
-        """Say how the loss stands after `done` iterations; "" where that is not shown, or no window is at its end."""
+        """Return a message about how the loss stands after `done` iterations; "" if this is not shown, or no window
+        ends.
+        """
         span = asked.patience
         if (done - began) % span:
             return ""

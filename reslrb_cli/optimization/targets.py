@@ -1,7 +1,7 @@
-"""The images that views are to see, and the pixels that are left out of a view's loss.
+"""Target images, and the pixels that a view's loss excludes.
 
-Such pixels are counted by kind, and the others have weights (`mask_of`). Images are read from files, or rendered with
-the true values of the parameters (`make_targets`).
+Excluded pixels are counted by kind, and the others have weights (`mask_of`). Images are read from files, or rendered
+with the true values of the parameters (`make_targets`).
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ WORDS = {
 
 
 def mask_of(config: Config, wanted: Wanted, scene: mi.Scene, photo: Photo | None, lacking: bool) -> Masked:
-    """Find the pixels of a view that its mask leaves out; `photo` is the target's file, None of a rendered one, and
-    `lacking` whether target and image differ by what light paths lack.
+    """Find the pixels of a view that its mask excludes.
 
-    Raises ConfigError where the file of weights is wrong.
+    `photo` is the file of the target, None for a rendered one. `lacking` says whether target and image differ by the
+    light that light paths cannot find. Raises ConfigError for a wrong file of weights.
     """
     mask, sensor, found = wanted.mask, scene.sensors()[wanted.sensor], Masked()
     width, height = (int(n) for n in sensor.film().crop_size())
@@ -82,7 +82,7 @@ def mask_of(config: Config, wanted: Wanted, scene: mi.Scene, photo: Photo | None
 
 
 def mask_line(name: str, masked: Masked, weights: Array) -> str | None:
-    """What the user is told of a view's mask, None where nothing is left out, weighed or counted."""
+    """Return a line for the user about a view's mask; None if nothing is excluded, weighted or counted."""
     counts = masked.counts()
     stay = [f"{count} {WORDS[kind]} and stay" for kind, count in masked.stay.items()]
     if not counts and not stay and masked.weights is None:
@@ -94,9 +94,9 @@ def mask_line(name: str, masked: Masked, weights: Array) -> str | None:
 
 
 def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
-    """Read or render every view's target; returns the problem with what that tells of the parameters, its `truth`.
+    """Read or render every view's target; return the problem with the true values of rendered targets as its `truth`.
 
-    `say` is told what takes long, and what of the targets is left out. Raises ConfigError.
+    `say` is called with lines about slow work and excluded pixels. Raises ConfigError.
     """
     config, upright = problem.config, are_upright(problem.config)
     for view in problem.views:
@@ -127,7 +127,7 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
 
 
 def _check_light(problem: Problem, say: Callable[[str], None]) -> None:
-    """Raise ConfigError where all targets are black, of which nothing can be learned; `say` which of several are."""
+    """Raise ConfigError if all targets are black; if only some are, `say` which."""
     black = [view.sensor for view in problem.views if not np.any(np.array(view.target))]
     if not black:
         return
@@ -141,7 +141,7 @@ def _check_light(problem: Problem, say: Callable[[str], None]) -> None:
 
 
 def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: Callable[[str], None]) -> None:
-    """Give a view its target, (H, W, C), and leave out what its mask does; `photo` is what was read, if it was."""
+    """Set the target of a view, (H, W, C), and its mask; `photo` is the file that was read, if any."""
     wanted, config = view.wanted, problem.config
     colors = color_channels(problem.scene.sensors()[view.sensor].film())
     if colors == 1 and image.shape[2] >= 3:
@@ -169,7 +169,7 @@ def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: C
 
 
 def _render_targets(problem: Problem, say: Callable[[str], None]) -> dict[str, Array]:
-    """Give the views without a file their targets; returns the parameters' true values."""
+    """Render the targets of views without a file; return the parameters' true values."""
     config, render = problem.config, problem.config.target.render
     assert render is not None, "called for rendered targets only"
     true_scene = load_configured(config, warn=False)
@@ -189,7 +189,7 @@ def _render_targets(problem: Problem, say: Callable[[str], None]) -> dict[str, A
 
 
 def _truth(problem: Problem, true_values: Selection, say: Callable[[str], None]) -> dict[str, Array]:
-    """The parameters' true values."""
+    """Return the parameters' true values."""
     truth: dict[str, Array] = {}
     for key in problem.selection.keys:
         if key in problem.selection.factors:  # the scene's own images are the target
@@ -203,9 +203,9 @@ def _truth(problem: Problem, true_values: Selection, say: Callable[[str], None])
 
 
 def set_true_values(config: Config, scene: mi.Scene) -> Selection:
-    """Set the values of `target.render.parameters` in `scene`; return them, selected.
+    """Set the values of `target.render.parameters` in `scene`; return them as a selection.
 
-    They are checked like initial values are; an error is located in the target.
+    They are checked like initial values; errors are located in the target.
     """
     render = config.target.render
     assert render is not None, "called for rendered targets only"

@@ -1,24 +1,25 @@
-"""Tests on a noisy series of losses: whether it stands, and whether it fell or rose over a run.
+"""Tests of a noisy series of losses: whether it stands, and whether it fell or rose over a run.
 
-Losses of iterations have heavy tails: one bright path multiplies a loss by ten. So no test takes a plain mean.
+Losses of iterations have heavy tails: one bright path can multiply a loss by ten. No test therefore uses a plain mean.
 
-`stands` shows a standstill; that a fall was not seen is no proof of one. A window of iterations has one level, its
-interquartile mean (`levels_of`). A line through the levels of the last k windows has a slope, and the standard error
-of it has k - 2 degrees of freedom. The loss stands where the upper bound for the fall per window is below `relative`.
-The levels' own spread gives the standard error, so losses may be correlated, over less than a window.
+`stands` shows a standstill; it is not enough that no fall was seen. A window of iterations has one level, its
+interquartile mean (`levels_of`). A line through the levels of the last k windows has a slope, whose standard error has
+k - 2 degrees of freedom. The loss stands if the upper bound for the fall per window is below `relative`. The standard
+error comes from the spread of the levels, so losses may be correlated over less than a window.
 
-The test is repeated after every window, for several k, and a run stops at the first success. The j-th look therefore
-has the share 2 / (j (j - 1)) of `CHANCE`, in equal parts for its k. The shares add up to 1 from j = 3 on. So a loss
-that falls by `relative` a window is stopped in at most 5 % of runs, however long they are.
+The test is repeated after every window, for several k, and a run stops at the first success. The j-th test therefore
+has the share 2 / (j (j - 1)) of `CHANCE`, in equal parts for its k. The shares sum to 1 from j = 3 on. A loss that
+falls by `relative` per window is stopped in at most 5 % of runs, however long they are.
 
 `find_trend` tests the ranks of all losses, in ten parts (Conover and Iman 1981), by the same line.
 
-- It rose, or fell, if the line does, or if the last tenth of the iterations is surely on that side of the first tenth.
-  Both need the levels of these tenths to agree.
-- It fell, too, if the first three losses are above the second half. Many falls are over within a few iterations.
-- It rose, too, if the first loss is below all others, and surely below the last tenth. Some runs leap at their first
-  step, and come down again to a level above their start.
-- It was flat if it did neither, and if it surely fell by less than `MOST_FALL`: raised by as much, the line rises.
+- It rose, or fell, if the line does, or if the last tenth of the iterations is significantly on that side of the first
+  tenth. Both need the levels of these tenths to agree.
+- It also fell if the first three losses are above the second half, because many falls end within a few iterations.
+- It also rose if the first loss is below all others, and significantly below the last tenth. Some runs leap at their
+  first step, and come down again to a level above their start.
+- It was flat if it did neither, and if it significantly fell by less than `MOST_FALL`: raised by as much, the line
+  rises.
 """
 
 from __future__ import annotations
@@ -60,14 +61,14 @@ PARTS = 10
 
 @dataclass(frozen=True)
 class Level:
-    """The interquartile mean of some losses, and its standard error."""
+    """Interquartile mean of some losses, and its standard error."""
 
     mean: float
     error: float
 
 
 class Change(str, enum.Enum):
-    """What became of a series, as far as its noise tells."""
+    """Change of a series, as far as its noise shows."""
 
     FELL = "fell"
     ROSE = "rose"
@@ -77,7 +78,7 @@ class Change(str, enum.Enum):
 
 @dataclass(frozen=True)
 class Trend:
-    """A series at its start and at its end, and what became of its second half alone (None: too short to say)."""
+    """Series at its start and at its end, and the change in its second half alone (None: too short)."""
 
     start: Level
     end: Level
@@ -85,12 +86,12 @@ class Trend:
     late: Change | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """As a mapping for JSON."""
+        """Return the content as a mapping for JSON."""
         return {**asdict(self), "change": self.change.value, "late": None if self.late is None else self.late.value}
 
 
 def find_trend(values: Sequence[float]) -> Trend | None:
-    """Return the trend of a value per iteration, None of too few; values that are not finite are left out."""
+    """Return the trend of a value per iteration, None for too few values; values that are not finite are left out."""
     series = np.array([value for value in values if math.isfinite(value)], dtype=np.float64)
     count, width = series.size, window(series.size)
     if count < LEAST_ITERATIONS:
@@ -115,10 +116,11 @@ def find_trend(values: Sequence[float]) -> Trend | None:
 
 
 def stands(levels: Array, relative: float, number: int) -> Array:
-    """Say of each series of levels (..., J), one a window, over how many of the last it stands; 0: it does not.
+    """Return for each series of levels (..., J), one per window, the number of last windows over which it stands; 0:
+    none.
 
-    It stands where it surely falls by less than the share `relative` from one to the next. `number` counts the windows
-    of the run so far, which has looked at the end of each.
+    It stands if it significantly falls by less than the share `relative` from one window to the next. `number` is the
+    number of windows of the run so far, each of which was tested.
     """
     spans = [k for k in SPANS if k <= levels.shape[-1]]
     found = np.zeros(levels.shape[:-1], dtype=int)
@@ -148,7 +150,7 @@ def line(values: Array, at: Array | None = None) -> tuple[Array, Array]:
 
 
 def window(iterations: int) -> int:
-    """Return how many of the first and of the last iterations are averaged."""
+    """Return the number of first and of last iterations that are averaged."""
     return max(iterations // 10, LEAST_WINDOW)
 
 
@@ -158,7 +160,7 @@ def _rises(values: Array, at: Array | None = None, chance: float = (1 - CONFIDEN
 
 
 def _apart(first: Array, last: Array, chance: float = (1 - CONFIDENCE) / 2) -> int:
-    """Whether the last losses are surely above the first (1), or below (-1); else 0."""
+    """Return 1 if the last losses are significantly above the first, -1 if below, otherwise 0."""
     ranks, is_last = _ranks(np.concatenate([first, last])), np.arange(first.size + last.size) >= first.size
     return _rises(ranks, is_last, chance) - _rises(-ranks, is_last, chance)
 
@@ -168,13 +170,13 @@ def _parts(values: Array) -> Array:
 
 
 def _ranks(values: Array) -> Array:
-    """Ranks; equal values share the mean of theirs."""
+    """Return ranks; equal values share the mean of their ranks."""
     _, place, count = np.unique(values, return_inverse=True, return_counts=True)
     return np.asarray((np.cumsum(count) - count / 2)[place])
 
 
 def _level(values: Array) -> Level:
-    """The interquartile mean, with the standard error of Tukey and McLaughlin (1963)."""
+    """Return the interquartile mean, with the standard error of Tukey and McLaughlin (1963)."""
     order, cut = np.sort(values), len(values) // 4
     kept = np.clip(values, order[cut], order[-1 - cut])
     share = 1 - 2 * cut / len(values)
@@ -182,7 +184,7 @@ def _level(values: Array) -> Level:
 
 
 def _quantile(freedom: int, chance: float) -> float:
-    """Student's t that is exceeded with this chance."""
+    """Return the quantile of Student's t that is exceeded with this probability."""
     from scipy.special import stdtrit  # late: imports of the command line are to be fast
 
     return -float(stdtrit(freedom, chance))

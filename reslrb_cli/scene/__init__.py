@@ -1,1 +1,1 @@
-"""Scenes: loading, what they contain and need, the parameters that can be recovered, and images to compare with."""
+"""Scenes: loading, contents and needs, the parameters that can be recovered, and images to compare with."""

@@ -1,7 +1,7 @@
 """Cameras of a file: NeRF's `transforms.json`, and COLMAP's `images.txt` with the `cameras.txt` beside it.
 
-Mitsuba's perspective sensor looks along +z, with x to the left and y up; its pixels are squares, and its lens has no
-distortion. What a file has beyond that is refused.
+Mitsuba's perspective sensor looks along +z, with x to the left and y up. Its pixels are squares, and its lens has no
+distortion. Files with other cameras are refused.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _NERF, _COLMAP = np.diag([-1.0, 1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0]
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera as a sensor of Mitsuba's: `focal` and `center` (x, y) are in pixels, `to_world` is (4, 4)."""
+    """Camera as a Mitsuba sensor: `focal` and `center` (x, y) are in pixels, `to_world` is (4, 4)."""
 
     name: str
     image: Path
@@ -52,7 +52,7 @@ class Camera:
 
 
 def read_cameras(file: Path) -> list[Camera]:
-    """The cameras of a file, in its order. Raises ConfigError, located in it, for what it lacks or Mitsuba does."""
+    """Return the cameras of a file, in order. Raises ConfigError, located in it, for missing or unsupported entries."""
     cameras = _nerf(file) if file.suffix.lower() == ".json" else _colmap(file)
     if not cameras:
         raise ConfigError(file, "", "has no cameras")
@@ -60,7 +60,7 @@ def read_cameras(file: Path) -> list[Camera]:
 
 
 def replace_sensors(description: Description, cameras: list[Camera]) -> None:
-    """Put cameras in the place of the sensors of a scene, with the filter and the sampler of its first one."""
+    """Replace the sensors of a scene by cameras, with the filter and the sampler of its first sensor."""
     root = description.root
     own = [child for child in root.children if child.tag == "sensor"]
     root.children = [child for child in root.children if child.tag != "sensor"]
@@ -101,7 +101,7 @@ def _sensor(like: Element, camera: Camera, name: str) -> Element:
 
 
 def _copy(element: Element) -> Element:
-    """The element for another sensor: what lies in it has ids of its own."""
+    """Return a copy of the element for another sensor, without the ids inside it."""
     attributes = {key: value for key, value in element.attributes.items() if key != "id"}
     return element.new(element.tag, *map(_copy, element.children), **attributes)
 
@@ -143,7 +143,7 @@ def _frame(file: Path, key: str, frame: Mapping[str, Any]) -> Camera:
 
 
 def _image(path: Path) -> Path:
-    """The path of an image, which Blender's files name without its suffix."""
+    """Return the path of an image; Blender's files omit its suffix."""
     if path.suffix or path.exists():
         return path
     names = [path.with_suffix(f".{name.strip().lower()}") for name in re.split(r",| or ", FORMATS)]
@@ -199,7 +199,7 @@ def _colmap(file: Path) -> list[Camera]:
 
 
 def _models(file: Path) -> Iterator[tuple[int, tuple[tuple[int, int], float, tuple[float, float]]]]:
-    """The size, focal length and centre of each camera, by its number."""
+    """Yield the number, size, focal length and centre of each camera."""
     for place, words in _lines(file):
         if not words:
             continue
@@ -221,7 +221,7 @@ def _models(file: Path) -> Iterator[tuple[int, tuple[tuple[int, int], float, tup
 
 
 def _lines(file: Path) -> Iterator[tuple[str, list[str]]]:
-    """File and number, and words of each line that is no comment; a line of points may be empty."""
+    """Yield the location and the words of each line that is no comment; a line of points may be empty."""
     text = read_file(file).decode("utf-8", errors="replace")
     for number, line in enumerate(text.splitlines(), 1):
         if not line.startswith("#"):

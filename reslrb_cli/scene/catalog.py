@@ -1,6 +1,6 @@
-"""The catalogue of a scene: its parameters and which of them can be recovered, and what `reslrb inspect` says of it.
+"""Catalogue of a scene: its parameters, whether they can be recovered, and the contents for `reslrb inspect`.
 
-Printing is up to the caller.
+The caller prints them.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _FEW = 4
 
 @dataclass(frozen=True)
 class Value:
-    """The current value of a parameter: its `numbers`, if they are few, and their `mean`, least and greatest."""
+    """Current value of a parameter: its `numbers`, if they are few, and their `mean`, minimum and maximum."""
 
     numbers: list[float] | None
     mean: float
@@ -46,13 +46,15 @@ class Value:
 
 @dataclass(frozen=True)
 class ParameterInfo:
-    """One entry of `mi.traverse`.
+    """Entry of `mi.traverse`.
 
-    `kind` is what it belongs to: `bsdf`, `emitter`, `attribute` (of a mesh, such as `vertex_color`), `shape`, `sensor`,
-    `film`, `medium`, `integrator` or `scene`. `type` and `shape` describe the value: (height, width, channels) for
-    textures. `obstacle` says why it cannot be recovered; None where it can. `value` is None for what is no number.
-    `bits` are those of a texel where Mitsuba keeps a texture with too few to follow a gradient, so that it has to be
-    read as floating point to be recovered (`load.read_as_floats`); None of all else.
+    - `kind` is the type of its owner: `bsdf`, `emitter`, `attribute` (of a mesh, such as `vertex_color`), `shape`,
+      `sensor`, `film`, `medium`, `integrator` or `scene`.
+    - `type` and `shape` describe the value: (height, width, channels) for textures.
+    - `obstacle` says why it cannot be recovered; None if it can.
+    - `value` is None if it is no number.
+    - `bits` are those of a texel if Mitsuba's precision is too low for gradients, so that the texture must be read as
+      floating point (`load.read_as_floats`); otherwise None.
     """
 
     key: str
@@ -67,17 +69,17 @@ class ParameterInfo:
 
     @property
     def remark(self) -> str | None:
-        """What is to be known of it before it is recovered."""
+        """Remark for users who want to recover it."""
         return None if self.bits is None else f"{self.bits} bits, read as floats if recovered"
 
 
 def list_parameters(params: Any, values: bool = False) -> list[ParameterInfo]:
-    """Describe every entry of a `mi.traverse` result, in its order; their `values` too, if they are asked for."""
+    """Describe every entry of a `mi.traverse` result in order, with its value if `values` is set."""
     return [describe(params, key, values) for key in params.properties]
 
 
 def describe(params: Any, key: str, values: bool = False) -> ParameterInfo:
-    """Describe one entry of a `mi.traverse` result, with its value where `values` are asked for."""
+    """Describe one entry of a `mi.traverse` result, with its value if `values` is set."""
     value, node, flags = entry_value(params, key), params.properties[key][2], int(params.flags(key))
     differentiable = flags & (int(mi.ParamFlags.NonDifferentiable) | int(mi.ParamFlags.ReadOnly)) == 0
     kind, bits = parameter_kind(params, key), coarse_bits(params, key)
@@ -95,7 +97,7 @@ def describe(params: Any, key: str, values: bool = False) -> ParameterInfo:
 
 
 def coarse_bits(params: Any, key: str) -> int | None:
-    """The bits with which Mitsuba keeps a texel of the bitmap `key`, where these are fewer than 32; else None."""
+    """Return the bits of a texel of the bitmap `key` if they are fewer than 32; otherwise None."""
     if not key.endswith("data") or not params.properties[key][2].class_name().startswith("BitmapTexture"):
         return None
     bits = _storage_bits(entry_value(params, key))
@@ -103,13 +105,15 @@ def coarse_bits(params: Any, key: str) -> int | None:
 
 
 def halo(node: Any, value: Any) -> int:
-    """How many columns Mitsuba adds at either side of a texture, copies of the opposite ones: one to an `envmap`."""
+    """Return the number of columns that Mitsuba adds at either side of a texture, copies of the opposite ones: one to
+    an `envmap`.
+    """
     is_texture = value is not None and dr.is_tensor_v(value) and len(value.shape) == 3
     return 1 if is_texture and node.class_name() == "EnvironmentMapEmitter" else 0
 
 
 def value_shape(value: Any, halo: int = 0) -> tuple[int, ...]:
-    """Shape of a parameter as a NumPy array, without its `halo`; () for one number, and for what was not given."""
+    """Return the shape of a parameter as a NumPy array, without its `halo`; () for one number, or a missing value."""
     if value is None or not dr.is_array_v(value):
         return ()
     shape = tuple(int(n) for n in dr.shape(value))
@@ -119,7 +123,7 @@ def value_shape(value: Any, halo: int = 0) -> tuple[int, ...]:
 
 
 def _current_value(params: Any, key: str) -> Value | None:
-    """The value of one entry of a `mi.traverse` result; None for what is no number."""
+    """Return the value of one entry of a `mi.traverse` result; None if it is no number."""
     value = entry_value(params, key)
     array = as_numbers(value)
     if array is None or array.size == 0:
@@ -133,7 +137,7 @@ def _current_value(params: Any, key: str) -> Value | None:
 
 
 def as_numbers(value: Any) -> np.ndarray | None:
-    """A parameter's value as an array, a transform by its matrix; None of what is no number."""
+    """Return a parameter's value as an array, a transform as its matrix; None if it is no number."""
     try:
         array = np.asarray(value.matrix if "AffineTransform" in type(value).__name__ else value)
     except (RuntimeError, TypeError):
@@ -142,7 +146,7 @@ def as_numbers(value: Any) -> np.ndarray | None:
 
 
 def _encoded_value(array: np.ndarray, texture: mi.Texture) -> Value:
-    """The value of a texture of 8 bits as it is looked up: a share of 255, decoded from sRGB unless it is raw."""
+    """Return the value of an 8-bit texture as it is looked up: divided by 255, decoded from sRGB unless it is raw."""
     table = np.arange(256, dtype=np.float32) / 255
     if not re.search(r"^ *raw = 1,$", str(texture), re.MULTILINE):
         table = np.array(dr.srgb_to_linear(mi.Float(table)))
@@ -154,16 +158,16 @@ def _encoded_value(array: np.ndarray, texture: mi.Texture) -> Value:
 
 
 def entry_value(params: Any, key: str) -> Any:
-    """The value of an entry of a `mi.traverse` result; None where there is none, as of a texture that may be missing.
+    """Return the value of an entry of a `mi.traverse` result; None if there is none, as for an optional texture.
 
-    Not params[key], which would mark every entry as one that update() has to look at, and fails where there is none.
+    params[key] would mark every entry as changed for update(), and fails for missing values.
     """
     value, value_type, node, _ = params.properties[key]
     return value if value_type is None else params.get_property(value, value_type, node)
 
 
 def parameter_kind(params: Any, key: str) -> str:
-    """What an entry of a `mi.traverse` result belongs to (`ParameterInfo.kind`)."""
+    """Return the type of the owner of a `mi.traverse` entry (`ParameterInfo.kind`)."""
     node, name = params.properties[key][2], key.rpartition(".")[2]
     is_attribute = name.startswith(("vertex_", "face_")) and name not in _MESH_GEOMETRY
     while node is not None:
@@ -204,7 +208,7 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
 
 
 def _storage_bits(value: Any) -> int | None:
-    """Bits of one entry of a numeric JIT array that a parameter could be; None for anything else."""
+    """Return the bits of one entry of a numeric JIT array that a parameter could be; otherwise None."""
     bits = {dr.VarType.UInt8: 8, dr.VarType.Float16: 16, dr.VarType.Float32: 32, dr.VarType.Float64: 64}
     is_number = dr.is_jit_v(value) and dr.is_arithmetic_v(value) and not dr.is_matrix_v(value)
     return bits.get(dr.type_v(value)) if is_number else None
@@ -212,10 +216,10 @@ def _storage_bits(value: Any) -> int | None:
 
 @dataclass(frozen=True)
 class SensorSummary:
-    """One sensor: its film in pixels (`crop` is offset and size), what it sees, and what light tracing needs for it.
+    """Sensor: its film in pixels (`crop` is offset and size), its view, and the needs of light tracing.
 
-    `obstacle` is the reason why light tracing cannot render for it, or None, and `camera_obstacle` the same of paths
-    from the sensor (`prb`). `view` is None where the reason lies in the scene's parts and not in what the sensor sees.
+    `obstacle` is the reason why light tracing cannot render for it, or None, and `camera_obstacle` the same for camera
+    paths (`prb`). `view` is None if the reason is in the scene's parts and not in the view.
     """
 
     index: int
@@ -234,7 +238,7 @@ class SensorSummary:
 
 @dataclass(frozen=True)
 class MovableSummary:
-    """A shape or an emitter by its id, and what can move it: `motion`, `heightmap`."""
+    """Shape or emitter by its id, and the parameters that can move it: `motion`, `heightmap`."""
 
     id: str
     by: list[str]
@@ -242,7 +246,7 @@ class MovableSummary:
 
 @dataclass(frozen=True)
 class SceneSummary:
-    """What a scene contains: class names and how often each occurs, sensors, all parameters, and what can be moved."""
+    """Contents of a scene: class names with counts, sensors, all parameters, and movable objects."""
 
     emitters: dict[str, int]
     bsdfs: dict[str, int]
@@ -254,7 +258,7 @@ class SceneSummary:
 
 
 def summarise(scene: Any, hide_emitters: bool = False, sensors: Sequence[int] | None = None) -> SceneSummary:
-    """Look `scene` over; `sensors` are the indices of those to describe, None for all."""
+    """Summarise `scene`; `sensors` are the indices of those to describe, None for all."""
     graph, params = SceneGraph.of(scene), mi.traverse(scene)
     shapes = graph.shapes()
     return SceneSummary(

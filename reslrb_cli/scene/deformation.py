@@ -1,21 +1,21 @@
-"""Scene parameters as functions of what is recovered: motions of shapes and emitters, and heightmaps on meshes.
+"""Scene parameters as functions of recovered values: motions of shapes and emitters, and heightmaps on meshes.
 
-Obstacles and movables: which shapes and emitters have derivatives of where they are, and why others have none; what a
-motion or a heightmap can move is found by id, with the scene parameter that places each.
+Obstacles and movables: which shapes and emitters have derivatives with respect to their place, and why others have
+none. Objects of a motion or a heightmap are found by id, with the scene parameter of their place.
 
-Surroundings: the sphere that light from infinitely far away falls into, kept around shapes that move. Emitters without
-a place (a constant sky, parallel light) send their rays through a sphere around the scene. Mitsuba gives it to them
-when the scene is loaded: what moves out of it later would be in the dark.
+Surroundings: emitters without a place (a constant sky, parallel light) send their rays through a sphere around the
+scene. Mitsuba sets it when the scene is loaded, and shapes that leave it later would be dark. The sphere is therefore
+kept around moving shapes.
 
-Deformation: a mesh has positions p = M(p0 + h n0), p0 and n0 its own positions and normals, h the heightmap where it
-has one, at the vertex's texture coordinates, and M the motion where it has one,
+Deformation: a mesh has positions p = M(p0 + h n0), with its own positions p0 and normals n0, the heightmap h, if any,
+at the vertex's texture coordinates, and the motion M, if any,
 
     M(p) = c + t + Rz Ry Rx s (p - c)      c the pivot, t the translation, R the rotation about each axis, s the scale
 
-An analytic shape, and an emitter without a surface, is placed by M after its own `to_world`; of emitters s scales the
-place alone. What the scene gets are values without a graph (leaves): a step adds its gradient to these, and `collect`
-brings it on to what is recovered, once, however many views, batches and passes the step has. In forward mode `push`
-takes tangents the other way.
+An analytic shape, and an emitter without a surface, is placed by M after its own `to_world`; for emitters, s scales
+only the place. The scene gets values without a graph (leaves). A step adds its gradient to these, and `collect`
+propagates it to the recovered values once, for any number of views, batches and passes. In forward mode, `push`
+propagates tangents the other way.
 """
 
 from __future__ import annotations
@@ -53,8 +53,11 @@ _PLACED = ("to_world", "vertex_positions", "position")
 
 
 def moving_obstacle(node: mi.Shape | mi.Emitter, key: str) -> str | None:
-    """Why there is no derivative of the parameter `key` of a shape or of an emitter without a surface, which says where
-    it is or where its light goes; None where there is one."""
+    """Return why the parameter `key` of a shape, or of an emitter without a surface, has no derivative; None if it has
+    one.
+
+    The parameter determines the place or the direction of the object.
+    """
     kind, name = node.class_name(), key.rpartition(".")[2]
     if not isinstance(node, mi.Shape):
         if name == MOVING_EMITTERS.get(kind):
@@ -75,9 +78,9 @@ def moving_obstacle(node: mi.Shape | mi.Emitter, key: str) -> str | None:
 
 @dataclass(frozen=True)
 class Movable:
-    """An object with this `id`, and the `key` of the scene parameter that says where it is.
+    """Object with this `id`, and the `key` of the scene parameter of its place.
 
-    That is a mesh's `vertex_positions`, an analytic shape's or an emitter's `to_world`, or a point light's `position`.
+    This is a mesh's `vertex_positions`, an analytic shape's or an emitter's `to_world`, or a point light's `position`.
     """
 
     id: str
@@ -91,7 +94,7 @@ class Movable:
 
     @property
     def is_point(self) -> bool:
-        """Whether it is a point without extent and direction, so that nothing turns or scales it."""
+        """Whether it is a point without extent and direction, which cannot be rotated or scaled."""
         return self.key.endswith(".position")
 
     @property
@@ -100,7 +103,7 @@ class Movable:
         return isinstance(self.node, mi.Shape)
 
     def heightmap_obstacle(self) -> str | None:
-        """Why no heightmap can displace it; None where one can."""
+        """Return why no heightmap can displace it; None if one can."""
         if not self.by_vertices:
             why = f"`{self.id}` is a {self.node.class_name()}; a heightmap displaces the vertices of a mesh"
             return (
@@ -111,13 +114,13 @@ class Movable:
         return None
 
     def casts_edges(self, scene: mi.Scene) -> bool:
-        """Whether it can have a silhouette or throw a shadow: a shape that does not enclose all others."""
+        """Whether it can have a silhouette or cast a shadow: a shape that does not enclose all others."""
         others = [shape.bbox() for shape in scene.shapes() if shape.ptr != self.node.ptr]
         return self.is_shape and not all(self.node.bbox().contains(box, strict=True) for box in others)
 
 
 def find_movable(params: mi.SceneParameters, id: str) -> Movable | str:
-    """The object with this id, or the reason why it cannot be moved."""
+    """Return the object with this id, or the reason why it cannot be moved."""
     for name in _PLACED:
         key = f"{id}.{name}"
         if key not in params.properties:
@@ -136,14 +139,14 @@ def find_movable(params: mi.SceneParameters, id: str) -> Movable | str:
 
 
 def list_movable(params: mi.SceneParameters) -> list[Movable]:
-    """All that can be moved, in the scene's order."""
+    """Return all movable objects, in the scene's order."""
     split = (key.rpartition(".") for key in params.properties)
     ids = dict.fromkeys(id for id, _, name in split if id and name in _PLACED)
     return [item for item in (find_movable(params, id) for id in ids) if isinstance(item, Movable)]
 
 
 def where_moved(params: mi.SceneParameters, keys: list[str]) -> list[Movable]:
-    """The objects that the scene parameters `keys` move."""
+    """Return the objects that the scene parameters `keys` move."""
     found = []
     for key in keys:
         id, _, name = key.rpartition(".")
@@ -162,7 +165,7 @@ TOO_LARGE = 2.0
 
 @dataclass(frozen=True)
 class Horizon:
-    """A sphere."""
+    """Sphere around a scene."""
 
     center: tuple[float, float, float]
     radius: float
@@ -174,15 +177,15 @@ class Horizon:
 
 
 class Surroundings:
-    """The horizon of one scene, always the same one."""
+    """Sphere around the shapes of one scene; always the same object."""
 
     def __init__(self) -> None:
         self._horizon: Horizon | None = None
 
     def follow(self, scene: mi.Scene) -> Horizon:
-        """A sphere that holds all shapes of the scene as they are now; the scene's emitters know it, too.
+        """Return a sphere around all current shapes of the scene, and set it in the scene's emitters.
 
-        It stays as it is while that is so.
+        It does not change as long as it contains them.
         """
         sphere, before = scene.bbox().bounding_sphere(), self._horizon
         if before is not None and before.holds(scene.bbox()) and before.radius < TOO_LARGE * sphere.radius:
@@ -203,13 +206,13 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class Motion:
-    """A motion about the point `pivot`; `names` are those of its values, by word."""
+    """Motion about the point `pivot`; `names` are those of its values, by word."""
 
     pivot: Sequence[float]
     names: Mapping[str, str]
 
     def matrix(self, values: Mapping[str, Any], scaled: bool = True) -> mi.AffineTransform4f:
-        """M, or, not `scaled`, its rotation alone."""
+        """Return M, or its rotation alone if not `scaled`."""
         transform = mi.AffineTransform4f
         pivot = mi.Vector3f(self.pivot)
         if "translation" in self.names:
@@ -228,7 +231,7 @@ class Motion:
 
 @dataclass
 class _Moved:
-    """One scene parameter that is a function: where it began, what moves it, and its value with and without graph.
+    """Scene parameter that is a function: its initial value, its motion, and its value with and without graph.
 
     `heightmap` is the name of the texture, (height, width, 1), that displaces a mesh along its own `normals`.
     """
@@ -244,7 +247,9 @@ class _Moved:
 
 
 def _corners(uv: mi.Point2f, width: int, height: int) -> tuple[list[mi.UInt32], list[mi.Float]]:
-    """Indices and weights of the four texels about each of `uv`; row 0 is at v = 0, as in Mitsuba's textures."""
+    """Return indices and weights of the four texels around each of `uv`; row 0 is at v = 0, as in Mitsuba's
+    textures.
+    """
     x = dr.clip(uv.x * width - 0.5, 0, width - 1)
     y = dr.clip(uv.y * height - 0.5, 0, height - 1)
     x0 = dr.minimum(mi.UInt32(x), width - 2)
@@ -270,12 +275,12 @@ class Deformation:
 
     @property
     def keys(self) -> list[str]:
-        """The scene parameters that are functions of the values."""
+        """Scene parameters that are functions of the values."""
         return list(self._moved)
 
     def add_motion(self, items: tuple[Movable, ...], pivot: Sequence[float] | None, words: Sequence[str]
                    ) -> None:  # fmt: skip
-        """Move `items`, none of which has a motion yet, about `pivot`; None: the centre of their bounding box."""
+        """Add a motion of `items`, which have none yet, about `pivot`; None: the centre of their bounding box."""
         names = {word: f"{items[0].id}.{word}" for word in words}
         motion = Motion(pivot or _centre(self.params, items), names)
         for item in items:
@@ -286,7 +291,7 @@ class Deformation:
             self.quantities[name] = {"rotation": "degrees", "scale": "scale"}.get(word, "length")
 
     def add_heightmap(self, items: tuple[Movable, ...], resolution: tuple[int, int]) -> None:
-        """Displace the meshes `items`, none of which has a heightmap yet."""
+        """Add a heightmap to the meshes `items`, which have none yet."""
         name = f"{items[0].id}.{HEIGHTMAP}"
         for item in items:
             moved, mesh = self._place(item), item.node
@@ -298,14 +303,17 @@ class Deformation:
         self.quantities[name] = "length"
 
     def laid_over(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (N, 3) and texture coordinates (N, 2) of the first mesh that the heightmap `name` displaces, as it
-        began."""
+        """Return positions (N, 3) and texture coordinates (N, 2) of the undeformed first mesh of the heightmap
+        `name`.
+        """
         moved = next(each for each in self._moved.values() if each.heightmap == name)
         return np.array(moved.base).T, np.array(moved.texcoords).T
 
     def displaced(self, name: str) -> tuple[mi.Mesh, np.ndarray, np.ndarray, np.ndarray]:
-        """The first mesh that the heightmap `name` displaces, its positions now (N, 3) float64, its texture coordinates
-        (N, 2), and directions (N, 3) along which heights go."""
+        """Return the first mesh of the heightmap `name`, with its current geometry.
+
+        It has positions (N, 3) float64, texture coordinates (N, 2), and directions (N, 3) of the heights.
+        """
         moved = next(each for each in self._moved.values() if each.heightmap == name)
         positions = np.array(self.params[moved.item.key], dtype=np.float64).reshape(-1, 3)
         texcoords, normals = (np.array(each, dtype=np.float64).T for each in (moved.texcoords, moved.normals))
@@ -314,7 +322,7 @@ class Deformation:
         return moved.item.node, positions, texcoords, normals
 
     def place(self) -> list[Any]:
-        """Give the scene what follows from the values; `params.update()` has to follow. Returns what to evaluate."""
+        """Set the scene's parameters from the values; `params.update()` must follow. Returns the arrays to evaluate."""
         for key, moved in self._moved.items():
             moved.tracked = self._function(moved)
             moved.leaf = _opaque(type(moved.tracked)(dr.detach(moved.tracked)))
@@ -324,7 +332,7 @@ class Deformation:
         return [moved.leaf for moved in self._moved.values()]
 
     def collect(self) -> None:
-        """Add the gradient that steps left at the scene's parameters to that of the values, and clear it there."""
+        """Add the gradient at the scene's parameters to that of the values, and clear it there."""
         tracked = self._tracked()
         for moved in tracked:
             dr.set_grad(moved.tracked, dr.grad(moved.leaf))
@@ -335,7 +343,7 @@ class Deformation:
             dr.traverse(dr.ADMode.Backward, dr.ADFlag.ClearVertices)
 
     def push(self) -> None:
-        """Give the scene's parameters, and what follows from them, the tangents that have reached what they are."""
+        """Propagate tangents of the values to the scene's parameters."""
         tracked = self._tracked()
         for moved in tracked:
             dr.set_grad(moved.leaf, dr.grad(moved.tracked))
@@ -369,7 +377,7 @@ class Deformation:
         return to().translate(there) @ turned @ to().translate(-place) @ base
 
     def _heights(self, moved: _Moved, values: mi.TensorXf) -> mi.Float:
-        """h at each vertex, bilinear between the centres of the texels."""
+        """Return h at each vertex, bilinear between the centres of the texels."""
         height, width = values.shape[:2]
         place = (moved.item.key, width, height)
         if place not in self._corners:
@@ -379,7 +387,9 @@ class Deformation:
 
 
 class _Lookup(dr.CustomOp):
-    """The weighted sum of entries of a buffer; derivatives that are not finite survive, which a gather's may not."""
+    """Weighted sum of entries of a buffer whose derivative keeps values that are not finite, unlike that of a
+    gather.
+    """
 
     def eval(self, buffer: mi.Float, indices: list[mi.UInt32], weights: list[mi.Float]) -> mi.Float:
         self.indices, self.weights, self.size = indices, weights, dr.width(buffer)
@@ -404,7 +414,7 @@ class _Lookup(dr.CustomOp):
 
 
 def _vertex_normals(mesh: mi.Mesh) -> mi.Normal3f:
-    """The normals of a mesh's vertices: its own, or, of one without, those of the faces about each, by area."""
+    """Return the normals of a mesh's vertices: its own, or the area-weighted means of adjacent faces."""
     if mesh.has_vertex_normals():
         return dr.normalize(dr.unravel(mi.Normal3f, mesh.vertex_normals_buffer()))
     faces = np.array(mesh.faces_buffer()).reshape(-1, 3)
@@ -416,7 +426,7 @@ def _vertex_normals(mesh: mi.Mesh) -> mi.Normal3f:
 
 
 def _centre(params: mi.SceneParameters, items: tuple[Movable, ...]) -> tuple[float, float, float]:
-    """The centre of the bounding box of `items`; emitters without a surface are points."""
+    """Return the centre of the bounding box of `items`; emitters without a surface are points."""
     corners: list[np.ndarray] = []
     for item in items:
         if item.is_shape:

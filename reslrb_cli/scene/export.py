@@ -1,7 +1,7 @@
-"""The export of a scene, with the values that its parameters have, into a new folder.
+"""Export of a scene with the current values of its parameters into a new folder.
 
-The values that a scene's parameters have are put into the description that the scene was built from, meshes and images
-in files beside it; what other files it names are copied. In the end Mitsuba has to read the same values back.
+The values are written into the description that the scene was built from, with meshes and images in files beside it.
+Other files are copied. Finally, Mitsuba must read the same values back.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ Array = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
 
 def replace(owner: Element, new: Element, *instead_of: str) -> None:
-    """Put `new` among the children of `owner`, in place of those of its name and of the names in `instead_of`."""
+    """Put `new` among the children of `owner`, in place of those with its name or with names in `instead_of`."""
     owner.drop(new.name, *instead_of)
     owner.children.insert(0, new)
 
 
 def numbers(values: Array) -> str:
-    """Numbers as text from which the same 32-bit floats are read."""
+    """Return numbers as text that is read as the same 32-bit floats."""
     return " ".join(f"{float(value):.9g}" for value in values.ravel())
 
 
 def number(owner: Element, name: str, value: float) -> Element:
-    """A number, or a spectrum that is the same at all wavelengths."""
+    """Return an element for a number, or for a spectrum that is the same at all wavelengths."""
     return owner.new("float", name=name, value=numbers(np.array(value, dtype=np.float32)))
 
 
 def colour(owner: Element, name: str, value: Array, bounded: bool) -> Element:
-    """A colour (3,), or a grey of one number; where it is `bounded`, Mitsuba's <rgb> has values from 0 to 1 only."""
+    """Return an element for a colour (3,) or a grey; if `bounded`, Mitsuba's <rgb> must be from 0 to 1."""
     if value.size == 1:
         return number(owner, name, float(value.ravel()[0]))
     if not bounded or bool(((value >= 0) & (value <= 1)).all()):
@@ -55,7 +55,7 @@ def colour(owner: Element, name: str, value: Array, bounded: bool) -> Element:
 
 
 def triple(owner: Element, tag: str, name: str, value: Array) -> Element:
-    """Three numbers: a <point> or a <vector>, by `tag`."""
+    """Return an element for three numbers: a <point> or a <vector>, by `tag`."""
     x, y, z = numbers(value).split()
     return owner.new(tag, name=name, x=x, y=y, z=z)
 
@@ -82,10 +82,10 @@ _CONDUCTORS = ("conductor", "roughconductor")
 
 
 class Replacing:
-    """The `description` of a scene, whose `params` have the values that it is to get.
+    """Description of a scene that gets the values of `params`.
 
-    `writers` are the files beside it by their path in the exported folder, with `/`: who writes each into a path that
-    is new. `source` is named in errors.
+    `writers` map paths in the exported folder, with `/`, to functions that write the file to a new path. `source` is
+    named in errors.
     """
 
     def __init__(self, description: Description, params: mi.SceneParameters, source: object) -> None:
@@ -95,7 +95,7 @@ class Replacing:
         self._owners = Owners(description.root)
 
     def put(self, key: str) -> None:
-        """Put the value of the scene parameter `key` in. Raises ConfigError where the description cannot say it."""
+        """Write the value of the scene parameter `key`. Raises ConfigError if the description cannot express it."""
         node = self.params.properties[key][2]
         if (place := self._owners.place(self.params, key)) is None:
             raise self._fail(key, "what it belongs to does not stand in the scene's files")
@@ -122,7 +122,7 @@ class Replacing:
             self._put_number(owner, name, self._array(key), key)
 
     def _put_nested(self, owner: Element, below: list[str], name: str, key: str) -> None:
-        """A value of something below `owner` that is no object in the scene's files."""
+        """Write a value of something below `owner` that is no object in the scene's files."""
         if name == "value" and len(below) == 1:
             self._put_spectrum(owner, below[0], key)
         elif name == "value" and below[0] == "bsdf" and len(below) == 2 and owner.tag == "shape":
@@ -171,7 +171,7 @@ class Replacing:
         return ConfigError(self.source, key, f"cannot be exported: {why}")
 
     def _add_file(self, owner: Element, stem: str, suffix: str, write: Callable[[Path], object]) -> None:
-        """Have `owner` name a file of recovered values in place of the one that it names."""
+        """Let `owner` name a file of recovered values in place of its own."""
         name = f"{RECOVERED}/{stem}{suffix}"
         self.writers[name] = write
         element = owner.new("string", name="filename", value=name)
@@ -179,9 +179,9 @@ class Replacing:
         replace(owner, element)
 
     def copy_assets(self) -> None:
-        """Have every file that elements name copied, and named by where its copy is.
+        """Copy every file that elements name, and let them name the copies.
 
-        A file in the folder of the scene keeps its path relative to that, any other goes to a folder of its own.
+        A file in the folder of the scene keeps its relative path; other files go to a separate folder.
         """
         own = {name.casefold() for name in (SCENE, *self.writers)}
         home = self.description.root.source.file.absolute().parent.resolve()
@@ -202,8 +202,11 @@ class Replacing:
 
 
 def _free(source: Path, home: Path, taken: set[str]) -> str:
-    """The path of a copy of `source` in the exported folder, as it is below `home`, or in a folder for those that are
-    not; with a number before its suffix where that is taken, by whatever case it is written in."""
+    """Return the path of a copy of `source` in the exported folder.
+
+    It is the path below `home`, or one in the folder for other files, with a number before its suffix if it is taken
+    (ignoring case).
+    """
     inside = source.is_relative_to(home)
     path = PurePosixPath(*source.relative_to(home).parts) if inside else PurePosixPath(ELSEWHERE, source.name)
     name, number = str(path), 1
@@ -214,7 +217,7 @@ def _free(source: Path, home: Path, taken: set[str]) -> str:
 
 
 def same_values(a: object, b: object) -> bool:
-    """Whether two values of a parameter agree but for rounding; a grey agrees with the same number in each channel."""
+    """Whether two values of a parameter agree up to rounding; a grey agrees with the same number in each channel."""
     x, y = as_numbers(a), as_numbers(b)
     if x is None or y is None:
         return x is y
@@ -240,12 +243,12 @@ def export_scene(
     beside: Mapping[str, Callable[[Path], object]] | None = None,
     note: str = "",
 ) -> None:
-    """Write what `description` says, with the values that `params` have of `keys`, and an integrator, to `folder`.
+    """Write `description`, with the values of `params` for `keys`, and an integrator, to `folder`.
 
-    `params` are of a scene that was built from the description, which is changed. `integrator` has its type and
-    options; `beside` are more files, by name, and who writes each; `note` stands at the head of the scene. The folder
-    appears once it is whole, and Mitsuba has read the same values back from it. Raises ConfigError, located in
-    `source` and the key, where a value cannot be said, and OSError.
+    `params` belong to a scene that was built from the description, which is modified. `integrator` has its type and
+    options; `beside` maps names of further files to their writers; `note` is a comment at the top of the scene. The
+    folder appears once it is complete, and Mitsuba has read the same values back. Raises ConfigError, located in
+    `source` and the key, if a value cannot be expressed, and OSError.
     """
     replacing, root = Replacing(description, params, source), description.root
     for key in keys:
@@ -273,7 +276,7 @@ def export_scene(
 
 
 def _check(folder: Path, params: mi.SceneParameters, source: object) -> None:
-    """Raise ConfigError where Mitsuba does not read from `folder` what `params` are."""
+    """Raise ConfigError if Mitsuba does not read the values of `params` from `folder`."""
     with looking_in([folder]):  # for plugins, which it would take from the working folder as well
         try:
             found = mi.traverse(mi.load_file(str(folder / SCENE), optimize=False))

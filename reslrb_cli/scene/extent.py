@@ -1,4 +1,4 @@
-"""The place and size of a scene and its parts, where single precision or a sensor's clip planes lose light by them."""
+"""Place and size of a scene and its parts, if single precision or a sensor's clip planes lose light because of them."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ _NAMED = 2
 
 
 def doubts(scene: Any) -> list[str]:
-    """What is wrong with the place or the size of a scene or its parts, in words."""
+    """Return problems with the place or the size of a scene or its parts, in words."""
     return [loss for loss in (_lost_light(scene), _thin_glass(scene), _coincident(scene)) if loss is not None]
 
 
 def _lost_light(scene: Any) -> str | None:
-    """What is wrong with a scene that is far from the origin, or tiny, and what to do; None where nothing is.
+    """Return the problem of a scene that is far from the origin, or tiny, and the remedy; None if there is none.
 
-    Mitsuba starts rays off their surface by RayEpsilon (1 + max |p|), in the scene's units, so that they jump over what
-    is nearer: light is lost in corners, in all integrators.
+    Mitsuba starts rays off their surface by RayEpsilon (1 + max |p|), in the scene's units, so that they jump over
+    nearer surfaces. Light is lost in corners, in all integrators.
     """
     low, high = bounds(scene)
     size = float(np.linalg.norm(high - low))
@@ -61,10 +61,10 @@ def _lost_light(scene: Any) -> str | None:
 
 
 def clipped(scene: Any, sensor: Any) -> tuple[bool, bool]:
-    """Whether anything of `scene`, as it stands, may be between a perspective or thin-lens sensor and its near clip
-    plane, where the sensor looks, and whether anything may be beyond its far clip plane, on any side.
+    """Return whether anything may be between a sensor and its near clip plane, and beyond its far clip plane.
 
-    Told by bounding boxes, and by triangles near the sensor: it may be so where it is not, never the other way round.
+    The sensor is perspective or thin-lens. Between sensor and near plane, only its view counts. The test uses bounding
+    boxes, and triangles near the sensor: it may return true wrongly, but never false wrongly.
     """
     params = mi.traverse(sensor)
     near, far, radius, focus = (
@@ -87,7 +87,8 @@ def clipped(scene: Any, sensor: Any) -> tuple[bool, bool]:
 
 def _touches(shape: Any, axes: np.ndarray, eye: np.ndarray, middle: np.ndarray, half: np.ndarray) -> bool:
     """Whether a shape may touch a box, given by its middle and half sizes in the coordinates of `axes` (columns) and
-    `eye`."""
+    `eye`.
+    """
     low, high = bounds(shape)
     centre, extent = (low + high) / 2, (high - low) / 2
     apart = centre - (eye + axes @ middle)
@@ -105,11 +106,12 @@ def _touches(shape: Any, axes: np.ndarray, eye: np.ndarray, middle: np.ndarray, 
 
 
 def _coincident(scene: Any) -> str | None:
-    """What is wrong with a scene in which a sensor or a light meets two faces at the same place; None where nothing is.
+    """Return the problem of a scene in which rays of a sensor or a light meet two coincident faces; None if there is
+    none.
 
-    Which of them a ray meets is decided by rounding. That makes no difference where both face the same way, or both
-    ways alike (`twosided`), and are of one BSDF; elsewhere paths from the light and from the sensor show two scenes.
-    Found are triangles with the same three corners, and disks and spheres that are the same.
+    Rounding decides which face a ray meets. This does not matter if both face the same way, or both ways alike
+    (`twosided`), and have one BSDF. Otherwise, light paths and camera paths show different scenes. Detected are
+    triangles with three common corners, and equal disks and spheres.
     """
     shapes = scene.shapes()
     twins = _twin_faces(shapes) | _twin_shapes(shapes)
@@ -133,7 +135,7 @@ _Twins = dict[tuple[int, int], tuple[int, int]]
 
 
 def _twin_faces(shapes: Sequence[Any]) -> _Twins:
-    """The triangles of meshes that are where others are, and differ."""
+    """Return the coincident triangles of meshes that differ."""
     meshes = [index for index, shape in enumerate(shapes) if shape.is_mesh() and shape.face_count()]
     if not meshes:
         return {}
@@ -170,7 +172,7 @@ def _twin_faces(shapes: Sequence[Any]) -> _Twins:
 
 
 def _twin_shapes(shapes: Sequence[Any]) -> _Twins:
-    """The disks and spheres that are where others are, and differ."""
+    """Return the coincident disks and spheres that differ."""
     before: dict[tuple[str, bytes], list[int]] = {}
     found: _Twins = {}
     for index, shape in enumerate(shapes):
@@ -192,9 +194,9 @@ def _twin_shapes(shapes: Sequence[Any]) -> _Twins:
 
 
 def _differ(one: Any, other: Any, turned: bool, bent: bool) -> bool:
-    """Whether it makes a difference which of two faces at the same place a ray meets.
+    """Whether it matters which of two coincident faces a ray meets.
 
-    `turned`: their normals are opposite; `bent`: they have shading normals that differ from those.
+    `turned`: their normals are opposite; `bent`: they have shading normals that differ from their normals.
     """
     if one.is_emitter() or other.is_emitter() or one.bsdf() != other.bsdf():
         return True
@@ -202,7 +204,7 @@ def _differ(one: Any, other: Any, turned: bool, bent: bool) -> bool:
 
 
 def _met(scene: Any, shapes: Sequence[Any]) -> set[tuple[int, int]]:
-    """The shapes and faces that rays meet first which leave sensors and lights."""
+    """Return the shapes and faces that rays from sensors and lights meet first."""
     place, lane = grid(_RAYS), dr.arange(mi.UInt32, _RAYS**2)
     numbers = [mi.Float(mi.sample_tea_float32(lane, mi.UInt32(k))) for k in range(3)]
     rays = [
@@ -233,10 +235,10 @@ _PATHS, _SURFACES = 4096, 8
 
 
 def _thin_glass(scene: mi.Scene) -> str | None:
-    """What is wrong with a scene in which light passes through two surfaces that nearly touch; None where nothing is.
+    """Return the problem of a scene in which light passes two surfaces that nearly touch; None if there is none.
 
-    Rays from the lights go straight on through what lets light pass; what lies between two surfaces is measured from
-    both sides, since a ray that leaves the first may not see the second.
+    Rays from the lights go straight through transparent surfaces. The distance of two surfaces is measured from both
+    sides, because a ray that leaves the first may miss the second.
     """
     passing = int(mi.BSDFFlags.Transmission)
     if not any(int(bsdf.flags()) & passing for bsdf in SceneGraph.of(scene).surface_bsdfs()):
@@ -259,7 +261,7 @@ def _thin_glass(scene: mi.Scene) -> str | None:
         return active & (k < _SURFACES)
 
     def cross(k: mi.UInt32, o: mi.Point3f, p: mi.Point3f, active: mi.Mask) -> tuple[Any, ...]:
-        """From the surface at `p`, which the ray leaves from `o`, to the next one."""
+        """Return the next surface after `p`, for rays that start at `o`."""
         ray = mi.Ray3f(o, d)
         hit = scene.ray_intersect_preliminary(ray, active=active)
         following = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)

@@ -1,7 +1,7 @@
-"""The files that an experiment reads, and digests of their contents.
+"""Files that an experiment reads, and digests of their contents.
 
-What is kept of an experiment (decisions, measurements, the state of a run) counts for these contents only. Each digest
-reads its whole file: times and sizes could hide a change.
+Stored results of an experiment (decisions, measurements, the state of a run) are valid only for these contents. Each
+digest reads its whole file, because times and sizes could hide a change.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ def option_texts(options: Mapping[str, Any]) -> dict[str, str]:
 
 
 def files_of(config: Config) -> dict[str, Path]:
-    """Return every file that an experiment reads, by the setting that leads to it.
+    """Return every file that an experiment reads, by its setting.
 
-    A setting may lead to more than one file: `scene.file (images/wood.png)`. Files that are missing are left out: who
-    loads the experiment says so. Raises ConfigError where a scene, cameras or a run cannot be read.
+    A setting may lead to more than one file: `scene.file (images/wood.png)`. Missing files are left out; loading the
+    experiment reports them. Raises ConfigError if a scene, cameras or a run cannot be read.
     """
     settings = config.model_dump(exclude={"run"})
     found = {key: path for key, path in _paths(settings, "") if path.exists()}

@@ -1,4 +1,4 @@
-"""The graph of a scene's objects: what there is, what uses what, which lamps emit, and meshes as arrays."""
+"""Graph of a scene's objects: objects, their users, emitting lamps, and meshes as arrays."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from reslrb_cli.errors import UnsupportedScene, is_machine_fault
 class SceneGraph:
     """All objects below a scene, each once, in order of traversal.
 
-    Unlike `mi.traverse`, which lists an object below the first that uses it, it knows all parents of each.
+    `mi.traverse` lists an object only below its first user; this graph knows all users.
     """
 
     objects: list[Any] = field(default_factory=list)
@@ -27,7 +27,7 @@ class SceneGraph:
 
     @classmethod
     def of(cls, scene: Any) -> SceneGraph:
-        """The graph of `scene`."""
+        """Return the graph of `scene`."""
 
         class Children(mi.TraversalCallback):
             def __init__(self) -> None:
@@ -53,11 +53,11 @@ class SceneGraph:
         return graph
 
     def of_type(self, kind: Any) -> list[Any]:
-        """All objects that are instances of `kind`, such as `mi.BSDF`."""
+        """Return all objects that are instances of `kind`, such as `mi.BSDF`."""
         return [item for item in self.objects if isinstance(item, kind)]
 
     def shapes(self) -> list[Any]:
-        """All shapes that rays can hit, also those inside of groups that are instanced."""
+        """Return all shapes that rays can hit, including those in instanced groups."""
         return [shape for shape in self.of_type(mi.Shape) if shape.class_name() not in ("Instance", "ShapeGroupPlugin")]
 
     def has_instances(self) -> bool:
@@ -65,11 +65,11 @@ class SceneGraph:
         return any(item.class_name() == "Instance" for item in self.objects)
 
     def is_shown(self, shape: Any) -> bool:
-        """Whether rays may meet a shape: it does not stand in a group alone, where nothing is instanced."""
+        """Whether rays may meet a shape, which is not the case in a group without instances."""
         return self.has_instances() or any(item.class_name() != "ShapeGroupPlugin" for item in self.parents[shape])
 
     def find_lamps(self, scene: mi.Scene) -> tuple[Lamp, ...]:
-        """All shapes of `scene` that emit, in the order of `scene.emitters()`."""
+        """Return all emitting shapes of `scene`, in the order of `scene.emitters()`."""
         textures = self.of_type(mi.Texture)
         found = []
         for index, emitter in enumerate(scene.emitters()):
@@ -81,11 +81,11 @@ class SceneGraph:
         return tuple(found)
 
     def surface_bsdfs(self) -> list[Any]:
-        """The BSDFs that shapes have (not those nested in others), each once."""
+        """Return the BSDFs of shapes, without nested ones, each once."""
         return list(dict.fromkeys(shape.bsdf() for shape in self.shapes() if shape.bsdf() is not None))
 
     def bsdfs_above(self, item: Any) -> list[Any]:
-        """The BSDFs that use `item` (a texture, or a BSDF, which is one of them) at any depth."""
+        """Return the BSDFs that use `item` (a texture, or a BSDF, which is included) at any depth."""
         found: dict[Any, None] = {}
         waiting = [item]
         while waiting:
@@ -96,12 +96,12 @@ class SceneGraph:
         return list(found)
 
     def owning_bsdfs(self, item: Any) -> list[Any]:
-        """The outermost of them: those that something else than a BSDF or a texture has."""
+        """Return the outermost of these BSDFs, which have another user than a BSDF or a texture."""
         found = ((bsdf, self.parents.get(bsdf, [])) for bsdf in self.bsdfs_above(item))
         return [bsdf for bsdf, parents in found if not all(isinstance(p, (mi.BSDF, mi.Texture)) for p in parents)]
 
     def nested_bsdfs(self, bsdf: Any) -> list[Any]:
-        """A BSDF and those nested in it."""
+        """Return a BSDF and those nested in it."""
         found = [bsdf]
         for item in found:  # which grows meanwhile
             found += [child for child in self.children[item] if isinstance(child, mi.BSDF) and child not in found]
@@ -110,10 +110,10 @@ class SceneGraph:
 
 @dataclass(frozen=True)
 class Lamp:
-    """A shape that emits; `emitter` is its emitter, and `index` the number of that in `scene.emitters()`.
+    """Emitting shape; `emitter` is its emitter, and `index` the number of the emitter in `scene.emitters()`.
 
-    `parallel`: light leaves along the normal alone (`directionalarea`). `texture`: what its points are sampled in
-    proportion to; None: evenly over its area.
+    `parallel`: light leaves only along the normal (`directionalarea`). `texture`: the texture that its points are
+    sampled from; None: uniformly over its area.
     """
 
     shape: mi.Shape
@@ -129,23 +129,26 @@ class Lamp:
 
     @cached_property
     def surrounds(self) -> bool:
-        """Whether it is a sphere that shines inwards, evenly. Mitsuba draws its points evenly over it, and takes their
-        density for that of a cone where rounding has the vertex outside: all those that lie on it."""
+        """Whether it is a sphere that emits inwards, evenly.
+
+        Mitsuba samples its points uniformly, but uses the density of a cone if rounding puts the vertex outside, which
+        happens for all vertices on it.
+        """
         return self.is_sphere and self.texture is None and not self.parallel and self.shape.has_flipped_normals()
 
     @cached_property
     def faces_by_area(self) -> bool:
-        """Whether one of its faces is drawn in proportion to its area, as Mitsuba has it now."""
+        """Whether its faces are sampled in proportion to their current areas by Mitsuba."""
         return self.has_faces and self.texture is None
 
     @cached_property
     def has_faces(self) -> bool:
-        """Whether the shape is a mesh of which each vertex can move."""
+        """Whether the shape is a mesh whose vertices can move."""
         return self.shape.is_mesh() and self.shape.class_name() != "Rectangle"
 
 
 def grid(side: int) -> mi.Point2f:
-    """The centres of side^2 cells of the unit square, row by row."""
+    """Return the centres of side^2 cells of the unit square, row by row."""
     lane = dr.arange(mi.UInt32, side**2)
     return (mi.Point2f(lane % side, lane // side) + 0.5) / side
 
@@ -153,10 +156,10 @@ def grid(side: int) -> mi.Point2f:
 def emitted_rays(
     scene: mi.Scene, wavelength: mi.Float, place: mi.Point2f, direction: mi.Point2f
 ) -> tuple[mi.Ray3f, mi.Spectrum]:
-    """Rays from all emitters, and their weights, of random numbers in [0, 1).
+    """Return rays from all emitters, and their weights, from random numbers in [0, 1).
 
-    Raises UnsupportedScene, which names it, where there is an emitter that Mitsuba cannot sample, such as a lamp or a
-    spot with a checkerboard.
+    Raises UnsupportedScene, which names the emitter, if Mitsuba cannot sample one, such as a lamp or a spot with a
+    checkerboard.
     """
     try:
         ray, weight, _ = scene.sample_emitter_ray(0, wavelength, place, direction, True)
@@ -175,16 +178,16 @@ def emitted_rays(
 def sensor_rays(
     sensor: mi.Sensor, time: float | mi.Float, place: mi.Point2f, aperture: mi.Point2f
 ) -> tuple[mi.Ray3f, mi.Spectrum]:
-    """Rays from a sensor, and their weights, of places on its film and in its aperture, in [0, 1)^2.
+    """Return rays from a sensor, and their weights, from places on its film and in its aperture, in [0, 1)^2.
 
-    By the call that every sensor has: an irradiance meter has no `sample_ray`.
+    It uses the call that every sensor has, because an irradiance meter has no `sample_ray`.
     """
     ray, weight = sensor.sample_ray_differential(time, 0.5, place, aperture, True)
     return mi.Ray3f(ray), weight
 
 
 def failure(call: Callable[[], object]) -> str | None:
-    """Mitsuba's reason, in one line, why it cannot do what `call` asks for; None where it can."""
+    """Return Mitsuba's reason, in one line, why `call` fails; None if it succeeds."""
     try:
         with dr.suspend_grad():
             call()
@@ -204,9 +207,9 @@ POINTS = 16
 
 
 def small_lamps(scene: mi.Scene, sensor: mi.Sensor, lamps: Iterable[Lamp]) -> tuple[Lamp, ...]:
-    """Those of the lamps that `sensor` sees directly as less than a pixel; none where there are more than MOST.
+    """Return the lamps that `sensor` sees directly as less than a pixel; none if there are more than MOST.
 
-    Lamps that shine along their normal alone are not seen at all.
+    Lamps that emit only along their normal are never seen.
     """
     found = [lamp for lamp in lamps if not lamp.parallel and _pixels(sensor, lamp.shape) < SMALL]
     if len(found) > MOST:
@@ -215,7 +218,9 @@ def small_lamps(scene: mi.Scene, sensor: mi.Sensor, lamps: Iterable[Lamp]) -> tu
 
 
 def _pixels(sensor: mi.Sensor, shape: mi.Shape) -> float:
-    """The diameter on the film, in pixels, of the sphere around the shape's bounding box, wherever the sensor looks."""
+    """Return the diameter on the film, in pixels, of the sphere around the shape's bounding box, for any view
+    direction.
+    """
     low, high = bounds(shape)
     radius = float(np.linalg.norm(high - low)) / 2
     eye = np.ravel(sensor.world_transform().translation())
@@ -227,7 +232,7 @@ def _pixels(sensor: mi.Sensor, shape: mi.Shape) -> float:
 
 
 def _is_in_view(scene: mi.Scene, sensor: mi.Sensor, shape: mi.Shape) -> bool:
-    """Whether any of a grid of points on the shape is before the lens, with nothing in between."""
+    """Whether any of a grid of points on the shape is in front of the lens, without occlusion."""
     with dr.suspend_grad():
         si = mi.SurfaceInteraction3f(shape.sample_position(sensor.shutter_open(), grid(POINTS)), mi.Color0f())
         ds, _ = sensor.sample_direction(si, mi.Point2f(0.5), True)
@@ -236,7 +241,7 @@ def _is_in_view(scene: mi.Scene, sensor: mi.Sensor, shape: mi.Shape) -> bool:
 
 
 def bounds(item: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The least and the greatest corner of the bounding box of a shape or a scene, (3,) float64 each."""
+    """Return the lower and the upper corner of the bounding box of a shape or a scene, (3,) float64 each."""
     box = item.bbox()
     low, high = np.ravel(box.min).astype(np.float64), np.ravel(box.max).astype(np.float64)
     if (low > high).any() and isinstance(item, mi.Mesh) and item.vertex_count():
@@ -247,22 +252,24 @@ def bounds(item: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def interpolates_normals(shape: mi.Shape) -> bool:
-    """Whether the shape is a mesh whose shading normals, as soon as it bends, differ from its geometric ones."""
+    """Whether the shape is a mesh whose shading normals, as soon as it bends, differ from its geometric normals."""
     return shape.is_mesh() and shape.has_vertex_normals() and not shape.has_face_normals()
 
 
 def triangles(mesh: mi.Mesh) -> np.ndarray:
-    """The corners of a mesh's faces, (F, 3, 3) float64."""
+    """Return the corners of a mesh's faces, (F, 3, 3) float64."""
     return _at_corners(mesh, mesh.vertex_positions_buffer())
 
 
 def face_normals(corners: np.ndarray) -> np.ndarray:
-    """Normals of triangles (F, 3, 3), (F, 3), of twice the length of their areas."""
+    """Return normals of triangles (F, 3, 3), (F, 3), with a length of twice their areas."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def bent_faces(mesh: mi.Mesh, cosine: float) -> np.ndarray:
-    """Of a mesh's faces, (F,), whether the normal of a vertex turns from that of the face, by less than this cosine."""
+    """Return for each face of a mesh, (F,), whether the cosine between a vertex normal and the face normal is below
+    `cosine`.
+    """
     if not interpolates_normals(mesh):
         return np.zeros(mesh.face_count(), bool)
     flat, shading = face_normals(triangles(mesh))[:, None], _at_corners(mesh, mesh.vertex_normals_buffer())

@@ -1,4 +1,4 @@
-"""A rectangle as a grid of vertices, so that a heightmap can displace it (`heightmap.grid`)."""
+"""Rectangles as grids of vertices that a heightmap can displace (`heightmap.grid`)."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from reslrb_cli.scene.xml.read import Description, Element
 
 
 def make_grid(description: Description, id: str, size: tuple[int, int], place: Place) -> None:
-    """Make a mesh with `size` vertices along its edges of the rectangle `id` of a description, before it is built.
+    """Replace the rectangle `id` of a description by a mesh with `size` vertices along its edges, before it is built.
 
-    That is a `rectangle`, a mesh of four vertices that are a parallelogram's, or one that is a flat grid over one
-    already; its place and its material stay. Raises ConfigError at `place` for any other shape.
+    The shape is a `rectangle`, a mesh of four vertices that form a parallelogram, or a mesh that is a flat grid over
+    one already. Its place and its material stay. Raises ConfigError at `place` for any other shape.
     """
     element = description.root.by_id().get(id)
     if element is None or element.tag != "shape":
@@ -54,10 +54,10 @@ Corners = tuple[np.ndarray, np.ndarray, np.ndarray, bool]
 
 
 def _corners_of(element: Element, description: Description) -> Corners | None:
-    """A corner of a parallelogram in a mesh's file, the ends of its edges along u and along v, and whether v is to the
-    right of u, seen from outside; None of anything else.
+    """Return the parallelogram of a mesh's file; None for anything else.
 
-    Of four vertices without texture coordinates u is what has the mesh to its left.
+    It is given by a corner, the ends of its edges along u and along v, and whether v is to the right of u, seen from
+    outside. For four vertices without texture coordinates, u has the mesh to its left.
     """
     name = element.find("filename")
     path = None if name is None else description.find_file(name.value)
@@ -83,8 +83,11 @@ def _corners_of(element: Element, description: Description) -> Corners | None:
 
 
 def _corners_of_grid(mesh: mi.Mesh) -> Corners | None:
-    """The same of a mesh of more vertices, whose texture coordinates are proportional to their places, and which covers
-    all of a parallelogram."""
+    """Return the parallelogram of a mesh with more vertices, whose texture coordinates are proportional to their
+    places.
+
+    The mesh must cover all of it; otherwise None.
+    """
     if mesh.vertex_count() < 4 or not mesh.has_vertex_texcoords():
         return None
     points = np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
@@ -106,7 +109,9 @@ def _corners_of_grid(mesh: mi.Mesh) -> Corners | None:
 
 @functools.cache
 def _grid_file(width: int, height: int, inside_out: bool) -> Path:
-    """A file with a grid over [-1, 1] x [-1, 1], its outside up, or down; it is there as long as this process."""
+    """Return a temporary file with a grid over [-1, 1] x [-1, 1], facing up or down, which exists as long as this
+    process.
+    """
     path = Path(_grid_folder().name) / f"grid_{width}x{height}{'_down' * inside_out}.ply"
     path.write_bytes(face_ply(Setting(size=(2.0, 2.0), thickness=0.0), width, height, back=inside_out))
     return path

@@ -1,10 +1,10 @@
-"""Image files: examined before they are decoded, and read as images to compare with or as textures.
+"""Image files: checked before they are decoded, and read as images to compare with or as textures.
 
-Examined is how large they say they are, whether they end where they should, and how the camera was held. A file of some
-kilobytes can say that it is an image of gigabytes, and Mitsuba's reader fills what a JPEG lacks with grey. A file that
-was cut off and then padded is told as well where its format is compressed, but for the last lines of an EXR, which has
-no check sums. Cameras and phones write the pixels as the sensor has them, and say beside it (EXIF, in JPEG and PNG) how
-these are to be turned to stand upright, which Mitsuba's reader does not look at.
+The checks cover the stated size, the end of the file, and the orientation. A file of some kilobytes can claim to be an
+image of gigabytes, and Mitsuba's reader fills missing data of a JPEG with grey. Files that were truncated and padded
+are detected if their format is compressed, except for the last lines of an EXR, which has no checksums. Cameras and
+phones write the pixels as the sensor has them, and the rotation to an upright image as metadata (EXIF, in JPEG and
+PNG), which Mitsuba's reader ignores.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ TURNS = {
 
 
 class DamagedImage(ConfigError):
-    """An image by which Mitsuba's reader, or what uses the image, would leave its own memory."""
+    """Image for which Mitsuba's reader, or a user of the image, would access memory out of bounds."""
 
 
 @dataclass(frozen=True)
 class _Header:
-    """What a file says of its image: (width, height) of the pixels as they lie in it, and EXIF's orientation."""
+    """Header of an image: (width, height) of the stored pixels, and EXIF's orientation."""
 
     size: Size
     orientation: int = 1
@@ -63,11 +63,11 @@ class _Header:
 
 
 def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> mi.Bitmap:
-    """Decode the image file `path`; `size` is the (width, height) that it must have, None for any.
+    """Decode the image file `path`; `size` is the required (width, height), None for any.
 
-    Its pixels are as they lie in the file, or `upright`: as a person sees them, turned as EXIF says (`TURNS`), and so
-    is the size. Raises ConfigError, located in the file, where it cannot be read, is no image, too large, of another
-    size, damaged or cut off. What is checked first is what the file says of itself.
+    Pixels are as stored, or, if `upright`, rotated by EXIF (`TURNS`), and so is the size. Raises ConfigError, located
+    in the file, if it cannot be read, is no image, too large, of another size, damaged or truncated. The header is
+    checked first.
     """
     header = _examine(path)
     orientation = header.orientation if upright else 1
@@ -104,7 +104,7 @@ def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> 
 
 
 def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """An image (H, W, ...) of this EXIF orientation as it is seen upright; a view."""
+    """Return an image (H, W, ...) of this EXIF orientation upright; a view."""
     if orientation >= 5:  # rows of the file are columns of what is seen
         pixels = pixels.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
@@ -115,12 +115,12 @@ def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def orientation_of(path: Path) -> int:
-    """EXIF's orientation of an image file, 1 to 8: 1 of one that has none. Raises ConfigError where it is no image."""
+    """Return EXIF's orientation of an image file, 1 to 8; 1 without one. Raises ConfigError if it is no image."""
     return _examine(path).orientation
 
 
 def image_size(path: Path) -> Size:
-    """The (width, height) of an image as it lies in its file. Raises ConfigError, located in it, where it is none."""
+    """Return the stored (width, height) of an image. Raises ConfigError, located in it, if it is none."""
     width, height = _examine(path).size
     if min(width, height) < 1:
         raise DamagedImage(path, "", f"says that it is {width}x{height} pixels; save it again")
@@ -128,8 +128,11 @@ def image_size(path: Path) -> Size:
 
 
 def _examine(path: Path) -> _Header:
-    """What a file says of its image. Raises ConfigError, located in it, where it is none, or a PNG or JPEG without its
-    end, which readers of the other formats tell themselves."""
+    """Return the header of an image.
+
+    Raises ConfigError, located in it, if it is no image, or a PNG or JPEG without its end; readers detect this for
+    other formats.
+    """
     header: _Header | None = None
     with open_file(path) as file:
         try:
@@ -197,9 +200,9 @@ def _jpeg(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
 
 
 def _orientation(exif: bytes) -> int:
-    """The orientation that EXIF data, a TIFF file's head, names: 1 to 8, and 1 where that is not to be read there.
+    """Return the orientation in EXIF data, the head of a TIFF file: 1 to 8, and 1 if it cannot be read.
 
-    Nothing of it but the entries of the first directory is looked at, each once.
+    Only the entries of the first directory are read, each once.
     """
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
     with suppress(struct.error):  # what stands outside of the data
@@ -241,8 +244,11 @@ def _hdr(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
 
 
 def _are_whole(data: bytes, width: int, height: int) -> bool:
-    """Whether the lines of a Radiance image are what its head says: runs that fill each of the four parts of a line to
-    its end, in all lines or in none. Mitsuba's reader believes what the lines say, and would write past its memory."""
+    """Whether the lines of a Radiance image fit its header.
+
+    Runs must fill each of the four parts of a line exactly, in all lines or in none. Mitsuba's reader trusts the lines,
+    and would write out of bounds.
+    """
     start = bytes((2, 2, width >> 8, width & 255)) if 8 <= width <= 0x7FFF else b""
     if not start or data[:2] != start[:2] or data[2:3] >= b"\x80":
         return len(data) >= 4 * width * height
@@ -287,9 +293,9 @@ _READERS: dict[bytes, Callable[[Path, bytes, BinaryIO], _Header | None]] = {
 
 @contextmanager
 def _heard(lines: list[str]) -> Iterator[None]:
-    """Adds to `lines` what is written to the process's standard error meanwhile, in place of the terminal.
+    """Append the process's standard error to `lines` instead of printing it.
 
-    That is the only way in which libjpeg, inside of Mitsuba, tells of missing data where a file has its end.
+    This is the only way in which libjpeg, inside Mitsuba, reports missing data of a complete-looking file.
     """
     try:
         before = os.dup(2)
@@ -316,10 +322,10 @@ Image = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class Photo:
-    """An image file as linear Rec. 709, (H, W, 3) float32, and what is wrong with its pixels, each boolean (H, W).
+    """Image file as linear Rec. 709, (H, W, 3) float32, with the defects of its pixels, each boolean (H, W).
 
-    `clipped`: at the greatest value that a file of 8 or 16 bits holds, in any channel; `transparent`: of alpha 0;
-    `nonfinite`: not finite in some channel.
+    `clipped`: at the maximum of a file of 8 or 16 bits in any channel; `transparent`: of alpha 0; `nonfinite`: not
+    finite in some channel.
     """
 
     image: Image
@@ -329,7 +335,9 @@ class Photo:
 
 
 def turned_line(path: Path, upright: bool = True) -> str | None:
-    """What the user is told of an image with an EXIF orientation, which is read `upright` or not; None of others."""
+    """Return a line for the user about an image with an EXIF orientation, read `upright` or not; None for other
+    images.
+    """
     turned = TURNS.get(orientation_of(path))
     if turned is None or upright:
         return None if turned is None else f"{path}: {turned}, as its EXIF orientation says"
@@ -339,11 +347,11 @@ def turned_line(path: Path, upright: bool = True) -> str | None:
 def read_image(path: Path, color_space: str = "auto", size: Size | None = None, signed: bool = False) -> Image:
     """Read an EXR, PNG, JPG, HDR, PFM, PPM or BMP file as linear Rec. 709: (H, W, 3) float32.
 
-    `color_space` says how the file's values are encoded: `linear`, `srgb`, or `auto` (integers srgb, floats linear).
-    Alpha is dropped; one channel becomes three. `size` is the (width, height) that the image must have. Pixels are as
-    they lie in the file, as Mitsuba reads textures; a warning says where EXIF would have them turned. Raises
-    ConfigError, located in the file, where it is missing or no image, damaged, cut off, too large or of another size,
-    or holds a value that is not finite or, unless `signed`, negative.
+    `color_space` is the encoding of the file's values: `linear`, `srgb`, or `auto` (integers srgb, floats linear).
+    Alpha is dropped; one channel becomes three. `size` is the required (width, height). Pixels are as stored, as
+    Mitsuba reads textures; a warning says if EXIF would rotate them. Raises ConfigError, located in the file, if it is
+    missing or no image, damaged, truncated, too large or of another size, or has a value that is not finite or, unless
+    `signed`, negative.
     """
     image = read_photo(path, color_space, size, upright=False, signed=signed).image
     orientation = orientation_of(path)
@@ -360,11 +368,10 @@ def read_photo(
     signed: bool = False,
     nonfinite: bool = False,
 ) -> Photo:
-    """Read an image file like `read_image`, and mark pixels that are not to be trusted.
+    """Read an image file like `read_image`, and mark unreliable pixels.
 
-    `upright` turns the image as its EXIF orientation says, to how a person sees it; `size` is that of the image then.
-    Values may be negative where it is `signed`, and not finite with `nonfinite`. Raises ConfigError, located in the
-    file.
+    `upright` rotates the image by its EXIF orientation; `size` then refers to the upright image. Values may be negative
+    if `signed`, and not finite with `nonfinite`. Raises ConfigError, located in the file.
     """
     bitmap = read_bitmap(path, size, upright)
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
@@ -395,10 +402,10 @@ def read_photo(
 
 
 def read_weights(path: Path, size: Size, upright: bool = True) -> Image:
-    """Read an image of weights, float32 (H, W): values as they stand in the file, the mean of several channels.
+    """Read an image of weights, float32 (H, W): the values in the file, the mean of several channels.
 
-    Those of 8 and 16 bits are shares of the greatest; alpha is dropped. `upright` turns it by its own EXIF orientation,
-    like the photograph that it belongs to by that one's. Raises ConfigError, located in the file, like `read_image`.
+    Values of 8 and 16 bits are divided by their maximum; alpha is dropped. `upright` rotates the image by its own EXIF
+    orientation. Raises ConfigError, located in the file, like `read_image`.
     """
     return read_photo(path, "linear", size, upright=upright).image.mean(axis=2)
 

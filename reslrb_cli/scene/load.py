@@ -1,4 +1,4 @@
-"""Loading of Mitsuba scene files, with errors that say where."""
+"""Loading of Mitsuba scene files, with located errors."""
 
 from __future__ import annotations
 
@@ -39,19 +39,22 @@ def load_scene(
 ) -> mi.Scene:
     """Load a Mitsuba scene (XML, versions 0.4 to 3); a variant must be set.
 
-    `options` are the values of the file's `$name` variables. Shapes are not merged, so that all parameters keep their
-    names, and an object without an id is named by its kind and its number among all of that kind in the file, such as
-    `Sphere_3`. What Mitsuba's parser would refuse because another version or an exporter wrote it is mended or left
-    out, with a warning in the log. Those of `cameras`, a file, stand in place of the scene's sensors. The scene's
-    integrator is not loaded: an experiment has its own. Plugins are loaded from Mitsuba's own folder alone. `size` is
-    the (width, height) of all films in pixels, in place of what the files say. `look` sees the description that the
-    scene is built from before anything of it is, and may raise; in the end Mitsuba has a use for every element of that.
-    `keys`, which may be globs, are of parameters that are to have derivatives: bitmaps among them that Mitsuba would
-    keep with 8 or 16 bits are read as floating point.
+    - `options` are the values of the file's `$name` variables.
+    - `size` is the (width, height) of all films in pixels, instead of those in the files.
+    - `cameras` is a file of cameras that replace the scene's sensors.
+    - `look` is called with the description before anything is built, and may raise exceptions.
+    - `keys`, which may be globs, are parameters that need derivatives: their bitmaps of 8 or 16 bits are read as
+      floating point.
+    - Without `warn`, the scene is not checked for doubtful parts.
 
-    Raises ConfigError, located in the scene file, where it is missing or wrong, has nothing in it, or no light. Warns,
-    too, of a scene that is too far from the origin, or too small, of glass that is too thin, and of faces at the same
-    place; without `warn`, as for a scene that was looked at before, none of this is looked for.
+    Shapes are not merged, so that all parameters keep their names. An object without an id is named by its kind and its
+    number among all of this kind in the file, such as `Sphere_3`. Elements of other versions or exporters that
+    Mitsuba's parser would refuse are repaired or left out, with a warning in the log. Mitsuba must use every remaining
+    element. The scene's integrator is not loaded, because an experiment has its own. Plugins are loaded only from
+    Mitsuba's own folder.
+
+    Raises ConfigError, located in the scene file, if it is missing or wrong, or without shapes or light. Warns of a
+    scene that is too far from the origin, or too small, of glass that is too thin, and of coincident faces.
     """
     file = Path(file)
     description = read_description(file, option_texts(options or {}))
@@ -92,14 +95,13 @@ def load_scene(
 def load_for_script(file: str | os.PathLike[str], keys: Iterable[str] = (), /, **options: Any) -> mi.Scene:
     """Load a Mitsuba scene file as the command line does: its parameters have the names that `reslrb inspect` lists.
 
-    In place of `mi.load_file(file, optimize=False, **options)`, which refuses what other versions of Mitsuba and
-    exporters wrote, and names objects without an id otherwise. `options` are the values of the file's `$name`
-    variables, which messages call `scene.options.NAME`, as configurations do. `keys` are parameters, or globs, that are
-    to have gradients: their textures of 8 or 16 bits are read as floating point. A variant must be set; the scene's own
-    integrator is not loaded.
+    It replaces `mi.load_file(file, optimize=False, **options)`, which refuses files of other versions and exporters,
+    and names objects without an id differently. `options` are the values of the file's `$name` variables, which
+    messages call `scene.options.NAME`. `keys` are parameters, or globs, that need gradients: their textures of 8 or 16
+    bits are read as floating point. A variant must be set; the scene's own integrator is not loaded.
 
-    Raises `reslrb_cli.errors.ConfigError`, one line that says where, for a file that is missing or wrong, and
-    BackendError under a variant that reslrb does not work with.
+    Raises `reslrb_cli.errors.ConfigError`, one located line, for a file that is missing or wrong, and BackendError
+    under an unsupported variant.
     """
     check_variant(mi.variant())
     path = as_path(file, "file", "the path of a scene file")
@@ -107,18 +109,18 @@ def load_for_script(file: str | os.PathLike[str], keys: Iterable[str] = (), /, *
 
 
 def read_as_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> mi.Scene:
-    """The scene with bitmaps of 8 or 16 bits that `keys`, which may be globs, name read as floating point.
+    """Return the scene with bitmaps of 8 or 16 bits among `keys`, which may be globs, read as floating point.
 
-    That is `scene` itself where there are none, else one that is built anew from `description`, which is changed.
+    This is `scene` itself if there are none; otherwise the scene is built again from `description`, which is modified.
     """
     return build(description)[0] if _mark_floats(scene, description, keys) else scene
 
 
 def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> bool:
-    """Have those bitmaps say in the description that they are floats; whether there are any.
+    """Mark these bitmaps as floats in the description; return whether there are any.
 
-    All others stay as they are: floats take four times the memory of bytes. The values are the same, decoded from sRGB
-    when they are read and not when they are looked up.
+    Other bitmaps do not change, because floats take four times the memory of bytes. Values are the same; they are
+    decoded from sRGB when they are read instead of when they are looked up.
     """
     keys = list(keys)
     if not keys or not any(element.type == "bitmap" for element in description.root.walk()):
@@ -139,7 +141,7 @@ def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str])
 
 
 def _check_meshes(file: Path, scene: mi.Scene) -> None:
-    """Raise ConfigError for a mesh whose faces name vertices that it lacks: Mitsuba reads past its end for them."""
+    """Raise ConfigError for a mesh whose faces refer to missing vertices, for which Mitsuba reads out of bounds."""
     for shape in scene.shapes():
         if shape.is_mesh() and shape.face_count() and shape.vertex_count():
             last = int(np.array(shape.faces_buffer()).max())
@@ -150,5 +152,5 @@ def _check_meshes(file: Path, scene: mi.Scene) -> None:
 
 @functools.cache
 def warn_once(line: str, level: int = logging.WARNING) -> None:
-    """Say it in the log, once: one experiment may load its scene several times."""
+    """Log a message once, because one experiment may load its scene several times."""
     logger.log(level, "%s", line)

@@ -1,4 +1,4 @@
-"""What a scene needs of a light tracer, and what of it paths from the light, or from the sensor, do not know."""
+"""Needs of a scene for light tracing, and parts of it that light paths, or camera paths, do not support."""
 
 from __future__ import annotations
 
@@ -60,11 +60,11 @@ LOOK = 128
 
 @dataclass(frozen=True)
 class SceneNeeds:
-    """Static facts of a scene as one sensor sees it; what is false or absent here need not be compiled.
+    """Static facts of a scene for one sensor; features that are false or absent need not be compiled.
 
-    `emitters` holds class names in the order of `scene.emitters()`; `environment` is the index in it of the emitter
-    that surrounds the scene, or None. `near_clip`: something may stand between the sensor and its near clip plane;
-    `lens_clip`: a thin lens may see something outside of its clip planes, or focuses where Mitsuba has it see nothing.
+    `emitters` holds class names in the order of `scene.emitters()`; `environment` is the index of the surrounding
+    emitter, or None. `near_clip`: something may be between the sensor and its near clip plane. `lens_clip`: a thin lens
+    may see something outside of its clip planes, or focuses where Mitsuba lets it see nothing.
     """
 
     emitters: tuple[str, ...]
@@ -89,11 +89,11 @@ class SceneNeeds:
 
 @dataclass(frozen=True)
 class PrimaryHits:
-    """What primary rays meet, after see-through surfaces: fractions of the film, which sum to 1.
+    """Surfaces that primary rays meet behind see-through surfaces: fractions of the film, which sum to 1.
 
-    `smooth`: surfaces that light paths can connect to the sensor from; `specular`: only smooth specular ones (glass,
-    mirrors), which stay black; `nothing`: no surface. `emission`: the fraction in which an emitter is seen directly,
-    which overlaps with the others.
+    `smooth`: surfaces that light paths can connect to the sensor; `specular`: only smooth specular surfaces (glass,
+    mirrors), which stay black; `nothing`: no surface. `emission`: the fraction with a directly visible emitter, which
+    overlaps with the others.
     """
 
     smooth: float
@@ -103,7 +103,7 @@ class PrimaryHits:
 
 
 def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
-    """Collect what light tracing of `scene` for `sensor` has to be able to do."""
+    """Return the needs of light tracing of `scene` for `sensor`."""
     graph = SceneGraph.of(scene)
     flags = 0
     for bsdf in graph.surface_bsdfs():
@@ -144,12 +144,12 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
 
 
 def is_bent(mesh: Any) -> bool:
-    """Whether the interpolated normals of a mesh differ from its geometric ones."""
+    """Whether the interpolated normals of a mesh differ from its geometric normals."""
     return bool(bent_faces(mesh, 1 - 1e-5).any())
 
 
 def check_paths(scene: Any, sensor: Any, paths: str, hide_emitters: bool = False) -> None:
-    """Raise UnsupportedScene, with the reason and the way out, if these paths cannot render `scene`.
+    """Raise UnsupportedScene, with the reason and the remedy, if these paths cannot render `scene`.
 
     `paths` is one of those of `paths_obstacle`.
     """
@@ -171,7 +171,7 @@ def check_paths(scene: Any, sensor: Any, paths: str, hide_emitters: bool = False
 def paths_obstacle(scene: Any, sensor: Any, paths: str, hide_emitters: bool = False) -> str | None:
     """Return the reason why `scene` cannot be rendered for `sensor`; None if it can.
 
-    `paths`: `light`, `camera` or `both`, as `reslrb` has them; `prb`: camera paths of Mitsuba's own integrators.
+    `paths`: `light`, `camera` or `both`, as in `reslrb`; `prb`: camera paths of Mitsuba's own integrators.
     """
     if paths == "light":
         return _light_obstacle(scene, sensor, hide_emitters)
@@ -184,10 +184,10 @@ def paths_obstacle(scene: Any, sensor: Any, paths: str, hide_emitters: bool = Fa
 
 
 def scaled_emitter(scene: Any) -> str | None:
-    """The reason why both kinds of paths do not render the same light, in words; None where they do.
+    """Return the reason why both kinds of paths do not render the same light, in words; None if they do.
 
-    Of a `directional` or `projector` emitter Mitsuba's `sample_ray` takes the scale of `to_world`, along which
-    directions are no longer of length 1, otherwise than its `sample_direction`.
+    For a `directional` or `projector` emitter with a scale in `to_world`, directions do not have length 1, and
+    Mitsuba's `sample_ray` and `sample_direction` treat them differently.
     """
     plugins = {"DirectionalEmitter": "directional", "Projector": "projector"}
     for emitter in scene.emitters():
@@ -205,9 +205,11 @@ DIRECT = 2
 
 
 def camera_finds_all(scene: Any, max_depth: int) -> bool:
-    """Whether paths from the sensor, of up to `max_depth` segments (-1: any number), find all light, and none of it by
-    rare accident: where no surface is specular or glossy, or light comes straight from the emitters, and no emitter
-    shines along its normal alone."""
+    """Whether camera paths of up to `max_depth` segments (-1: any number) find all light, and none of it rarely.
+
+    This holds if no surface is specular or glossy, or if light comes straight from the emitters, and no emitter emits
+    only along its normal.
+    """
     if any(emitter.class_name() == "DirectionalArea" for emitter in scene.emitters()):
         return False
     if 0 <= max_depth <= DIRECT:
@@ -217,8 +219,10 @@ def camera_finds_all(scene: Any, max_depth: int) -> bool:
 
 
 def light_finds_all(scene: Any, sensors: Sequence[Any], hide_emitters: bool) -> bool:
-    """Whether light paths find all that these sensors see: where none of them looks at a mirror or at clear glass, and
-    no lamp that is hidden stands in the way of connections."""
+    """Whether light paths find all light for these sensors.
+
+    This holds if no sensor sees a mirror or clear glass, and no hidden lamp blocks connections.
+    """
     if hide_emitters and any(shape.is_emitter() for shape in scene.shapes()):
         return False
     return all(
@@ -228,7 +232,7 @@ def light_finds_all(scene: Any, sensors: Sequence[Any], hide_emitters: bool) -> 
 
 
 def camera_finds_nothing(scene: Any) -> bool:
-    """Whether all light of `scene` is from emitters that shine along their normal alone, which no camera path finds."""
+    """Whether all light of `scene` is from emitters that emit only along their normal, which no camera path finds."""
     return all(emitter.class_name() == "DirectionalArea" for emitter in scene.emitters())
 
 
@@ -248,7 +252,7 @@ def _light_obstacle(scene: Any, sensor: Any, hide_emitters: bool) -> str | None:
 
 
 def _unsampled(scene: Any) -> str | None:
-    """The reason why Mitsuba cannot sample rays of some emitter; None where it can."""
+    """Return the reason why Mitsuba cannot sample rays of some emitter; None if it can."""
     try:
         emitted_rays(scene, mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
     except UnsupportedScene as error:
@@ -263,7 +267,7 @@ def _film_obstacle(sensor: Any) -> str | None:
 
 
 def stock_clip(needs: SceneNeeds) -> str | None:
-    """The fault of Mitsuba's own light tracing with a sensor's clip planes, in words; None where it has none."""
+    """Return the error of Mitsuba's own light tracing with a sensor's clip planes, in words; None if there is none."""
     if needs.lens_clip:
         return "does not clip what a `thinlens` sees, and loses light where it focuses on a clip plane or beyond"
     if needs.near_clip:
@@ -274,7 +278,7 @@ def stock_clip(needs: SceneNeeds) -> str | None:
 def _camera_obstacle(scene: Any, sensor: Any, beside_light: bool = False) -> str | None:
     """Return the reason why camera paths cannot render `scene` for `sensor`, without tracing a ray; None if they can.
 
-    `beside_light`: light paths add what camera paths cannot find.
+    `beside_light`: light paths add the light that camera paths cannot find.
     """
     graph = SceneGraph.of(scene)
     if (obstacle := _unknown_part(scene, sensor, graph)) is not None:
@@ -292,7 +296,7 @@ def _camera_obstacle(scene: Any, sensor: Any, beside_light: bool = False) -> str
 
 
 def unsupported_part(scene: Any, sensor: Any) -> str | None:
-    """What in the scene no light path can deal with, found without tracing a ray; None where there is nothing."""
+    """Return a part of the scene that light paths do not support, without tracing a ray; None if there is none."""
     graph, name = SceneGraph.of(scene), sensor.id()
     if (obstacle := _unknown_part(scene, sensor, graph)) is not None:
         return obstacle
@@ -310,7 +314,7 @@ def unsupported_part(scene: Any, sensor: Any) -> str | None:
 
 
 def _unknown_part(scene: Any, sensor: Any, graph: SceneGraph) -> str | None:
-    """What in the scene no integrator here knows, found without tracing a ray; None where there is nothing."""
+    """Return a part of the scene that no integrator supports, without tracing a ray; None if there is none."""
     for shape in graph.shapes():
         if shape.is_medium_transition() and graph.is_shown(shape):
             return f"shape {shape.id() or 'of a group'} bounds{_MEDIUM}"
@@ -337,13 +341,15 @@ def _unknown_part(scene: Any, sensor: Any, graph: SceneGraph) -> str | None:
 
 
 def _first_failure(calls: Iterable[tuple[str, Callable[[], object]]]) -> str | None:
-    """The first of `calls` that Mitsuba cannot do, by what it is to do, and its reason."""
+    """Return the purpose of the first of `calls` that Mitsuba refuses, and the reason."""
     found = ((what, failure(call)) for what, call in calls)
     return next((f"Mitsuba cannot {what}: {reason}" for what, reason in found if reason is not None), None)
 
 
 def _lamp_on(graph: SceneGraph, plugins: dict[str, str]) -> str | None:
-    """The first emitter that is on a shape of one of those classes, and on which; not all of those know their shape."""
+    """Return the first emitter on a shape of one of these classes, and the shape; some emitters do not know their
+    shape.
+    """
     for shape in graph.shapes():
         if shape.is_emitter() and shape.class_name() in plugins:
             return f"emitter {shape.emitter().id()} is on a shape `{plugins[shape.class_name()]}`"
@@ -351,14 +357,14 @@ def _lamp_on(graph: SceneGraph, plugins: dict[str, str]) -> str | None:
 
 
 def _somewhere() -> Any:
-    """A point on a surface, of one entry, looked at from straight above."""
+    """Return a point on a surface, of one entry, seen from straight above."""
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.wi, si.n, si.sh_frame = mi.Vector3f(0, 0, 1), mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Vector3f(0, 0, 1))
     return si
 
 
 def _one_of_a_kind(graph: SceneGraph, items: Sequence[Any]) -> list[Any]:
-    """Of objects that consist of the same kinds of objects the first: thousands may differ in numbers alone."""
+    """Return the first of each group of objects of equal structure; thousands may differ only in numbers."""
     found: dict[tuple[Any, ...], Any] = {}
     for item in items:
         found.setdefault(_kind(item, graph), item)
@@ -366,7 +372,7 @@ def _one_of_a_kind(graph: SceneGraph, items: Sequence[Any]) -> list[Any]:
 
 
 def _kind(item: Any, graph: SceneGraph) -> tuple[Any, ...]:
-    """What an object consists of. No closure, which would call itself and so keep the scene alive."""
+    """Return the structure of an object. A recursive closure would keep the scene alive."""
     name = item.class_name()
     # The one texture that has one channel or three by what it was given.
     size = np.size(mi.traverse(item)["value"]) if name == "RawConstantTexture" else 0
@@ -382,8 +388,11 @@ def look(scene: Any, sensor: Any) -> PrimaryHits:
 
 
 def what_is_seen(scene: Any, sensor: Any, aperture: tuple[float, float] | None = None) -> tuple[Any, Any, Any]:
-    """Of the rays through a grid of LOOK^2 cells, row by row, which meet surfaces that are smooth, those that are
-    specular alone, and emission (`PrimaryHits`). They start at a point of the `aperture`, by default its middle."""
+    """Return which rays through a grid of LOOK^2 cells, row by row, meet smooth surfaces, specular surfaces, and
+    emission.
+
+    `PrimaryHits` defines them. The rays start at a point of the `aperture`, by default its middle.
+    """
     lens = mi.Point2f(0.5) if aperture is None else mi.Point2f(*(dr.opaque(mi.Float, place) for place in aperture))
     ray, _ = sensor_rays(sensor, sensor.shutter_open(), grid(LOOK), lens)
     active = dr.full(mi.Mask, True, LOOK**2)
@@ -400,10 +409,11 @@ def what_is_seen(scene: Any, sensor: Any, aperture: tuple[float, float] | None =
 
 
 def surfaces_met(scene: Any, ray: Any, active: Any, random: Any = None) -> Iterator[tuple[Any, Any]]:
-    """Follow rays through see-through surfaces; yield each interaction and the mask of rays that it belongs to.
+    """Follow rays through see-through surfaces; yield each interaction and the mask of its rays.
 
     The last interaction of a ray that leaves the scene is invalid. With a generator of `random` numbers, rays also
-    follow mirrors and clear glass. Schedule what you collect: one kernel then evaluates it with the next rays.
+    follow mirrors and clear glass. Schedule the collected results, so that one kernel evaluates them with the next
+    rays.
     """
     for _ in range(CROSSINGS):
         si = scene.ray_intersect(ray, active)
@@ -431,9 +441,11 @@ def _read_geometry(graph: SceneGraph) -> bool:
 
 
 def _focuses_outside(params: mi.SceneParameters) -> bool:
-    """Whether a thin lens with these `params` focuses so far out that Mitsuba's `sample_direction`, in single
-    precision, may take it to lie outside of the clip planes, and so to see nothing. By default it focuses on the far
-    one."""
+    """Whether a thin lens with these `params` may see nothing in Mitsuba because of its focus.
+
+    It may focus so far out that `sample_direction`, in single precision, considers it outside of the clip planes. By
+    default it focuses on the far plane.
+    """
     near, far, focus = (float(np.ravel(params[key])[0]) for key in ("near_clip", "far_clip", "focus_distance"))
     depth = (1 - near / focus) * far / (far - near) if focus > 0 else -np.inf  # as projected: 0 at near, 1 at far
     return not _DEPTH_ROUNDING < depth < 1 - _DEPTH_ROUNDING

@@ -1,6 +1,6 @@
-"""The parameters that are recovered: selected by key or glob, checked, and set to where they start.
+"""Parameters that are recovered: selected by key or glob, checked, and set to their initial values.
 
-A `Selection` has their settings, and is the way between their values and the scene.
+A `Selection` has their settings, and transfers values to and from the scene.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from reslrb_cli.scene.values import ParameterValue, Place, check_bounds, check_t
 
 @dataclass(frozen=True)
 class Selection:
-    """The parameters that are recovered, by the keys that they are recorded by.
+    """Recovered parameters, by the keys of their records.
 
     `params` is all of the scene's `mi.traverse`; `specs` holds the settings of each key, in the order of the
     configuration and, for a glob, of the scene. A key is one of `params`, or a value of `deformation`: a motion's
-    `ID.translation`, or a heightmap. `tied` has, by such a key, the others of `params` that have the same value.
-    `factors` are values that are none of the scene's: what its images are multiplied by (`add_factor`).
+    `ID.translation`, or a heightmap. `tied` maps such a key to other keys of `params` with the same value. `factors`
+    are values outside of the scene that multiply its images (`add_factor`).
     """
 
     params: mi.SceneParameters
@@ -40,26 +40,26 @@ class Selection:
     factors: dict[str, Any] = field(default_factory=dict)
 
     def add_factor(self, key: str, value: Any, settings: Settings) -> None:
-        """Recover a value that is none of the scene's along with what is."""
+        """Recover a factor that is not part of the scene."""
         self.specs[key], self.factors[key] = settings, value
 
     @property
     def keys(self) -> list[str]:
-        """The keys of what is recovered."""
+        """Keys of the recovered values."""
         return list(self.specs)
 
     @property
     def scene_keys(self) -> list[str]:
-        """The entries of `params` that what is recovered determines."""
+        """Entries of `params` that the recovered values determine."""
         own = [key for key in self.keys if self._holder(key) is self.params]
         return [*own, *(other for key in own for other in self.tied.get(key, ())), *self.deformation.keys]
 
     def spec(self, key: str) -> Settings:
-        """What the configuration says about the selected `key`."""
+        """Return the settings of the selected `key`."""
         return self.specs[key]
 
     def kind(self, key: str) -> str:
-        """What regularizers take `key` for: `heightmap`, `bitmap`, `mesh`; "" for anything else."""
+        """Return the kind of `key` for regularizers: `heightmap`, `bitmap`, `mesh`; "" for anything else."""
         slot = self.slot(key)
         if key in self.deformation.values:
             return HEIGHTMAP if key.endswith(f".{HEIGHTMAP}") else ""
@@ -68,7 +68,7 @@ class Selection:
         return "bitmap" if slot.is_texture and not slot.halo and not slot.is_signed else ""
 
     def check_regularizers(self, key: str, place: Place) -> None:
-        """Raise ConfigError for what has no meaning for `key`, or cannot be twice."""
+        """Raise ConfigError for regularizers that do not apply to `key`, or occur twice."""
         kind, seen = self.kind(key), set()
         for number, each in enumerate(self.specs[key].regularizers):
             at = f"regularizers[{number}].type"
@@ -84,7 +84,7 @@ class Selection:
                 self._check_opposite(key, each.opposite, place, f"regularizers[{number}].opposite")
 
     def _check_opposite(self, key: str, mesh: str, place: Place, at: str) -> None:
-        """Raise ConfigError where no heightmap of `mesh` looks away from that of `key`."""
+        """Raise ConfigError if no heightmap of `mesh` faces away from that of `key`."""
         name = f"{mesh}.{HEIGHTMAP}"
         maps = [each for each in self.deformation.values if each.endswith(f".{HEIGHTMAP}") and each != key]
         if name not in maps:
@@ -97,24 +97,26 @@ class Selection:
                              "thickness is that of a plate, whose faces are opposite")  # fmt: skip
 
     def value(self, key: str) -> Any:
-        """The current value of `key`, as Dr.Jit has it."""
+        """Return the current value of `key`, in Dr.Jit's form."""
         return self._holder(key)[key]
 
     def quantity(self, key: str) -> str | None:
-        """What `key` measures: `length`, `degrees` or `scale` of what moves; None of what is the scene's own."""
+        """Return the quantity of `key`: `length`, `degrees` or `scale` of a motion; None for the scene's own
+        parameters.
+        """
         return self.deformation.quantities.get(key)
 
     def array(self, key: str) -> np.ndarray[Any, Any]:
-        """The current value of `key`: a texture (H, W, C), a colour (C,), a buffer (N,), a number ().
+        """Return the current value of `key`: a texture (H, W, C), a colour (C,), a buffer (N,), a number ().
 
-        An environment map comes without the halo columns that its tensor has.
+        An environment map has no halo columns, which its tensor has.
         """
         return self.slot(key).get()
 
     def hand_over(self, values: Mapping[str, Any]) -> None:
-        """Give the scene these values of keys, as Dr.Jit has them; gradients of a step find their way back to them.
+        """Write values by key, in Dr.Jit's form, to the scene, so that the gradients of a step reach them.
 
-        All is evaluated, so that a step's kernels are the same from the first one on.
+        Everything is evaluated, so that a step's kernels are the same from the first one on.
         """
         own: list[str] = []
         for key, value in values.items():
@@ -129,25 +131,25 @@ class Selection:
         dr.eval([self.params[key] for key in own], moved, settled, self.factors)
 
     def collect(self) -> None:
-        """Bring what steps added to the gradients of moved things on to that of the values that move them."""
+        """Propagate the gradients at moved objects to the values that move them."""
         self.deformation.collect()
 
     def push(self) -> None:
-        """Bring tangents of the values that move things, once propagated, on to what is moved in the scene."""
+        """Propagate tangents of the values that move objects to the scene."""
         self.deformation.push()
 
     def shown(self, key: str, value: Any) -> np.ndarray[Any, Any]:
-        """Another value of `key`, as Dr.Jit has it, as `array` returns it."""
+        """Return another value of `key`, in Dr.Jit's form, in the form of `array`."""
         return self.slot(key).shown(value)
 
     def set_arrays(self, values: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Set parameters in the scene, from arrays as `array` returns them."""
+        """Set parameters in the scene, from arrays in the form of `array`."""
         for key, value in values.items():
             self.slot(key).set(value)
         self.update()
 
     def update(self) -> None:
-        """Have the scene follow values that were set: of tied keys, and of what moves."""
+        """Update tied keys and moved objects of the scene after values were set."""
         for key, others in self.tied.items():
             for other in others:
                 self.params[other] = type(self.params[other])(self.params[key])
@@ -155,21 +157,21 @@ class Selection:
         self.params.update()
 
     def is_map(self, key: str) -> bool:
-        """Whether `key` is a texture or a heightmap of two texels at least, whose sides do not meet."""
+        """Whether `key` is a texture or a heightmap of at least two texels, whose sides do not meet."""
         slot = self.slot(key)
         return slot.is_texture and not slot.halo and min(slot.get().shape[:2]) > 1
 
     def faces(self, key: str) -> np.ndarray[Any, Any] | None:
-        """The triangles (3 m indices) of the mesh whose vertices' positions `key` is; None of what is none."""
+        """Return the triangles (3 m indices) of the mesh with the vertex positions `key`; None for other keys."""
         mesh, _, name = key.rpartition(".")
         return np.array(self.params[f"{mesh}.faces"]) if name == "vertex_positions" else None
 
     def slot(self, key: str) -> ParameterValue:
-        """The value of `key`, to be read and set; `update` has to follow."""
+        """Return the value of `key`, to read and set; `update` must follow."""
         return ParameterValue(self._holder(key), key)
 
     def _holder(self, key: str) -> Any:
-        """What has the value of `key` under that name."""
+        """Return the object that has the value of `key` under this name."""
         if key in self.factors:
             return self.factors
         return self.deformation.values if key in self.deformation.values else self.params
@@ -181,12 +183,12 @@ def select_parameters(
     source: object,
     values: Mapping[str, np.ndarray[Any, Any]] | None = None,
 ) -> Selection:
-    """Select the parameters of `scene` that `specs` name, and set their initial values, or `values`, in the scene.
+    """Select the parameters of `scene` in `specs`, and set their initial values, or `values`, in the scene.
 
-    A glob selects what it matches and can be recovered. `source` names the configuration in errors. Raises ConfigError
-    where a key matches nothing, or nothing that can be recovered, or what another spec has already; where what is to
-    move cannot; where an initial value does not fit, is not finite, or lies outside of the bounds or of what the
-    transform yields; and where a resolution is given for no texture.
+    A glob selects the matching parameters that can be recovered. `source` names the configuration in errors. Raises
+    ConfigError if a key matches nothing, nothing that can be recovered, or a parameter of another spec; if an object
+    cannot be moved; if an initial value does not fit, is not finite, or lies outside of the bounds or the range of the
+    transform; and if a resolution is given for another parameter than a texture.
     """
     selection, origin = _choose(mi.traverse(scene), specs, source)
     for key, settings in selection.specs.items():
@@ -213,10 +215,10 @@ def select_parameters(
 def set_values(
     scene: mi.Scene, specs: Sequence[ParameterSpec], values: Mapping[str, Any], source: object, option: str
 ) -> Selection:
-    """Select the parameters of another load of the scene as `specs` do, and set `values`, of any of its keys, in it.
+    """Select the parameters of another load of the scene as `specs` do, and set `values`, by any of its keys.
 
-    What is given no value stays as the scene has it. Values are checked like initial ones are; an error is located at
-    `option` and the key. A heightmap may have the resolution of its image file.
+    Other parameters keep the values of the scene. Values are checked like initial ones; errors are located at `option`
+    and the key. A heightmap may have the resolution of its image file.
     """
     selection, _ = _choose(mi.traverse(scene), specs, source)
     names = selection.deformation.values
@@ -241,7 +243,7 @@ def set_values(
 
 def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: object
             ) -> tuple[Selection, dict[str, int]]:  # fmt: skip
-    """What `specs` select of a scene, as it stands, and the number of the spec that each key comes from."""
+    """Return the selection of `specs` in an unchanged scene, and the number of the spec of each key."""
     chosen: dict[str, Settings] = {}
     tied: dict[str, list[str]] = {}
     origin: dict[str, int] = {}  # of what is recovered, and of all scene parameters that this determines
@@ -273,7 +275,7 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
 
 
 def _warn_of_finer(items: tuple[Movable, ...], resolution: tuple[int, int]) -> None:
-    """Warn, once, of a map with more texels than its meshes have vertices: what lies between these has no effect."""
+    """Warn, once, of a map with more texels than its meshes have vertices: texels between vertices have no effect."""
     vertices, (width, height) = sum(item.node.vertex_count() for item in items), resolution
     if width * height > vertices:
         hint = f"; `grid: [{width}, {height}]` makes one as fine of a rectangle" if vertices == 4 * len(items) else ""
@@ -284,7 +286,7 @@ def _warn_of_finer(items: tuple[Movable, ...], resolution: tuple[int, int]) -> N
 
 def _movables(params: mi.SceneParameters, spec: ParameterSpec, place: Place, origin: dict[str, int]
               ) -> tuple[Movable, ...]:  # fmt: skip
-    """What a motion or a heightmap moves."""
+    """Return the objects that a motion or a heightmap moves."""
     found, named = [], spec.objects()
     for option, number, name in named:
         at = option if len(named) == 1 else f"{option}[{number}]"
@@ -303,7 +305,7 @@ def _movables(params: mi.SceneParameters, spec: ParameterSpec, place: Place, ori
 
 
 def _check_effect(items: list[Movable], word: str, pivot: bool, place: Place) -> None:
-    """Raise ConfigError where what is free moves nothing."""
+    """Raise ConfigError if the free part of a motion moves nothing."""
     id, alone = f"`{items[0].id}`", len(items) == 1 and not pivot
     obstacle = None
     if word != "rotation" and all(item.node.class_name() == "DirectionalEmitter" for item in items):
@@ -317,7 +319,7 @@ def _check_effect(items: list[Movable], word: str, pivot: bool, place: Place) ->
 
 
 def _tied_keys(params: mi.SceneParameters, keys: list[str], place: Place) -> list[str]:
-    """Keys that share one value; each names one parameter, and all have one shape."""
+    """Return keys that share one value; each names one parameter, and all have one shape."""
     found: list[str] = []
     for number, key in enumerate(keys):
         at = Place(place.source, f"{place.key}.key[{number}]", lambda _: "")
@@ -333,7 +335,7 @@ def _tied_keys(params: mi.SceneParameters, keys: list[str], place: Place) -> lis
 
 
 def _matching(params: mi.SceneParameters, pattern: str, place: Place, names: Sequence[str] = ()) -> list[str]:
-    """The keys that `pattern` names, all of which can be recovered; `names` are others that could be meant."""
+    """Return the keys that match `pattern`, which must be recoverable; `names` are other suggestions."""
     is_key = pattern in params.properties
     matches = [pattern] if is_key else [key for key in params.properties if fnmatchcase(key, pattern)]
     if not matches:
@@ -359,7 +361,7 @@ def _matching(params: mi.SceneParameters, pattern: str, place: Place, names: Seq
 
 
 def _obstacle(info: ParameterInfo) -> str | None:
-    """Why a parameter cannot be recovered as the scene is: a texture of few bits, too, which loading has not mended."""
+    """Return why a parameter cannot be recovered, including textures of few bits that loading has not converted."""
     if info.bits is None:
         return info.obstacle
     return (

@@ -1,6 +1,6 @@
-"""Proposals for recovering a scene from a photograph: which of its parameters someone may want, large in view first.
+"""Proposals for recovering a scene from a photograph: likely parameters, those large in view first.
 
-Also the photograph at the size of a film: what it is, and a copy of it with fewer pixels.
+Also the photograph: its properties, and a copy with fewer pixels.
 """
 
 from __future__ import annotations
@@ -29,9 +29,8 @@ Image = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class Photograph:
-    """An image file: its (width, height) in pixels, and whether it holds integers, which clip what is bright.
-
-    It is as a person sees it, turned as its EXIF orientation says.
+    """Image file: its (width, height) in pixels, upright by EXIF, and whether it holds integers, which clip bright
+    parts.
     """
 
     path: Path
@@ -41,17 +40,17 @@ class Photograph:
 
 
 def open_photograph(path: Path) -> Photograph:
-    """Read an image file. Raises ConfigError, located in it, where it is none."""
+    """Read an image file. Raises ConfigError, located in it, if it is no image."""
     bitmap = read_bitmap(path, upright=True)
     width, height = (int(n) for n in bitmap.size())
     return Photograph(path, (width, height), np.array(bitmap).dtype.kind in "ui", bitmap)
 
 
 def write_smaller(photo: Photograph, size: tuple[int, int], path: Path) -> None:
-    """Write the photograph with fewer pixels, `size` (width, height), to `path`: the means of linear values.
+    """Write the photograph with fewer pixels, `size` (width, height), to `path`: means of linear values.
 
-    Integers become PNG of 16 bits, in which a pixel stays marked as what any part of it is: clipped where it was at the
-    greatest value, transparent of alpha 0. Floats become EXR, in which what is not finite stays so. Raises OSError.
+    Integers become PNG of 16 bits, in which a pixel keeps the mark of any of its parts: clipped (at the maximum) or
+    transparent (alpha 0). Floats become EXR, which keeps values that are not finite. Raises OSError.
     """
     raw = np.array(photo.bitmap)
     raw = raw.reshape(*raw.shape[:2], -1)
@@ -75,7 +74,7 @@ def write_smaller(photo: Photograph, size: tuple[int, int], path: Path) -> None:
 
 
 def _means(image: Image, size: tuple[int, int]) -> Image:
-    """The means of an (H, W, C) image over the pixels of one of `size` (width, height), shares of its own included."""
+    """Return the area-weighted means of an (H, W, C) image over the pixels of one of `size` (width, height)."""
     values = image.astype(np.float32)
     known = np.isfinite(values)
     if not known.all():  # which would reach whole rows
@@ -116,10 +115,10 @@ TEXELS = 64
 
 @dataclass(frozen=True)
 class Proposal:
-    """A parameter that could be recovered: `share` of the picture that it colours, 0 where it is not seen itself.
+    """Parameter that could be recovered: `share` is the part of the picture that it colours, 0 if it is not visible.
 
-    `bounds` are YAML, or None; `resolution` is (width, height) of a texture that has many texels, else None; `first`
-    says whether to begin with it.
+    `bounds` are YAML, or None; `resolution` is (width, height) of a texture with many texels, else None; `first` says
+    whether it is recovered by default.
     """
 
     info: ParameterInfo
@@ -130,16 +129,16 @@ class Proposal:
 
     @property
     def is_bounded(self) -> bool:
-        """Whether the bounds say how large the parameter may be, and so how large a step is."""
+        """Whether the bounds determine the size of the parameter, and so the size of a step."""
         return self.bounds is not None and "inf" not in self.bounds
 
 
 def propose(scene: mi.Scene, sensor: int, lamps: bool = False, wanted: Sequence[str] = ()) -> list[Proposal]:
-    """What of `scene` can be recovered by key, through the sensor of this index, without vertices of meshes.
+    """Return the recoverable parameters of `scene` through the sensor of this index, without vertices of meshes.
 
-    In the order of their shares. At least one is to begin with, where there is any: those that match a glob of
-    `wanted`, and without any what is large in view, lamps too where the image to come is known to show how bright they
-    are (`lamps`). Raises LookupError, with the glob, where one matches nothing.
+    They are sorted by their shares. If there are any, at least one is recovered by default: those that match a glob of
+    `wanted`, or without globs those that are large in view, including lamps if the photograph shows their brightness
+    (`lamps`). Raises LookupError, with the glob, if one matches nothing.
     """
     params = mi.traverse(scene)
     shares = _shares(scene, sensor)
@@ -171,7 +170,7 @@ def propose(scene: mi.Scene, sensor: int, lamps: bool = False, wanted: Sequence[
 
 
 def _is_foremost(params: mi.SceneParameters, info: ParameterInfo) -> bool:
-    """Whether a parameter of a surface is what a photograph shows of it first: its colour, or a metal's roughness."""
+    """Whether a surface parameter is the most visible one: its colour, or a metal's roughness."""
     bsdf = next((item for item in _above(params, info.key) if isinstance(item, mi.BSDF)), None)
     diffuse = int(mi.BSDFFlags.DiffuseReflection) | int(mi.BSDFFlags.DiffuseTransmission)
     is_glossy = bsdf is not None and int(bsdf.flags()) & diffuse == 0
@@ -183,14 +182,14 @@ def _is_foremost(params: mi.SceneParameters, info: ParameterInfo) -> bool:
 
 
 def _is_left_out(params: mi.SceneParameters, info: ParameterInfo) -> bool:
-    """Whether Mitsuba has left out the lobe that a parameter is of, so that no value has any effect."""
+    """Whether Mitsuba has left out the lobe of a parameter, so that no value has any effect."""
     owner, name = params.hierarchy[params.properties[info.key][2]][0], info.key.split(".")[-2]
     is_principled = owner is not None and owner.class_name().startswith("Principled")
     return is_principled and name in LOBES and info.value is not None and info.value.high == 0
 
 
 def _above(params: mi.SceneParameters, key: str) -> list[Any]:
-    """The object that has a parameter, and those above it, without the scene."""
+    """Return the object that has a parameter, and those above it, without the scene."""
     node: Any = params.properties[key][2]
     chain: list[Any] = []
     kinds = (mi.BSDF, mi.Emitter)
@@ -203,8 +202,10 @@ def _above(params: mi.SceneParameters, key: str) -> list[Any]:
 
 
 def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
-    """The share of the picture that each BSDF, shape and emitter has, as the rays from the sensor meet it first, or by
-    way of mirrors and clear glass."""
+    """Return the share of the picture of each BSDF, shape and emitter that rays from the sensor meet first.
+
+    Rays also pass mirrors and clear glass.
+    """
     sensor = scene.sensors()[index]
     # One for each ray: an irradiance meter makes a single direction of a single one, which Dr.Jit fails to compile.
     aperture = dr.opaque(mi.Point2f, 0.5, shape=_RAYS**2)

@@ -1,4 +1,4 @@
-"""Conversion between what a configuration says about a parameter's value and what the scene holds."""
+"""Conversion between values in a configuration and values in the scene."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ Array = np.ndarray[Any, Any]
 
 
 class Place:
-    """Where in the configuration a value stands: `fail` raises there.
+    """Place of a value in the configuration, for errors of `fail`.
 
-    `at` says by what name an option of it goes there, "" where it has none.
+    `at` is the name of one of its options there, "" if it has none.
     """
 
     def __init__(self, source: object, key: str, at: Callable[[str], str] = str) -> None:
         self.source, self.key, self.at = source, key, at
 
     def fail(self, option: str, message: str) -> ConfigError:
-        """The error for `option` of this place."""
+        """Return the error for `option` of this place."""
         option = self.at(option)
         return ConfigError(self.source, f"{self.key}.{option}" if option else self.key, message)
 
@@ -37,8 +37,8 @@ class Place:
 class ParameterValue:
     """One value of `holder` as a NumPy array: a texture (H, W, C), a colour (C,), a buffer (N,), a number ().
 
-    `holder` is a scene's `mi.traverse`, or maps names to values that are none of the scene's own. An environment map
-    stands without the halo columns that Mitsuba adds to it.
+    `holder` is a scene's `mi.traverse`, or a mapping of values outside of the scene. An environment map has no halo
+    columns, which Mitsuba adds to it.
     """
 
     def __init__(self, holder: Any, key: str) -> None:
@@ -55,18 +55,18 @@ class ParameterValue:
         self.channels = _channels(node, key, value, self.is_tensor)
 
     def get(self) -> Array:
-        """The current value."""
+        """Return the current value."""
         return self.shown(self.holder[self.key])
 
     def shown(self, value: Any) -> Array:
-        """Another value for the same place, as Dr.Jit has it, in the shape of `get`."""
+        """Return another value for the same place, in Dr.Jit's form, in the shape of `get`."""
         array = np.array(dr.detach(value), dtype=np.float32)
         if not self.is_tensor and array.ndim and array.shape[-1] == 1:
             array = array[..., 0]
         return array[:, self.halo : array.shape[1] - self.halo] if self.halo else array
 
     def set(self, array: Array) -> None:
-        """Set the value; of a scene, `params.update()` has to follow."""
+        """Set the value; for a scene, `params.update()` must follow."""
         if self.halo:
             array = np.concatenate([array[:, -self.halo :], array, array[:, : self.halo]], axis=1)
         array = np.ascontiguousarray(array, dtype=np.float32)
@@ -81,7 +81,7 @@ class ParameterValue:
 def initial_array(
     slot: ParameterValue, initial: Any, resolution: tuple[int, int] | None, place: Place, any_size: bool = False
 ) -> Array:
-    """The value that `initial` ("scene", a number, a list, an image file or a run) gives the parameter in `slot`.
+    """Return the initial value of the parameter in `slot` from "scene", a number, a list, an image file or a run.
 
     `resolution` is the (width, height) to which a texture is resampled, or None; with `any_size` it may be that of the
     file. Raises ConfigError at `place`.
@@ -111,14 +111,14 @@ def initial_array(
 
 
 def check_bounds(slot: ParameterValue, array: Array, bounds: tuple[float, float], place: Place) -> None:
-    """Raise ConfigError at `place` where an entry of `array` lies outside of `bounds`."""
+    """Raise ConfigError at `place` if an entry of `array` lies outside of `bounds`."""
     low, high = np.float32(bounds[0]), np.float32(bounds[1])
     if (outside := _first(array, (array < low) | (array > high))) is not None:
         raise place.fail("bounds", f"exclude the initial value of `{slot.key}`, {outside}")
 
 
 def check_transform(slot: ParameterValue, array: Array, spec: Settings, place: Place) -> None:
-    """Raise ConfigError at `place` where an entry of `array` is not among the values that the transform yields."""
+    """Raise ConfigError at `place` if an entry of `array` is outside of the range of the transform."""
     if spec.transform == "none":
         return
     bounded = spec.transform == "sigmoid"
@@ -201,7 +201,7 @@ def _size(image: Array) -> str:
 
 
 def _first(array: Array, mask: Array) -> str | None:
-    """The first entry of `array` that `mask` marks, and where it is, in words; None where there is none."""
+    """Return the first entry of `array` in `mask`, and its index, in words; None if there is none."""
     if not mask.any():
         return None
     value, index = f"{float(array[mask].flat[0]):g}", [int(n) for n in np.argwhere(mask)[0]]
@@ -211,11 +211,10 @@ def _first(array: Array, mask: Array) -> str | None:
 
 
 def settle(params: mi.SceneParameters, keys: Iterable[str]) -> list[Any]:
-    """Have what follows from parameters that were just set made up now; returns what is left to evaluate.
+    """Compute data that depend on newly set parameters now; return the arrays to evaluate.
 
-    A texture pads its storage when it is first looked up, and unpads it when it is read; the normals of a mesh follow
-    its vertices. Left to the step, either would cut its kernels in two, and differently in the first step and the
-    second.
+    A texture pads its storage at its first lookup, and unpads it when it is read; the normals of a mesh depend on its
+    vertices. In a step, either would split its kernels, and differently in the first step and the second.
     """
     normals = []
     for key in keys:

@@ -1,9 +1,9 @@
-"""The view that sensors have of a scene: pixels and texels of use to light tracing, and how long its paths have to be.
+"""View of sensors: useful pixels and texels for light tracing, and the necessary length of paths.
 
-Light tracing lacks something at the film's border (`interior`), and where the sensor sees glass, mirrors, coats
-(`sees_specular`), from the smooth lobes of which light paths cannot connect to the sensor. A photograph has light of
-any number of bounces; an image of paths of at most d segments is darker, which an exposure or a colour would make up
-for (`find_depth`).
+Light tracing lacks light at the film's border (`interior`), and where the sensor sees glass, mirrors, or coats
+(`sees_specular`), whose smooth lobes do not connect to the sensor. A photograph contains light of any number of
+bounces. An image of paths of at most d segments is darker, and an exposure or a colour would compensate for this
+(`find_depth`).
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ _APERTURE = ((0.5, 0.5), (0.05, 0.5), (0.95, 0.5), (0.5, 0.05), (0.5, 0.95))
 
 
 def _margin(sensor: mi.Sensor) -> int:
-    """How many pixels away a sample is at most that lies within the filter's radius of a pixel's centre."""
+    """Return the maximum distance in pixels of a sample within the filter's radius of a pixel's centre."""
     return int(np.ceil(float(sensor.film().rfilter().radius()) - 0.5))
 
 
 def interior(shape: tuple[int, ...], sensor: mi.Sensor) -> np.ndarray:
-    """Where light tracing loses nothing by the film's border: boolean (H, W), for a sensor whose film is so large.
+    """Return where light tracing loses nothing at the film's border: boolean (H, W), for a sensor with such a film.
 
-    Samples just outside of the film are lost, so that pixels within the filter's radius of its border lack what they
-    would have added; paths from the sensor lose none.
+    Samples just outside of the film are lost, so pixels within the filter's radius of its border are too dark. Camera
+    paths lose none.
     """
     margin = _margin(sensor)
     inside = np.zeros(shape[:2], dtype=bool)
@@ -44,7 +44,7 @@ def interior(shape: tuple[int, ...], sensor: mi.Sensor) -> np.ndarray:
 
 
 def spread(pixels: np.ndarray, sensor: mi.Sensor) -> np.ndarray:
-    """The pixels whose reconstruction filter reaches some of `pixels`, which are among them; boolean (H, W) each."""
+    """Return the pixels whose reconstruction filter reaches some of `pixels`, including these; boolean (H, W) each."""
     from scipy.ndimage import maximum_filter  # here: a run that is refused, or needs none, does not wait for it
 
     return np.asarray(maximum_filter(pixels, 2 * _margin(sensor) + 1))
@@ -52,10 +52,10 @@ def spread(pixels: np.ndarray, sensor: mi.Sensor) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SeenSpecular:
-    """Pixels (H, W) of a sensor's crop window that smooth specular lobes reach, by way of the reconstruction filter.
+    """Pixels (H, W) of a sensor's crop window that smooth specular lobes reach, including the reconstruction filter.
 
-    `alone`: of surfaces that have no others (glass, mirrors), which stay black under light tracing. `mixed`: of those
-    that have others beside them (coats, blends, thin panes), of which light tracing lacks a part.
+    `alone`: of surfaces that have no other lobes (glass, mirrors), which stay black under light tracing. `mixed`: of
+    surfaces with other lobes, too (coats, blends, thin panes), of which light tracing lacks a part.
     """
 
     alone: np.ndarray
@@ -63,9 +63,9 @@ class SeenSpecular:
 
 
 def sees_specular(scene: mi.Scene, sensor: mi.Sensor) -> SeenSpecular:
-    """Trace CELLS^2 primary rays a pixel, through see-through surfaces, and mark the pixels that their filter reaches.
+    """Trace CELLS^2 primary rays per pixel through see-through surfaces, and mark the pixels that their filter reaches.
 
-    What is smaller than a cell may be missed. The rays are the same at every call.
+    Objects smaller than a cell may be missed. The rays are the same at every call.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     count = width * height
@@ -88,7 +88,7 @@ def sees_specular(scene: mi.Scene, sensor: mi.Sensor) -> SeenSpecular:
 
 
 def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
-    """Pixels (H, W) of a sensor's crop window that see an emitter directly, by way of the reconstruction filter too.
+    """Return pixels (H, W) of a sensor's crop window that see an emitter directly, including the reconstruction filter.
 
     A lamp smaller than the cells of a grid of LOOK^2 may be missed.
     """
@@ -108,7 +108,7 @@ def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
 
 
 def _first_surfaces(scene: mi.Scene, ray: mi.Ray3f, count: int) -> tuple[mi.Bool, mi.Bool]:
-    """Whether delta lobes are all that a surface has, or some of it, up to the first that is not see-through."""
+    """Return whether a surface has only delta lobes, or some, up to the first surface that is not see-through."""
     lobes = int(mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission)
     alone, mixed = dr.zeros(mi.Bool, count), dr.zeros(mi.Bool, count)
     for si, reached in surfaces_met(scene, ray, dr.full(mi.Bool, True, count)):
@@ -128,15 +128,15 @@ def visible_texels(
     scene: Any, sensors: Sequence[Any], key: str, pixels: Sequence[np.ndarray[Any, Any] | None] = (),
     mirrored: bool = False,
 ) -> np.ndarray[Any, Any]:  # fmt: skip
-    """Which texels of the texture `key` some sensor sees: boolean (H, W).
+    """Return the texels of the texture `key` that some sensor sees: boolean (H, W).
 
-    `pixels` (H, W) are those of each sensor that count; None, or none at all, where all do. `mirrored`: what mirrors
-    and clear glass show is seen; camera paths find it.
+    `pixels` (H, W) are those of each sensor that count; None if all do. With `mirrored`, views through mirrors and
+    clear glass count, which camera paths find.
 
-    A texel counts as seen if a primary ray hits the inner quarter of its cell, after see-through surfaces (masks), but
-    else not through glass or in mirrors, from where light paths cannot connect to the sensor. For a texture that is on
-    no surface (an environment map, emission), every texel counts. Texture coordinates outside of [0, 1] are taken to
-    repeat.
+    A texel counts if a primary ray hits the inner quarter of its cell, behind see-through surfaces (masks), but
+    otherwise not through glass or in mirrors, from where light paths cannot connect to the sensor. For a texture that
+    is on no surface (an environment map, emission), every texel counts. Texture coordinates outside of [0, 1] are
+    assumed to repeat.
     """
     params = mi.traverse(scene)
     node = params.properties[key][2]
@@ -159,8 +159,7 @@ def visible_texels(
 
 @dataclass(frozen=True)
 class _Texels:
-    """The texels of a texture of `size` (width, height), on surfaces of the BSDFs `owners`; `transform` is its
-    `to_uv`."""
+    """Texels of a texture of `size` (width, height), on surfaces of the BSDFs `owners`; `transform` is its `to_uv`."""
 
     owners: Sequence[Any]
     transform: list[list[float]]
@@ -183,8 +182,11 @@ class _Texels:
 def _mark_seen(
     scene: Any, sensor: Any, texels: _Texels, random: Any, seen: Any, kept: np.ndarray[Any, Any] | None, mirrored: bool,
 ) -> None:  # fmt: skip
-    """Cast one primary ray per lane, through pixels (H, W) that are `kept`, and mark in `seen` the texels that it
-    meets, where `mirrored` by way of mirrors and clear glass, too."""
+    """Cast one primary ray per lane, through pixels (H, W) that are `kept`, and mark the texels that it meets in
+    `seen`.
+
+    With `mirrored`, rays also pass mirrors and clear glass.
+    """
     time = sensor.shutter_open() + random.next_float32() * sensor.shutter_open_time()
     film = mi.Point2f(random.next_float32(), random.next_float32())
     aperture = mi.Point2f(random.next_float32(), random.next_float32())
@@ -210,17 +212,21 @@ _RAYS, _PATHS = 48, 32
 
 @dataclass(frozen=True)
 class Depth:
-    """A path depth in segments, and the share of a pixel's light that longer paths have, on average; None of the
-    greatest depth, to which nothing was compared."""
+    """Path depth in segments, and the mean share of a pixel's light that longer paths have.
+
+    The share is None for the greatest depth, which was compared with nothing.
+    """
 
     segments: int
     missing: float | None
 
 
 def find_depth(scene: mi.Scene, sensor: int) -> Depth:
-    """The least of `DEPTHS` at which the view through the sensor of this index has all but `LOST` of its light.
+    """Return the smallest of `DEPTHS` at which the view through the sensor of this index lacks at most `LOST` of its
+    light.
 
-    By camera paths of equal random numbers without roulette, so that those of one depth begin those of the next.
+    It uses camera paths with equal random numbers and without roulette, so that paths of one depth begin those of the
+    next.
     """
     whole = _pixels(scene, sensor, DEPTHS[-1])
     lit = np.isfinite(whole) & (whole > 0)
@@ -234,7 +240,7 @@ def find_depth(scene: mi.Scene, sensor: int) -> Depth:
 
 
 def _pixels(scene: mi.Scene, index: int, segments: int) -> np.ndarray:
-    """What the sensor sees of paths of at most so many segments, by ray: (N,) float64."""
+    """Return the light of paths of at most `segments` segments, by ray: (N,) float64."""
     sensor, count = scene.sensors()[index], _RAYS**2 * _PATHS
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, count)

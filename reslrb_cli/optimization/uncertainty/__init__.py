@@ -1,1 +1,1 @@
-"""How certain the values are that a run ends with: their spread about the optimum, and a verdict on each parameter."""
+"""Certainty of the final values of a run: their spread around the optimum, and a verdict on each parameter."""

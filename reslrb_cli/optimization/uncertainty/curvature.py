@@ -1,6 +1,6 @@
-"""The Gauss-Newton curvature of the loss, and the directions in which it is measured.
+"""Gauss-Newton curvature of the loss, and the directions in which it is measured.
 
-Directions are those in which images are differentiated: entries of small parameters, and textures brightened as a whole
+Images are differentiated along the entries of small parameters, and along the brightness of whole textures
 (`plan_changes`).
 
 The curvature (`Curvature`) is H = J^T W J at the parameters' values: J of the image, W = d2L/dI2, by pixel.
@@ -10,21 +10,21 @@ The curvature (`Curvature`) is H = J^T W J at the parameters' values: J of the i
     by entry            random signs v over the pixels: with p_s = J_s^T (sqrt(W) v), the mean of p_a p_b is the
                         diagonal of H (Hutchinson 1989; Bekas et al. 2007), again from two sets of samples
 
-Of the first kind a standard error is taken off, by the terms of its sum over the pixels: too much curvature would make
-results look too sure. The second kind is noise for the most part at each entry alone. Entries whose gradients have
-alike noise have alike curvature, so it is averaged over those: `smooth`.
+Along directions, a standard error is subtracted, by the terms of the sum over the pixels, because too much curvature
+would make results look too certain. By entry, single values are mostly noise. Entries whose gradients have similar
+noise have similar curvature, so they are averaged: `smooth`.
 
-What regularizers cost has a curvature of its own, without noise: differences of its gradient are added to both kinds.
+Regularizers have their own curvature, without noise: differences of their gradient are added to both kinds.
 
-Noise of a rendered target is in all gradients alike: b = J^T d, d what it makes of dL/dI. It is sampled by images of
-the target's own integrator (`_noises`). `d_even` is its mean, which pulls all pixels the same way (a relative loss
-weighs what noise darkens), `d_odd` the rest, taken in blocks of pixels, which the film's filter may have mixed. Then
-the second moment of b is
+Noise of a rendered target is the same in all gradients: b = J^T d, with d its effect on dL/dI. It is sampled by images
+of the target's own integrator (`_noises`). `d_even` is its mean, which pulls all pixels in the same direction (a
+relative loss gives darkened pixels more weight), and `d_odd` the rest, taken in blocks of pixels that the film's filter
+may have mixed. The second moment of b is then
 
     B = sum over blocks (J_a^T d_odd) (J_b^T d_odd)^T + (J^T d_even) (J^T d_even)^T
 
-By entry its diagonal is probed and averaged as that of H is, and a standard error is added: of few entries the average
-may come out as next to nothing, and too little noise would make results look too sure as well.
+By entry, its diagonal is probed and averaged like that of H, and a standard error is added: for few entries, the
+average may be almost zero, and too little noise would make results look too certain as well.
 """
 
 from __future__ import annotations
@@ -68,10 +68,10 @@ PROBED = 2
 
 @dataclass(frozen=True)
 class Direction:
-    """One coordinate: `vector`, in the layout of a gradient in a row, is what a unit of it adds to the parameter `key`.
+    """One coordinate: `vector`, in the layout of a flat gradient, is the change of the parameter `key` per unit.
 
-    `channel` is the only channel of images that it changes, or None. `entry` is that of a small parameter; None where
-    all of a texture's channel change together, in proportion to what they are.
+    `channel` is the only channel of images that it changes, or None. `entry` is that of a small parameter; None if all
+    entries of a texture's channel change together, in proportion to their values.
     """
 
     key: str
@@ -82,7 +82,9 @@ class Direction:
 
 @dataclass(frozen=True)
 class Change:
-    """A rendering of `values` (by key, as `Selection.array` has them), `amount` of each of these directions away."""
+    """Rendering of `values` (by key, in the form of `Selection.array`), changed by `amount` along each of these
+    directions.
+    """
 
     values: dict[str, Array]
     amount: float
@@ -90,12 +92,14 @@ class Change:
 
 
 def row_of(problem: Problem, key: str) -> Array:
-    """A parameter's value in a row, as its gradient is (`take_gradient`), an environment map's halo in it."""
+    """Return a parameter's value in the layout of its flat gradient (`take_gradient`), with an environment map's
+    halo.
+    """
     return np.array(dr.detach(problem.optimizer[key]), dtype=np.float64).ravel()
 
 
 def separates(problem: Problem, key: str) -> bool:
-    """Whether each channel of a parameter changes that channel of images alone, as colours do where there are three."""
+    """Whether each channel of a parameter changes only that channel of images, as three-channel colours do."""
     if not mi.is_rgb or any(view.target.shape[2] != 3 for view in problem.trained):
         return False
     if any(part in MIXING for part in key.replace("_", ".").split(".")):
@@ -107,9 +111,10 @@ def separates(problem: Problem, key: str) -> bool:
 
 
 def plan_changes(problem: Problem, scales: Mapping[str, float], share: float, most: int) -> list[Change]:
-    """The renderings that the directions of all parameters take, `share` of the scale away, small parameters first.
+    """Return the renderings for the directions of all parameters, with steps of `share` of the scale, small parameters
+    first.
 
-    At most `most` of them: parameters that are left have no directions.
+    There are at most `most` renderings; the remaining parameters have no directions.
     """
     small = [key for key in problem.selection.keys if problem.selection.array(key).size <= MOST_ENTRIES]
     textures = [key for key in problem.selection.keys if problem.selection.array(key).ndim == 3]
@@ -148,21 +153,24 @@ def _wholes(problem: Problem, key: str, share: float) -> list[Change]:
 
 @dataclass
 class TargetNoise:
-    """What the noise of one view's target makes of dL/dI, (H, W, C): `even` on average, and `odd` in one sample of it
-    besides; `side` is that of the blocks of pixels that share noise."""
+    """Effect of the noise of one view's target on dL/dI, (H, W, C): `even` on average, and `odd` in addition in one
+    sample.
+
+    `side` is that of the blocks of pixels with common noise.
+    """
 
     odd: Array
     even: Array
     side: int
 
     def in_blocks(self, slope: Array) -> Array:
-        """The sums over each block of what an image's derivative (H, W, C) makes of the odd part, in a row."""
+        """Return the sums over each block of an image's derivative (H, W, C) times the odd part, flat."""
         product = np.sum(slope * self.odd, axis=2)
         rows, columns = (np.arange(0, size, self.side) for size in product.shape)
         return np.asarray(np.add.reduceat(np.add.reduceat(product, rows, axis=0), columns, axis=1).ravel())
 
     def signed(self, random: np.random.Generator) -> Array:
-        """The odd part with a random sign for each block."""
+        """Return the odd part with a random sign for each block."""
         height, width = self.odd.shape[:2]
         signs = random.choice([-1.0, 1.0], size=(-(-height // self.side), -(-width // self.side)))
         spread = np.repeat(np.repeat(signs, self.side, axis=0), self.side, axis=1)[:height, :width, None]
@@ -170,7 +178,9 @@ class TargetNoise:
 
 
 class Curvature:
-    """Measures it where `problem`, which has its targets, stands, with `spp` samples per pixel in each of two sets."""
+    """Measurement of the curvature at the current values of `problem`, which needs its targets, with `spp` samples per
+    pixel in each of two sets.
+    """
 
     def __init__(self, problem: Problem, spp: int) -> None:
         self.problem, self.spp = problem, spp
@@ -189,7 +199,9 @@ class Curvature:
         self.noises = self._target_noises()
 
     def along(self, changes: Sequence[Change], go_on: Callable[[], bool]) -> tuple[list[Direction], Array, Array]:
-        """The directions of the changes that were rendered before `go_on` said no, and H and B of those (M, M)."""
+        """Return the directions of the changes that were rendered before `go_on` returned false, and their H and B (M,
+        M).
+        """
         directions: list[Direction] = []
         columns: list[list[Array]] = [[], []]
         odd: list[list[Array]] = [[], []]
@@ -227,7 +239,7 @@ class Curvature:
         return directions, H, _symmetric(a @ b.T / len(self.noises)) + np.outer(even, even)
 
     def _of_regularizers(self, directions: Sequence[Direction]) -> Array:
-        """What regularizers add to H along directions (M, M); of different parameters nothing."""
+        """Return the curvature of regularizers along directions (M, M); zero between different parameters."""
         bent = [self.problem.stiffness(direction.key, direction.vector) for direction in directions]
         return _symmetric(np.array([
             [one.vector @ change if one.key == other.key else 0.0
@@ -236,7 +248,7 @@ class Curvature:
         ]))  # fmt: skip
 
     def by_entry(self, probes: int, go_on: Callable[[], bool]) -> dict[str, Array]:
-        """For each parameter the diagonal of H in a row, unsmoothed; nothing where `go_on` said no at once."""
+        """Return the diagonal of H for each parameter, flat, unsmoothed; empty if `go_on` returned false at once."""
         total: dict[str, Array] = {}
         random = np.random.default_rng(self._seed(0, probes))
         for probe in range(probes):
@@ -250,8 +262,9 @@ class Curvature:
         return {key: value / self.probes for key, value in total.items()}
 
     def by_entry_of_target(self, first: int, go_on: Callable[[], bool]) -> dict[str, Array]:
-        """The diagonal of B in the same way, by probes of which `first` is the number; nothing without a rendered
-        target."""
+        """Return the diagonal of B in the same way, by probes from number `first` on; empty without a rendered
+        target.
+        """
         odd: dict[str, Array] = {}
         even: dict[str, Array] = {}
         random = np.random.default_rng(self._seed(1, first))
@@ -265,7 +278,7 @@ class Curvature:
         return {key: value / len(views) + even[key] for key, value in odd.items()}
 
     def _add_probe(self, total: dict[str, Array], gradients: Sequence[Array], number: int) -> None:
-        """Add what two sets of samples make of dL/dI, by view, multiplied."""
+        """Add the product of the gradients of two sets of samples, for dL/dI by view."""
         a, b = (self._probe(gradients, number + half) for half in (0, 1))
         for key in a:
             total[key] = total.get(key, 0.0) + a[key].astype(np.float64) * b[key]
@@ -284,11 +297,11 @@ class Curvature:
         return [list(sample) for sample in zip(*by_view, strict=True)]
 
     def _noises(self, view: View, integrator: Any, spp: int, multiple: int | None) -> list[TargetNoise]:
-        """Samples of what the noise of a view's target, of `spp` samples, makes of dL/dI; nothing of one that was read.
+        """Return samples of the effect of the noise of a view's target, of `spp` samples, on dL/dI; empty for a file.
 
-        Of images with as many samples each is the target in turn, and the mean of the others what it shows. Where that
-        would cost too much, and noise is small, differences of images of few samples are added to the target. All
-        samples are multiples of `multiple`.
+        Each of several images with as many samples takes the role of the target, and the mean of the others is its
+        expected value. If this would cost too much, and noise is small, differences of images of few samples are added
+        to the target. All numbers of samples are multiples of `multiple`.
         """
         true = np.array(view.target, dtype=np.float64)
         if view.wanted.file is not None:
@@ -320,7 +333,7 @@ class Curvature:
         return [TargetNoise(each, even, side) for each in odd]
 
     def _slope(self, view: View, target: Array, image: Array) -> Array:
-        """dL/dI of an exposed image with another target, both (H, W, C)."""
+        """Return dL/dI of an exposed image with another target, both (H, W, C)."""
         return np.nan_to_num(slope(replace(view, made=to_tensor(target)).judge, image)) * view.share
 
     def _in_a_row(self, images: Sequence[Array]) -> Array:
@@ -328,7 +341,9 @@ class Curvature:
         return row if self._picked is None else row[self._picked]
 
     def _probe(self, gradients: Sequence[Array], number: int) -> dict[str, Array]:
-        """What dL/dI of the views' exposed images (H, W, C) is in the parameters, by one set of samples."""
+        """Return the gradient of the parameters for dL/dI of the views' exposed images (H, W, C), by one set of
+        samples.
+        """
         problem = self.problem
         for place, view in enumerate(problem.trained):
             channels = int(problem.scene.sensors()[view.sensor].film().base_channels_count())
@@ -343,9 +358,10 @@ class Curvature:
         return take_gradient(problem)
 
     def _weight(self, place: int, view: View) -> Array:
-        """d2L/dI2 of a view's exposed image, for its pixels (H, W, C): differences of dL/dI over the residual's size.
+        """Return d2L/dI2 of a view's exposed image, for its pixels (H, W, C): differences of dL/dI over the size of the
+        residual.
 
-        Where L has a kink (`l1`), this is its curvature as noise of that size sees it.
+        If L has a kink (`l1`), this is its curvature at the scale of the noise.
         """
         image = 0.5 * (self._base[0][place] + self._base[1][place])
         true = view.kept(np.array(view.target, dtype=np.float64))
@@ -358,9 +374,9 @@ class Curvature:
 
 
 def smooth(diagonal: Array, noise: Array, sure: float = 0.0) -> Array:
-    """`diagonal` (N,) averaged over groups of entries whose gradients have alike `noise`, at least GROUP of them.
+    """Return `diagonal` (N,) averaged over groups of at least GROUP entries whose gradients have similar `noise`.
 
-    `sure` standard errors of each average are added to it.
+    `sure` standard errors of each average are added.
     """
     order = np.argsort(noise, kind="stable")
     result = np.empty_like(diagonal)
@@ -381,9 +397,10 @@ def _of_channel(image: Array, channel: int | None) -> Array:
 
 
 def _sure_share(terms: Array) -> Array:
-    """What of the sums of (M, N) terms is left once MARGIN of their standard errors are taken off, as a share, (M,).
+    """Return the share of the sums of (M, N) terms that is left after MARGIN of their standard errors are subtracted,
+    (M,).
 
-    A few bright pixels may make up all of a curvature, and be an accident.
+    A few bright pixels may make up all of a curvature by accident.
     """
     sums, errors = terms.sum(axis=1), np.sqrt(np.square(terms).sum(axis=1))
     return np.asarray(np.clip(1 - MARGIN * errors / np.maximum(sums, 1e-300), 0, 1))

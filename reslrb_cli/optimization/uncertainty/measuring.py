@@ -1,4 +1,4 @@
-"""Measures, after the last iteration, how certain the values are: gradients and curvature where the run stands."""
+"""Measurement of the certainty of the values after the last iteration: gradients and curvature at the final values."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ SHARE, MOST_STEPS = 0.25, 50
 
 @dataclass(frozen=True)
 class Noted:
-    """After how many iterations the squares of gradients were noted (0: not yet), and of which parameters; how many
-    steps of small ones since; and after so many iterations how far a step moved each parameter, per unit of gradient.
+    """Iterations at which data were recorded: squares of gradients (0: not yet) and their parameters, the number of
+    steps of small ones since, and the movement of each parameter per unit of gradient after some iterations.
     """
 
     seen: int
@@ -58,7 +58,7 @@ class Noted:
 
 
 class Certainty:
-    """Of one run of `problem`: made before its first iteration, `measure` after the last."""
+    """Certainty of one run of `problem`: make it before the first iteration, and call `measure` after the last."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
@@ -75,16 +75,16 @@ class Certainty:
 
     @property
     def noted(self) -> Noted:
-        """What it has taken note of, but for arrays."""
+        """Recorded data without arrays."""
         return Noted(self._seen, list(self.squares), {key: len(each) for key, each in self.last.items()}, self._paces)
 
     def last_steps(self) -> dict[str, dict[str, Array]]:
-        """The arrays of `last`, by their names and keys."""
+        """Return the arrays of `last`, by name and key."""
         names = [each.name for each in fields(LastSteps)]
         return {name: {key: getattr(each, name) for key, each in self.last.items()} for name in names}
 
     def restore(self, noted: Noted, squares: dict[str, Any], last: Mapping[str, Mapping[str, Array]]) -> None:
-        """Go on from what was noted; `last` are the arrays of `LastSteps`, by their names and keys."""
+        """Continue from recorded data; `last` are the arrays of `LastSteps`, by name and key."""
         self._seen, self.squares = noted.seen, squares
         names = [each.name for each in fields(LastSteps)]
         known = [key for key in noted.steps if key in self._initial]
@@ -92,13 +92,13 @@ class Certainty:
         self._paces |= {key: looks for key, looks in noted.paces.items() if key in self._initial}
 
     def expects(self, noted: Noted) -> dict[str, dict[str, Array]]:
-        """What `restore` is to be given as `last`, by shape, of a run's own parameters."""
+        """Return the expected argument `last` of `restore`, by shape, for a run's own parameters."""
         sizes = {key: (rows, self._initial[key].size) for key, rows in noted.steps.items() if key in self._initial}
         shapes = {key: expected(size) for key, size in sizes.items()}
         return {each.name: shapes for each in fields(LastSteps)}
 
     def see(self, before: State, state: State) -> None:
-        """Take note of an iteration, which led from `before` to `state`; it costs next to nothing."""
+        """Record data of an iteration from `before` to `state`, at almost no cost."""
         planned, iterations = self.problem.config.run.iterations, state.iteration
         is_last = state.stage == before.stage == len(self.problem.config.run.stages)
         if is_last and 0 < self._seen < iterations:
@@ -126,13 +126,15 @@ class Certainty:
         )
 
     def _pace(self, key: str) -> float:
-        """How far a step moves a parameter now, per unit of gradient, by its steepest entries."""
+        """Return the current movement of a parameter by a step per unit of gradient, for its steepest entries."""
         with np.errstate(divide="ignore"):  # of what has not been moved yet
             steepness = rms(1 / self.problem.optimizer.response(key))
         return 1 / max(steepness, 1e-300)
 
     def _recent(self, key: str, iterations: int) -> Array | None:
-        """The mean square of the gradients since `see` took note, (N,); None where the optimiser keeps none."""
+        """Return the mean square of the gradients since the recorded squares, (N,); None if the optimiser stores
+        none.
+        """
         before, now = self.squares.get(key), self.problem.optimizer.squares(key)
         if before is None or now is None or iterations <= self._seen:
             return None
@@ -142,9 +144,10 @@ class Certainty:
         return np.asarray(squares / np.maximum(self.problem.optimizer.slope(key) ** 2, 1e-300))
 
     def measure(self, iterations: int, elapsed_s: float, stop: Callable[[], bool]) -> CertaintyRecord | None:
-        """Measure after so many iterations, which took `elapsed_s`; None after too few, or where `stop()` says so.
+        """Measure after `iterations` iterations of `elapsed_s` seconds; None after too few, or if `stop()` returns
+        true.
 
-        Parameters and optimiser are left as they were.
+        Parameters and optimiser are not changed.
         """
         if iterations < LEAST_ITERATIONS:
             return None
@@ -209,12 +212,12 @@ class Certainty:
             problem.apply()
 
     def _target_noise(self) -> str:
-        """Whether the noise of the targets is in the spreads, as `CertaintyRecord` has it."""
+        """Return whether the spreads include the noise of the targets, in the words of `CertaintyRecord`."""
         read = [view.wanted.file is not None for view in self.problem.trained]
         return "left out" if all(read) else "in part" if any(read) else "measured"
 
     def _with_course(self, key: str, about: ParameterCertainty, own: Measured) -> ParameterCertainty:
-        """With how far it went, how far it could have gone, and what of it is seen."""
+        """Return the certainty with the distance moved, the possible distance, and the visible share."""
         optimizer = self.problem.optimizer
         step = optimizer.first_step(key)
         reach = None if step is None else step * float(sum(own.rates))
@@ -224,8 +227,11 @@ class Certainty:
         return replace(about, moved=moved, reach=reach, rate=optimizer.rate(key), seen=seen)
 
     def scale(self, key: str) -> float:
-        """The size of a parameter, in its unit: the largest root mean square of its values at the start and at the end
-        and of what lies between them, or, without a unit of light, half of its range; where all are 0, 1."""
+        """Return the scale of a parameter, in its unit.
+
+        It is the largest root mean square of its initial values, its final values, and their difference; for parameters
+        without a unit of light, at least half of its range; 1 if all are 0.
+        """
         first, last = self._initial[key], row_of(self.problem, key)
         sizes = [rms(first), rms(last), rms(last - first)]
         low, high = self.problem.selection.spec(key).bounds or (-np.inf, np.inf)
@@ -235,7 +241,9 @@ class Certainty:
         return max(sizes) or 1.0
 
     def _seen_entries(self, key: str, gradients: Array) -> Array | None:
-        """Which entries of a texture some view shows, in a row as gradients are; None of what is no texture."""
+        """Return the entries of a texture that some view shows, in the layout of flat gradients; None for other
+        parameters.
+        """
         shown = shown_texels(self.problem, key)
         if shown is None:
             return None
@@ -272,7 +280,9 @@ class Certainty:
         return found
 
     def _paces_of(self, key: str, iterations: int) -> Array | None:
-        """How far a step moved a parameter in each iteration, over how far it does now; None where nobody looked."""
+        """Return the step length of a parameter in each iteration, divided by the current one; None if it was not
+        recorded.
+        """
         if not (looks := self._paces[key]):
             return None
         at, found = np.array(looks).T
@@ -286,7 +296,7 @@ def hides(directions: Sequence[Direction], curvature: Array, gradients: Gradient
 
 
 class _Budget:
-    """Whether there is time for more; what compiles at first is in it, so that the first call always says yes."""
+    """Time for more measurements; the first call always returns true, because it compiles."""
 
     def __init__(self, seconds: float, stop: Callable[[], bool]) -> None:
         self._seconds, self._stop = seconds, stop

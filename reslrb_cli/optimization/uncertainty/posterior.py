@@ -1,46 +1,49 @@
-"""The distance of final values from the optimum: what the run's steps leave open, less what gradients at the end say.
+"""Distance of final values from the optimum: the remainder after the run's steps, corrected by gradients at the end.
 
-What was measured of one parameter at the end of a run is a `Measured`; what follows from it is a `Posterior`, of
-entries together (`joint`), or of each as if all others were known (`alone`).
+A `Measured` has the measurements of one parameter at the end of a run; a `Posterior` is the result, for entries
+together (`joint`), or for each as if all others were known (`alone`).
 
 Near the optimum the loss is quadratic with curvature H, and the offset d = x - x* of the values x follows the steps
 
-    d <- d - eta_t P (H d + noise)        P: how far a step moves an entry per unit of gradient (`Optimizer.response`)
+    d <- d - eta_t P (H d + noise)        P: movement of an entry by a step per unit of gradient (`Optimizer.response`)
 
-so that the covariance C of the offset goes from that of the start, the square of each entry's scale (nothing is known
-of where the optimum is), to that of the end:
+The covariance C of the offset starts with the square of each entry's scale (nothing is known of the optimum), and
+changes with each step to
 
     C <- (1 - eta_t P H) C (1 - eta_t P H)^T + eta_t^2 P Sigma P
 
-It holds what too few iterations have not forgotten of the start, what the view does not tell (H has no curvature there,
-and the start stays), and the noise of the steps. K gradients at the final values, of mean g, then measure H d (Kalman):
+It contains the remainder of the start after too few iterations, the directions that the view does not determine (H has
+no curvature there, and the start remains), and the noise of the steps. K gradients at the final values, of mean g, then
+measure H d (Kalman):
 
     gain = C H (H C H + Sigma / K)^-1,   to go = gain g,   C <- C - gain H C
 
-The last iterations measure it as well (`LastSteps`). Their noise is part of C; but how far they took the values is
-known, m in all, so that C is that of the values before them, and d has the mean m in place of 0. A step's gradient
-where the values were y off the end is H (d + y) and noise: less H y it is one more at the end, and
+The last iterations measure it as well (`LastSteps`). Their noise is part of C, but their total movement m is known, so
+that C is that of the values before them, and d has the mean m in place of 0. The gradient of a step with the values y
+off the end is H (d + y) and noise: minus H y, it is one more at the end, and
 
     to go = m + gain (g - H m)
 
-C is no better than the model. Where values that are off drove others the wrong way at first, or curvature was less on
-the way, C is too small by any factor, for what is left of the start falls exponentially. Gradients at the end tell:
-along an eigenvector u of H, of curvature h, u (g - H m) has by the model the variance h^2 c + s, c that of C and s that
-of noise. Where it is larger than `SURPRISE` standard deviations, c is what it is then found to be,
+C is only as good as the model. If values that were off drove others in the wrong direction at first, or if the
+curvature was smaller on the way, C is too small by any factor, because the remainder of the start falls exponentially.
+Gradients at the end show this: along an eigenvector u of H, of curvature h, the model predicts the variance h^2 c + s
+for u (g - H m), with c that of C and s that of noise. If it is larger than `SURPRISE` standard deviations, c is
+replaced by the observed value,
 
     c <- ((u (g - H m))^2 - s) / h^2      at most that of the start
 
-Noise of the target is in every gradient alike: H d + b + noise, d now the offset from what a target without noise would
-have. With B the second moment of b, and D how far a constant gradient drives the steps,
+Noise of the target is the same in every gradient: H d + b + noise, with d the offset from the optimum for a target
+without noise. With B the second moment of b, and D the movement of the steps by a constant gradient,
 
     D <- (1 - eta_t P H) D + eta_t P
     E = C + D B D^T,   cov(d, g) = E H - D B,   cov(g) = H E H - H D B - B D^T H + B + Sigma / K
 
-take the places of C, C H and H C H + Sigma / K. Where the run has converged, D = H^-1, what b does is in no gradient,
-and H^-1 B H^-1 is left.
+take the places of C, C H and H C H + Sigma / K. If the run has converged, D = H^-1, no gradient shows the effect of b,
+and H^-1 B H^-1 remains.
 
-Momentum is left out: over many steps it moves as far. P is that of the end; how much less a step moved before, as
-Adam's do until the large gradients of the start are forgotten, is in eta_t (`Measured.pace`).
+Momentum is left out, because over many steps the movement is the same. P is that of the end; eta_t contains the ratio
+of earlier step lengths, which are shorter for Adam until the large gradients of the start are forgotten
+(`Measured.pace`).
 """
 
 from __future__ import annotations
@@ -64,7 +67,9 @@ STEPS_OFF = 3.0
 
 @dataclass(frozen=True)
 class LastSteps:
-    """The last n iterations of a parameter of N entries: their gradients, and at which values, both (n, N)."""
+    """Last n iterations of a parameter of N entries: their gradients, and the values that they belong to, both
+    (n, N).
+    """
 
     gradients: Array
     values: Array
@@ -75,15 +80,16 @@ class LastSteps:
 
 @dataclass(frozen=True)
 class Measured:
-    """One parameter of N entries at the end of a run: its values (N,), bounds, scale, and K gradients (K, N).
+    """Parameter of N entries at the end of a run: its values (N,), bounds, scale, and K gradients (K, N).
 
-    `response` is how far a step moves an entry per unit of gradient, at the factor 1, and `rates` are the schedule's
-    factors of all iterations; `pace` is how far a step moved the parameter then, over how far it does at the end, by
-    iteration (None: as far). `last` are its last iterations, where they are known, and `recent` is the mean square of
-    their gradients, (N,), where the optimiser kept it. `seen` (N,) says which entries of a texture some view shows;
-    None of what is no texture. `start` (N,) has the values before the first iteration.
-
-    `mean` and `noise`, both (N,), are the gradients' mean and variance.
+    - `response` is the movement of an entry by a step per unit of gradient, at the factor 1, and `rates` are the
+      schedule's factors of all iterations.
+    - `pace` is the step length of each iteration divided by that at the end (None: equal).
+    - `last` are the last iterations, if known, and `recent` is the mean square of their gradients, (N,), if the
+      optimiser stores it.
+    - `seen` (N,) are the entries of a texture that some view shows; None for other parameters.
+    - `start` (N,) are the values before the first iteration.
+    - `mean` and `noise`, both (N,), are the gradients' mean and variance.
     """
 
     value: Array
