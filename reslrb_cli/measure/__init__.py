@@ -1,1 +1,1 @@
-"""Measurements: what a step costs. They yield records, and draw nothing."""
+"""Measurements, which yield records and draw nothing."""

@@ -1,7 +1,7 @@
-"""Workers that take turns: what `bench` and `convergence` have in common, from their start to their end.
+"""Workers that take turns: the common part of `bench` and `convergence`, from start to end.
 
-As they take turns, one computing at a time, a drift of the machine hits all alike. One more worker may be there for all
-of them, the referee: it makes what they are compared by, and nothing is measured where it fails.
+One worker computes at a time, so a drift of the machine affects all alike. One more worker may serve all of them, the
+referee: it makes their common reference, and nothing is measured if it fails.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ Measured = TypeVar("Measured", bound=Measurement)
 
 
 def in_turn(workers: Sequence[Item], round: int) -> list[Item]:
-    """The workers in the order of a round: who begins changes from round to round."""
+    """Return the workers in the order of a round; the first one changes from round to round."""
     start = round % max(len(workers), 1)
     return [*workers[start:], *workers[:start]]
 
 
 def start_process(first: dict[str, Any], does: str) -> Process:
-    """A process that does what `load` finds by this name; `first` is its first message."""
+    """Start a process that runs the function `load` finds by this name; `first` is its first message."""
     imports = "from reslrb_cli.measure.arena import load\nfrom reslrb_cli.measure.workers import run"
     return Process(first, python_command(f"{imports}\nrun(lambda: load({does!r}))"))
 
 
 class Arena(Generic[Measured, Worker]):
-    """Workers under way, `members`; what they write goes to `folder`, which is the caller's to remove.
+    """Running workers, `members`; their files go to `folder`, which the caller removes.
 
-    `facts` are the referee's; of the budget `spent_s` have gone before. What an `earlier` session has measured counts,
-    and is gone on from. Raises ConfigError where that is of another measurement.
+    `facts` are the referee's; `spent_s` of the budget are already spent. Measurements of an `earlier` session count,
+    and are continued. Raises ConfigError if they belong to another measurement.
     """
 
     #: The most rounds.
@@ -81,14 +81,14 @@ class Arena(Generic[Measured, Worker]):
         self._end = now() + self._budget_s
 
     def _set_up(self, earlier: Earlier | None) -> int:
-        """Begin what a kind of session has beside all this, with what it has of an earlier one.
+        """Set up the parts of a specific kind of session, with data of an earlier one.
 
-        Returns how many depths there are to share the time. Raises ConfigError.
+        Returns the number of depths that share the time. Raises ConfigError.
         """
         raise NotImplementedError
 
     def _taking_turns(self, course: Iterator[Item]) -> Iterator[Item]:
-        """What `course` yields, until it ends or `stop()`; no worker is left then."""
+        """Yield the items of `course`, until it ends or `stop()` returns true; all workers have then ended."""
         try:
             yield from course
         except Stopped:
@@ -100,15 +100,15 @@ class Arena(Generic[Measured, Worker]):
                 self._referee.close()
 
     def _alive(self) -> list[Worker]:
-        """Those that can be asked for more."""
+        """Return the workers that can take more steps."""
         return [member for member in self.members if member.alive]
 
     def _tight(self) -> bool:
-        """Whether workers that hold so much together have to release what they can after a step."""
+        """Whether workers together use so much memory that they must release it after each step."""
         return sum(member.peak_mib for member in self._alive()) * MIB > MEMORY_SHARE * self.plan.memory
 
     def _take_rounds(self, workers: Callable[[], Sequence[Stepping]], first: int, before: int) -> Iterator[int]:
-        """The number of rounds after each of them, from number `first` on, of which `before` are known already."""
+        """Yield the number of rounds after each of them, from number `first` on; `before` are known already."""
         tight, done = self._tight(), 0
         self._pace.begin_rounds(before)
         while workers() and self._pace.another(done):
@@ -118,11 +118,13 @@ class Arena(Generic[Measured, Worker]):
             yield first + done
 
     def _budget_for(self, seconds: float) -> float:
-        """The budget that leaves so many seconds for measuring, from the beginning on."""
+        """Return the budget that leaves this number of seconds for measuring, from the beginning on."""
         return (seconds + self.AFTERWARDS_S) / (1 - self.AFTERWARDS)
 
     def _ask_referee(self, plan: Plan, question: dict[str, Any] | None = None) -> dict[str, Any] | None:
-        """An answer, or what it says first; None where the budget was spent over it. Raises Refused where it ended."""
+        """Return an answer of the referee, or its first message; None if the budget is spent. Raises Refused if it
+        ended.
+        """
         assert self._referee is not None, "it is started first"
         if question is not None:
             self._referee.process.ask(question)
@@ -134,7 +136,7 @@ class Arena(Generic[Measured, Worker]):
         return answer
 
     def _open(self, member: Contestant) -> dict[str, Any] | None:
-        """What a worker says first, its scene loaded; None where it ended over that, or time was up."""
+        """Return a worker's first message, with its scene loaded; None if it ended, or time was up."""
         opening = member.answer(self._stop, self._pace.over)
         self._warn(opening or {})
         return opening
@@ -142,11 +144,11 @@ class Arena(Generic[Measured, Worker]):
     # --- what is said -------------------------------------------------------------------------------------------------
 
     def _first(self, config: Config, arrays: str) -> dict[str, Any]:
-        """A worker's first message, with the file of the referee's arrays by the name `arrays`."""
+        """Return the first message to a worker, with the file of the referee's arrays under the name `arrays`."""
         return self.plan.first(config) | {arrays: str(self.folder / f"{arrays}.npz")}
 
     def _warn(self, opening: dict[str, Any]) -> None:
-        """Say what loading warned of, once: every process loads the same scene."""
+        """Print warnings of loading once, because every process loads the same scene."""
         for line in opening.get("warnings", ()):
             self._once(line)
 
@@ -156,14 +158,14 @@ class Arena(Generic[Measured, Worker]):
             self._say(line)
 
     def _say_end(self, member: Worker, label: str, more: str = "") -> None:
-        """Say how a worker came to its end, if it did."""
+        """Print how a worker ended, if it did."""
         if member.refusal is not None:
             self._say(f"left out: {label}: {member.refusal}")
         elif member.end is not None:
             self._say(f"{label}{more}: {member.end.status.value}: {member.end.reason}")
 
     def _say_left_out(self) -> None:
-        """Name what nobody named and cannot do the scene: of the default list alone."""
+        """Print the methods of the default list that do not support the scene."""
         for case in self.plan.cases:
             reason = self._without(case)
             if reason is not None:
@@ -174,7 +176,7 @@ class Arena(Generic[Measured, Worker]):
         return self._without(case) is None
 
     def _without(self, case: Case) -> str | None:
-        """Why a method of the default list is left out; None where it takes part."""
+        """Return why a method of the default list is left out; None if it takes part."""
         if not self.plan.default:
             return None
         if self.facts.get("paths") == "light" and case.options.get("paths", "light") != "light":
@@ -184,7 +186,7 @@ class Arena(Generic[Measured, Worker]):
 
 
 def load(does: str) -> Begin:
-    """What begins a process, by the name of what it does. Whatever is imported for it is, here and in that function."""
+    """Return the function that starts a process, by name; imports happen here and in that function."""
     if does == "measured_steps":
         from reslrb_cli.measure.stepper import begin_steps
 

@@ -1,14 +1,14 @@
-"""Time and memory of a step against path depth, for several integrators side by side; or against something else.
+"""Time and memory of a step against path depth, or another quantity, for several integrators side by side.
 
-At each depth (or number of samples, or size of the film or of textures: `sweep` says which) every case (`BenchRun`)
-has a process of its own, and all live at once (`Bench`). They take a cold step each, then as many as it takes until no
-new kernel comes, and then steps in rounds, one each in turn, from round to round in another order. Ratios are taken
-within a round, whose steps also share a seed.
+At each depth (or number of samples, or size of the film or of textures, by `sweep`), every case (`BenchRun`) has its
+own process, and all run at once (`Bench`). They take a cold step each, then steps until no new kernel is compiled, and
+then rounds of one step each, in an order that changes from round to round. Ratios are taken within a round, whose steps
+share a seed.
 
-A case that runs out of memory is tried again at greater depths: what is recorded was seen, and a failure costs no more
-time than it takes to fill the memory once. One that nobody named, but the default list, and that refuses the scene, is
-left out, and named with its reason. Once the budget is spent, which covers loading and compiling, what is not warm is
-left out, and named, with what it would take; what is takes one round, if it had none.
+A case that runs out of memory is tried again at greater depths, so that records are observations; a failure only takes
+the time to fill the memory once. A case of the default list that does not support the scene is left out, with the
+reason. Once the budget, which includes loading and compiling, is spent, cases that are not warm are left out, with the
+time that they need; warm cases take one round if they had none.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ TIMES = ("step_ms", "kernel_ms", "codegen_ms", "tracing_ms")
 
 @dataclass(frozen=True)
 class BenchResult:
-    """A record, what it is compared with, and what the record has no room for.
+    """Record, its baseline, and data beyond the record.
 
-    `value` is that of what is swept.
-    `kernel_ratio` and `step_ratio` are times over those of the baseline, round by round; None where either has none.
+    `value` is that of the swept quantity. `kernel_ratio` and `step_ratio` are times divided by those of the baseline,
+    round by round; None if either is missing.
     """
 
     case: Case
@@ -50,7 +50,7 @@ class BenchResult:
 class BenchRun(Stepping):
     """One case at one value; `steps` are by round.
 
-    `size` is the film's, width and height in pixels; `texels` those of all textures that are parameters.
+    `size` is the film's, width and height in pixels; `texels` are those of all recovered textures.
     """
 
     case: Case
@@ -61,31 +61,31 @@ class BenchRun(Stepping):
 
     @property
     def done(self) -> bool:
-        """Whether it has anything to say."""
+        """Whether it has any result."""
         return self.end is not None or bool(self.steps)
 
     def question(self, round: int | None) -> dict[str, Any]:
-        """What asks for one step, whose seed is the round's."""
+        """Return the request for one step with the seed of the round."""
         return {"round": 0 if round is None else round + 1}
 
     def keep(self, round: int, answer: dict[str, Any]) -> None:
-        """Take note of a step."""
+        """Record a step."""
         self.steps[round] = answer
 
     def kept(self) -> dict[str, Any]:
-        """What a later session needs, as JSON has it."""
+        """Return the data for a later session, for JSON."""
         return {"case": self.case.label, "size": self.size, "texels": self.texels, "cold": self.cold,
                 "steps": self.steps, "end": self.end and vars(self.end)}  # fmt: skip
 
     def restore(self, entry: Mapping[str, Any]) -> None:
-        """Have what `kept` returned."""
+        """Restore the result of `kept`."""
         self.size, self.texels, self.cold = entry["size"] and tuple(entry["size"]), entry["texels"], entry["cold"]
         self.steps = {int(round): step for round, step in entry["steps"].items()}
         self.end = entry["end"] and Ended(**entry["end"])
 
 
 def results(runs: Sequence[BenchRun], value: int, sweep: Sweep) -> list[BenchResult]:
-    """What those of the cases at one value that have anything to say come to."""
+    """Return the results of the cases at one value."""
     return [_result(run, value, sweep, runs) for run in runs if run.done]
 
 
@@ -118,7 +118,7 @@ def _result(run: BenchRun, value: int, sweep: Sweep, runs: Sequence[BenchRun]) -
 
 
 def _ratio(run: BenchRun, baseline: BenchRun, key: str) -> Spread | None:
-    """Ratios of the rounds that both have; None where there is none, or one of them has ended."""
+    """Return ratios of the common rounds; None if there is none, or one of them has ended."""
     both = [(step[key], baseline.steps[round][key]) for round, step in run.steps.items() if round in baseline.steps]
     ratios = [own / its for own, its in both if its and run.end is None and baseline.end is None]
     return Spread.of(ratios) if ratios else None
@@ -129,9 +129,9 @@ SLOW = 10.0
 
 
 class Bench(Arena[Sweep, BenchRun]):
-    """A measurement, value by value of what is swept; see `Arena`. No process writes into its folder.
+    """Measurement for each value of the sweep (see `Arena`). No process writes into its folder.
 
-    `runs` are by value, `done` the values that are over, `left_out` the cases that refused the scene.
+    `runs` are by value, `done` are the finished values, and `left_out` the cases that do not support the scene.
     """
 
     AFTERWARDS, AFTERWARDS_S, MOST_ROUNDS = 0.0, 0.0, MAX_ROUNDS
@@ -160,7 +160,7 @@ class Bench(Arena[Sweep, BenchRun]):
         return BenchRun(process=None, may_refuse=may_refuse, case=case, config=self.plan.at(case, value))
 
     def results(self, done: bool | None = None) -> list[BenchResult]:
-        """What the runs come to, in the order of the sweep: of all values, or those that are `done`, or are not."""
+        """Return the results in the order of the sweep: of all values, or only those that are `done`, or not."""
         return [
             result
             for value in self.plan.values
@@ -169,7 +169,7 @@ class Bench(Arena[Sweep, BenchRun]):
         ]
 
     def kept(self) -> Kept | None:
-        """What a later session needs to go on; None where there is nothing yet."""
+        """Return the data for a later session; None if there are none yet."""
         values = [(value, [run.kept() for run in runs if run.done]) for value, runs in self.runs.items()]
         if not any(entries for _, entries in values):
             return None
@@ -177,10 +177,10 @@ class Bench(Arena[Sweep, BenchRun]):
         return resume_store.head(self.plan.KIND, self.settings, values=values, left_out=left_out), {}
 
     def run(self) -> Iterator[list[BenchResult]]:
-        """Measure what is to do; yield the results of each value, and nothing after each round on the way to them.
+        """Measure; yield the results of each value, and nothing after each round before.
 
-        Ends early, with what is done, once `stop()`. What the budget did not suffice for is said, and, once, what the
-        scene's loading warned of. Raises Refused where a case that may not be left out cannot begin.
+        Ends early, with the finished results, after `stop()`. Prints missing measurements and, once, warnings of
+        loading. Raises Refused if a required case cannot start.
         """
         return self._taking_turns(self._course())
 
@@ -214,7 +214,7 @@ class Bench(Arena[Sweep, BenchRun]):
                 return
 
     def _begin(self, value: int) -> None:
-        """Start the cases at one value, with what has been measured of them, but for those that ended at it."""
+        """Start the cases at one value with their measurements so far, except those that ended at it."""
         plan, before = self.plan, {run.case.label: run for run in self.runs.get(value, ())}
         self.members = self.runs[value] = []
         for case in plan.cases:
@@ -242,7 +242,7 @@ class Bench(Arena[Sweep, BenchRun]):
         return self._take_rounds(self._alive, first, min((len(run.steps) for run in self._alive()), default=0))
 
     def _needed(self, left: int) -> str:
-        """What the value that has just ended, and those that are `left` with it, would have taken."""
+        """Return the time that the value that has just ended, and those `left`, would have taken."""
         late, warm = sum(run.late for run in self.members), len(self._alive())
         if warm == 0:
             return "; nothing had compiled by then, so allow several times as much"

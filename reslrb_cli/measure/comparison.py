@@ -1,29 +1,27 @@
-"""Comparisons of Monte Carlo estimates of gradients, and of images, with a reference.
+"""Comparisons of Monte Carlo estimates of gradients and images with a reference.
 
-Whether two means agree, over N and M independent samples, is told by Welch's test of each entry:
+Welch's test of each entry compares two means over N and M independent samples:
 
     t = (mean_a - mean_b) / sqrt(s_a^2 / N + s_b^2 / M)
 
-t is turned into the standard normal z of the same probability (Welch-Satterthwaite degrees of freedom), so that few
+t is converted to the standard normal z of the same probability (Welch-Satterthwaite degrees of freedom), so that few
 samples do not look like a bias.
 
-The entries in which a gradient is compared are those of a small parameter, tiles and projections of a large one. A
-texel that few paths meet has a gradient whose noise is far from normal, and z scores of thousands of them raise false
-alarms. So a large texture is compared in tiles, each the sum over its texels, per channel; any other large parameter in
-runs of consecutive entries. What sums hide, an error that cancels within a tile, shows in projections on random signs,
-which take every texel in, and whose noise is nearer to normal than a texel's. The sum of all comes last, where small
-errors of all entries add up.
+A gradient is compared in the entries of a small parameter, or in tiles and projections of a large one. The gradient of
+a texel that few paths meet has noise far from normal, and z scores of thousands of them raise false alarms. A large
+texture is therefore compared in tiles, each the sum over its texels, per channel; any other large parameter in runs of
+consecutive entries. Errors that cancel within a tile show in projections on random signs, which include every texel,
+and whose noise is closer to normal. The last entry is the sum of all, in which small errors add up.
 
-Whether gradients agree with a reference: over many seeds by z scores (`compare_expectations`), or at equal seeds by
-relative L2 (`compare_equal_seeds`). Samples are (N, P): N seeds, P entries. Where both sides have the same seeds the
-test of expectations is on their differences, which is valid whatever noise they share, and the sharper the more they
-share:
+Gradients are compared over many seeds by z scores (`compare_expectations`), or at equal seeds by relative L2
+(`compare_equal_seeds`). Samples are (N, P): N seeds, P entries. With equal seeds on both sides, the test of
+expectations uses their differences, which is valid for any common noise, and more powerful with more of it:
 
     t_k = mean_k(a - b) / sqrt(var_k(a - b) / N + floor_k^2)         to z, the normal deviate of the same probability
 
-Two criteria must hold. The largest |z| stays under Sidak's threshold for all entries of all rows of a
-table, and the root mean square of a row's z under that of nu normal deviates, nu the row's effective number of
-independent entries (Satterthwaite, with the mean squared correlation r^2 of its entries' samples, chance taken off):
+Two criteria must hold. The largest |z| must be below Sidak's threshold for all entries of all rows of a table, and the
+root mean square of a row's z below that of nu normal deviates, where nu is the row's effective number of independent
+entries (Satterthwaite, with the mean squared correlation r^2 of its entries' samples, corrected for chance):
 
     nu = E / (1 + (E - 1) r^2)
 """
@@ -44,10 +42,10 @@ ALPHA = 1e-4
 
 
 def z_scores(a: np.ndarray, b: np.ndarray, rounding: float = 1e-5) -> np.ndarray:
-    """Standard normal scores of mean(a) - mean(b) along axis 0, for each of the other entries.
+    """Return standard normal scores of mean(a) - mean(b) along axis 0, for each of the other entries.
 
-    `rounding` is the relative error that floating point alone may cause: it is added to the standard error, so that
-    entries without noise (a lamp seen directly) can be compared.
+    `rounding` is the relative error of floating point: it is added to the standard error, so that entries without noise
+    (a directly visible lamp) can be compared.
     """
     mean_a, mean_b = a.mean(0), b.mean(0)
     var_a, var_b = a.var(0, ddof=1) / len(a), b.var(0, ddof=1) / len(b)
@@ -62,10 +60,10 @@ def z_scores(a: np.ndarray, b: np.ndarray, rounding: float = 1e-5) -> np.ndarray
 
 
 def paired_z_scores(difference: np.ndarray, floor: Any = 0.0, bias: Any = 0.0) -> np.ndarray:
-    """Standard normal scores of mean(difference) along axis 0 against zero, for each of the other entries.
+    """Return standard normal scores of mean(difference) along axis 0 against zero, for each of the other entries.
 
-    For estimates at equal seeds, whose noise is in part the same: `difference` is (N, ...). `floor`, what rounding may
-    cause, is added to the standard error; `bias`, such as truncation, is taken off what the means differ by.
+    For estimates at equal seeds, which share some noise, `difference` is (N, ...). `floor`, the rounding error, is
+    added to the standard error; `bias`, such as truncation, is subtracted from the difference of the means.
     """
     mean, var, floor = difference.mean(0), difference.var(0, ddof=1) / len(difference), np.square(floor)
     mean = np.sign(mean) * np.maximum(np.abs(mean) - bias, 0.0)
@@ -76,29 +74,31 @@ def paired_z_scores(difference: np.ndarray, floor: Any = 0.0, bias: Any = 0.0) -
 
 
 def _normal_scores(t: np.ndarray, freedom: np.ndarray) -> np.ndarray:
-    """The standard normal z of the same probability as Student's t."""
+    """Return the standard normal z of the same probability as Student's t."""
     z = -np.sign(t) * stats.norm.ppf(stats.t.sf(np.abs(t), np.minimum(freedom, 1e6)))
     # Beyond what doubles resolve: as bad as t says.
     return np.where(np.isfinite(z), z, t)
 
 
 def sidak(count: int, alpha: float = ALPHA) -> float:
-    """The |z| that the largest of `count` independent normal deviates exceeds with probability `alpha`."""
+    """Return the |z| that the largest of `count` independent normal deviates exceeds with probability `alpha`."""
     return float(stats.norm.isf(-np.expm1(np.log1p(-alpha) / count) / 2))
 
 
 def combined_z_rms(z: np.ndarray) -> float:
-    """Root mean square of z scores: 1 where the two estimators agree. NaN stays NaN."""
+    """Return the root mean square of z scores: 1 if the two estimators agree. NaN stays NaN."""
     return float(np.sqrt(np.mean(np.square(z))))
 
 
 def z_rms_limit(count: float, alpha: float = ALPHA) -> float:
-    """What the root mean square of `count` independent normal deviates exceeds with probability `alpha`."""
+    """Return the limit that the root mean square of `count` independent normal deviates exceeds with probability
+    `alpha`.
+    """
     return float(np.sqrt(stats.chi2.isf(alpha, count) / count))
 
 
 def effective_entries(samples: np.ndarray) -> float:
-    """How many independent entries the correlated ones of (N, E) samples are worth: between 1 and E."""
+    """Return the effective number of independent entries of (N, E) samples: between 1 and E."""
     count, entries = samples.shape
     deviation = samples - samples.mean(0)
     size = np.linalg.norm(deviation, axis=0)
@@ -123,7 +123,7 @@ PROJECTIONS = 16
 
 
 def divisions(shape: tuple[int, ...]) -> list[int]:
-    """How a parameter of this shape can be divided, the finest first: tiles along each side, 0 for every entry."""
+    """Return the divisions of a parameter of this shape, the finest first: tiles along each side, 0 for every entry."""
     size = int(np.prod(shape, dtype=int))
     if size <= 4:
         return [0]
@@ -132,7 +132,7 @@ def divisions(shape: tuple[int, ...]) -> list[int]:
 
 
 def parts(samples: np.ndarray, shape: tuple[int, ...], tiles: int) -> np.ndarray:
-    """Sums over the parts of one division: (N, E) of the (N, P) gradients of a parameter of this shape."""
+    """Return sums over the parts of one division: (N, E) from the (N, P) gradients of a parameter of this shape."""
     if tiles == 0:
         return samples
     height, width, channels = shape if len(shape) == 3 else (1, samples.shape[1], 1)
@@ -145,7 +145,9 @@ def parts(samples: np.ndarray, shape: tuple[int, ...], tiles: int) -> np.ndarray
 
 
 def overall(samples: np.ndarray) -> np.ndarray:
-    """What takes all P entries in: projections on random signs where there are many, and the sum; (N, E)."""
+    """Return the entries that include all P values: projections on random signs if there are many, and the sum;
+    (N, E).
+    """
     size = samples.shape[1]
     if size == 1:
         return samples[:, :0]
@@ -159,7 +161,7 @@ def overall(samples: np.ndarray) -> np.ndarray:
 
 
 def entry_count(shape: tuple[int, ...]) -> int:
-    """The most entries in which a parameter of this shape is compared."""
+    """Return the maximum number of entries in which a parameter of this shape is compared."""
     none = np.zeros((1, int(np.prod(shape, dtype=int))))
     return parts(none, shape, divisions(shape)[0]).shape[1] + overall(none).shape[1]
 
@@ -191,7 +193,7 @@ TAIL_SEEDS = 8
 
 @dataclass(frozen=True)
 class Family:
-    """The comparisons that are corrected for together: `rows` of a table, with `entries` in all."""
+    """Comparisons with a common correction: `rows` of a table, with `entries` in total."""
 
     rows: int = 1
     entries: int = 1
@@ -199,11 +201,13 @@ class Family:
 
     @property
     def z_max_limit(self) -> float:
-        """What the largest |z| of the table exceeds with probability `alpha` if all is right."""
+        """Limit that the largest |z| of a correct table exceeds with probability `alpha`."""
         return sidak(self.entries, self.alpha)
 
     def z_rms_limit(self, independent: float) -> float:
-        """What the root mean square of a row's z exceeds; in any row of the table with probability `alpha`."""
+        """Return the limit of the root mean square of a row's z; any row of a correct table exceeds it with probability
+        `alpha`.
+        """
         return z_rms_limit(independent, float(-np.expm1(np.log1p(-self.alpha) / self.rows)))
 
 
@@ -213,9 +217,9 @@ def compare_expectations(
 ) -> Comparison:  # fmt: skip
     """Compare the means of (N, P) samples with those of a reference.
 
-    `reference` is (N, P) at the same seeds if `paired`, else (M, P) at others, or (P,): exact values. `shape` is that
-    of the parameter: with it, z scores are of its parts (`entries`), not of each of the P. By `bias` the reference may
-    be wrong itself, in its units (a number, or one for each entry; not of other seeds): only what goes beyond counts.
+    `reference` is (N, P) at the same seeds if `paired`, else (M, P) at others, or (P,): exact values. With the `shape`
+    of the parameter, z scores are those of its parts (`entries`) instead of each of the P. `bias` is the possible error
+    of the reference in its units (a number, or one for each entry; not for other seeds); only larger differences count.
     `rounding` is relative to the entries, and added to the standard error.
     """
     problem = _problem(ours, reference)
@@ -269,7 +273,7 @@ def compare_equal_seeds(ours: np.ndarray, reference: np.ndarray, limit: float = 
 
 
 def _alikeness(ours: np.ndarray, reference: np.ndarray) -> tuple[float | None, float | None]:
-    """The cosine of the angle between the means, and the summed variance over the reference's; None for 0 / 0."""
+    """Return the cosine of the angle between the means, and the ratio of summed variances; None for 0 / 0."""
     a, b = ours.mean(0), np.atleast_2d(reference).mean(0)
     cosine = _ratio(a @ b, np.linalg.norm(a) * np.linalg.norm(b)) if a.size > 1 else None
     if reference.ndim == 1 or len(ours) < 2:
@@ -278,7 +282,9 @@ def _alikeness(ours: np.ndarray, reference: np.ndarray) -> tuple[float | None, f
 
 
 def tail_weight(samples: np.ndarray) -> float:
-    """How much of the variance of (N, E) samples single ones carry: 0 as of normal deviates, 1 one sample alone."""
+    """Return how much of the variance of (N, E) samples single ones carry: 0 as for normal deviates, 1 for one sample
+    alone.
+    """
     count = len(samples)
     squares = np.square(samples - samples.mean(0))
     squares = squares[:, squares.sum(0) > 0]
@@ -292,7 +298,9 @@ def tail_weight(samples: np.ndarray) -> float:
 def _entries(
     ours: np.ndarray, reference: np.ndarray, shape: tuple[int, ...] | None, joined: bool, rounding: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Both sides in the finest division of the parameter whose samples are near enough to normal, (N, E) each."""
+    """Return both sides in the finest division of the parameter whose samples are close enough to normal, (N, E)
+    each.
+    """
     if shape is None:
         return ours, reference
     for tiles in divisions(shape):
@@ -307,7 +315,7 @@ def _entries(
 
 
 def _detectable(standard_error: np.ndarray, bias: Any, expected: np.ndarray, family: Family) -> float:
-    """The least factor, less 1, on the whole gradient that would have been seen in its clearest entry."""
+    """Return the smallest relative error of the whole gradient that its clearest entry would have shown."""
     seen = np.abs(expected) > 0
     if not seen.any():
         return np.inf
@@ -316,7 +324,7 @@ def _detectable(standard_error: np.ndarray, bias: Any, expected: np.ndarray, fam
 
 
 def _problem(ours: np.ndarray, reference: np.ndarray) -> Comparison | None:
-    """What keeps samples from being compared at all."""
+    """Return why samples cannot be compared at all, or None."""
     for name, samples in (("gradient", ours), ("reference", reference)):
         bad = int(np.count_nonzero(~np.isfinite(samples)))
         if bad:

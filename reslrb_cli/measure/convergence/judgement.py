@@ -1,4 +1,4 @@
-"""What the samples of a session come to: errors, slopes, efficiencies, and who is biased."""
+"""Results from the samples of a session: errors, slopes, efficiencies, and biases."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class ConvergenceResults:
 
 @dataclass(frozen=True)
 class _Bias:
-    """What is known of a bias, of one parameter or the worst of all of them; fields are as in a `MethodRecord`."""
+    """Bias of one parameter, or the worst of all of them; fields are as in a `MethodRecord`."""
 
     biased: bool | None = None
     bias_z: float | None = None
@@ -51,7 +51,7 @@ class _Bias:
 
 
 class Judgement:
-    """Judges what a session has sampled, as far as it came."""
+    """Evaluation of the samples of a session so far."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -63,28 +63,28 @@ class Judgement:
                 self._whole = {key: ReferenceMean(self._rows(found, place)) for key, place in self._places().items()}
 
     def _places(self) -> dict[str, slice]:
-        """Where each parameter stands, and all together, unless the image is what is estimated."""
+        """Return the place of each parameter, and of all together unless the image is estimated."""
         if "image" in self._slices:
             return self._slices
         return self._slices | {ALL: slice(None)}
 
     def _rows(self, member: Member, place: slice) -> np.ndarray:
-        """Independent estimates by a reference; steps that share one dL/dI where there are several are one."""
+        """Return independent estimates by a reference; steps with the same of several dL/dI are combined."""
         several = self._session.plan.objective == "loss" and len(set(member.turns)) > IMAGES
         return member.means(place, IMAGES if several else None)
 
     @property
     def ready(self) -> bool:
-        """Whether there is anything to say."""
+        """Whether there is any result."""
         return bool(self._whole)
 
     def overall(self, member: Member) -> MethodRecord:
-        """Figures of all parameters together (or the image), biases not looked at."""
+        """Return the figures of all parameters together (or the image), without biases."""
         key = next(reversed(self._places()))
         return self._method(member, key, self._places()[key], _Bias())
 
     def results(self) -> ConvergenceResults:
-        """Everything."""
+        """Return all records."""
         session = self._session
         cases, references = session.of(Role.CASE), session.of(Role.REFERENCE)
         points: list[PointRecord] = []
@@ -105,13 +105,13 @@ class Judgement:
         return ConvergenceResults(points, methods, stood)
 
     def _measured(self, member: Member) -> bool:
-        """Whether there are figures of a member."""
+        """Whether a member has figures."""
         return self.ready and member.end is None and not member.message and len(member.rows) >= FEWEST
 
     # --- bias ---------------------------------------------------------------------------------------------------------
 
     def _judge(self, member: Member, key: str) -> Member | None:
-        """Who a member's bias is judged by: an independent stock integrator, else what errors are taken from."""
+        """Return the member that tests for bias: an independent stock integrator, otherwise the reference."""
         session = self._session
         reference = session.of(Role.REFERENCE)[0]
         stock = session.judges.get(session.facts["independent"][key] or "")
@@ -121,7 +121,7 @@ class Judgement:
         return None if member is reference else reference
 
     def _biases(self, member: Member) -> dict[str, _Bias]:
-        """By parameter, and of all."""
+        """Return the biases by parameter, and of all together."""
         found = {key: self._bias(member, key) for key in self._slices}
         if "image" in found:
             return found
@@ -153,7 +153,7 @@ class Judgement:
         return _Bias(biased, figures.z_max, figures.z_max_limit, judge.label, independent, _words(figures))
 
     def _family(self) -> Family:
-        """All comparisons of the session, which are corrected for together."""
+        """Return all comparisons of the session, which have a common correction."""
         members = len(self._session.of(Role.CASE)) + 1
         shapes = self._session.facts["shapes"].values()
         return Family(members * len(shapes), members * sum(entry_count(tuple(shape)) for shape in shapes))
@@ -219,7 +219,7 @@ _UNSEEN = "nothing of it stands out of the reference's noise"
 
 
 def _kin(member: Member) -> str:
-    """Whose code a member's light paths are: ours, or a stock integrator's."""
+    """Return whose code traces a member's paths: that of `reslrb`, or a stock integrator."""
     name = member.method.integrator
     return name if name in ("ptracer", "prb") else "ours"
 

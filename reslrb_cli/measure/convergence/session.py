@@ -1,7 +1,7 @@
-"""The processes of a `convergence`: what is compared, what errors are taken from, and what biases are judged by.
+"""Processes of a `convergence`: the compared methods, the reference, and the tests for bias.
 
-All take turns (`Arena`), with seeds of their own: no two share noise. A session may go on from the steps that an
-earlier one has taken, with the same dL/dI.
+All take turns (`Arena`), with their own seeds, so that no two share noise. A session may continue from the steps of an
+earlier one, with the same dL/dI.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ INDEPENDENT_PATHS = 2**18
 
 
 class Session(Arena[Plan, Member]):
-    """Processes under way and what they have sampled; see `Arena`.
+    """Running processes and their samples (see `Arena`).
 
-    `judges` has the members that stand for an independent stock integrator, by its name.
+    `judges` maps names of independent stock integrators to their members.
     """
 
     def _set_up(self, earlier: Earlier | None) -> int:
@@ -43,17 +43,18 @@ class Session(Arena[Plan, Member]):
         return 1
 
     def slices(self) -> dict[str, slice]:
-        """Where each parameter (or the image) stands in a sample."""
+        """Return the place of each parameter (or of the image) in a sample."""
         return places({key: int(np.prod(shape, dtype=int)) for key, shape in self.facts["shapes"].items()})
 
     def of(self, role: Role) -> list[Member]:
-        """The members of one role."""
+        """Return the members of one role."""
         return [member for member in self.members if member.role is role]
 
     def run(self) -> Iterator[int]:
-        """Measure; yield the number of rounds after each of them. Ends early, with what is done, once `stop()`.
+        """Measure; yield the number of rounds after each of them. Ends early, with the finished results, after
+        `stop()`.
 
-        Raises Refused where what may not be left out cannot begin.
+        Raises Refused if a required member cannot start.
         """
         return self._taking_turns(self._course())
 
@@ -65,9 +66,9 @@ class Session(Arena[Plan, Member]):
         self._say_what_it_takes()
 
     def kept(self) -> Kept | None:
-        """What a later session needs to go on; None where nothing has been sampled.
+        """Return the data for a later session; None if nothing has been sampled.
 
-        A method that was left out, or never came to a step, has none there: what it is kept for is to be asked again.
+        A method that was left out, or never took a step, has none there, so that it is tried again.
         """
         if not self.rounds or not any(member.rows for member in self.members):
             return None
@@ -81,7 +82,7 @@ class Session(Arena[Plan, Member]):
         return resume_store.kept(self.plan.KIND, self.settings, samples, **content)
 
     def _restore(self, earlier: Earlier) -> None:
-        """Hand the members their steps. Raises ConfigError where they are others."""
+        """Give the members their earlier steps. Raises ConfigError if they differ."""
         entries = earlier.head["members"]
         if [member.name for member in self.members] != [entry["name"] for entry in entries]:
             raise earlier.other("its methods are others: " + ", ".join(entry["name"] for entry in entries))
@@ -93,13 +94,13 @@ class Session(Arena[Plan, Member]):
 
     @property
     def _arrays(self) -> Path:
-        """The file of the survey's arrays."""
+        """File of the survey's arrays."""
         return self.folder / "arrays.npz"
 
     # --- before the rounds --------------------------------------------------------------------------------------------
 
     def _survey(self) -> bool:
-        """Ask what stands as a reference, and have dL/dI made; False where time is up over it."""
+        """Find the references, and make dL/dI; return false if time is up."""
         plan = self.plan
         if self._earlier is not None:
             found = {name: array for (what, name), array in self._earlier.samples.items() if what == "survey"}
@@ -200,16 +201,16 @@ class Session(Arena[Plan, Member]):
 
     @property
     def _fewest(self) -> int:
-        """The rounds that this session has to take, or it could as well take none."""
+        """Minimum number of rounds of this session."""
         return max(FEWEST - self._before, 1)
 
     @property
     def _round_s(self) -> float:
-        """Seconds of a round, by what each took when it was warm."""
+        """Seconds of a round with warm members."""
         return sum(member.count * member.step_s for member in self._alive())
 
     def _say_what_it_takes(self) -> None:
-        """Where the budget did not suffice for figures, or for slopes: what it would take."""
+        """Print the budget that would suffice for figures, or for slopes, if this one did not."""
         late = [member for member in self.members if member.late]
         taken = self.rounds - self._before
         if taken >= self._fewest and not late:
@@ -240,6 +241,6 @@ class Session(Arena[Plan, Member]):
         self._say(f"no slope of {names}: it takes {FEWEST_FOR_SLOPE} steps of each; {advice}")
 
     def _budget_of(self, rounds: int, share: float = 1.0) -> float:
-        """Seconds for so many rounds of this session, `share` times as much work as what has been measured."""
+        """Return the seconds for `rounds` rounds of this session, with `share` times the measured work."""
         before = self._now() - self._began - (self.rounds - self._before) * self._round_s
         return self._budget_for(share * (before + rounds * self._round_s))

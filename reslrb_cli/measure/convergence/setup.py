@@ -1,6 +1,6 @@
-"""The members of a `convergence`, what is found out before it measures (`survey`), and the steps of one (`Sampler`).
+"""Members of a `convergence`, the facts found before it measures (`survey`), and the steps of a member (`Sampler`).
 
-Both run in processes of their own (`workers.py`), which `begin_survey` and `begin_sampling` begin.
+Both run in separate processes (`workers.py`), which `begin_survey` and `begin_sampling` start.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ MOST_REFERENCE_STEPS = 64
 
 
 class Role(str, enum.Enum):
-    """What a member is there for."""
+    """Role of a member."""
 
     CASE = "case"
     REFERENCE = "reference"
@@ -64,10 +64,10 @@ class Role(str, enum.Enum):
 
 @dataclass(kw_only=True)
 class Member(Stepping):
-    """One process, the steps that it is to take, and those that it has taken.
+    """Process with its steps so far and its steps per turn.
 
-    `rows` are samples (P,), `turns` says in which round each was taken, `seconds` are those of one step in each turn.
-    `count` is the number of steps of a turn, `taken` of all that were ever asked for, whose numbers make the seeds.
+    `rows` are samples (P,), `turns` are their rounds, and `seconds` the time of one step in each turn. `count` is the
+    number of steps of a turn, and `taken` that of all requested steps, which determines the seeds.
     """
 
     role: Role
@@ -85,7 +85,7 @@ class Member(Stepping):
 
     @property
     def label(self) -> str:
-        """What it is called."""
+        """Name of the method."""
         return self.method.label
 
     @property
@@ -95,17 +95,17 @@ class Member(Stepping):
 
     @property
     def name(self) -> str:
-        """Its role and label."""
+        """Role and label."""
         return f"{self.role.value} {self.label}"
 
     def question(self, round: int | None) -> dict[str, Any]:
-        """What asks for the steps of a turn, with the round's dL/dI; one step while it is getting warm."""
+        """Return the request for the steps of a turn, with the round's dL/dI; one step during warm-up."""
         start, count = self.taken, 1 if round is None else self.count
         self.taken += count
         return {"start": start, "count": count, "spp": self.spp, "image": round or 0, "out": str(self.out)}
 
     def keep(self, round: int, answer: dict[str, Any]) -> None:
-        """Take note of a turn's steps."""
+        """Record a turn's steps."""
         rows = np.load(self.out)
         if not np.isfinite(rows).all() and not self.message:
             self.message = f"{np.count_nonzero(~np.isfinite(rows))} entries of step {len(self.rows) + 1} are not finite"
@@ -115,9 +115,9 @@ class Member(Stepping):
         self.seconds.append(float(np.mean(times[1:] if len(times) > 1 else times)) / 1e3)
 
     def kept(self, rounds: int) -> tuple[dict[str, Any], np.ndarray]:
-        """What a later session needs, as JSON has it, and the samples (N, P) of so many rounds.
+        """Return the data for a later session, for JSON, and the samples (N, P) of this number of rounds.
 
-        A round that was broken off is not among them: the next session begins it anew, with other seeds.
+        An interrupted round is left out; the next session repeats it with other seeds.
         """
         turns = [turn for turn in self.turns if turn < rounds]
         entry = {"name": self.name, "config": dump(self.config), "taken": self.taken, "turns": turns,
@@ -126,7 +126,7 @@ class Member(Stepping):
         return entry, np.array(self.rows[: len(turns)], np.float32)
 
     def restore(self, entry: dict[str, Any], rows: np.ndarray) -> None:
-        """Have what `kept` returned; what has ended, or refused, is not asked again."""
+        """Restore the result of `kept`; members that have ended are not tried again."""
         for name in ("taken", "turns", "seconds", "message", "cold"):
             setattr(self, name, entry[name])
         self.rows, self.end = list(rows), entry["end"] and Ended(**entry["end"])
@@ -134,7 +134,7 @@ class Member(Stepping):
             self.close()
 
     def means(self, key: slice, groups: int | None = None) -> np.ndarray:
-        """Means over turns, or over every so many-th of them together, of some entries: (K, P)."""
+        """Return means over turns, or over groups of turns, of some entries: (K, P)."""
         turns, rows = np.array(self.turns), np.stack(self.rows)[:, key].astype(np.float64)
         if groups is not None:
             turns = turns % groups
@@ -142,9 +142,9 @@ class Member(Stepping):
 
 
 def share_turns(members: list[Member], fixed: bool) -> None:
-    """Set how many steps each takes in a turn: about equal times, since what is fast has steps to spare.
+    """Set the number of steps per turn of each member for about equal times; fast methods take more steps.
 
-    With `fixed`, so many whatever time they take.
+    With `fixed`, all take this number.
     """
     for member in members if fixed else ():
         member.count = FIXED[member.role.value]
@@ -182,7 +182,7 @@ _PURPOSE = "convergence, dL/dI"
 
 
 def begin_survey(first: dict[str, Any]) -> Begun:
-    """Begin the process. The one question names the file for arrays, `out`; its answer is `survey`'s facts."""
+    """Start the process. The only request names the file for arrays, `out`; its answer is `survey`'s facts."""
     problem = assemble_scene(told(first).with_exposures_fixed())
 
     def answer(question: dict[str, Any]) -> dict[str, Any]:
@@ -196,15 +196,20 @@ def begin_survey(first: dict[str, Any]) -> Begun:
 def survey(
     problem: Problem, objective: str, camera: bool, named: bool, budget_s: float | None, light: bool = True
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """What is known of a problem, targets not made yet, and arrays that its samples are taken with.
+    """Return the facts of a problem without targets, and the arrays for its samples.
 
-    The facts: `keys`, `shapes` of what is estimated (of the parameters, or `image`), `independent` (key to the name of
-    a stock integrator, or None), `why` (key to what keeps others from it), `without` (stock integrators that are right
-    for nothing here, with the reason), `paths` (those of what errors are taken from, by which all of this goes),
-    `masked` (whether pixels along the border are left out), `pixels`, and in words what was rendered, `pictures`. The
-    arrays: `mask` (H, W, 1), and unless the image is the objective the first view's `target_arrays` and `adjoints` (B,
-    H, W, C). `camera`: paths from the camera take part, where they are right or `named`, which lose nothing by the
-    film's border, `light`: such take part that do; `budget_s` is the time of the whole measurement, if it counts.
+    The facts:
+
+    - `keys` and `shapes` of the estimated quantities (of the parameters, or `image`)
+    - `independent` (key to the name of a stock integrator, or None), and `why` (key to the reason against others)
+    - `without` (stock integrators that are right for nothing here, with the reason)
+    - `paths` (those of the reference, which determine everything here)
+    - `masked` (whether pixels along the border are left out), and `pixels`
+    - `pictures`, the rendered images in words
+
+    The arrays are `mask` (H, W, 1) and, unless the image is the objective, the first view's `target_arrays` and
+    `adjoints` (B, H, W, C). `camera`: camera paths take part, if they are right or `named`, which lose nothing at the
+    film's border; `light`: methods take part that do. `budget_s` is the time of the whole measurement, if it matters.
     """
     film = problem.scene.sensors()[problem.sensors[0]].film()
     width, height = (int(n) for n in film.crop_size())
@@ -233,7 +238,7 @@ def survey(
 
 
 def adjoint(problem: Problem, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """dL/dI (H, W, C) at an image of that shape, the pixels that `mask` (H, W, 1) has as 0 left out of the loss."""
+    """Return dL/dI (H, W, C) at an image of this shape, without the pixels whose `mask` (H, W, 1) is 0."""
     leaf = mi.TensorXf(image)
     dr.enable_grad(leaf)
     dr.backward(masked_loss(problem.views[0], leaf, None if mask.all() else mi.TensorXf(mask)))
@@ -241,7 +246,7 @@ def adjoint(problem: Problem, image: np.ndarray, mask: np.ndarray) -> np.ndarray
 
 
 def masked_loss(view: View, image: mi.TensorXf, mask: mi.TensorXf | None) -> mi.Float:
-    """The view's loss of an attached image (H, W, C): what `mask` (H, W, 1) has as 0 is as the target has it."""
+    """Return the view's loss of an attached image (H, W, C); pixels whose `mask` (H, W, 1) is 0 equal the target."""
     if mask is None:
         return view.compare(image)
     target = view.target
@@ -249,7 +254,7 @@ def masked_loss(view: View, image: mi.TensorXf, mask: mi.TensorXf | None) -> mi.
 
 
 def find_references(problem: Problem, objective: str) -> dict[str, Any]:
-    """Keys, shapes, and which stock integrator counts for each."""
+    """Return keys, shapes, and the valid stock integrator for each."""
     at = Situation.of_problem(problem, problem.sensors[0])
     keys = ["image"] if objective == "image" else list(problem.selection.keys)
     found: dict[str, dict[Reference, str | None]] = {}
@@ -271,7 +276,7 @@ def find_references(problem: Problem, objective: str) -> dict[str, Any]:
 
 
 def _unlike(config: Config) -> str | None:
-    """Why naive AD has other derivatives of what moves light than the experiment asks for."""
+    """Return why naive AD has other derivatives of moving parameters than the experiment requests."""
     options, alike = config.integrator.options(), ALIKE[Reference.PTRACER]
     if all(options.get(name, value) == value for name, value in alike.items()):
         return None
@@ -279,7 +284,7 @@ def _unlike(config: Config) -> str | None:
 
 
 def affordable_paths(problem: Problem, pixels: int, seconds: float) -> int:
-    """So many light paths take so long: a power of 2, so that machines of about the same speed have the same images."""
+    """Return the number of light paths for this time: a power of 2, so that similar machines have the same images."""
     spp = multiple_of(TRIAL // pixels, problem.samples_per_pass)
     for _ in range(2):  # the first one compiles
         began = time.perf_counter()
@@ -290,7 +295,7 @@ def affordable_paths(problem: Problem, pixels: int, seconds: float) -> int:
 
 
 def shorten_target(problem: Problem, most: int) -> tuple[Problem, str]:
-    """The problem with a bound to the samples per pixel of a target that has to be rendered, and what to say of it."""
+    """Return the problem with a limit for the samples per pixel of a rendered target, and a message about it."""
     render = problem.config.target.render
     if render is None:
         return problem, ""
@@ -304,10 +309,10 @@ def shorten_target(problem: Problem, most: int) -> tuple[Problem, str]:
 
 
 class Sampler(Steps):
-    """Steps as `convergence` takes them.
+    """Steps of `convergence`.
 
-    `mode` says what is sampled: `known`, the gradient with dL/dI held at one of `adjoints`; `loss`, the gradient of the
-    experiment's own loss with its `run.adjoint`; `image`. `arrays` are the survey's.
+    `mode` is the sampled quantity: `known`, the gradient with dL/dI fixed at one of `adjoints`; `loss`, the gradient of
+    the experiment's loss with its `run.adjoint`; `image`. `arrays` are the survey's.
     """
 
     def __init__(self, config: Config, mode: str, arrays: dict[str, np.ndarray]) -> None:
@@ -320,7 +325,7 @@ class Sampler(Steps):
         self.inside = arrays["mask"] != 0
 
     def step(self, seed: int, spp: int, image: int) -> tuple[np.ndarray, StepTimes]:
-        """One sample, all parameters (or pixels) in a row, float32; what it took is of the step alone."""
+        """Return one sample, all parameters (or pixels) flat, float32, and the times of the step alone."""
         problem = self.problem
         if self.mode == "image":
             with dr.suspend_grad(), self.clock.step() as times:
@@ -336,10 +341,10 @@ class Sampler(Steps):
 
 
 def begin_sampling(first: dict[str, Any]) -> Begun:
-    """Begin the process. A question asks for `count` steps from number `start` on, with `spp` samples per pixel.
+    """Start the process. A request asks for `count` steps from number `start` on, with `spp` samples per pixel.
 
-    Its answer has `step_ms` of each and the number of `new_kernels`; the samples (count, P) go to the file `out`. Where
-    `cold`, also the peak of Dr.Jit's arrays. Seeds are those of the `purpose`; `image` says which dL/dI.
+    Its answer has `step_ms` of each and the number of `new_kernels`; the samples (count, P) go to the file `out`. If
+    `cold`, it also has the peak of Dr.Jit's arrays. Seeds are those of the `purpose`; `image` selects dL/dI.
     """
     config = told(first)
     with np.load(first["arrays"]) as arrays:

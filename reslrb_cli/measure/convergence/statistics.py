@@ -1,16 +1,16 @@
-"""Statistics of convergence: the error of averages of n steps, its slope, efficiency, and the time that an error takes.
+"""Statistics of convergence: the error of averages of n steps, its slope, efficiency, and the time for a given error.
 
 Samples x are (R, P): R steps, P entries. The reference r is the mean of rows (K, P), other steps, each an independent
 estimate of the same mean. Sums over entries of variances are traces, written tr:
 
     noise   = tr Var(r)                                  the reference's own squared standard error
-    signal  = |r|^2 - noise                              the squared size of what is estimated
+    signal  = |r|^2 - noise                              the squared size of the estimated quantity
     MSE(n)  = mean over blocks of n steps |mean of a block - r|^2 - noise
     RMSE(n) = sqrt(MSE(n) / signal)                      relative
     bias^2  = |mean(x) - r|^2 - tr Var(x) / R - noise
 
-all without bias, so that single values may be negative. Intervals are those of the jackknife: one turn of steps after
-the other is left out of the samples, one row after the other of the reference, and the two variances add up.
+All are unbiased, so single values may be negative. Intervals are those of the jackknife: one turn of steps after the
+other is left out of the samples, one row after the other of the reference, and the two variances are added.
 """
 
 from __future__ import annotations
