@@ -1,17 +1,17 @@
-"""Gradients of a scene over many seeds, in forward mode and by finite differences.
+"""Gradients of a scene over many seeds, in reverse and forward mode and by finite differences.
 
-`Case`: a scene, its parameters and its objective, sum(image * weights) with fixed weights, so that dL/dI is the same
-for every estimator. A gradient is one flat vector over all parameters of a case.
+`Case` is a scene with its parameters and the objective sum(image * weights). The weights are fixed, so dL/dI is the
+same for every estimator. A gradient is one flat vector over all parameters of a case.
 
-Finite differences are taken at common random numbers, along a few directions of one parameter (`Direction`). The step h
-is chosen by a sweep (`choose_step`). Central differences, and the one-sided ones of three nodes, are wrong by
-c h^2 + ..., so that two steps tell the truncation error of the smaller one (L. F. Richardson, 1911),
+Finite differences use common random numbers, along a few directions of one parameter (`Direction`). `choose_step`
+chooses the step h. The error of central differences, and of one-sided differences with three nodes, is c h^2 + ...
+Two steps therefore give the truncation error of the smaller one (L. F. Richardson, 1911):
 
-    D(h) - F' ~ (D(r h) - D(h)) / (r^2 - 1),
+    D(h) - F' ~ (D(r h) - D(h)) / (r^2 - 1)
 
-while noise that grows as h shrinks, from paths that flip, shows in how much D(r h) - D(h) varies between seeds. Where
-light is moved, rounding can be the same for all seeds, for it is the scene that is rounded: a change that does not
-shrink with h is no truncation, and counts in full. The step with the least sum is taken, and its error comes with it.
+Noise from paths that change discontinuously grows as h shrinks. It shows in the variation of D(r h) - D(h) between
+seeds. If light moves, rounding of the scene can be equal for all seeds: a change that does not shrink with h is not
+truncation, and counts in full. The step with the smallest sum of errors is chosen, and its truncation error is stored.
 """
 
 from __future__ import annotations
@@ -33,24 +33,21 @@ from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.deformation import Deformation
 from reslrb_cli.scene.parameters import Selection
 
-#: How far the largest step of finite differences moves things, relative to their size, in units of the step.
+#: Size of a direction that moves an object, relative to the object's size.
 REACH = 0.1
 
-#: The same of a heightmap, relative to the scene's size.
+#: Size of a direction of a heightmap, relative to the scene's size.
 RELIEF = 0.02
 
-#: The same of what makes up a motion: a turn is in degrees; None stands for `REACH` of the scene's size.
+#: Size of a direction of a motion's component; rotations are in degrees. None: `REACH` times the scene's size.
 UNITS = {"translation": None, "rotation": 10.0, "scale": REACH}
 
-#: Waves that have room in what is displaced, at most.
+#: Maximum number of wavelengths across a displaced object.
 WAVES = 1.5
 
 
 def moves_light(params: mi.SceneParameters, key: str) -> bool:
-    """Whether a parameter moves what light meets or leaves from.
-
-    What the scene itself does not have is a function of such: a motion, or a heightmap.
-    """
+    """Whether a parameter moves shapes or lights. Motions and heightmaps, which `params` lacks, always do."""
     if key not in params.properties:
         return True
     kind = parameter_kind(params, key)
@@ -58,9 +55,10 @@ def moves_light(params: mi.SceneParameters, key: str) -> bool:
 
 
 def smooth_weights(height: int, width: int, channels: int = 3) -> np.ndarray:
-    """A smooth dL/dI of mean 1 that vanishes at the film's border: light that lands beyond says nothing.
+    """Return a smooth dL/dI of mean 1 that vanishes at the film's border, so that light beyond it has no effect.
 
-    Finite differences of what moves over the film need it: within each pixel of noise they would have to be small.
+    Finite differences of light that moves over the film need a smooth dL/dI. With noise per pixel, steps would have to
+    be much smaller than a pixel.
     """
     y, x = (np.mgrid[0:height, 0:width] + 0.5) / np.array([height, width]).reshape(2, 1, 1)
     value = np.stack([np.sin(5 * x) * np.cos(4 * y) + 1.5, np.cos(3 * x + 2 * y) + 1.2, x + y], -1)[:, :, :channels]
@@ -70,10 +68,10 @@ def smooth_weights(height: int, width: int, channels: int = 3) -> np.ndarray:
 
 
 def smooth_rows(key: str, value: Any, extent: float, count: int, seed: int = 3) -> list[np.ndarray]:
-    """Directions in which a parameter moves smoothly, each a row, in units of which a fraction is a step.
+    """Return directions in which a parameter moves smoothly, each a row. A step is a fraction of a direction.
 
-    Vertices are displaced by waves in all directions, a heightmap by waves over its texels; of what is not so many
-    numbers (a position, a rotation) each is moved. `extent` is the scene's size.
+    Vertices are displaced by waves in all directions, heightmaps by waves over their texels. For small parameters (a
+    position, a rotation), all entries move. `extent` is the scene's size.
     """
     random, found, name = np.random.default_rng(seed), [], key.rpartition(".")[2]
     shape = np.shape(value)
@@ -96,45 +94,45 @@ def smooth_rows(key: str, value: Any, extent: float, count: int, seed: int = 3) 
 
 
 def _waves(points: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """A wave (N,) over points (N, D) of about unit extent."""
+    """Return a random wave (N,) over points (N, D) of about unit extent."""
     wave = random.normal(size=points.shape[1])
     wave *= random.uniform(0.5, 1) * WAVES * 2 * np.pi / np.linalg.norm(wave)
     return np.asarray(np.cos(points @ wave + random.uniform(0, 2 * np.pi)))
 
 
 class Values(Protocol):
-    """What `scene.Selection` has of this kind: the parameters of a scene, or what they are functions of."""
+    """The interface of parameters of a scene, or of values on which they depend. `scene.Selection` implements it."""
 
     @property
     def params(self) -> mi.SceneParameters:
-        """All of the scene's `mi.traverse`."""
+        """The scene's `mi.traverse`."""
 
     def value(self, key: str) -> Any:
-        """The current value of `key`, as Dr.Jit has it."""
+        """Return the current value of `key` as a Dr.Jit array."""
 
     def hand_over(self, values: Mapping[str, Any]) -> None:
-        """Give the scene these values, and evaluate what follows from them, derivatives included."""
+        """Set these values in the scene, with their derivatives, and evaluate everything that depends on them."""
 
     def collect(self) -> None:
-        """Bring the gradients of what is in the scene on to the values that were handed over."""
+        """Propagate gradients from the scene to the values of `hand_over`."""
 
     def push(self) -> None:
-        """Bring tangents of the values that were handed over, once propagated, on to what is in the scene."""
+        """Propagate tangents from the values of `hand_over` to the scene."""
 
 
-#: Steps that are tried, in units of the direction.
+#: Candidate steps, as fractions of the direction.
 STEPS = (0.1, 0.01, 0.001)
 
-#: How many seeds the comparison may have, by which the noise of a single one is judged.
+#: Assumed number of seeds of the comparison, which scales the noise of a single seed.
 PLANNED_SEEDS = 16
 
 
 @dataclass(frozen=True)
 class Direction:
-    """A direction in the space of all parameters (P,), whose entries are in the parameters' own units.
+    """A direction in the space of all parameters (P,), in the parameters' own units.
 
-    `sides` are as in `Case.difference`; `step` is in units of `vector`, `truncation` the error that it brings, a bound
-    on its absolute value, in units of the difference.
+    `sides` is as in `Case.difference`. `step` is a fraction of `vector`. `truncation` is a bound on the absolute error
+    due to the step, in units of the difference.
     """
 
     vector: np.ndarray
@@ -143,16 +141,16 @@ class Direction:
     truncation: float = 0.0
 
     def difference(self, case: Case, integrator: Any, seed: int, spp: int) -> float:
-        """The objective's derivative along the direction."""
+        """Return the finite difference of the objective along the direction."""
         return case.difference(integrator, self.vector, seed, spp, self.step, self.sides)
 
 
 def directions(case: Case, key: str, bounds: tuple[float, float], count: int, seed: int = 3) -> list[Direction]:
-    """Up to `count` directions along which the parameter `key` alone changes, and can without leaving its `bounds`.
+    """Return up to `count` directions that change only the parameter `key` and stay within its `bounds`.
 
-    All entries of the first grow, so that nothing cancels; in the others signs are random. Where some entry is too near
-    to a bound for the largest step, differences are one-sided, and every entry moves away from the bound it is nearer
-    to. Entries are 0.5 to 1 of the width of the bounds, or of the parameter's own size where these are infinite.
+    In the first direction all entries grow, so that nothing cancels. In the others signs are random. If some entry is
+    too near to a bound for the largest step, differences are one-sided, and every entry moves away from its nearer
+    bound. Entries are 0.5 to 1 times the width of the bounds, or times the parameter's size if the bounds are infinite.
     """
     random, found = np.random.default_rng(seed), []
     values, (low, high) = case.initial[key], bounds
@@ -169,7 +167,7 @@ def directions(case: Case, key: str, bounds: tuple[float, float], count: int, se
 
 
 def all_directions(case: Case, selection: Selection, moving: int, others: int) -> dict[str, list[Direction]]:
-    """By parameter, so many of each that moves light, along which it changes smoothly, and of each of the others."""
+    """Return directions by parameter: `moving` smooth ones if it moves light, else `others` as in `directions`."""
     box, found = case.scene.bbox(), {}
     extent = float(np.linalg.norm(np.array(box.max - box.min)))
     for key in case.keys:
@@ -185,7 +183,7 @@ def all_directions(case: Case, selection: Selection, moving: int, others: int) -
 
 
 def choose_step(case: Case, integrator: Any, direction: Direction, seeds: Sequence[int], spp: int) -> Direction:
-    """The same direction with the step of the least error, estimated from differences at these seeds, two at least."""
+    """Return the direction with the step of the smallest estimated error. Needs at least two seeds."""
     samples = {
         step: np.array([replace(direction, step=step).difference(case, integrator, seed, spp) for seed in seeds])
         for step in STEPS
@@ -195,7 +193,7 @@ def choose_step(case: Case, integrator: Any, direction: Direction, seeds: Sequen
         change = samples[larger] - samples[smaller]
         spread = float(change.std(ddof=1))
         changed = abs(float(change.mean())) + spread / np.sqrt(len(seeds))
-        # Kinks make errors that shrink as h does, no slower.
+        # Truncation shrinks at least as fast as h, even at kinks.
         truncation = changed / ((larger / smaller) ** 2 - 1) if changed <= before * smaller / larger else changed
         before = changed
         error = truncation + spread / np.sqrt(PLANNED_SEEDS)
@@ -205,14 +203,18 @@ def choose_step(case: Case, integrator: Any, direction: Direction, seeds: Sequen
 
 
 def natural_bounds(kind: str, values: np.ndarray) -> tuple[float, float]:
-    """What a parameter of this kind (`ParameterInfo.kind`) may be: 0 to 1 for what a BSDF has, where it is so now."""
+    """Return plausible bounds for a parameter of this kind (`ParameterInfo.kind`) with these values.
+
+    The bounds are 0 to 1 if all values are in this range, except for emitters; otherwise 0 to infinity if none is
+    negative.
+    """
     if kind != "emitter" and np.all((values >= 0) & (values <= 1)):
         return 0.0, 1.0
     return (0.0, np.inf) if np.all(values >= 0) else (-np.inf, np.inf)
 
 
 def extrapolated(near: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """Return differences by a step and by twice that, D(h) and D(2 h), without their error of h^2.
+    """Combine differences of a step and of twice the step, D(h) and D(2 h), so that the error of order h^2 cancels.
 
     E(h) = (4 D(h) - D(2 h)) / 3 (L. F. Richardson, 1911).
     """
@@ -220,16 +222,16 @@ def extrapolated(near: np.ndarray, far: np.ndarray) -> np.ndarray:
 
 
 def embed(case: Case, key: str, row: np.ndarray) -> np.ndarray:
-    """A row of one parameter among zeros for the others."""
+    """Return a vector (P,) with the row of one parameter, and zeros for the others."""
     whole = np.zeros(case.size)
     whole[case.places[key]] = row
     return whole
 
 
 class Case:
-    """A scene, or what it is loaded from, seen through one of its sensors; its parameters, and a linear objective.
+    """A scene (or a dictionary to load) with one sensor, parameters, and a linear objective.
 
-    `keys` are of `values`, where these are given, and of the scene otherwise.
+    `keys` are keys of `values` if given, else of the scene.
     """
 
     def __init__(self, scene: Any, keys: Iterable[str], sensor: int = 0, values: Values | None = None) -> None:
@@ -247,7 +249,7 @@ class Case:
         width, height = film.crop_size()
         self.channels = int(film.base_channels_count())
         shape = (int(height), int(width), 1 if self.channels <= 2 else 3)
-        # Mean 1, so that entries do not cancel; random, so that a wrong film position shows.
+        # The mean is 1, so that entries do not cancel. Random weights reveal wrong film positions.
         self.weigh(np.random.default_rng(7).uniform(0.2, 1.8, shape))
 
     def weigh(self, weights: np.ndarray) -> None:
@@ -256,16 +258,16 @@ class Case:
 
     @property
     def adjoint(self) -> Any:
-        """dL/dI, (H, W, C) with as many channels as the film has: none of its alpha counts."""
+        """dL/dI (H, W, C) with the channels of the film. It is 0 for alpha."""
         weights = np.array(self.weights)
         return mi.TensorXf(np.pad(weights, ((0, 0), (0, 0), (0, self.channels - weights.shape[2]))))
 
     def flat(self, key: str) -> np.ndarray:
-        """The parameter's values in a row; colours that are stored by channel come channel by channel."""
+        """Return the parameter's values in a row, in the order of their storage."""
         return np.array(self.values.value(key), dtype=np.float64).ravel()
 
     def shaped(self, key: str, row: np.ndarray) -> Any:
-        """A row of values as the parameter's type."""
+        """Convert a row of values to the parameter's type."""
         now, array = self.values.value(key), np.asarray(row, np.float32)
         kind = type(now)
         if dr.is_tensor_v(kind):
@@ -279,12 +281,12 @@ class Case:
         self.values.hand_over(shaped)
 
     def objective(self, image: Any) -> Any:
-        """sum(image * weights) over the colour channels."""
+        """Return sum(image * weights) over the colour channels."""
         return dr.sum(first_channels(image, self.weights.shape[2]) * self.weights, axis=None)
 
     def gradient(self, integrator: Any, seed: int, spp: int, objective: Callable | None = None,
                  step: Callable = gradient_step, **options: Any) -> np.ndarray:  # fmt: skip
-        """The gradient of all parameters in a row, by one step; `options` are the step's."""
+        """Return the gradient of all parameters in a row, from one step with these `options`."""
         leaves = self.leaves()
         objective = objective or self.objective
         step(integrator, self.scene, self.sensor, objective, seed=seed, spp=spp, params=self.params, **options)
@@ -294,13 +296,13 @@ class Case:
         return np.concatenate(result)
 
     def known_step(self, integrator: Any, scene: Any, sensor: Any, _objective: Any, **options: Any) -> Any:
-        """A step for `gradient` that knows dL/dI before the image."""
+        """Take a step with dL/dI known before the image, for `gradient`."""
         return known_step(integrator, scene, sensor, self.adjoint, **options)
 
     def leaves(self) -> dict[str, Any]:
-        """The parameters with derivatives enabled, handed over to the scene.
+        """Create leaves with derivatives for all parameters, and set them in the scene.
 
-        They are leaves of our own: the scene may put something derived in their place (an environment map pads its
+        The leaves are separate copies: the scene may replace its values by derived ones (an environment map pads its
         columns).
         """
         leaves = {}
@@ -312,30 +314,30 @@ class Case:
         return leaves
 
     def release(self, leaves: dict[str, Any]) -> None:
-        """Have the scene forget the derivatives that `leaves` gave it."""
+        """Detach the scene's values from `leaves`."""
         self.values.hand_over({key: dr.detach(leaf) for key, leaf in leaves.items()})
 
     def gradients(self, integrator: Any, seeds: Iterable[int], spp: int, **step: Any) -> np.ndarray:
-        """Gradients at all seeds: (N, P)."""
+        """Return the gradients at all seeds, (N, P)."""
         return np.stack([self.gradient(integrator, seed, spp, **step) for seed in seeds])
 
     def value(self, integrator: Any, seed: int, spp: int) -> float:
-        """The objective."""
+        """Render an image and return its objective."""
         return self.weighted(self.image(integrator, seed, spp))
 
     def image(self, integrator: Any, seed: int, spp: int) -> np.ndarray:
-        """The image, (H, W, C) float64, without alpha."""
+        """Render an image, (H, W, C) float64, without alpha."""
         image = np.array(render_image(integrator, self.scene, self.sensor, seed, spp), np.float64)
         return image[:, :, : self.weights.shape[2]]
 
     def weighted(self, image: np.ndarray) -> float:
-        """The objective of an image, or its derivative where `image` is one."""
+        """Return the objective of an image, or its derivative if `image` is the derivative of an image."""
         return float(np.sum(image[:, :, : self.weights.shape[2]] * np.array(self.weights)))
 
     def along(self, direction: np.ndarray, tangent: Callable[[], Any]) -> np.ndarray:
-        """What `tangent()` returns, an image, while the parameters carry the tangent `direction` (P,); float64.
+        """Return the image of `tangent()`, float64, while the parameters carry the tangent `direction` (P,).
 
-        For forward mode: `tangent` is to render the derivative of the image along that direction.
+        For forward mode: `tangent` renders the derivative of the image along this direction.
         """
         leaves = self.leaves()
         for key, leaf in leaves.items():
@@ -348,22 +350,22 @@ class Case:
         return image
 
     def tangent(self, integrator: Any, direction: np.ndarray, seed: int, spp: int) -> float:
-        """The objective's derivative along `direction` (P,) in forward mode."""
+        """Return the objective's derivative along `direction` (P,) in forward mode."""
         sensor, opaque = self.scene.sensors()[self.sensor], dr.opaque(mi.UInt32, seed)
         return self.weighted(
             self.along(direction, lambda: integrator.tangent(Job(self.scene, sensor, opaque, spp, self.params)))
         )
 
     def directions(self, count: int, seed: int = 3) -> np.ndarray:
-        """Random directions in the space of parameters, (count, P): entries of size 0.5 to 1, either sign."""
+        """Return random directions in the space of parameters, (count, P): entries of size 0.5 to 1, either sign."""
         random, shape = np.random.default_rng(seed), (count, self.size)
         return random.uniform(0.5, 1.0, shape) * random.choice([-1.0, 1.0], shape)
 
     def difference(self, integrator: Any, direction: np.ndarray, seed: int, spp: int, step: float, sides: str = "both"
                    ) -> float:  # fmt: skip
-        """Finite difference of the objective along `direction`, at common random numbers.
+        """Return the finite difference of the objective along `direction`, at common random numbers.
 
-        `sides`: `both` (second order), or `up` / `down`, also second order, where the domain ends here.
+        `sides` is `both`, or `up` or `down` at the edge of the domain. All are of second order.
         """
         nodes = {"both": (1, -1), "up": (0, 1, 2), "down": (0, -1, -2)}[sides]
         coefficients = {"both": (0.5, -0.5), "up": (-1.5, 2, -0.5), "down": (1.5, -2, 0.5)}[sides]
@@ -377,27 +379,27 @@ class Case:
     def differences(
         self, integrator: Any, directions: np.ndarray, seeds: Iterable[int], spp: int, step: float, sides: str = "both"
     ) -> np.ndarray:
-        """Finite differences along each of K directions at each of N seeds: (N, K)."""
+        """Return finite differences along each of K directions at each of N seeds, (N, K)."""
         fixed = spp, step, sides
         return np.array([[self.difference(integrator, d, seed, *fixed) for d in directions] for seed in seeds])
 
 
 def places(sizes: Mapping[str, int]) -> dict[str, slice]:
-    """Where things of these sizes stand in a row, one behind the other."""
+    """Return the slices of consecutive blocks of these sizes."""
     ends = np.cumsum([0, *sizes.values()]).tolist()
     return {key: slice(*ends[number : number + 2]) for number, key in enumerate(sizes)}
 
 
 def seeds(count: int, block: int = 0) -> range:
-    """`count` seeds; another `block` has others."""
+    """Return `count` seeds. Different blocks have different seeds."""
     return range(1000 * block + 100, 1000 * block + 100 + count)
 
 
 def integrator(name: str, max_depth: int = 4, rr_depth: int = 1000, **options: Any) -> Any:
-    """An integrator without roulette unless asked for, as `gradient_step` takes it."""
+    """Create an integrator for `gradient_step`, by default without roulette."""
     return make_integrator(name, max_depth=max_depth, rr_depth=rr_depth, **options)
 
 
 def relative(a: np.ndarray, b: np.ndarray) -> float:
-    """Relative L2 distance of a from b."""
+    """Return the relative L2 distance of a from b."""
     return float(np.linalg.norm(a - b) / np.linalg.norm(b))

@@ -1,6 +1,7 @@
-"""The methods that measurements compare (`Case`), and what these measure, as their options say it. Knows no Mitsuba.
+"""The methods that measurements compare (`Case`), and the plans of measurements. Does not import Mitsuba.
 
-A list is written as `ptracer,reslrb:reservoir(capacity=4)`. `Sweep` is of `bench`, `Plan` of `convergence`.
+A list of methods looks like `ptracer,reslrb:reservoir(capacity=4)`. `Sweep` is the plan of `bench`, `Plan` that of
+`convergence`.
 """
 
 from __future__ import annotations
@@ -23,40 +24,40 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure import resume_store
 from reslrb_cli.records.measurements import Method
 
-#: Options that a case takes over from the configuration's integrator, where it knows them.
+#: Options that a case inherits from the configuration's integrator if its own integrator has them.
 SHARED = (
     *("rr_depth", "hide_emitters", "samples_per_pass", "attached", "filter_normalization", "attached_sampling"),
     *("sppc", "sppp", "sppi", *UNDECIDED),
 )
 
-#: Options that say which paths there are.
+#: Options that set the kinds of paths.
 PATHS_OPTIONS = ("paths", "light_share")
 
 
 def records_of(paths: str, light_share: Any) -> dict[str, Any]:
-    """`paths` and `light_share` as records have them: a share where there are both kinds of paths and it is known."""
+    """Return `paths` and `light_share` for records. The share is None unless there are both kinds and it is known."""
     known = paths == "both" and isinstance(light_share, (int, float))
     return {"paths": paths, "light_share": float(light_share) if known else None}
 
 
 def paths_in_records(config: Config) -> dict[str, Any]:
-    """Those of an integrator; `auto` where that is left to measurement."""
+    """Return `paths` and `light_share` of an integrator for records; `auto` if the run measures them."""
     options = config.integrator.options()
     usual = "light" if isinstance(config.integrator, LightTracerOptions) else "camera"
     return records_of(str(options.get("paths", usual)), options.get("light_share", UNDECIDED["light_share"]))
 
 
-#: The share of light paths where there are both kinds, and nothing else is asked for.
+#: Default share of light paths if there are both kinds.
 BOTH_SHARE = float(UNDECIDED["light_share"])
 
-#: The estimator of a case that names none, as that of the plugin.
+#: The estimator of a case that names none, as in the plugin.
 PLUGIN_ESTIMATOR = "reservoir"
 
-#: Options of a case that are those of `run`, for itself alone.
+#: Options of `run` that a case can set for itself.
 ADJOINT = ("adjoint", "batches")
 _TYPES = {str(kind.model_fields["type"].default): kind for kind in get_args(get_args(AnyIntegrator)[0])}
 
-#: Options that make an estimator another one, in records.
+#: Options that records show with the estimator's name.
 _ESTIMATOR_OPTIONS = {option for options in ESTIMATOR_OPTIONS.values() for option in options} - {"capacity"}
 _ESTIMATOR_OPTIONS |= set(UNDECIDED)
 
@@ -68,7 +69,7 @@ _ITEM = re.compile(r"(?P<type>\w+)(?::(?P<estimator>\w+))?(?:\((?P<options>.*)\)
 
 @dataclass(frozen=True)
 class Case:
-    """One integrator with its options, at no depth yet; `label` is how the user wrote it, `source` where."""
+    """One integrator with its options, but without a depth. `label` is the user's text, `source` its option."""
 
     label: str
     type: str
@@ -76,27 +77,27 @@ class Case:
     source: str = _OPTION
 
     def at(self, config: Config, max_depth: int, known: bool, auto: bool = False) -> Config:
-        """The experiment with this integrator at this depth. Raises ConfigError where the integrator cannot be.
+        """Return the experiment with this integrator at this depth. Raises ConfigError if the integrator is invalid.
 
-        `known`: dL/dI is, before the image, so that `run.adjoint` has no part in it. `auto`: options may be left to
-        measurement, which whole runs do.
+        `known`: dL/dI is known before the image, so `run.adjoint` has no effect. `auto`: options may be `auto`, as in
+        whole runs.
         """
         blame = f"{self.source} {self.label}"
         adjoint = {name: value for name, value in self.options.items() if name in ADJOINT}
         if known and adjoint:
             raise ConfigError(blame, next(iter(adjoint)), "has no effect where dL/dI is known; change --objective")
         if known:
-            adjoint = {"adjoint": "independent"}  # which goes with any weight
+            adjoint = {"adjoint": "independent"}  # valid with any loss
         shared, own = config.integrator.options(), _TYPES[self.type].model_fields if self.type in _TYPES else {}
         values = {"type": self.type} | {name: shared[name] for name in SHARED if name in shared and name in own}
-        # A run decides these by measurement; a method that is named here does not.
+        # A run chooses these by measurement, but a method has fixed values.
         values = {name: value for name, value in values.items() if name not in UNDECIDED or value != "auto"}
-        if "paths" in self.options:  # a share is of the experiment's own paths
+        if "paths" in self.options:  # the experiment's share belongs to its own paths
             values.pop("light_share", None)
-        if self.type == "custom":  # which paths it has is its own affair
+        if self.type == "custom":  # a user's integrator chooses its own paths
             values.pop("paths", None)
         given = {name: value for name, value in self.options.items() if name not in ADJOINT}
-        if self.type == "custom":  # what is not ours is for the class
+        if self.type == "custom":  # unknown options are arguments of the user's class
             given["arguments"] = {name: given.pop(name) for name in [*given] if name not in own}
         values |= given
         if self.type == "reslrb" and values.setdefault("estimator", PLUGIN_ESTIMATOR) == "auto" and not auto:
@@ -113,7 +114,7 @@ class Case:
 
     @property
     def estimator(self) -> str | None:
-        """Name of the estimator, with the options that make it another than the default one, but for `capacity`."""
+        """Name of the estimator with its non-default options, except `capacity`; None for other integrators."""
         if self.type != "reslrb":
             return None
         name = str(self.options.get("estimator", PLUGIN_ESTIMATOR))
@@ -128,21 +129,21 @@ class Case:
 
 
 def parse_cases(text: str, source: str = _OPTION, deep: bool = True) -> list[Case]:
-    """The cases in a list. Raises ConfigError where one is not written as it must be, or stands there twice.
+    """Parse a list of cases. Raises ConfigError if one has a wrong format or is given twice.
 
-    `source` is the option that the list was given by; `deep`: depths are what is varied. What an option means is not
-    looked at here, but in `Case.at`.
+    `source` is the command-line option of the list. `deep`: the measurement varies depths. `Case.at` checks the options
+    of the cases.
     """
     return _parse(text, source, "", "integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)]", deep)
 
 
 def parse_estimators(text: str) -> list[Case]:
-    """The cases in a list of estimators of `reslrb`, such as `stack,reservoir(capacity=4)`; raises as `parse_cases`."""
+    """Parse a list of estimators of `reslrb`, such as `stack,reservoir(capacity=4)`. Raises like `parse_cases`."""
     return _parse(text, "--estimators", "reslrb:", "estimator; write ESTIMATOR[(OPTION=VALUE,...)]", False)
 
 
 def parse_own(text: str) -> list[Case]:
-    """The cases in a list of a user's own integrators, FILE.py:CLASS[(OPTION=VALUE,...)]; raises as `parse_cases`."""
+    """Parse a list of a user's own integrators, FILE.py:CLASS[(OPTION=VALUE,...)]. Raises like `parse_cases`."""
     cases = _parse(text, _OPTION, "", "integrator of your own; write FILE.py:CLASS[(OPTION=VALUE,...)]", False)
     if others := [case.label for case in cases if case.type != "custom"]:
         reason = f"`{others[0]}` is none of your own (FILE.py:CLASS); estimators of reslrb go with --estimators"
@@ -151,12 +152,12 @@ def parse_own(text: str) -> list[Case]:
 
 
 def all_estimators(config: Config) -> list[Case]:
-    """Every estimator of `reslrb`; that of the configuration has the options that stand there.
+    """Return every estimator of `reslrb`. The configuration's estimator has the options given there.
 
-    Where paths are left to measurement, both kinds of them as well: light paths are what all estimators have.
+    All estimators use light paths. If `paths` is `auto`, a case with both kinds of paths is added.
     """
     cases, own = [], config.integrator
-    camera = isinstance(own, ReslrbConfig) and own.paths == "camera"  # of which there is one estimator alone
+    camera = isinstance(own, ReslrbConfig) and own.paths == "camera"  # only `stack` has camera paths
     for name in ESTIMATOR_OPTIONS:
         if name != "auto" and (name == "stack" or not camera):
             mine = isinstance(own, ReslrbConfig) and own.estimator == name
@@ -199,7 +200,7 @@ def _parse(text: str, source: str, prefix: str, wanted: str, deep: bool) -> list
 
 
 def _split(text: str) -> list[str]:
-    """The parts between commas that stand in no parentheses."""
+    """Split at commas outside of parentheses."""
     parts, depth = [""], 0
     for character in text:
         depth += {"(": 1, ")": -1}.get(character, 0)
@@ -211,45 +212,47 @@ def _split(text: str) -> list[str]:
 
 
 def depths(max_depth: int) -> list[int]:
-    """2, 4, 8, ... up to `max_depth`, which comes last."""
+    """Return 2, 4, 8, ... and finally `max_depth`."""
     powers = [2**k for k in range(1, max_depth.bit_length()) if 2**k < max_depth]
     return [*powers, max_depth]
 
 
-#: What can be swept, and what it is called where a single value of it is named.
+#: Quantities that can be swept, and their names in messages.
 SWEPT = {"depth": "depth", "spp": "spp", "film": "film width", "texture": "texture width"}
 
-#: Samples per pixel that are measured where the user names none, as shares of those of the experiment.
+#: Default sample counts of a sweep, as multiples of the experiment's.
 SHARES = (0.25, 0.5, 1, 2, 4)
 
-#: Widths that are measured where the user names none, in pixels or texels.
+#: Default widths of a sweep, in pixels or texels.
 WIDTHS = {"film": (32, 64, 128, 256), "texture": (16, 64, 256, 1024)}
 
 
 def usual_values(swept: str, config: Config) -> list[int]:
-    """What is measured of anything but depth, where the user names nothing."""
+    """Return the default values of a sweep, except for depths."""
     if swept == "spp":
         return sorted({max(round(share * config.run.spp), 1) for share in SHARES})
     return list(WIDTHS[swept])
 
 
 def with_run(config: Config, **changes: Any) -> Config:
-    """The experiment with other settings of `run`."""
+    """Return the experiment with other settings of `run`."""
     return config.model_copy(update={"run": config.run.model_copy(update=changes)})
 
 
 def code_files(cases: Iterable[Case]) -> dict[str, Path]:
-    """Return the files of integrators of the user's own among `cases`, by label."""
+    """Return the files of the user's own integrators among `cases`, by label."""
     return {case.label: code_file(case.options["file"]) for case in cases if case.type == "custom"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Measurement:
-    """What every measurement by processes has; `memory_limit` is of each, None: none.
+    """The settings common to all measurements that use processes.
 
-    `memory` is what the machine has, in bytes, `device` what computes, in words. `rounds` is None where `budget_s`
-    decides their number; else there are so many, whatever time they take. Of the `cases`, those that cannot do what the
-    scene asks for are left out where they are the `default` ones.
+    - `memory_limit`: the limit of each process in bytes, or None.
+    - `memory`: the machine's memory in bytes.
+    - `device`: the name of the device.
+    - `rounds`: the number of rounds, whatever time they take; None: `budget_s` decides.
+    - `default`: the `cases` are the default list. Cases that do not support the scene are then left out.
     """
 
     config: Config
@@ -263,29 +266,29 @@ class Measurement:
     default: bool = False
     device: str = ""
 
-    #: What is kept says that it is of this.
+    #: The kind of measurement in stored samples.
     KIND: ClassVar[str]
 
     def first(self, config: Config) -> dict[str, Any]:
-        """What a process is told first, to measure `config`."""
+        """Return the first message to a process that measures `config`."""
         return {"config": dump(config), "source": str(config.source), "variant": self.variant,
                 "memory_limit": self.memory_limit, "allow_code": config.allows_code}  # fmt: skip
 
     def settings(self) -> dict[str, Any]:
-        """What has to be the same in all sessions, as JSON has it; see `resume_store.settings`."""
+        """Return the settings that must be the same in all sessions, as JSON; see `resume_store.settings`."""
         labels = [case.label for case in self.cases]
         options = {"integrators": labels, **self._options(), "memory limit": self.memory_limit}
         codes = code_files([*self.cases, *(each for each in vars(self).values() if isinstance(each, Case))])
         return resume_store.settings(self.config, codes, self.variant, self.device, **options)
 
     def _options(self) -> dict[str, Any]:
-        """Those of the command that count among the settings."""
+        """Return the command's options that belong to the settings."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep(Measurement):
-    """What is measured: at each of `values` of what is `swept`, times over those of the `baseline`."""
+    """The plan of `bench`: times at each of `values` of the `swept` quantity, relative to the `baseline`."""
 
     values: Sequence[int]
     swept: str = "depth"
@@ -294,35 +297,34 @@ class Sweep(Measurement):
 
     @property
     def baseline(self) -> Case:
-        """`ptracer` where it is there, or the first."""
+        """`ptracer` if it is among the cases, else the first case."""
         return next((case for case in self.cases if case.type == "ptracer"), self.cases[0])
 
     def _options(self) -> dict[str, Any]:
         return {"values": list(self.values), "objective": self.objective, "sweep": self.swept}
 
     def may_refuse(self, case: Case) -> bool:
-        """Whether the rest goes on without this case, where it refuses the scene."""
+        """Whether the measurement continues without this case if it refuses the scene."""
         return self.default and case != self.baseline
 
     def at(self, case: Case, value: int) -> Config:
-        """The experiment of one case, all but the sizes of film and textures. Raises ConfigError."""
+        """Return the experiment of one case, without changing film and texture sizes. Raises ConfigError."""
         config = with_run(self.config, spp=value) if self.swept == "spp" else self.config
         depth = value if self.swept == "depth" else config.integrator.max_depth
         return case.at(config, depth, known=self.objective == "fixed")
 
     def name(self, *values: int) -> str:
-        """Some values of what is swept, in words: `depth 2, 4`."""
+        """Format values of the swept quantity: `depth 2, 4`."""
         return f"{SWEPT[self.swept]} {', '.join(map(str, values))}"
 
     def check(self) -> None:
-        """Raise ConfigError where an integrator of the list cannot be."""
+        """Raise ConfigError if an integrator of the list is invalid."""
         for case in self.cases:
             for value in self.values if self.swept == "spp" else self.values[:1]:
                 self.at(case, value)
 
 
-#: What is compared where the user names nothing, by what is estimated: the gradient with dL/dI held, that of the
-#: configuration's loss, or the image.
+#: Default cases by objective: the gradient with fixed dL/dI, the gradient of the configuration's loss, or the image.
 DEFAULTS = {
     "fixed": "ptracer,prb,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,reslrb:stack(guiding=on),"
     "reslrb:stack(paths=camera),reslrb:stack(paths=both)",
@@ -330,26 +332,26 @@ DEFAULTS = {
     "image": "ptracer,prb,reslrb:stack,reslrb:stack(paths=camera),reslrb:stack(paths=both)",
 }
 
-#: What errors are taken from where the user names nothing: all light, `both` at a share that nothing is measured for,
-#: where the scene allows it, and else what paths can render it.
+#: Default reference for errors. Its paths are `both`, with a fixed share, if the scene allows it, and otherwise the
+#: paths that can render the scene.
 REFERENCE = "reslrb:stack(paths=auto)"
 
-#: A depth at which roulette never begins.
+#: An `rr_depth` at which Russian roulette never starts.
 NEVER = 1_000_000
 
-#: Images that dL/dI is held at in turn where the loss is the configuration's: the noise of a single one would look like
-#: a bias of those that take dL/dI from images of their own.
+#: Number of images whose dL/dI are used in turn for the configuration's loss. The noise of a single image would look
+#: like a bias of methods that take dL/dI from their own images.
 IMAGES = 8
 
-#: All parameters together.
+#: Key of all parameters together.
 ALL = "all"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plan(Measurement):
-    """What is measured, and what errors are taken from, the `reference`.
+    """The plan of `convergence`. Errors are relative to the `reference`.
 
-    `spps` are samples per pixel of a step, nothing for those of `run`.
+    `spps` are the samples per pixel of a step; empty: those of `run`.
     """
 
     reference: Case
@@ -362,39 +364,43 @@ class Plan(Measurement):
 
     @property
     def known(self) -> bool:
-        """Whether dL/dI is known before the image, or not asked for."""
+        """Whether dL/dI is known before the image, or not needed."""
         return self.objective != "loss"
 
     @property
     def camera(self) -> dict[str, bool]:
-        """Whether paths from the `camera` take part, whether that is so in any case, `named`, and whether those from
-        the `light` alone do, as `survey` asks."""
+        """Arguments of `survey`: which kinds of paths the measurement contains.
+
+        - `camera`: some method may have camera paths.
+        - `named`: this is certain, whatever the scene supports.
+        - `light`: some method has only light paths.
+        """
         spp = self.config.run.spp
         sides = [self._has_camera_paths(self.config_of(case, spp)) for case in self.cases]
-        named = self._has_camera_paths(self.reference_config)  # what errors are taken from is a side too
+        named = self._has_camera_paths(self.reference_config)  # the reference counts, too
         return {"camera": named or any(sides), "named": named or not self.default,
                 "light": not (named and all(sides))}  # fmt: skip
 
     def _has_camera_paths(self, config: Config) -> bool:
-        """Whether an integrator's images lose nothing by the film's border, as far as that is known of it."""
+        """Whether an integrator's images are complete at the film's border, as far as its options tell."""
         return str(paths_in_records(config)["paths"]) != "light"
 
     @property
     def entries(self) -> list[tuple[Case, int]]:
-        """What is compared: cases, each with its samples per pixel."""
+        """The compared cases, each with its samples per pixel."""
         return [(case, spp) for case in self.cases for spp in self.spps or [self.config.run.spp]]
 
     def config_of(self, case: Case, spp: int) -> Config:
-        """The experiment with the integrator of a case, and so many samples per pixel. Raises ConfigError."""
+        """Return the experiment with the integrator of a case and this sample count. Raises ConfigError."""
         return case.at(with_run(self.config, spp=spp), self.config.integrator.max_depth, self.known)
 
     @property
     def reference_config(self) -> Config:
-        """The experiment with the integrator that errors are taken from, dL/dI known. Raises ConfigError."""
+        """The experiment with the reference integrator and known dL/dI. Raises ConfigError."""
         return self.reference.at(self.config, self.config.integrator.max_depth, True, auto=True)
 
     def settled_reference(self, paths: str) -> Case:
-        """What errors are taken from, with these `paths` where that was left to what the scene allows."""
+        """Return the reference, with these `paths` if its own are `auto`."""
         if self.reference.options.get("paths") != "auto":
             return self.reference
         own: dict[str, Any] = {} if paths == "light" else {"paths": paths}
@@ -405,14 +411,14 @@ class Plan(Measurement):
         return replace(self.reference, label=f"{kind}({text})" if text else kind, options=options)
 
     def independent_config(self, name: str) -> Config:
-        """The experiment with a stock integrator: without roulette, which naive AD does not differentiate rightly."""
+        """Return the experiment with a stock integrator. `ptracer` has no roulette, since naive AD would be wrong."""
         depth = self.config.integrator.max_depth
         roulette = depth < 0 or self.config.integrator.rr_depth <= depth
         options = {"rr_depth": NEVER} if name == "ptracer" and roulette else {}
         return Case(name, name, options, "the independent reference").at(self.config, depth, True)
 
     def check(self) -> None:
-        """Raise ConfigError where an integrator of the list, or the reference, cannot be."""
+        """Raise ConfigError if an integrator of the list, or the reference, is invalid."""
         if self.reference.options.get("estimator") == "auto":
             raise ConfigError("--reference", "", "`auto` measures which estimator to take; name one")
         for case, spp in self.entries:
@@ -420,7 +426,7 @@ class Plan(Measurement):
         _ = self.reference_config
 
     def method(self, case: Case, config: Config, spp: int, known: bool, reference: bool) -> Method:
-        """How a case, or a `reference`, stands in records."""
+        """Describe a case, or a `reference`, for records."""
         options: dict[str, Any] = config.integrator.options()
         adjoint = None if known else config.adjoint
         own = {name: value for name, value in case.options.items() if name not in ADJOINT}
@@ -431,7 +437,7 @@ class Plan(Measurement):
 
 
 def compared(integrators: str | None, reference: str | None, usual: str) -> dict[str, Any]:
-    """Return what a `Plan` compares, and takes errors from: lists as written, or the `usual`. Raises ConfigError."""
+    """Return cases and reference of a `Plan` from lists as text, or the defaults (`usual`). Raises ConfigError."""
     cases = parse_cases(integrators or usual, deep=False)
     stands = parse_cases(reference or REFERENCE, "--reference", deep=False)
     if len(stands) != 1:
@@ -440,7 +446,7 @@ def compared(integrators: str | None, reference: str | None, usual: str) -> dict
 
 
 def machine_of(config: Config, memory_limit: int | None) -> dict[str, Any]:
-    """What computes, as a `Measurement` has it: variant, memory, and the limit of each process. Raises ConfigError."""
+    """Return the machine's fields of a `Measurement`: variant, device, memory, and memory limit. Raises ConfigError."""
     variant, _ = choose(config.variant)
     on_gpu, memory = variant.startswith("cuda"), memory_bytes(variant)
     if on_gpu and memory_limit is not None:

@@ -1,1 +1,1 @@
-"""What a scene's files say, before Mitsuba makes objects of it: read, named, mended, checked, and built."""
+"""Scene files before Mitsuba makes objects of them: reading, mending, checks, and building."""

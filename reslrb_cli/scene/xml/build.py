@@ -1,4 +1,4 @@
-"""The way from a scene's elements to Mitsuba's objects, by its own parser, and from their parameters back."""
+"""Building of Mitsuba's objects from elements with Mitsuba's own parser, and the map from parameters to elements."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.xml.mend import Note
 from reslrb_cli.scene.xml.read import Description, Element, quoted, tag_lines
 
-#: Elements, by what Mitsuba makes of them.
+#: Mitsuba's class for each tag.
 _KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "shape": "Shape", "texture": "Texture"}
 
 
 class Owners:
-    """The elements of a description by the ids of their objects, for the way back from a parameter to its element."""
+    """The elements of a description by the ids of their objects, to find the element of a parameter."""
 
     def __init__(self, root: Element) -> None:
         self._elements = root.by_id()
 
     def place(self, params: mi.SceneParameters, key: str) -> tuple[Element, list[str]] | None:
-        """The element of the nearest object above the parameter `key` that has one, and the names that lead on.
+        """Return the element of the nearest object above the parameter `key`, and the remaining names of the key.
 
-        None of a parameter that nothing in the files is above of. `params` are those of a scene that was built from
-        the description.
+        Returns None if no object above the parameter has an element. `params` are those of a scene built from the
+        description.
         """
         chain = [params.properties[key][2]]
         while chain[-1].id() not in self._elements:
@@ -46,15 +46,15 @@ class Owners:
         return owner, names
 
     def _nested(self, owner: Element, name: str, node: mi.Object) -> Element | None:
-        """The element, among those in `owner`, of the object `node` that Mitsuba calls `name` there.
+        """Return the child element of `owner` for the object `node`, which Mitsuba calls `name` there.
 
-        Some objects lose their ids, as bitmaps do; those in a group have none.
+        This works without ids: some objects, such as bitmaps, lose them, and objects in a group have none.
         """
         tag = next((tag for tag, kind in _KINDS.items() if isinstance(node, getattr(mi, kind))), None)
         unnamed: list[Element] = []
         for item in owner.children:
             meant = self._elements.get(item.id, item) if item.tag == "ref" else item
-            has_own_id = owner.type == "shapegroup" and meant.id  # by which it is found
+            has_own_id = owner.type == "shapegroup" and meant.id  # `place` finds it by its id
             if meant.tag == tag and item.name in (name, "") and not has_own_id:
                 if item.name:
                     return meant
@@ -69,17 +69,17 @@ _ORIGIN = re.compile(r"\[[\w.]+(:\d+)?\]\s*")
 #: "At string (line 3, col 7): " and the like, before the message proper.
 _PREAMBLE = re.compile(r"^(At|Error while loading|While loading) .*?\(line \d+, col \d+\):? ?")
 _PLACE = re.compile(r"\(line (\d+), col \d+\)")
-#: What Mitsuba says of a mesh without faces.
+#: Mitsuba's message about a mesh without faces.
 _NO_FACES = re.compile(r"Storing new normals in a Mesh that didn't have normals.*")
-#: Parameters of one object for which names that are like theirs are looked for.
+#: Maximum number of unused parameters of one object for which similar names are searched.
 _HINTS = 30
 
 
 def _place_textures(root: Element) -> None:
-    """Move each texture right below `root` into the place of the first reference to it; other references stay.
+    """Move each texture directly below `root` to the place of the first reference to it. Other references stay.
 
-    Mitsuba lists the parameters of what stands right below the scene as the scene's own, by the id of a texture, which
-    some lose: nothing would say that they are properties of a material or a light.
+    Otherwise Mitsuba would list its parameters as the scene's own, by the texture's id, which some textures lose.
+    Nothing would show that they belong to a material or a light.
     """
     textures = {child.id: child for child in root.children if child.tag == "texture" and child.id}
     for alias in root.walk("alias"):
@@ -98,15 +98,15 @@ def _place_textures(root: Element) -> None:
 
 
 def build(description: Description) -> tuple[Any, list[Note]]:
-    """The Mitsuba object that a description stands for, and notes on parameters that no plugin asked for.
+    """Build the Mitsuba object of a description. Return it with notes on parameters that no plugin uses.
 
-    Nothing is merged: all parameters keep their names. Raises ConfigError, located, for what Mitsuba refuses.
+    Nothing is merged, so all parameters keep their names. Raises ConfigError, located, if Mitsuba refuses the scene.
     """
     _place_textures(description.root)
     text = _Text(description.root)
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
-    config.unused_properties = mi.LogLevel.Debug  # they are looked for below
+    config.unused_properties = mi.LogLevel.Debug  # `_unused` reports them
     with looking_in(description.folders):
         try:
             state = mi.parser.parse_string(config, text.xml)
@@ -118,24 +118,24 @@ def build(description: Description) -> tuple[Any, list[Note]]:
 
 
 class _Text:
-    """A description as XML, one tag a line, and which element each line comes from."""
+    """A description as XML with one tag per line, and the element of each line."""
 
     def __init__(self, root: Element) -> None:
         self._root = root
         lines, elements = zip(*tag_lines(root), strict=True)
         self._elements: tuple[Element, ...] = elements
-        #: Kept for as long as the parser's state, which refers to it.
+        #: Must live as long as the parser's state, which refers to it.
         self.xml = "\n".join(lines)
         self._starts = [0]
         for line in lines:
             self._starts.append(self._starts[-1] + len(line.encode("utf-8")) + 1)
 
     def element_at(self, offset: int) -> Element:
-        """The element at that byte of `xml`."""
+        """Return the element at a byte offset of `xml`."""
         return self._elements[bisect.bisect_right(self._starts, offset) - 1]
 
     def located(self, message: str) -> ConfigError:
-        """Mitsuba's message as one located line, without the places in its own sources and in `xml`."""
+        """Convert Mitsuba's message to one line located in the scene's files instead of Mitsuba's sources and `xml`."""
         place = _PLACE.search(message)
         element = self._elements[int(place[1]) - 1] if place else None
         text = _ORIGIN.sub("", message).strip()
@@ -147,7 +147,7 @@ class _Text:
 
 
 def _unused(props: mi.Properties, element: Element) -> list[Note]:
-    """Notes on what `element` gives its plugin, and the plugin did not ask for."""
+    """Return notes on parameters of `element` that its plugin does not use."""
     notes: list[Note] = []
     unnamed = [child for child in element.children if not child.name and (child.is_object or child.tag == "ref")]
     for name in props.unqueried():

@@ -1,6 +1,6 @@
-"""The refusals of what a scene's files must not say, before Mitsuba sees any of it.
+"""Checks of a scene's description before Mitsuba parses it.
 
-These are plugins that are not Mitsuba's, files that never end, and sizes for which the machine has no room.
+They refuse plugins that are not Mitsuba's own, files that never end, and sizes that exceed the memory.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.images import DamagedImage, image_size
 from reslrb_cli.scene.xml.read import Description, Element, quoted
 
-#: Plugins of Mitsuba 0.6 that Mitsuba 3 does not have, and what comes near them.
+#: Plugins of Mitsuba 0.6 that Mitsuba 3 does not have, with substitutes.
 LOST_PLUGINS = {
     **dict.fromkeys((("bsdf", "coating"), ("bsdf", "roughcoating")), "`principled` with a clearcoat comes near"),
     ("bsdf", "mixturebsdf"): "nested `blendbsdf` say the same",
@@ -40,25 +40,25 @@ LOST_PLUGINS = {
     ("texture", "vertexcolors"): "`mesh_attribute` says the same",
 }
 
-#: Plugins that Mitsuba 3 has, and that no scene file can use here.
+#: Plugins that Mitsuba 3 has, or whose name it has, but that scene files cannot use here.
 REFUSED_PLUGINS = {
     ("shape", "hair"): "is a plugin of Mitsuba 0.6 that Mitsuba 3 does not have; `bsplinecurve` draws strands",
     ("shape", "blender"): "reads the memory of a running Blender; export the mesh as `ply` or `obj`",
     ("sensor", "flat_sensor"): "belongs to Mitsuba's own RayDataLoader; take a `perspective` one",
 }
 
-#: Parameters without which a plugin reads memory that is not its own.
+#: Parameters without which a plugin reads memory out of bounds.
 _NEEDED = {"bitmap": "filename", "normalmap": "normalmap"}
 _VECTORS = ("point", "vector", "translate", "scale", "rotate")
 _NUMBERS = ("float", "rgb", "spectrum", "matrix", "lookat", *_VECTORS)
-#: Mitsuba reads these as numbers.
+#: Words that Mitsuba reads as non-finite numbers.
 _NOT_FINITE = re.compile(r"(?i)(?<![\w.])[-+]?(nan|inf|infinity)(?!\w)")
-#: Lines, or objects, that one message names.
+#: Maximum number of lines that one message names.
 _SHOWN = 5
 
 
 def check(description: Description) -> None:
-    """Raise ConfigError, located by file and line, for what must not reach Mitsuba's parser."""
+    """Raise ConfigError, located by file and line, if the description is not safe for Mitsuba's parser."""
     for element in description.root.walk():
         if element.is_object:
             _check_plugin(description.root, element)
@@ -71,8 +71,7 @@ def check(description: Description) -> None:
 
 
 def _check_plugin(root: Element, element: Element) -> None:
-    """Refuse an object of another plugin than Mitsuba's, or without what Mitsuba takes to be there, and reads memory
-    that is not its own."""
+    """Refuse plugins that are not Mitsuba's, and objects without a part that Mitsuba would read out of bounds."""
     tag, type = element.tag, element.type
     if (refused := REFUSED_PLUGINS.get((tag, type))) is not None:
         raise element.fail("", f"{tag} `{type}` {refused}")
@@ -88,8 +87,10 @@ def _check_plugin(root: Element, element: Element) -> None:
 
 
 def _check_numbers(element: Element) -> None:
-    """Refuse what is no number, a colour or a place that is infinite, of which nothing comes that is finite, and a
-    vector that is given in two ways, or by a number of numbers; Mitsuba would not say where."""
+    """Refuse NaN, infinite colours and positions, and vectors given in two ways or by two or more than three numbers.
+
+    Mitsuba would not report their location.
+    """
     for name, text in element.attributes.items():
         bad = _NOT_FINITE.search(text) if name not in ("id", "name", "filename", "type") else None
         if bad is not None and (element.tag != "float" or bad[1].lower() == "nan"):
@@ -115,15 +116,17 @@ def _unknown_plugin(root: Element, element: Element) -> ConfigError:
 
 
 def _object_type(tag: str) -> mi.ObjectType:
-    """Mitsuba's word for what an element is."""
+    """Return Mitsuba's object type of a tag."""
     others = {"bsdf": "BSDF", "phase": "PhaseFunction", "rfilter": "ReconstructionFilter", "spectrum": "Texture"}
     return getattr(mi.ObjectType, others.get(tag, tag.capitalize()))
 
 
 @dataclass(frozen=True)
 class FilmSize:
-    """Width and height of a film in pixels, how many of them its crop window has, and channels of a pixel; 0 pixels
-    where the file does not say."""
+    """Width and height of a film in pixels, pixels in its crop window, and channels per pixel.
+
+    Sizes are 0 if the file does not give them.
+    """
 
     width: int
     height: int
@@ -132,12 +135,12 @@ class FilmSize:
 
 
 def film_sizes(description: Description) -> list[FilmSize]:
-    """What the scene's films say of their sizes."""
+    """Return the sizes of the scene's films."""
     return [_size_of(film) for film in description.root.walk("film")]
 
 
 def _size_of(film: Element) -> FilmSize:
-    """What a film says of its size; what is no number there, Mitsuba refuses."""
+    """Return the size of a film. Ignores values that are not numbers: Mitsuba refuses them."""
     values = {child.name: child.value.strip() for child in film.children}
     numbers = {name: int(value[:20]) for name, value in values.items() if value.isdecimal()}
     width, height = numbers.get("width", 0), numbers.get("height", 0)
@@ -147,14 +150,17 @@ def _size_of(film: Element) -> FilmSize:
 
 
 def check_files(description: Description) -> None:
-    """Raise ConfigError, located by file and line, for files that are missing, damaged or too large."""
+    """Raise ConfigError, located by file and line, if a file is missing, damaged or too large."""
     for _, element, name in description.named_files():
         if (wrong := _wrong_file(name, description)) is not None:
             raise element.fail("material" if element.name == "material" else "filename", wrong)
 
 
 def _wrong_file(name: str, description: Description) -> str | None:
-    """Say what is wrong with a file: missing, a pipe or a device, which might never end, or not a whole image."""
+    """Return what is wrong with a file; None if nothing is.
+
+    Finds missing files, pipes and devices (which might never end), and images that are damaged or too large.
+    """
     path = description.find_file(name)
     if path is None:
         looked = "" if os.path.isabs(name) else f"; looked for in {', '.join(map(str, description.folders))}"
@@ -166,18 +172,18 @@ def _wrong_file(name: str, description: Description) -> str | None:
     except DamagedImage as error:
         return str(error)
     except ConfigError:
-        return None  # no image, or none that we know
+        return None  # not an image, or of an unknown format
     if width * height > PIXELS:
         return f"{path} is {width}x{height} pixels; more than {PIXELS} are not read"
     return None
 
 
-#: What of a film says how many pixels it has.
+#: Parameters of a film that set its size.
 _SIZES = ("width", "height", "crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
 
 
 def resize_films(root: Element, size: tuple[int, int]) -> None:
-    """Give the film of every sensor below `root` this (width, height) in pixels, and no crop window."""
+    """Set the films of all sensors below `root` to this (width, height) in pixels, and remove crop windows."""
     for sensor in root.walk("sensor"):
         films = [child for child in sensor.children if child.tag == "film"]
         if not films:

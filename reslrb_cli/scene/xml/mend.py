@@ -1,13 +1,11 @@
-"""The mending of what other versions of Mitsuba and exporters for them wrote, where Mitsuba 3 can say it, and of ids.
+"""Conversion of scene files of other Mitsuba versions and exporters to Mitsuba 3, and stable ids.
 
-Mitsuba names an object without an id by its address in memory, which differs each time that the scene is loaded. Its
-lasting name is its kind, and its number among all of that kind.
+Mitsuba names an object without an id by its address in memory, which differs at each load. `mend` gives it an id made
+of its kind and its number among all objects of this kind. The notes that it returns say what was mended or left out.
 
-Notes say what was mended, or left out, so that a scene could be loaded; tables, how those versions and exporters say
-what Mitsuba 3 says in another way. The plugins `regular`, `irregular` and `blackbody` can be evaluated by wavelength
-alone, which RGB variants lack. Of the same spectrum written as `<spectrum value="400:0.1, 700:0.9"/>` Mitsuba computes
-the colour, by the CIE's matching functions: that of light where it is what an emitter emits, elsewhere that of a
-surface under D65.
+The plugins `regular`, `irregular` and `blackbody` need wavelengths, which RGB variants lack. `mend` writes them as
+`<spectrum value="400:0.1, 700:0.9"/>`, for which Mitsuba computes a colour with the CIE matching functions: the colour
+of light for emitters, and otherwise the colour of a surface under D65.
 """
 
 from __future__ import annotations
@@ -25,15 +23,15 @@ from reslrb_cli.backend.installation import is_known
 from reslrb_cli.scene.images import decode_srgb
 from reslrb_cli.scene.xml.read import Description, Element, quoted
 
-#: Lines that one warning names, and warnings of one scene.
+#: Maximum number of lines that one warning names, and of warnings per scene.
 _LINES, _WARNINGS = 5, 30
 
 
 @dataclass(frozen=True)
 class Note:
-    """One thing in a scene's files that Mitsuba would refuse: `wrong` says what, `done` what was made of it.
+    """A part of a scene's files that Mitsuba would refuse: what is `wrong`, and what was `done` about it.
 
-    `owner` is the object that has the element among its children and no use for it, where that is what is wrong.
+    `owner` is the parent of an element that its plugin does not use; None for other notes.
     """
 
     element: Element
@@ -43,7 +41,7 @@ class Note:
 
 
 def _in_order(notes: Iterable[Note], root: Element) -> list[Note]:
-    """The notes in the order of lines, those on the file of `root` first."""
+    """Sort notes by file and line, with the file of `root` first."""
 
     def place(note: Note) -> tuple[bool, str, int]:
         source = note.element.source
@@ -53,7 +51,7 @@ def _in_order(notes: Iterable[Note], root: Element) -> list[Note]:
 
 
 def warnings(notes: Sequence[Note], root: Element) -> list[str]:
-    """A line for each kind of thing, located where it is first met."""
+    """Return one line per kind of note, located at its first occurrence."""
     kinds: dict[tuple[str, str, object], list[Element]] = {}
     for note in _in_order(notes, root):
         kinds.setdefault((note.wrong, note.done, note.element.source.file), []).append(note.element)
@@ -68,10 +66,10 @@ def warnings(notes: Sequence[Note], root: Element) -> list[str]:
     return lines
 
 
-#: Spellings of elements.
+#: Elements with another name in Mitsuba 3.
 ELEMENTS = {"lookAt": "lookat", "srgb": "rgb"}
 _BEFORE_04 = "an element of Mitsuba before 0.4, whose axes pointed elsewhere; save the scene with Mitsuba 0.6"
-#: Elements of Mitsuba 0.x that mean what Mitsuba 3 cannot be told, and what to do.
+#: Elements of Mitsuba 0.x that Mitsuba 3 cannot express, with the reason and a remedy.
 LOST_ELEMENTS = {
     **dict.fromkeys(("camera", "luminaire"), _BEFORE_04),
     "subsurface": "an element of Mitsuba 0.6 that Mitsuba 3 does not have; remove it, or take a medium",
@@ -79,7 +77,7 @@ LOST_ELEMENTS = {
     "animation": "an element of Mitsuba 0.6; nothing moves in Mitsuba 3: write one of its transforms",
 }
 
-#: Attributes of elements other than objects.
+#: Attributes of elements that are not objects.
 ATTRIBUTES = {
     **dict.fromkeys(("float", "integer", "boolean", "string", "rgb"), ("name", "value")),
     **dict.fromkeys(("point", "vector"), ("name", "value", "x", "y", "z")),
@@ -95,19 +93,19 @@ ATTRIBUTES = {
 
 OBJECT_ATTRIBUTES = ("type", "id", "name")
 
-#: Plugins by other names, for elements of one kind.
+#: Plugins with another name in Mitsuba 3, by tag and old name.
 PLUGINS = {
     ("bsdf", "bump"): "bumpmap",
     **{("film", name): "hdrfilm" for name in ("exrfilm", "pngfilm", "ldrfilm", "tiledhdrfilm", "mfilm")},
 }
 
-#: Objects without which the same light reaches the same film, and what takes their place.
+#: Objects that do not affect the light on the film, and what replaces them.
 REPLACEABLE = {
     "sampler": "an `independent` one takes its place",
     "rfilter": "the film's default takes its place",
 }
 
-#: Values of text parameters, by plugin and parameter.
+#: Renamed values of text parameters, by plugin and parameter.
 VALUES = {
     ("bitmap", "filter_type"): {"trilinear": "bilinear", "ewa": "bilinear"},
     ("hdrfilm", "pixel_format"): {
@@ -118,7 +116,7 @@ VALUES = {
     },
 }
 
-#: Formats of files that `hdrfilm` knows; nothing here is written by the film, so that another can be left out.
+#: File formats that `hdrfilm` knows. Others can be left out, since films write no files here.
 FORMATS = {
     "file_format": frozenset({"openexr", "exr", "rgbe", "pfm"}),
     "component_format": frozenset({"float16", "float32", "uint32"}),
@@ -126,20 +124,20 @@ FORMATS = {
 
 
 def snake_case(name: str) -> str:
-    """A parameter's name as it is spelled since Mitsuba 2: `toWorld` is `to_world`, `intIOR` is `int_ior`."""
+    """Convert a parameter's name to the spelling since Mitsuba 2: `toWorld` to `to_world`, `intIOR` to `int_ior`."""
     return re.sub(r"(?<=[a-z])[A-Z]+", lambda capitals: "_" + capitals[0].lower(), name)
 
 
-#: Spectra by wavelength, by plugin.
+#: Plugins of spectra by wavelength.
 SPECTRA = ("regular", "irregular", "blackbody")
-#: Wavelengths, in nm, of what Mitsuba takes for visible, how far apart a black body's are taken, and how many at most.
+#: Mitsuba's visible range in nm; for black bodies, the step in nm and the maximum number of steps.
 _VISIBLE, _STEP, _MOST = (360.0, 830.0), 5.0, 2**14
-#: Planck's constant times the speed of light squared, twice (W m^2), and times it over Boltzmann's (m K), as Mitsuba's.
+#: Planck's law: 2 h c^2 (W m^2) and h c / k_B (m K), with Mitsuba's constants.
 _FIRST, _SECOND = 2 * 6.62607004e-34 * 2.99792458e8**2, 6.62607004e-34 * 2.99792458e8 / 1.38064852e-23
 
 
 def _floats(text: str) -> list[float]:
-    """The numbers of a list of them; none where one is no number."""
+    """Parse a list of numbers. Returns an empty list if any is not a number."""
     try:
         return [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
@@ -147,7 +145,7 @@ def _floats(text: str) -> list[float]:
 
 
 def hexadecimal(element: Element) -> str:
-    """The three numbers of `#rrggbb`, each a fraction of 255. Raises ConfigError where it is none."""
+    """Return the three numbers of `#rrggbb`, each divided by 255. Raises ConfigError if the format differs."""
     text = element.value.strip()
     if re.fullmatch(r"#[0-9a-fA-F]{6}", text) is None:
         raise element.fail(element.name, f"must be a colour such as #80ff00, not {quoted(text)}")
@@ -155,7 +153,7 @@ def hexadecimal(element: Element) -> str:
 
 
 def linear(element: Element) -> str:
-    """The value of an <srgb> element, one or three numbers or `#rrggbb`, as linear Rec. 709. Raises ConfigError."""
+    """Convert an <srgb> element (one or three numbers, or `#rrggbb`) to linear Rec. 709. Raises ConfigError."""
     text = element.value
     encoded = _floats(hexadecimal(element) if text.strip().startswith("#") else text)
     if len(encoded) not in (1, 3):
@@ -164,9 +162,9 @@ def linear(element: Element) -> str:
 
 
 def by_wavelength(spectrum: Element, owner: Element) -> dict[str, str]:
-    """The attributes of the <spectrum> that says what a plugin of `SPECTRA` says, as a parameter of `owner`.
+    """Return the attributes of a <spectrum> element equal to a plugin of `SPECTRA`, as a parameter of `owner`.
 
-    Raises ConfigError where it is no spectrum, or a black body that is not what an emitter emits.
+    Raises ConfigError if the plugin is not a valid spectrum, or is a black body outside of an emitter.
     """
     inner = spectrum.find("value")
     if spectrum.type == "blackbody":
@@ -189,19 +187,19 @@ def by_wavelength(spectrum: Element, owner: Element) -> dict[str, str]:
 
 
 def _black_body(spectrum: Element) -> tuple[np.ndarray, np.ndarray]:
-    """Wavelengths in nm, and the radiance of a black body in W/(m^2 sr nm)."""
+    """Return wavelengths in nm, and the radiance of a black body in W/(m^2 sr nm)."""
     temperature = _numbers(spectrum, "temperature")
     if len(temperature) > 1 or temperature[0] <= 0:
         raise spectrum.fail("temperature", "must be a number of kelvin above 0")
     first, last = _range(spectrum, _VISIBLE)
     nm = np.linspace(first, last, min(math.ceil((last - first) / _STEP), _MOST) + 1)
     exponent = _SECOND / (1e-9 * nm * temperature[0])
-    # Beyond 700 it is 0 to a float, and the other overflows.
+    # Above 700 the radiance is 0 in single precision, and expm1 overflows.
     return nm, 1e-9 * _FIRST / ((1e-9 * nm) ** 5 * np.expm1(np.minimum(exponent, 700)))
 
 
 def _range(spectrum: Element, default: Sequence[float]) -> tuple[float, float]:
-    """The ends of the wavelengths, in nm: those of `default` where they are not given, and there is one."""
+    """Return the range of wavelengths in nm. Missing ends come from `default`, if there is one."""
     names = ("wavelength_min", "wavelength_max")
     low, high = (
         default[place] if default and spectrum.find(name) is None else _numbers(spectrum, name)[0]
@@ -213,7 +211,7 @@ def _range(spectrum: Element, default: Sequence[float]) -> tuple[float, float]:
 
 
 def _numbers(spectrum: Element, name: str) -> np.ndarray:
-    """The numbers of a parameter, one or more, none of them negative or not finite."""
+    """Return the numbers of a parameter. Raises ConfigError if there are none, or any is negative or not finite."""
     if (parameter := spectrum.find(name)) is None:
         raise spectrum.fail("", f"{spectrum.type} needs a parameter `{name}`")
     numbers = np.array(_floats(parameter.value))
@@ -223,14 +221,14 @@ def _numbers(spectrum: Element, name: str) -> np.ndarray:
 
 
 def transform_coordinates(texture: Element) -> Element | None:
-    """Write what a texture says of `uscale` and its like as the transform that they mean; return the first of them."""
+    """Replace `uscale`, `voffset` and so on of a texture by a `to_uv` transform. Return the first of them, or None."""
     names = ("uoffset", "voffset", "uscale", "vscale")
     given = {child.name: child for child in texture.children if child.tag == "float" and child.name in names}
     if not given:
         return None
     first = next(iter(given.values()))
     steps = []
-    for tag, word in (("translate", "offset"), ("scale", "scale")):  # in their order
+    for tag, word in (("translate", "offset"), ("scale", "scale")):  # the order of the steps matters
         axes = {axis: given[u + word].value for axis, u in (("x", "u"), ("y", "v")) if u + word in given}
         steps += [first.new(tag, **axes)] if axes else []
     texture.drop(*given)
@@ -238,21 +236,20 @@ def transform_coordinates(texture: Element) -> Element | None:
     return first
 
 
-#: Plugins that name what they hold by its place among the others, in every load alike.
+#: Plugins that name their children by position, which is the same at every load.
 _GROUPS = ("shapegroup", "batch")
-#: How the ids begin that Mitsuba gives to objects without one when it writes a scene; it takes them for none.
+#: Prefix of the ids that Mitsuba writes for objects without an id. It ignores them when it reads a scene.
 _UNNAMED = "_unnamed_"
-#: Characters of an id that is kept: keys become names of files.
+#: Maximum length of an id: keys become file names.
 _LONGEST = 120
 
 
 def _name_objects(root: Element) -> list[Note]:
-    """Give every object below `root` an id that is there in every load of the same files; say whose ids were changed.
+    """Give every object below `root` an id that is the same at every load. Return notes on changed ids.
 
-    The third `sphere` of the files becomes `Sphere_3`, whether or not the first two have ids. An id that Mitsuba could
-    not use in a key is replaced: one that is empty, starts with `_unnamed_`, is very long or holds what cannot be
-    printed, or is that of an earlier object. References follow. Raises ConfigError where a reference is to an id of two
-    objects that differ.
+    The third `sphere` of the files becomes `Sphere_3`, whether or not the first two have ids. Ids that cannot be used
+    in a key are replaced: empty, very long or unprintable ones, those that start with `_unnamed_`, and those of an
+    earlier object. References are updated. Raises ConfigError if a reference names the id of two objects that differ.
     """
     root.attributes.pop("id", None)
     objects = root.objects()[1:]
@@ -299,7 +296,7 @@ def _name_objects(root: Element) -> list[Note]:
 
 
 def _same(a: Element, b: Element) -> bool:
-    """Whether two elements, their ids aside, say the same."""
+    """Whether two elements are equal except for their ids."""
     one, other = ({**element.attributes, "id": ""} for element in (a, b))
     return (
         (a.tag, one, len(a.children)) == (b.tag, other, len(b.children))
@@ -311,11 +308,11 @@ CURRENT_VERSION = "3.0.0"
 
 
 def mend(description: Description) -> list[Note]:
-    """Bring the elements of a scene to Mitsuba 3's spelling, in place; say what its parser would have refused.
+    """Convert the elements of a scene to Mitsuba 3 in place. Return notes on parts that its parser would refuse.
 
-    What Mitsuba itself upgrades, in files of before version 2, is brought over without a word. Materials, lights and
-    shapes keep their meaning: those that Mitsuba 3 does not have stay as they are, to be refused. Parameters that no
-    plugin asks for show only when the scene is built.
+    Conversions that Mitsuba itself makes for files from before version 2 have no notes. Materials, lights and shapes
+    keep their meaning: those that Mitsuba 3 does not have stay as they are, and are refused later. Unused parameters
+    are found only when the scene is built.
     """
     mender, root = _Mender(description), description.root
     mender.notes += _name_objects(root)
@@ -327,7 +324,7 @@ def mend(description: Description) -> list[Note]:
         mender.mend_element(root)
     mender.mend_below(root)
     mender.mend_spectra(root)
-    # What refers to something that was left out goes with it.
+    # Remove references to objects that were left out.
     for element in root.walk() if mender.gone else ():
         element.children[:] = [child for child in element.children if child.tag != "ref" or child.id not in mender.gone]
     root.attributes["version"] = CURRENT_VERSION
@@ -344,11 +341,11 @@ class _Mender:
         self.notes.append(Note(element, wrong, done))
 
     def mend_below(self, element: Element) -> None:
-        """Mend all below `element`, which is mended itself."""
+        """Mend all elements below `element`, which must be mended already."""
         kept = []
         names = {child.name for child in element.children}
         for child in element.children:
-            # In place of a scene's integrator there is the experiment's own.
+            # The experiment's integrator replaces that of the scene.
             is_kept = child.tag != "integrator" and self.mend_element(child)
             if not is_kept or (child.is_object and not self._plugin(child)):
                 self.gone.update(other.id for other in child.objects())
@@ -367,7 +364,7 @@ class _Mender:
     # --- elements and plugins -----------------------------------------------------------------------------------------
 
     def mend_element(self, element: Element) -> bool:
-        """Mend tag and attributes; False where the element is to be left out."""
+        """Mend tag and attributes. Return False if the element must be left out."""
         tag = element.tag
         if tag == "srgb":
             element.attributes["value"] = linear(element)
@@ -386,13 +383,13 @@ class _Mender:
         return True
 
     def _plugin(self, element: Element) -> bool:
-        """Mend the name of an object's plugin; False where the object is to be left out."""
+        """Mend the name of an object's plugin. Return False if the object must be left out."""
         type = element.type
         wrong = f"there is no {element.tag} {quoted(type)} in Mitsuba 3"
         other = PLUGINS.get((element.tag, type), type.lower())
         if is_known(type):
             if element.tag == "sampler" and type != "independent":
-                # Others round the number of samples, which is the experiment's, and fail where it is split otherwise.
+                # Other samplers round the sample count, which the experiment sets, and fail if it is split differently.
                 element.attributes["type"] = "independent"
                 element.children[:] = [child for child in element.children if child.name == "sample_count"]
         elif is_known(other):
@@ -406,10 +403,12 @@ class _Mender:
     # --- parameters ---------------------------------------------------------------------------------------------------
 
     def _parameter(self, element: Element, owner: Element, names: set[str]) -> bool:
-        """Mend the name and the value of a parameter of `owner`, whose parameters have these `names`; False where it is
-        to be left out."""
+        """Mend the name and the value of a parameter of `owner`, whose parameters have these `names`.
+
+        Returns False if the parameter must be left out.
+        """
         if owner.tag == "scene" and element.is_object:
-            # A name says nothing here, but of two objects with the same one Mitsuba drops the first.
+            # Names have no meaning here, but Mitsuba drops the first of two objects with the same name.
             element.attributes.pop("name", None)
             return True
         self._name(element, owner, names)
@@ -426,7 +425,7 @@ class _Mender:
         old, name = element.name, snake_case(element.name)
         if owner.type == "diffuse" and name == "diffuse_reflectance":
             name = "reflectance"
-        # An attribute of a mesh has a name of the user's own.
+        # Users choose the names of mesh attributes.
         is_attribute = owner.tag == "shape" and old.startswith(("vertex_", "face_"))
         if name == old or is_attribute or name in names:
             return
@@ -437,11 +436,11 @@ class _Mender:
     def _text(self, element: Element, owner: Element, value: str) -> bool:
         wrong = f"{owner.type} has no {element.name} {quoted(value)} in Mitsuba 3"
         if owner.type == "hdrfilm" and value.lower() not in FORMATS.get(element.name, (value.lower(),)):
-            self.note(element, wrong, "left out")  # images are written without it
+            self.note(element, wrong, "left out")  # the film writes no files here
             return False
         other = VALUES.get((owner.type, element.name), {}).get(value)
         if (owner.type, element.name) == ("hdrfilm", "pixel_format") and "," in value:
-            other = value.partition(",")[0].strip()  # one for each of several images
+            other = value.partition(",")[0].strip()  # a list has one format per image; keep the first
         if element.name == "filename" and "\\" in value and self.find_file(value) is None:
             slashed = value.replace("\\", "/")
             if self.find_file(slashed) is not None:
@@ -452,7 +451,7 @@ class _Mender:
         return True
 
     def _repetitions(self, owner: Element) -> None:
-        """Of parameters that are given more than once keep the last, as Mitsuba 0.6 did."""
+        """Keep only the last of parameters that are given more than once, as in Mitsuba 0.6."""
         last: dict[str, Element] = {}
         dropped: set[Element] = set()
         for child in owner.children:
@@ -464,7 +463,7 @@ class _Mender:
         owner.children[:] = [child for child in owner.children if child not in dropped]
 
     def mend_spectra(self, root: Element) -> None:
-        """Write spectra by wavelength as parameters of what has them, since RGB variants have no such plugins."""
+        """Replace plugins of spectra by <spectrum> parameters, since RGB variants cannot evaluate the plugins."""
         named = {id: item for id, item in root.by_id().items() if item.type in SPECTRA}
         for owner in [element for element in root.objects() if element.type != "specfilm"]:
             kept = []

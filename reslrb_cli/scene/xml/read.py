@@ -1,6 +1,6 @@
-"""Scene files as elements: read, included files and variables put in, and written for Mitsuba's parser.
+"""Scene files as elements: reading, with includes and variables resolved, and XML for Mitsuba's parser.
 
-Each element knows the file and the line that it comes from.
+Each element knows its file and line.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from xml.sax.saxutils import quoteattr
 from reslrb_cli.config.files import read_file
 from reslrb_cli.errors import ConfigError
 
-#: Elements that are objects, made by plugins; a <spectrum> with a type is one, too.
+#: Tags of objects, which plugins create. A <spectrum> with a type is also an object.
 OBJECTS = frozenset(
     (
         *("scene", "sensor", "film", "sampler", "rfilter", "integrator", "emitter"),
@@ -25,36 +25,36 @@ OBJECTS = frozenset(
     )
 )
 
-#: Elements that are values of parameters; a <spectrum> without a type is one, too.
+#: Tags of parameter values. A <spectrum> without a type is also a value.
 VALUES = frozenset(("float", "integer", "boolean", "string", "point", "vector", "rgb", "transform"))
-#: Characters of a quotation.
+#: Maximum length of a quotation.
 _QUOTED = 60
 
 
 def quoted(text: str, mark: str = "`") -> str:
-    """What a file says, as it can stand in a message: not too long, and nothing in it that a terminal would obey."""
+    """Quote text from a file for a message: shortened, and with terminal control characters escaped."""
     text = text if len(text) <= _QUOTED else text[: _QUOTED - 3] + "..."
     return f"{mark}{text if text.isprintable() else repr(text)[1:-1]}{mark}"
 
 
 @dataclass(frozen=True)
 class Source:
-    """One file of a scene; `version` is that of Mitsuba which it says that it was written for, None without one."""
+    """One file of a scene, and the Mitsuba `version` that it declares, or None."""
 
     file: Path
     version: tuple[int, ...] | None
 
     @property
     def is_old(self) -> bool:
-        """Whether it was written for Mitsuba before 2, which spelled parameters in another way."""
+        """Whether the file is for a Mitsuba before version 2, which spelled parameters differently."""
         return self.version is not None and self.version < (2,)
 
 
 @dataclass(slots=True, eq=False)
 class Element:
-    """One element, with its attributes and children in their order.
+    """An XML element with its attributes and children in their order.
 
-    `written` is its name as the file has it, where that is another.
+    `written` is its name in the file if mending has changed the name.
     """
 
     tag: str
@@ -66,52 +66,52 @@ class Element:
 
     @property
     def place(self) -> str:
-        """File and line, as errors name them."""
+        """File and line, for errors."""
         return f"{self.source.file}:{self.line}"
 
     @property
     def is_object(self) -> bool:
-        """Whether a plugin is to be made of it."""
+        """Whether the element is an object, which a plugin creates."""
         return self.tag in OBJECTS or (self.tag == "spectrum" and "type" in self.attributes)
 
     @property
     def is_value(self) -> bool:
-        """Whether it is the value of a parameter."""
+        """Whether the element is the value of a parameter."""
         return self.tag in VALUES or (self.tag == "spectrum" and "type" not in self.attributes)
 
     @property
     def name(self) -> str:
-        """The name of the parameter that it is, or empty."""
+        """The name of the parameter, or ""."""
         return self.attributes.get("name", "")
 
     @property
     def value(self) -> str:
-        """What it says that it is, or empty."""
+        """The attribute `value`, or ""."""
         return self.attributes.get("value", "")
 
     @property
     def file_attribute(self) -> str:
-        """The attribute that names a file, empty where none does; Mitsuba's plugins read files by `filename` alone."""
+        """The attribute that names a file, or "". Mitsuba's plugins read files only from `filename`."""
         if self.tag == "spectrum":
             return "filename" if self.attributes.get("filename") else ""
         return "value" if self.tag == "string" and self.name == "filename" else ""
 
     @property
     def id(self) -> str:
-        """Its own id, or the one that it refers to; empty where it has none."""
+        """The element's id, or the id that it refers to, or ""."""
         return self.attributes.get("id", "")
 
     @property
     def type(self) -> str:
-        """The name of its plugin; empty where it has none."""
+        """The name of the plugin, or ""."""
         return self.attributes.get("type", "scene" if self.tag == "scene" else "")
 
     def fail(self, key: str, message: str) -> ConfigError:
-        """The error for this element."""
+        """Return a ConfigError located at this element."""
         return ConfigError(self.place, key, message)
 
     def walk(self, *tags: str) -> Iterator[Element]:
-        """This element and all below it, in the order of the file; those with one of `tags`, where any are given."""
+        """Yield this element and all below it, in the order of the file, optionally only those with one of `tags`."""
         waiting = [self]
         while waiting:
             element = waiting.pop()
@@ -120,11 +120,11 @@ class Element:
             waiting += reversed(element.children)
 
     def objects(self) -> list[Element]:
-        """The objects among them: the nodes that Mitsuba's parser makes, in its order."""
+        """Return all objects of `walk`: the nodes of Mitsuba's parser, in its order."""
         return [element for element in self.walk() if element.is_object]
 
     def by_id(self) -> dict[str, Element]:
-        """The objects among them by their ids, and by the aliases of these."""
+        """Return all objects of `walk` by their ids and aliases."""
         found = {element.id: element for element in self.objects() if element.id}
         for alias in self.walk("alias"):
             if alias.id in found:
@@ -132,20 +132,20 @@ class Element:
         return found
 
     def find(self, name: str) -> Element | None:
-        """The first parameter of this name."""
+        """Return the first parameter with this name, or None."""
         return next((child for child in self.children if child.name == name), None)
 
     def drop(self, *names: str) -> None:
-        """Remove the parameters of these names."""
+        """Remove the parameters with these names."""
         self.children[:] = [child for child in self.children if child.name not in names]
 
     def new(self, tag: str, /, *children: Element, **attributes: str) -> Element:
-        """An element that stands where this one does, and is not among its children."""
+        """Return a new element with the location of this one. It is not added to the children."""
         return Element(tag, attributes, self.source, self.line, list(children))
 
 
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
-#: An ampersand that begins none of XML's own references: Mitsuba's parser takes it for itself.
+#: An ampersand that does not start an XML reference. Mitsuba's parser reads it literally.
 _BARE_AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[0-9a-fA-F]+);)")
 _DECLARED_ENCODING = re.compile(rb"""^\s*<\?xml[^>]*\bencoding\s*=\s*["']([\w.-]+)["']""")
 
@@ -157,7 +157,7 @@ def read_document(file: Path) -> Element:
 
 
 def _decode(data: bytes) -> str:
-    """The text of a file; Mitsuba's parser takes bytes that are not of their encoding as they come."""
+    """Decode the text of a file. Never fails, since Mitsuba's parser also accepts bytes of a wrong encoding."""
     declared = _DECLARED_ENCODING.match(data)
     encodings = ["utf-8-sig", *([declared[1].decode("ascii")] if declared else [])]
     for encoding in ["utf-16"] if data.startswith((b"\xff\xfe", b"\xfe\xff")) else encodings:
@@ -187,23 +187,24 @@ def _parse(file: Path, text: str) -> Element:
 
 
 def _version(text: str) -> tuple[int, ...] | None:
-    """A version as numbers; None where there is none, or it is not three numbers, which Mitsuba asks for."""
+    """Parse a version; None unless it is three numbers, as Mitsuba requires."""
     return tuple(map(int, text.split("."))) if re.fullmatch(r"\d+\.\d+\.\d+", text) else None
 
 
-#: A `$` that stands for no other sign, and what may be the name of a variable behind it: longer ones are never found.
+#: An unescaped `$`, and the text after it that may be the name of a variable, at most 256 characters.
 _VARIABLE = re.compile(r"(?<!\\)\$([^$]{0,256})")
-#: Includes within one another; that of Mitsuba's parser.
+#: Maximum depth of nested includes, as in Mitsuba's parser.
 MAX_INCLUDE_DEPTH = 15
 
 
 @dataclass
 class Description:
-    """A scene as its files describe it, with nothing left to include or to put in.
+    """A scene as described by its files, with all includes and variables resolved.
 
-    `folders` are those in which the files that it names are looked for, first to last; `variables` are the values of
-    its `$name` variables, those that it has itself among them. `hides_emitters`: whether the integrator that it names,
-    of which nothing else is kept, leaves lights out of the picture. `files` are the XML files that were read.
+    - `folders`: the search path for the files that it names.
+    - `variables`: the values of its `$name` variables, including the scene's own defaults.
+    - `hides_emitters`: whether its integrator hides emitters. Nothing else of the integrator is used.
+    - `files`: the XML files that were read.
     """
 
     root: Element
@@ -213,13 +214,14 @@ class Description:
     files: list[Path]
 
     def find_file(self, name: str) -> Path | None:
-        """The file or folder that Mitsuba opens by this name: the first in `folders`, or what it says by itself."""
+        """Return the file or folder that Mitsuba opens for this name, or None. Searches `folders` first."""
         return _find(name, self.folders)
 
     def named_files(self) -> Iterator[tuple[Element, Element, str]]:
-        """Yield the name of each file that Mitsuba opens for the scene, after the object and the element that name it.
+        """Yield the object, the element and the file name for each file that Mitsuba opens for the scene.
 
-        A metal's `material` names two tables of Mitsuba's own; files in `folders` take their place.
+        The `material` of a metal names two of Mitsuba's own tables. They are included if files in `folders` replace
+        them.
         """
         for owner in self.root.walk():
             for element in owner.children:
@@ -231,10 +233,10 @@ class Description:
 
 
 def read_description(file: Path, options: Mapping[str, str]) -> Description:
-    """Read the scene in `file` and all that it includes; `options` are the values of its `$name` variables.
+    """Read the scene in `file` and all files that it includes. `options` are the values of its `$name` variables.
 
-    Raises ConfigError, located by file and line, for what cannot be read, for variables without a value, and for
-    options without a variable.
+    Raises ConfigError, located by file and line, if a file cannot be read, a variable has no value, or an option has no
+    variable.
     """
     reader = _Reader(dict(options), set(options))
     folders = [file.absolute().parent]
@@ -246,15 +248,18 @@ def read_description(file: Path, options: Mapping[str, str]) -> Description:
         names = quoted(", ".join(f"${name}" for name in options if name in reader.unused), "")
         raise ConfigError(file, names, "is set in scene.options, but the scene file does not use it")
     said = [value for child in root.children if child.tag == "integrator" for value in child.walk()]
-    # In the spelling of any version.
+    # Accept the spelling of any version.
     hides = any(each.name in ("hide_emitters", "hideEmitters") and each.value.strip() == "true" for each in said)
     return Description(root, folders, reader.values, hides, reader.files)
 
 
 @dataclass
 class _Reader:
-    """What the files of one scene share: the `values` of variables by name, those that the user gives, and the files'
-    defaults as they are met."""
+    """State shared by the files of one scene.
+
+    `values` holds variables by name: those that the user gives, and defaults in the order of the files. `unused` are
+    the user's variables that no file has used so far.
+    """
 
     values: dict[str, str]
     unused: set[str]
@@ -262,7 +267,7 @@ class _Reader:
     files: list[Path] = field(default_factory=list)
 
     def read(self, file: Path, folders: list[Path], include: Element | None) -> Element:
-        """The root of `file`, complete. `folders` grows by what its <path> elements name."""
+        """Return the root of `file` with includes and variables resolved. Adds folders of <path> to `folders`."""
         if include is not None and self.including + 1 >= MAX_INCLUDE_DEPTH:
             raise include.fail("", f"files are included more than {MAX_INCLUDE_DEPTH} levels deep")
         try:
@@ -279,9 +284,9 @@ class _Reader:
         return root
 
     def _complete(self, element: Element, root: Element, folders: list[Path]) -> None:
-        """Put variables into `element` and all below it, and what is included in the place of its includes."""
+        """Resolve variables and includes in `element` and all elements below it."""
         if element.tag == "spectrum" and "filename" in element.attributes:
-            # Mitsuba opens it while it parses, from the folder of the file that is being parsed.
+            # Mitsuba opens this file during parsing, relative to the folder of the parsed file.
             name = element.attributes["filename"]
             element.attributes["filename"] = str(_find(name, folders) or name)
         children: list[Element] = []
@@ -301,14 +306,14 @@ class _Reader:
         element.children[:] = children
 
     def _put_variables(self, element: Element) -> None:
-        """Replace the variables in the attributes of `element`. Raises ConfigError for one without a value."""
+        """Replace the variables in the attributes of `element`. Raises ConfigError if one has no value."""
         for key, text in element.attributes.items():
             if "$" in text:
                 element.attributes[key] = self._replace(text, element)
 
     def _replace(self, text: str, element: Element) -> str:
         def value_of(found: re.Match[str]) -> str:
-            """The value of the longest name: one may be the beginning of another."""
+            """Return the value of the longest matching name, since one name may be a prefix of another."""
             behind = found[1]
             name = next((behind[:n] for n in range(len(behind), 0, -1) if behind[:n] in self.values), None)
             if name is None:
@@ -325,13 +330,13 @@ class _Reader:
         return element.fail(f"${name}", message)
 
     def _include(self, include: Element, folders: list[Path]) -> list[Element]:
-        """What stands in the place of `include`: the objects of a scene, or the one object that a file holds."""
+        """Return the elements that replace `include`: the objects of a scene, or the single object of a file."""
         here = [include.source.file.absolute().parent, *folders]
         if (file := _find(_required(include, "filename"), here)) is None:
             raise include.fail("", f"included file {quoted(include.attributes['filename'])} not found")
         root = self.read(file, here, include)
         if root.type == "scene":
-            # Parameters of the included <scene> itself, and references right below it, are nobody's: so with Mitsuba.
+            # Drop parameters of the included <scene> itself and references directly below it, as Mitsuba does.
             return [child for child in root.children if not child.is_value and child.tag != "ref"]
         root.attributes.pop("version", None)
         root.attributes.pop("name", None)
@@ -348,7 +353,7 @@ def _required(element: Element, attribute: str) -> str:
 
 def _find(name: str, folders: Sequence[Path]) -> Path | None:
     places = [*(folder / name for folder in folders), Path(name)]
-    return next((path for path in places if os.path.exists(path)), None)  # False of a name that is too long, too
+    return next((path for path in places if os.path.exists(path)), None)  # False for too long names, too
 
 
 def _folder(element: Element, folders: list[Path]) -> Path:
@@ -360,8 +365,8 @@ def _folder(element: Element, folders: list[Path]) -> Path:
 
 
 def tag_lines(element: Element, depth: int = 0) -> Iterator[tuple[str, Element]]:
-    """The XML of `element` and all below it, a tag a line, each with the element that it belongs to."""
-    # `$` begins a variable for Mitsuba's parser; here all are put in already.
+    """Yield the XML of `element` and all below it, one tag per line, each with its element."""
+    # Escape `$`, which starts a variable in Mitsuba's parser. All variables are resolved already.
     attributes = "".join(f" {key}={quoteattr(value)}" for key, value in element.attributes.items())
     indent, end = "    " * depth, "" if element.children else "/"
     yield f"{indent}<{element.tag}{attributes.replace('$', chr(92) + '$')}{end}>", element
