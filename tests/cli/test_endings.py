@@ -46,7 +46,7 @@ def test_a_signal_ends_a_run_after_the_iteration(optimize, during, number):
     assert read_content(RUN)["results"]["iterations"] == len(read_metrics(RUN)) == 2
     *_, ending, advice = out.splitlines()
     assert ending.startswith("interrupted after 2 iterations")
-    assert advice == f"next: `reslrb optimize --resume {RUN}` goes on from here"
+    assert advice == f"next: `reslrb optimize --resume {RUN}` continues this run"
 
 
 @pytest.mark.parametrize(("name", "call"), [("write_image", 0), ("write_parameters", 2), ("write_image", 2)])

@@ -231,7 +231,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
     done("lens", folder / "p.exr", "-o", folder / "lens", "--pixels", "16")
     sets = [f"run.output={folder}/runs", "run.iterations=1", "run.spp=4", "run.final_spp=4", "run.certainty=false"]
     said = done("optimize", folder / "lens/lens.yaml", *(word for line in sets for word in ("--set", line))).output
-    assert "runs/lens -o FOLDER` makes the solid" in said  # what comes next
+    assert "runs/lens -o FOLDER` writes the solid" in said  # what comes next
     return folder / "runs/lens"
 
 
