@@ -403,7 +403,7 @@ def test_usual_values() -> None:
         (("--sweep", "film", "--max-depth", "4"), "--max-depth: goes with --sweep depth; take --set integrator.max"),
         (("--values", "2", "--max-depth", "4"), "--max-depth: does not go with --values"),
         (("--sweep", "size"), "'size' is not one of 'depth', 'spp', 'film', 'texture'"),
-        (("--sweep", "spp", "--values", "4,4"), "`4,4` names a number twice"),
+        (("--sweep", "spp", "--values", "4,4"), "`4,4` has a number twice"),
         (("--sweep", "spp", "--integrators", "ptracer(max_depth=3)"), "all share one max_depth"),
     ],
 )
