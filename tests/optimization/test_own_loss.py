@@ -231,7 +231,7 @@ def test_a_later_nan_is_a_run_s_own_affair(experiment: Path, capsys: pytest.Capt
     with pytest.raises(SystemExit) as ended:
         main(["inspect", "runs/a/config.yaml", "--nonfinite"])
     assert ended.value.code == 2
-    assert "--nonfinite: runs no code of your own, which loss.file names" in capsys.readouterr().err
+    assert "--nonfinite: does not run your own code, which loss.file names" in capsys.readouterr().err
 
 
 def test_a_later_nan_of_a_function_names_it_and_leaves_the_folder_whole(experiment: Path) -> None:
