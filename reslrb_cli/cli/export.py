@@ -1,4 +1,4 @@
-"""`reslrb export`: write a run's scene with its recovered values for plain Mitsuba, and the solid of a lens or mirror."""
+"""`reslrb export`: write a run's scene with recovered values for plain Mitsuba, and the solid of a lens or mirror."""
 
 from __future__ import annotations
 

@@ -232,7 +232,7 @@ def command(
         raise ConfigError("--directions", "", "needs --missing")
     place = None if cluster is None else Place.parse(cluster)
     if missing and place is not None:
-        raise ConfigError("--cluster", "", "has no effect with --missing, which uses one process; remove one of them")
+        raise ConfigError("--cluster", "", "has no effect with --missing, which distributes nothing; remove one")
     check_writable("--json", json_file)
     if suite is not None:
         if option := _given(CONFIGURED):
