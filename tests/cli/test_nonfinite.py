@@ -284,7 +284,7 @@ def test_the_run_s_own_step_is_traced_again(spoilt_experiment, capsys):
     optimize(capsys, STOP, "scene.options={wall: spoilt.exr}")
     command = ("inspect", "runs/config/config.yaml", "--nonfinite")
     code, _, err = reslrb_nonfinite(capsys, *command, "--set", "run.spp=4")
-    assert (code, err) == (2, "--set: does not go with --nonfinite, which traces the run's own step again\n")
+    assert (code, err) == (2, "--set: has no effect with --nonfinite, which repeats a step of the run\n")
     wall = Path("spoilt.exr").read_bytes()
     Path("spoilt.exr").write_bytes(Path("wall.exr").read_bytes())
     code, _, err = reslrb_nonfinite(capsys, *command)

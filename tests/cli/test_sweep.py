@@ -310,7 +310,7 @@ def test_ctrl_c_ends_it_after_the_iteration_with_folders_complete(folder, monkey
     words = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", RATES, "-o", "s"]
     result = reslrb(*words)
     assert result.exit_code == 130
-    assert "interrupted, 0 of 2 runs done; look at s/sweep.html; `reslrb sweep --resume s` goes on" in result.output
+    assert "interrupted, 0 of 2 runs done; look at s/sweep.html; `reslrb sweep --resume s` continues" in result.output
     run = Path("s/learning_rate=0.02-seed=0")
     assert tiny.faults(run, 130, "") == []
     assert "finished, 2 of 2 runs done" in tiny.done(*words).output
@@ -356,9 +356,9 @@ def wait_for(happened, seconds=60.0):
 def test_a_process_that_crashes_is_told_by_its_last_words(monkeypatch):
     for end, code, said in (
         ("print('>>> no room'); print('x'); sys.stdout.flush(); os.kill(os.getpid(), 9)", -9,
-         "ended by SIGKILL (the system ends so what takes too much memory): no room"),
+         "ended by SIGKILL (often sent when memory runs out): no room"),
         ("print('a.yaml: wrong'); sys.exit(2)", 2, "a.yaml: wrong"),
-        ("sys.exit(4)", 4, "ended with exit code 4, and said nothing"),
+        ("sys.exit(4)", 4, "ended with exit code 4, without a message"),
         ("time.sleep(60)", 130, "ended by SIGTERM: "),
     ):  # fmt: skip
         monkeypatch.setattr(sweep, "_PROGRAM", f"import os, sys, time; {end}")
