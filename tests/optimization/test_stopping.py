@@ -185,7 +185,7 @@ def test_a_run_whose_time_was_up_goes_on_with_more(experiment: Path, capsys: pyt
 
 @pytest.mark.parametrize(
     ("more", "line"),
-    [("run.stages=[{until: 0.5, film: 0.5}]", "run.max_seconds: does not go with run.stages")],
+    [("run.stages=[{until: 0.5, film: 0.5}]", "run.max_seconds: cannot be combined with run.stages")],
 )  # fmt: skip
 def test_what_counts_iterations_does_not_go_with_a_time(tmp_path: Path, more: str, line: str) -> None:
     with pytest.raises(ConfigError, match=line):
