@@ -279,8 +279,8 @@ def check_stages(stages: list[Stage]) -> None:
     """Raise a located error if stages are out of order, or one is coarser than the stage before it."""
     for place, (before, stage) in enumerate(pairwise(stages), 1):
         if stage.until <= before.until:
-            raise located(f"run.stages[{place}].until", f"must be above {before.until:g}, the value of the previous stage")
+            raise located(f"run.stages[{place}].until", f"must be above {before.until:g}, that of the previous stage")
         for name in ("resolution", "film"):
             if getattr(stage, name) < getattr(before, name):
-                reason = f"must be at least {getattr(before, name):g}, the value of the previous stage"
+                reason = f"must be at least {getattr(before, name):g}, that of the previous stage"
                 raise located(f"run.stages[{place}].{name}", reason)

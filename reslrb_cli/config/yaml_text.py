@@ -152,7 +152,7 @@ def _problem(error: yaml.MarkedYAMLError, text: str, example: Callable[[str], st
     if word is not None and "alias" in problem:
         quoted = f'"{word[0]}"'
         mended = quoted if example is None else example(text[: word.start()] + quoted + text[word.end() :])
-        return f"{word[0]} is an unknown alias in YAML; put text that begins with * in quotes: {mended}"
+        return f"{word[0]} is an alias in YAML, but undefined; put text that begins with * in quotes: {mended}"
     if "'\\t' that cannot start any token" in problem:
         return "not valid YAML: a tab; YAML allows only spaces for indentation and after a colon"
     hint = "; put text that begins with it in quotes" if "cannot start any token" in problem else ""

@@ -358,7 +358,7 @@ def test_an_export_is_that_of_the_command(folder: Path) -> None:
     assert scene == Path("mine/scene.xml")
     assert scene.read_bytes() == Path("command/scene.xml").read_bytes()
     assert tiny.files(Path("mine")) == tiny.files(Path("command"))
-    with pytest.raises(rl.ConfigError, match="folder: mine exists; name a folder that does not exist yet"):
+    with pytest.raises(rl.ConfigError, match="folder: mine exists; give a new or empty folder"):
         rl.export(run.folder, "mine")
     # and a run's folder is an experiment, which begins where that is
     assert np.array_equal(rl.render(run.folder, spp=8)[0], rl.render("tiny.yaml", 8, run.parameters)[0])

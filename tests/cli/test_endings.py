@@ -139,7 +139,7 @@ def test_a_part_that_fails_leaves_the_others_alone(optimize, monkeypatch, part):
     [line] = lines(err)
     assert line == content["error"]
     kept = 0 if part == "checkpoint" else 5
-    assert line.startswith(f"runs/tiny/x: No space left on device; kept: the state after {kept} of 5 iterations, in ")
+    assert line.startswith(f"runs/tiny/x: No space left on device; saved: the state after {kept} of 5 iterations, in ")
     with np.load(RUN / "checkpoint" / "state.npz") as state:
         assert int(state["iteration"]) == kept
 
@@ -435,7 +435,7 @@ def test_what_is_in_a_folder_is_removed_and_what_can_be_kept_is(optimize, during
     assert (code, faults(RUN, code, err), out) == (6, [], "")
     [line] = lines(err)
     assert "runs/tiny/metrics.jsonl: has been removed while the run went on; " in line
-    assert "; kept: the state after 3 of 3 iterations, in " in line
+    assert "; saved: the state after 3 of 3 iterations, in " in line
     assert line.endswith("runs/tiny/checkpoint")
     content = read_content(RUN)
     assert (content["status"], content["error"], content["results"]["iterations"]) == ("failed", line, 3)

@@ -153,7 +153,7 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
         target("{render: {}, color_space: srgb}"),
         "target.color_space: has no effect",
     ),
-    "truth of a rendered target": (target("{render: {}, truth: true}"), "target.truth: has no effect on a rendered target"),
+    "truth of a rendered target": (target("{render: {}, truth: true}"), "target.truth: has no effect on a rendered"),
     "colour space unknown": (
         target("{file: a.png, color_space: sRGB}"),
         "target.color_space: must be one of auto, linear, srgb (did you mean srgb?)",

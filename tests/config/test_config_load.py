@@ -318,7 +318,7 @@ WRONG = {
     "no resolution": ("{heightmap: {mesh: a}}", ("parameters[0].heightmap.resolution: missing",)),
     "resolution of one": ("{heightmap: {mesh: a, resolution: [1, 4]}}", ("heightmap.resolution: must be at least",)),
     "huge": ("{heightmap: {mesh: a, resolution: [99999, 99999]}}", ("heightmap.resolution: must be at least",)),
-    "resolution outside": (f"{{{MAP}, resolution: [4, 4]}}", ("parameters[0].resolution: has no effect here; set `heightmap",)),
+    "resolution outside": (f"{{{MAP}, resolution: [4, 4]}}", ("parameters[0].resolution: has no effect here",)),
     "motion with a resolution": (f"{{{LENS}, resolution: [4, 4]}}", ("parameters[0].resolution: has no effect",)),
     "word misspelt": (
         f"{{{LENS}, bounds: {{rotaton: [0, 1]}}}}",

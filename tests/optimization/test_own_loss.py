@@ -227,7 +227,7 @@ def test_a_later_nan_is_a_run_s_own_affair(experiment: Path, capsys: pytest.Capt
     assert json.loads(Path("runs/a/manifest.json").read_text())["status"] == "failed"
     [line] = [each for each in lines(capsys.readouterr().err) if "not finite" in each]
     assert f"the loss (your own `{experiment}/own.py:own`); dL/dI" in line
-    assert "look at what your own code returns, which `reslrb inspect --nonfinite` does not run" in line
+    assert "check what your own code returns; `reslrb inspect --nonfinite` does not run it" in line
     with pytest.raises(SystemExit) as ended:
         main(["inspect", "runs/a/config.yaml", "--nonfinite"])
     assert ended.value.code == 2
