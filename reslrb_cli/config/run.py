@@ -38,7 +38,7 @@ def check_name(name: str) -> str:
     """Return `name` if it can name a run. Raises an error that says what is wrong otherwise."""
     folder = folder_name(name)
     if _PATH.search(name.strip()):
-        raise wrong("must be a name, not a path; set run.output to choose the folder")
+        raise wrong("must be a name and not a path; set run.output to choose the folder")
     if not folder:
         raise wrong("must contain a letter or a digit")
     if _RESERVED.fullmatch(folder):

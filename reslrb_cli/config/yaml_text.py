@@ -76,7 +76,7 @@ def _construct_float(loader: Loader, node: yaml.ScalarNode) -> float:
 
 def _refuse(loader: Loader, node: yaml.Node) -> None:
     tag = node.tag.replace(_TAG, "!!")
-    raise loader.fail(node.start_mark, f"not valid YAML: a configuration cannot contain the tag {tag}")
+    raise loader.fail(node.start_mark, f"not valid YAML: the tag {tag} is not allowed in a configuration")
 
 
 Loader.add_implicit_resolver(f"{_TAG}null", re.compile(r"(~|null|Null|NULL)?$"), ["~", "n", "N", ""])

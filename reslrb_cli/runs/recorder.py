@@ -242,7 +242,7 @@ class Recording:
             write_report(self.folder.path)
         except Exception as error:
             if failure is None:
-                logger.warning("the page was not written: %s; other results are in %s", describe(error), self.folder.path)
+                logger.warning("the page was not written: %s; the rest is in %s", describe(error), self.folder.path)
             with contextlib.suppress(OSError):  # the previous page shows the run as still running
                 (self.folder.path / "report.html").unlink(missing_ok=True)
         remove_parts(self.folder.path)

@@ -273,7 +273,7 @@ def _check_same(folder: Path, kept: Sweep, plan: Plan) -> None:
     here = [(each.name, each.settings) for each in plan.sweep.combinations]
     if there != here:
         what = ", ".join(dict.fromkeys([*kept.keys, *plan.sweep.keys])) or "nothing"
-        raise ConfigError(folder, "", f"contains a sweep with other settings ({what}); {advice}")
+        raise ConfigError(folder, "", f"has a sweep with other settings or values ({what}); {advice}")
     if kept.seeds[0] != plan.sweep.seeds[0]:
         reason = f"is {plan.sweep.seeds[0]}, and {kept.seeds[0]} in the sweep in {folder}; {advice}"
         raise ConfigError(plan.sweep.config, "run.seed", reason)

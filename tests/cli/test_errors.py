@@ -208,7 +208,7 @@ REFUSED = {
     ),
     "record": (
         [f"integrator={TRAJECTORY}"],
-        "integrator.max_depth: must be less than 65536, not 70000: the record of a path has room for as many vertices",
+        "integrator.max_depth: must be less than 65536, not 70000: the record of a path has one entry for each vertex",
     ),
 }
 

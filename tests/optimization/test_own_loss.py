@@ -197,7 +197,7 @@ def test_a_file_that_cannot_be_run(experiment: Path, capsys: pytest.CaptureFixtu
 @pytest.mark.parametrize(
     ("file", "words"),
     [("own.py", "must be FILE.py:NAME"), ("own.txt:own", "must be FILE.py:NAME"),
-     ("'own.py:a b'", "must be FILE.py:NAME"), ("gone.py:own", "no such file"), ("null", "missing: FILE.py:NAME")],
+     ("'own.py:a b'", "must be FILE.py:NAME"), ("gone.py:own", "no such file"), ("null", "missing; give FILE.py:NAME")],
 )  # fmt: skip
 def test_a_name_that_is_none(experiment: Path, capsys: pytest.CaptureFixture[str], file: str, words: str) -> None:
     assert run(f"{{type: custom, file: {file}}}", "--allow-code") == 2
