@@ -1,7 +1,7 @@
-"""The command line: `main` finds the commands, `run` is the program, which is `main` under signals.
+"""Command line: `main` is the group of commands, and `run` is the program, which also handles signals.
 
-`main` is the one place where an error becomes an exit code. Each command is one module here that holds a click command
-named `command`; it is loaded when it is called.
+`main` is the only place where an error becomes an exit code. Each command is a module of this package with a click
+command named `command`; it is loaded when it is called.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from reslrb_cli.cli.terminal import Interrupts, LogLines, tell
 from reslrb_cli.errors import LINE_LENGTH, ExitCode, one_line
 from reslrb_cli.version import __version__
 
-# What `reslrb --help` says of each command, so that it need not load them; in the order of a user's work.
+# Summaries for `reslrb --help`, which does not load the commands; in the order of a user's work.
 _SUMMARIES = {
     "example": "Copy an experiment that comes with the program.",
     "init": "Write a configuration for a scene, to begin with.",
@@ -39,12 +39,12 @@ _SUMMARIES = {
     "doctor": "Say which backend is in use, and what is missing.",
 }
 
-#: The variable by which a shell asks what a line may go on with, as click makes it of the program's name.
+#: Environment variable with which a shell requests completions; click derives it from the program's name.
 COMPLETE_VARIABLE = "_RESLRB_COMPLETE"
 
 
 class _Main(click.Group):
-    """Loads commands by name, and maps every error that a user can cause to one line and an exit code."""
+    """Group that loads commands by name and turns every user error into one line and an exit code."""
 
     debug = False
 
@@ -77,8 +77,8 @@ class _Main(click.Group):
         standalone_mode: bool = True,
         **extra: Any,
     ) -> Any:
-        """Runs the command line `args` and exits with its code; `standalone_mode=False` hands errors through."""
-        if not standalone_mode or os.environ.get(COMPLETE_VARIABLE):  # by which a shell asks: the answer is in bytes
+        """Run the command line `args` and exit with its code; `standalone_mode=False` lets errors through."""
+        if not standalone_mode or os.environ.get(COMPLETE_VARIABLE):  # completions are bytes, not lines
             return super().main(args, prog_name, complete_var, standalone_mode=False, **extra)
         self.debug = os.environ.get("RESLRB_DEBUG", "0") not in ("", "0")
         try:
@@ -96,7 +96,7 @@ class _Main(click.Group):
 
 
 def _explained(error: BaseException) -> BaseException:
-    """Return an error that says what to do in place of a removed option; other errors as they are."""
+    """Return an error that names the replacement of a removed option; return other errors unchanged."""
     if isinstance(error, click.NoSuchOption):
         from reslrb_cli.cli.options import REMOVED
 
@@ -125,15 +125,15 @@ def main() -> None:
         logger.setLevel(logging.INFO)
     try:
         os.getcwd()
-    except OSError as error:  # removed; relative paths start from it, and Mitsuba does not load without
+    except OSError as error:  # it was removed, and Mitsuba does not load without it
         raise OSError(error.errno, error.strerror, "the working directory") from None
 
 
 def run() -> None:
-    """The program `reslrb`: a signal ends it at once and in order, unless a command sees to that itself."""
+    """Run the program `reslrb`. A signal ends it at once, with cleanup, unless the command handles signals itself."""
     interrupts = Interrupts(tolerated=0)
     with interrupts:
         try:
             main(prog_name="reslrb")
         finally:
-            interrupts.ignore()  # nothing of the work is left
+            interrupts.ignore()  # the work is complete

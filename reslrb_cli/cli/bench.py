@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from reslrb_cli.records.measurements import BenchRecord
 
 
-#: What is compared where the user names nothing.
+#: Integrators that are compared by default.
 INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,trajectory"
 
 
@@ -83,14 +83,14 @@ def command(
     began = time.monotonic()
     from reslrb_cli.backend.installation import load_packages
 
-    load_packages()  # before what follows asks for them
+    load_packages()  # before the imports below need them
     from reslrb_cli.measure.methods import Sweep, depths, machine_of, parse_cases, usual_values
     from reslrb_cli.records.measurements import BenchStatus
 
     config = read_or_box(config_file, overrides).with_code(allow_code)
     if (swept != "depth" or values is not None) and is_given("max_depth"):
-        reason = "goes with --sweep depth" if values is None else "does not go with --values"
-        raise ConfigError("--max-depth", "", f"{reason}; take --set integrator.max_depth={max_depth}")
+        reason = "needs --sweep depth" if values is None else "has no effect with --values"
+        raise ConfigError("--max-depth", "", f"{reason}; use --set integrator.max_depth={max_depth}")
     cases = parse_cases(integrators or INTEGRATORS, deep=swept == "depth")
     check_writable("--json", json_file)
     sweep = Sweep(
@@ -111,7 +111,7 @@ def command(
 
 
 def _run(sweep: Sweep, json_file: Path | None, began: float) -> tuple[list[BenchResult], bool]:
-    """Measure, print and write; returns all results, and whether the user interrupted."""
+    """Measure, print and write; return all results, and whether the user interrupted."""
     from reslrb_cli.measure.bench import Bench
     from reslrb_cli.report.tables import bench_cells, bench_columns
 
@@ -142,13 +142,13 @@ def _run(sweep: Sweep, json_file: Path | None, began: float) -> tuple[list[Bench
 
 
 def _conditions(config: Config, sweep: Sweep) -> str:
-    """What was measured, in one line."""
+    """Describe the measurement in one line."""
     rr_depth, own = config.integrator.rr_depth, config.integrator.max_depth
     deepest = max(sweep.values) if sweep.swept == "depth" else own
     roulette = "no roulette" if 0 <= deepest < rr_depth else f"roulette from depth {rr_depth}"
     parts = [str(config.source)]
     parts += [] if sweep.swept == "depth" else [f"depth {own}"]
     parts += [] if sweep.swept == "spp" else [f"{config.run.spp} spp"]
-    delta = "dL/dI known before" if sweep.objective == "fixed" else f"l2, adjoint {config.adjoint}"
+    delta = "dL/dI known in advance" if sweep.objective == "fixed" else f"l2, adjoint {config.adjoint}"
     limit = "" if sweep.memory_limit is None else f", {sweep.memory_limit / 2**30:.2f} GiB each"
-    return ", ".join([*parts, roulette, delta, f"ratios over {sweep.baseline.label}{limit}"])
+    return ", ".join([*parts, roulette, delta, f"ratios to {sweep.baseline.label}{limit}"])

@@ -77,7 +77,7 @@ def command(
     from reslrb_cli.backend.installation import load_packages
     from reslrb_cli.config.loader import check_code, load
 
-    load_packages()  # before what follows asks for them
+    load_packages()  # before the imports below need them
     from reslrb_cli.measure.methods import DEFAULTS, Plan, compared, machine_of
 
     config = load(config_file, overrides).with_code(allow_code)
@@ -120,7 +120,7 @@ def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[ConvergenceR
         for rounds in session.run():
             keeper.refresh()
             if rounds < 4 or rounds & (rounds - 1):
-                continue  # lines come whenever the number of rounds has doubled
+                continue  # print lines only when the number of rounds has doubled
             if table is None:
                 echo(_conditions(plan, session))
                 table = _table(session)
@@ -147,7 +147,7 @@ def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[ConvergenceR
 
 
 def _table(session: Session) -> Columns:
-    """A table whose columns fit what the session has measured, or is about to."""
+    """Return a table whose columns fit the session's results, finished or expected."""
     from reslrb_cli.measure.convergence.setup import Role
     from reslrb_cli.report.convergence_tables import method_columns
 
@@ -156,17 +156,17 @@ def _table(session: Session) -> Columns:
 
 
 def _shown(records: Sequence[MethodRecord]) -> list[str]:
-    """The parameters that have lines: a single one is all there is."""
+    """Return the parameters to show; `all` is left out if there is only one parameter."""
     keys = list(dict.fromkeys(record.parameter for record in records))
     return [key for key in keys if key != "all"] if len(keys) == 2 else keys
 
 
 def _conditions(plan: Plan, session: Session) -> str:
-    """What was measured, in one line."""
+    """Describe the measurement in one line."""
     config, facts = plan.config, session.facts
     depth, rr_depth = config.integrator.max_depth, config.integrator.rr_depth
     roulette = "no roulette" if 0 <= depth < rr_depth else f"roulette from depth {rr_depth}"
-    what = {"fixed": "dL/dI held", "loss": f"loss {loss_words(config.loss)}", "image": "the image"}[plan.objective]
+    what = {"fixed": "dL/dI fixed", "loss": f"loss {loss_words(config.loss)}", "image": "the image"}[plan.objective]
     if plan.objective != "image" and any(spec.regularizers for spec in config.parameters):
         what += ", without the regularizers, which have no noise"
     spp = ", ".join(str(count) for count in plan.spps or [config.run.spp])

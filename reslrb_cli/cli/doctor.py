@@ -1,4 +1,4 @@
-"""`reslrb doctor`: what this machine has, what works on it, and what to install where something is missing."""
+"""`reslrb doctor`: report the backends and packages of this machine, and what to install."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def command(as_json: bool) -> None:
     if missing:
         raise BackendError(f"missing packages; install them with `pip install {' '.join(missing)}`")
     if report.variant is None:
-        raise BackendError("no backend works; one of those above is needed")
+        raise BackendError("no backend works; install one of those above")
 
 
 def _lines(report: Report) -> list[tuple[str, str]]:

@@ -1,7 +1,7 @@
-"""`reslrb example`: the experiments that come with the program, listed, and copied to where they can be changed.
+"""`reslrb example`: list the experiments that come with the program, and copy them.
 
-They are those of `configs/` and `scenes/` in the repository, to which `reslrb_cli/examples` has links; a wheel has the
-files themselves there.
+They are in `configs/` and `scenes/` of the repository; `reslrb_cli/examples` links to them. A wheel contains the files
+themselves there.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from reslrb_cli.records.atomic import write_atomically
 
 FOLDER = Path(reslrb_cli.__file__).parent / "examples"
 
-#: A path in a configuration that leads to a scene's folder, from wherever that configuration is.
+#: Relative path from a configuration to the folder of a scene.
 _SCENE = re.compile(r"(?:\.\./)+scenes/(\w+)/")
 
 
 def examples() -> dict[str, Path]:
-    """The configurations by name, such as `cornell_floor` and `stiff/lamp`; empty where they were not installed."""
+    """Return the configurations by name, e.g. `cornell_floor` or `stiff/lamp`; empty if they are not installed."""
     configs = FOLDER / "configs"
     found = [*configs.glob("*.yaml"), *configs.glob("*/*.yaml")]
     return {path.relative_to(configs).with_suffix("").as_posix(): path for path in sorted(found)}
@@ -39,7 +39,7 @@ def _complete(_context: click.Context, _parameter: click.Parameter, begun: str) 
 
 
 def _about(path: Path) -> str:
-    """The first sentence of what an example says of itself."""
+    """Return the first sentence of the comment at the head of an example."""
     lines = path.read_text(encoding="utf-8").splitlines()
     ends = next((place for place, line in enumerate(lines) if not line.startswith("#")), len(lines))
     words = " ".join(line.lstrip("# ") for line in lines[:ends])
@@ -57,7 +57,7 @@ def command(name: str | None, folder: Path | None) -> int:
     """
     known = examples()
     if not known:
-        raise ConfigError(FOLDER, "", "has no examples: the program was not installed as a whole; install it again")
+        raise ConfigError(FOLDER, "", "has no examples: the installation is incomplete; install reslrb again")
     if name is None:
         width = max(map(len, known))
         for each, path in known.items():
@@ -73,9 +73,9 @@ def command(name: str | None, folder: Path | None) -> int:
 
 
 def copy(path: Path, folder: Path) -> Path:
-    """Copy the configuration `path`, and the folders of scenes that it names, into `folder`; return its own copy.
+    """Copy the configuration `path` and the folders of its scenes into `folder`; return the path of the copy.
 
-    Raises ConfigError, located in what is there already, before anything is written, and where nothing can be.
+    Raises ConfigError if a file exists already, before anything is written, or if `folder` cannot be written to.
     """
     text = path.read_text(encoding="utf-8")
     scenes = [FOLDER / "scenes" / name for name in dict.fromkeys(_SCENE.findall(text))]

@@ -1,4 +1,4 @@
-"""`reslrb export`: a run's scene with the values that it recovered, for Mitsuba alone, and the solid that it shapes."""
+"""`reslrb export`: write a run's scene with recovered values for plain Mitsuba, and the solid of a lens or mirror."""
 
 from __future__ import annotations
 

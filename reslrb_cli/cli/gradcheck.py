@@ -1,4 +1,4 @@
-"""`reslrb gradcheck`: whether gradients of a scene can be trusted, and what of derivatives they lack (`--missing`)."""
+"""`reslrb gradcheck`: check the gradients of a scene, and measure which part of derivatives they lack (`--missing`)."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ if TYPE_CHECKING:
     from reslrb_cli.measure.gradcheck import CheckResult, Gradcheck
 
 
-#: Options that say something about comparisons, of which `--missing` makes none.
+#: Options of comparisons; `--missing` makes none.
 COMPARING = {"suite": "--suite", "cases": "--case", "estimators": "--estimators", "integrators": "--integrators",
              "folder": "--images"}  # fmt: skip
 
-#: Options that mean nothing without a configuration, as of a suite.
+#: Options of a configuration; a suite has none.
 CONFIGURED = {"config_file": "CONFIG", "overrides": "--set", "budget": "--budget", "spp": "--spp", "folder": "--images"}
 
 
 def _given(options: dict[str, str]) -> str | None:
-    """The first of `options`, written by their parameters' names, that the user gave."""
+    """Return the first of `options` that the user gave; their keys are parameter names."""
     return next((option for name, option in options.items() if is_given(name)), None)
 
 
@@ -62,7 +62,7 @@ def run_missing(
     config: Config, variant: str, budget: float, seeds: int | None, spp: int | None, along: int | None,
     json_file: Path | None,
 ) -> int:  # fmt: skip
-    """Measure, print and write; returns the exit code. `variant` must be set."""
+    """Measure, print and write; return the exit code. `variant` must be set."""
     from reslrb_cli.measure.missing import KIND, MissingCheck
 
     to_keep = settings(config, {}, variant, device_name(variant), spp=spp, directions=along)
@@ -84,9 +84,9 @@ def run_missing(
 def run_suite_command(
     names: tuple[str, ...], estimators: str | None, seeds: int | None, json_file: Path | None, place: Place | None
 ) -> int:
-    """Run the cases of these names, all where there is none; print a line for each, write the file.
+    """Run the named cases, or all cases without names; print a line for each and write the file.
 
-    Cases that the file has are not run again. At a `place` its workers run them.
+    Cases in the file are not run again. With a `place`, its workers run the cases.
     """
     chosen = _estimators(estimators)
     variant = set_variant("auto")
@@ -117,7 +117,7 @@ def run_suite_command(
         interrupts = stack.enter_context(Interrupts())
         found = in_order(run(lambda: interrupts.requested, case_records, work))
         for name, rows in zip(to_do, found, strict=True):
-            if interrupts.requested:  # there may be more of this one
+            if interrupts.requested:  # this case may be incomplete
                 break
             done[name] = rows
             keeper.refresh()
@@ -136,14 +136,14 @@ def _cases_at(place: Place, variant: str) -> contextlib.AbstractContextManager[C
 
 
 def _estimators(text: str | None) -> list[str] | None:
-    """Estimators as they are written, without options other than `paths`: the cases have their own."""
+    """Parse the estimators for a suite. They have no options except `paths`, because the cases have their own."""
     if text is None:
         return None
     written = []
     for case in parse_estimators(text):
         name, label = case.options["estimator"], case.label.partition(":")[2]
         if not case.options.keys() <= {"estimator", *PATHS_OPTIONS}:
-            raise ConfigError("--estimators", label, "a suite takes names without options, other than paths")
+            raise ConfigError("--estimators", label, "a suite allows no option except paths")
         if name not in ESTIMATOR_OPTIONS or name == "auto":
             known = ", ".join(other for other in ESTIMATOR_OPTIONS if other != "auto")
             raise ConfigError("--estimators", "", f"`{name}` is no estimator; there are {known}")
@@ -153,7 +153,7 @@ def _estimators(text: str | None) -> list[str] | None:
 
 
 def _case_line(case: str, rows: list[GradcheckRecord]) -> str:
-    """A case with its largest deviations, and how many of its comparisons hold."""
+    """Return a line with a case, its largest deviations, and the number of comparisons that hold."""
     z = max((row.z_max for row in rows if row.z_max is not None), default=0.0)
     distance = max((row.relative_l2 or 0.0 for row in rows if row.relative_l2_limit is not None), default=0.0)
     holds, open_ = (sum(row.holds is value for row in rows) for value in (True, None))
@@ -217,7 +217,7 @@ def command(
     describe the failures. docs/gradcheck.md explains the columns.
     """
     began = time.monotonic()
-    load_packages()  # before what follows asks for them
+    load_packages()  # before the imports below need them
     from reslrb_cli.measure.gradcheck import Gradcheck
     from reslrb_cli.measure.participants import settings_of
     from reslrb_cli.measure.sampling import KIND
@@ -225,22 +225,22 @@ def command(
     from reslrb_cli.report.tables import summary_lines
 
     if missing and (option := _given(COMPARING)):
-        raise ConfigError(option, "", "does not go with --missing, which compares no estimators; leave out one")
+        raise ConfigError(option, "", "has no effect with --missing, which compares nothing; remove one of them")
     if missing and config_file is None:
-        raise ConfigError("--missing", "", "needs a CONFIG, whose parameters and loss it looks at")
+        raise ConfigError("--missing", "", "needs a CONFIG with parameters and a loss")
     if directions is not None and not missing:
-        raise ConfigError("--directions", "", "goes with --missing alone")
+        raise ConfigError("--directions", "", "needs --missing")
     place = None if cluster is None else Place.parse(cluster)
     if missing and place is not None:
-        raise ConfigError("--cluster", "", "does not go with --missing, which shares nothing out; leave out one")
+        raise ConfigError("--cluster", "", "has no effect with --missing, which distributes nothing; remove one")
     check_writable("--json", json_file)
     if suite is not None:
         if option := _given(CONFIGURED):
-            reason = f"{option} has no effect on a suite, whose cases have their own; remove it"
+            reason = f"{option} has no effect on a suite; remove it"
             raise ConfigError("--suite", "", reason)
         return run_suite_command(cases, estimators, seeds, json_file, place)
     if cases:
-        raise ConfigError("--case", "", "names a case of a suite; take --suite extreme with it")
+        raise ConfigError("--case", "", "names a case of a suite; add --suite extreme")
     config = read_or_box(config_file, overrides).with_code(allow_code)
     if missing:
         check_code(config)
@@ -287,7 +287,7 @@ def _exit_code(records: Iterable[GradcheckRecord]) -> int:
 def _run(
     check: Gradcheck, variant: str, to_keep: dict[str, Any], json_file: Path | None, folder: Path | None
 ) -> tuple[list[GradcheckRecord], bool]:
-    """Measure, print and write; returns all records, and whether the user interrupted."""
+    """Measure, print and write; return all records, and whether the user interrupted."""
     from reslrb_cli.report.tables import cells, gradcheck_columns
 
     records: list[GradcheckRecord] = []
@@ -319,7 +319,7 @@ def _draw(result: CheckResult, folder: Path | None) -> None:
 
 
 def _check_folder(folder: Path | None) -> None:
-    """Raise ConfigError where maps could not be written."""
+    """Raise ConfigError if maps cannot be written."""
     if folder is None:
         return
     above = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))

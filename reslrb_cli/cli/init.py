@@ -1,6 +1,6 @@
-"""`reslrb init`: a configuration for a scene, to begin with.
+"""`reslrb init`: write a first configuration for a scene.
 
-Its text, with what could be set and why in comments, is `templates/first_config.yaml.j2`.
+Its text, with comments on the settings, is `templates/first_config.yaml.j2`.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ if TYPE_CHECKING:
     from reslrb_cli.scene.xml.read import Description
 
 
-#: Pixels with which a run takes minutes on two cores, at the samples below.
+#: Pixels of a film with which a run takes minutes on two cores, with the samples below.
 PIXELS = 2**14
 SPP, ITERATIONS, RATE = 16, 200, 0.03
 
-#: The same with a parameter that has no upper bound, of which rates are shares: it and what it shines on are told apart
-#: in many steps.
+#: The same for parameters without an upper bound, whose rates are relative. Separating a lamp from the colours that it
+#: lights takes many steps.
 UNBOUNDED_ITERATIONS, UNBOUNDED_RATE = 300, 0.1
 
-#: Commented lines of parameters; a scene can have thousands.
+#: Maximum number of parameters in comments; a scene can have thousands.
 _MOST_OTHERS = 60
 
-#: Variables and sensors that a comment names, and characters of a variable there.
+#: Maximum number of variables and sensors in a comment, and of characters of a variable.
 _MOST_VARIABLES, _MOST_SENSORS, _LONGEST = 8, 6, 40
 
-#: Columns of a comment of several lines.
+#: Width of a comment with several lines.
 _COMMENT = 110
 _NUMBER = re.compile(r"-?\d{1,15}(\.\d{1,15})?")
 _PLAIN = re.compile(r"(\.\./)*[A-Za-z_][\w.\-]*(/[\w.\-]+)*")
@@ -60,13 +60,13 @@ def _first_config(
     proposals: Sequence[Proposal],
     **known: Any,
 ) -> str:
-    """The YAML of a configuration in the file `path`, by the template `first_config.yaml.j2`.
+    """Return the YAML of a configuration in the file `path`, from the template `first_config.yaml.j2`.
 
-    `options` are the scene file's variables that the user has set, `variables` all that it has, as text; `sensors` the
-    ids of its sensors, of which the one with the index `sensor` is used; `known` is what the template has besides.
+    `options` are the scene file's variables that the user has set, and `variables` all its variables, as text.
+    `sensors` are the ids of the sensors, and `sensor` is the index of the used one. `known` are other template values.
     """
     first = [proposal for proposal in proposals if proposal.first]
-    # Steps have to be measured where something that may be of any size is to begin with.
+    # Step sizes must be measured if a parameter is unbounded.
     is_scaled = not all(proposal.is_bounded for proposal in first)
     others = [f"{_word(name)}: {_word(text)}" for name, text in variables.items() if name not in options]
     listed = [text for text in others if len(text) <= _LONGEST][:_MOST_VARIABLES]
@@ -92,12 +92,12 @@ def _first_config(
 
 
 def _comment(text: str) -> list[str]:
-    """The lines of a comment."""
+    """Split a comment into lines."""
     return wrap(printable(text), _COMMENT - len("  # "), break_long_words=False)
 
 
 def _entry(proposal: Proposal, is_scaled: bool) -> str:
-    """What has no upper bound has a rate of its own where steps are not measured."""
+    """Return the entry of a parameter. Unbounded ones get their own rate if step sizes are not measured."""
     parts = [f"key: {_text(proposal.info.key)}"]
     parts += [f"bounds: {proposal.bounds}"] if proposal.bounds is not None else []
     parts += [f"resolution: {list(proposal.resolution)}"] if proposal.resolution is not None else []
@@ -119,12 +119,12 @@ def _note(proposal: Proposal) -> str:
 
 def _path(path: Path, folder: Path) -> str:
     relative = os.path.relpath(path, folder)
-    # What lies elsewhere altogether does not move with the configuration.
+    # Files far from the configuration will not be moved with it.
     return _text(str(path.absolute()) if relative.startswith(os.path.join("..", "..", "..")) else relative)
 
 
 def _word(text: str) -> str:
-    """A name or a value of the scene file within a comment, where no character may end the line."""
+    """Quote a name or a value of the scene file for a comment, if needed, so that it cannot end the line."""
     return text if _PLAIN.fullmatch(text) or _NUMBER.fullmatch(text) else json.dumps(text)
 
 
@@ -134,7 +134,7 @@ def _text(text: str) -> str:
 
 Size = tuple[int, int]
 
-#: By how much the ratio of a photograph's sides may differ from the film's.
+#: Tolerance for the aspect ratio of a photograph, relative to the film's.
 _RATIO = 0.01
 
 
@@ -193,12 +193,12 @@ def command(
     """
     from reslrb_cli.backend.variant import set_variant
 
-    # Of the folder's own name, also where it is given as `..`; the root of all has none.
+    # abspath, because `..` has no name of its own; the root folder has none.
     folder = Path(os.path.abspath(scene_file)).parent.name if scene_file.stem == "scene" else ""
     named = folder or scene_file.stem
     path = output or Path(f"{named}.yaml")
     if path.suffix.lower() not in (".yaml", ".yml"):
-        raise ConfigError("--output", "", f"{path} must end in .yaml, as configurations do")
+        raise ConfigError("--output", "", f"{path} must end in .yaml or .yml")
     _check_free(path, force)
     check_writable("--output", path)
     options = _read_options(scene_file, overrides)
@@ -236,7 +236,7 @@ def command(
     )  # fmt: skip
     specs = loads(text, path).parameters
     scene = read_as_floats(scene, description, [key for spec in specs for key in spec.keys])
-    select_parameters(scene, specs, path)  # what is wrong is to show before anything is written
+    select_parameters(scene, specs, path)  # raises errors before anything is written
     with writing("--output", path):
         if copied and photo is not None and image is not None:
             write_smaller(photo, size, image)
@@ -246,14 +246,14 @@ def command(
     echo(f"{path}{made}: {count} of {len(proposals)} parameters, at {size[0]}x{size[1]} pixels")
     if reason is not None:
         echo(f"integrator.paths: camera, since light paths cannot render this: {reason}")
-    echo(f"next: look at it, and `reslrb optimize {path}`" + ("" if target is not None else ", once there is a target"))
+    echo(f"next: check it, then run `reslrb optimize {path}`" + ("" if target is not None else " with a target"))
 
 
 def choose_size(film: Size, photo: Photograph | None, fixed: bool = False) -> Size:
-    """The (width, height) of a film with which a run takes minutes, in the ratio of the photograph, or its own.
+    """Return the (width, height) of a film with which a run takes minutes, with the photograph's or its own ratio.
 
-    A `fixed` one, which is a window of a larger film, stays as it is. Raises ConfigError for a photograph whose ratio
-    is not that of the film.
+    A `fixed` film, which is a crop of a larger one, keeps its size. Raises ConfigError if the ratios of the photograph
+    and the film differ.
     """
     width, height = film if photo is None else photo.size
     if photo is not None and abs(width / height * film[1] / film[0] - 1) > _RATIO:
@@ -262,8 +262,8 @@ def choose_size(film: Size, photo: Photograph | None, fixed: bool = False) -> Si
         raise ConfigError(
             photo.path,
             "",
-            f"is {width}x{height} pixels, and the scene's film {film[0]}x{film[1]}, of another ratio; cut it to "
-            f"what the film sees, such as {fits[0]}x{fits[1]}, or give the film and its view the photograph's ratio",
+            f"is {width}x{height} pixels, the scene's film {film[0]}x{film[1]}, with another aspect ratio; crop it to "
+            f"the film's view, such as {fits[0]}x{fits[1]}, or give the film the photograph's ratio",
         )
     if fixed:
         return film
@@ -272,11 +272,11 @@ def choose_size(film: Size, photo: Photograph | None, fixed: bool = False) -> Si
 
 
 def _read_options(scene_file: Path, overrides: tuple[str, ...]) -> Mapping[str, bool | int | float | str]:
-    """The values of the scene file's variables that `--set` gives. Raises ConfigError for another setting."""
+    """Return the values of the scene file's variables from `--set`. Raises ConfigError for other settings."""
     for override in map(parse_override, overrides):
         if override.location[:2] != ("scene", "options"):
             raise ConfigError(
-                override.label, "", "init takes scene.options.NAME=VALUE alone; other settings go into what it writes"
+                override.label, "", "init takes only scene.options.NAME=VALUE; edit other settings in its output"
             )
     stand_ins = {"target": {"render": {}}, "parameters": [{"key": "*"}]}
     text = write({"scene": {"file": str(scene_file.absolute())}, **stand_ins})
@@ -284,7 +284,7 @@ def _read_options(scene_file: Path, overrides: tuple[str, ...]) -> Mapping[str, 
 
 
 def _tell_sensor(index: int, sensors: Sequence[str]) -> None:
-    """Say which sensor is taken where there are several. Raises ConfigError for one that is not there."""
+    """Print which of several sensors is used. Raises ConfigError if the scene has no such sensor."""
     named = [f"{number} ({name})" for number, name in enumerate(sensors)]
     if index >= len(sensors):
         more = "" if len(named) <= LISTED_SENSORS else " ..."
@@ -292,27 +292,27 @@ def _tell_sensor(index: int, sensors: Sequence[str]) -> None:
     if len(sensors) > 1:
         others = [name for number, name in enumerate(named) if number != index]
         more = "" if len(others) <= LISTED_SENSORS else f" and {len(others) - LISTED_SENSORS} more"
-        echo(f"sensor {named[index]}; --sensor takes another: {', '.join(others[:LISTED_SENSORS])}{more}")
+        echo(f"sensor {named[index]}; --sensor selects another: {', '.join(others[:LISTED_SENSORS])}{more}")
 
 
 def _propose(scene_file: Path, scene: mi.Scene, index: int, wanted: tuple[str, ...], lamps: bool) -> list[Proposal]:
-    """What of the scene can be recovered, at least one to begin with. Raises ConfigError where there is nothing."""
+    """Return the parameters that can be recovered. Raises ConfigError if there are none."""
     from reslrb_cli.scene.proposal import propose
 
     try:
         proposals = propose(scene, index, lamps, wanted)
     except LookupError as error:
         more = f"reslrb inspect {scene_file} lists the keys"
-        raise ConfigError("--recover", "", f"`{error.args[0]}` is nothing that can be recovered; {more}") from None
+        raise ConfigError("--recover", "", f"`{error.args[0]}` matches no recoverable parameter; {more}") from None
     if not proposals:
-        raise ConfigError(scene_file, "", "nothing in it can be recovered; reslrb inspect --all says why")
+        raise ConfigError(scene_file, "", "has no recoverable parameter; reslrb inspect --all says why")
     return proposals
 
 
 def _why_camera(scene: mi.Scene, sensor: mi.Sensor, hides_emitters: bool, file: Path) -> str | None:
-    """Why paths have to begin at the sensor; None where they may begin at the lights, too.
+    """Return the reason if only camera paths can render the scene; None if light paths can, too.
 
-    Raises ConfigError, located in the scene's `file`, where no paths can render it.
+    Raises ConfigError, located in the scene's `file`, if no paths can render it.
     """
     from reslrb_cli.scene.needs import check_paths, paths_obstacle
 
@@ -321,11 +321,11 @@ def _why_camera(scene: mi.Scene, sensor: mi.Sensor, hides_emitters: bool, file: 
     except UnsupportedScene as error:
         obstacles = [paths_obstacle(scene, sensor, kind) for kind in ("both", "camera")]
         if all(obstacles):
-            raise ConfigError(file, "", str(error)) from None  # which has words for both
+            raise ConfigError(file, "", str(error)) from None  # this message covers both kinds of paths
         return paths_obstacle(scene, sensor, "light", hides_emitters) if obstacles[0] else None
     return None
 
 
 def _check_free(path: Path, force: bool) -> None:
     if os.path.lexists(path) and not (force and path.is_file()):
-        raise ConfigError(path, "", "exists" + ("; --force replaces it" if path.is_file() else " and is no file"))
+        raise ConfigError(path, "", "exists" + ("; --force replaces it" if path.is_file() else " and is not a file"))

@@ -1,7 +1,7 @@
-"""`reslrb inspect`: what a scene contains, and which of its parameters can be recovered.
+"""`reslrb inspect`: list the contents of a scene, and the parameters that can be recovered.
 
-It is given a scene file, a configuration (complete or not), or the folder of a run (`read_subject`), and says in lines
-what it finds of the scene, its sensors, the plan of a step and the parameters (`templates/inspect.txt.j2`).
+The argument is a scene file, a configuration, complete or not, or the folder of a run (`read_subject`). The output
+lists the scene, its sensors, the plan of a step and the parameters (`templates/inspect.txt.j2`).
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ if TYPE_CHECKING:
     from reslrb_cli.scene.parameters import Selection
 
 
-#: What stands for sections that a configuration needs and the user has not written.
+#: Placeholders for required sections that are missing in the configuration.
 _STAND_INS = {"target": "{render: {spp: 1}}", "parameters": "[{key: '*'}]"}
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A configuration, with stand-ins for the sections in `missing`.
+    """Configuration with placeholders for the sections in `missing`.
 
-    `path` is what the user named, `run` the manifest of the run whose configuration it is, or None.
+    `path` is the user's argument, and `run` the manifest if the configuration belongs to a run, otherwise None.
     """
 
     path: Path
@@ -54,7 +54,7 @@ class Subject:
 
 
 def read_subject(path: Path, overrides: tuple[str, ...]) -> Subject:
-    """Read what `path` is, with `overrides` put in. Raises ConfigError."""
+    """Read the scene, configuration or run at `path`, with `overrides` applied. Raises ConfigError."""
     manifest = read_manifest(path) if path.is_dir() else None
     if path.is_dir() and manifest is None:
         raise ConfigError(path, "", "is a folder without a run; name a scene file, a configuration or a run folder")
@@ -66,7 +66,7 @@ def read_subject(path: Path, overrides: tuple[str, ...]) -> Subject:
     data = parse(text, str(file))
     given = {str(parse_override(override).location[0]) for override in overrides}
     sections = {key for key, value in data.items() if value is not None} if isinstance(data, dict) else set(_STAND_INS)
-    if "views" in sections or "cameras" in _keys(data, "scene"):  # which bring targets along
+    if "views" in sections or "cameras" in _keys(data, "scene"):  # both supply targets
         sections |= {"target"}
     missing = tuple(section for section in _STAND_INS if section not in sections | given)
     stand_ins = [f"{section}={_STAND_INS[section]}" for section in missing]
@@ -75,7 +75,7 @@ def read_subject(path: Path, overrides: tuple[str, ...]) -> Subject:
 
 
 def _keys(data: Any, section: str) -> set[str]:
-    """The keys of a section, of which nothing is known yet."""
+    """Return the keys of a section whose content is not checked yet."""
     inside = data.get(section) if isinstance(data, dict) else None
     return set(inside) if isinstance(inside, dict) else set()
 
@@ -86,14 +86,14 @@ def _is_scene(file: Path) -> bool:
         return True
     try:
         return file.is_file() and file.open("rb").read(64).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
-    except OSError:  # said when it is read
+    except OSError:  # reading it later reports the error
         return False
 
 
-#: Sensors, and parameters that can be recovered, without `--all`.
+#: Maximum number of listed sensors and recoverable parameters without `--all`.
 LISTED_SENSORS, _LISTED = 3, 30
 
-#: And what can be moved.
+#: Maximum number of listed objects that can be moved.
 _MOVED = 10
 
 
@@ -113,7 +113,7 @@ def _needed(needs: SceneNeeds) -> str:
 
 
 def plan_lines(rows: Sequence[PlanRow]) -> list[str]:
-    """Lay out the plan as a table; features that the plan has come first."""
+    """Format the plan as a table, with the features that it contains first."""
     ordered = sorted(rows, key=lambda row: not row.needed)
     return table([("needed" if row.needed else "left out", row.feature, row.reason) for row in ordered])
 
@@ -122,9 +122,9 @@ def plan_lines(rows: Sequence[PlanRow]) -> list[str]:
 
 
 def parameter_lines(infos: Sequence[ParameterInfo], wanted: Sequence[str], everything: bool) -> list[str]:
-    """The parameters that can be recovered, with their values, then how many others there are, and why.
+    """List the recoverable parameters with their values, then the number of others, with reasons.
 
-    Those that a key or glob in `wanted` names are marked. `everything` lists the others, too.
+    Parameters that match a key or glob in `wanted` are marked. `everything` also lists the others.
     """
     usable = [info for info in infos if info.obstacle is None]
     others = [info for info in infos if info.obstacle is not None]
@@ -145,7 +145,7 @@ def parameter_lines(infos: Sequence[ParameterInfo], wanted: Sequence[str], every
 
 
 def moving_lines(movable: Sequence[MovableSummary], everything: bool) -> list[str]:
-    """What can be moved, and by what."""
+    """List the objects that can be moved, by the options that move them."""
     lines = [f"can be moved: {len(movable) or 'nothing'}"]
     if everything:
         return lines + [f"  {line}" for line in table([(item.id, ", ".join(item.by)) for item in movable])]
@@ -159,17 +159,17 @@ def moving_lines(movable: Sequence[MovableSummary], everything: bool) -> list[st
 
 
 def _reasons(others: Sequence[ParameterInfo]) -> list[str]:
-    """How many there are with each reason."""
+    """Count the parameters with each reason."""
     groups: dict[str, list[str]] = {}
     for info in others:
-        # What comes in brackets differs from one to the next.
+        # Details in brackets differ between parameters.
         groups.setdefault(str(info.obstacle).partition(" (")[0].partition(";")[0], []).append(info.key)
     counted = sorted(groups.items(), key=lambda group: -len(group[1]))
     return table([(str(len(keys)), reason) for reason, keys in counted], "><")
 
 
 def _value(info: ParameterInfo) -> str:
-    """The value as far as it fits: numbers as `initial` takes them, of more their count, mean and range."""
+    """Format a value: a few numbers in the form of `initial`, more numbers as count, mean and range."""
     value = info.value
     if value is not None and value.numbers is not None:
         words = [f"{number:.4g}" for number in value.numbers]
@@ -185,7 +185,7 @@ def _value(info: ParameterInfo) -> str:
 
 
 def _noted(info: ParameterInfo) -> str:
-    """The value, and what is to be known of it."""
+    """Format a value and the remark about it."""
     return _value(info) + (f"; {info.remark}" if info.remark is not None else "")
 
 
@@ -193,7 +193,7 @@ def _flags(info: ParameterInfo) -> str:
     return ("" if info.differentiable else "not ") + "differentiable" + ", discontinuous" * info.discontinuous
 
 
-#: Gradients that `--conditioning` takes.
+#: Default number of gradients for `--conditioning`.
 SAMPLES = 8
 
 
@@ -240,10 +240,10 @@ def command(
     subject = read_subject(path, overrides)
     config = subject.config
     if conditioning and subject.missing:
-        raise ConfigError(path, subject.missing[0], "missing; --conditioning measures a complete experiment")
+        raise ConfigError(path, subject.missing[0], "missing; --conditioning needs a complete experiment")
     if nonfinite:
         if overrides:
-            raise ConfigError("--set", "", "does not go with --nonfinite, which traces the run's own step again")
+            raise ConfigError("--set", "", "has no effect with --nonfinite, which repeats a step of the run")
         from reslrb_cli.cli.nonfinite import show_offenders
 
         return show_offenders(config, as_json)
@@ -262,7 +262,7 @@ def command(
         known |= {"plan": {"obstacle": plan} if isinstance(plan, str) else plan and {"rows": plan}, "edges": edges}
         if measured is not None:
             known["conditioning"] = measured.to_json()
-        # Objects of the scene are told by their ids.
+        # Objects of the scene are written as their ids.
         data = to_jsonable_python(known, inf_nan_mode="constants", fallback=lambda item: item.id())
         click.echo(json.dumps(finite(data, str), indent=2, allow_nan=False))
         return None
@@ -295,30 +295,30 @@ def command(
 
 
 def run_words(run: Mapping[str, Any]) -> str:
-    """How far a run came, by its manifest."""
+    """Describe the status of a run from its manifest."""
     iterations = run.get("results", {}).get("iterations")
     words = [str(run.get("status")), "" if iterations is None else f"{iterations} iterations"]
     return ", ".join(word for word in [*words, str(run.get("error") or "")] if word)
 
 
 def next_step(subject: Subject, summary: SceneSummary) -> str:
-    """What someone who has read all this may want to do now."""
+    """Suggest the next step to the user."""
     keys = [info.key for info in summary.parameters if info.obstacle is None]
     if summary.sensors and all(sensor.obstacle == sensor.camera_obstacle is not None for sensor in summary.sensors):
-        return "change what cannot be rendered; the reason above says how"
+        return "change the scene so that it can be rendered; the reason above says how"
     if not keys:
-        return "nothing here can be recovered as it stands; the reasons above say what may be changed in the scene file"
+        return "no parameter can be recovered; the reasons above say what to change in the scene file"
     sections = {"target": "target: {file: IMAGE}", "parameters": f"parameters: [{{key: {json.dumps(keys[0])}}}]"}
     missing = " and ".join(f"`{sections[section]}`" for section in subject.missing)
     if subject.is_scene:
-        return f"`reslrb init {subject.path} --target PHOTO` writes a configuration of it"
+        return f"`reslrb init {subject.path} --target PHOTO` writes a configuration"
     if missing:
-        return f"add {missing} to {subject.path}, and run `reslrb optimize {subject.path}`"
+        return f"add {missing} to {subject.path}, then run `reslrb optimize {subject.path}`"
     return f"`reslrb optimize {subject.config.source}`" + (" runs it again" if subject.run else " runs it")
 
 
 def measure(subject: Subject, overrides: tuple[str, ...], samples: int) -> Conditioning:
-    """The conditioning of the experiment; an estimator that is to be measured first makes no difference to it."""
+    """Measure the conditioning of the experiment. It does not depend on the estimator, so `auto` becomes `stack`."""
     from reslrb_cli.optimization.assemble import assemble
     from reslrb_cli.optimization.sensitivity import measure_conditioning
 
@@ -329,7 +329,7 @@ def measure(subject: Subject, overrides: tuple[str, ...], samples: int) -> Condi
 
 
 def select(config: Config, scene: Any) -> Selection | str:
-    """What the configuration recovers, or why that cannot be. Sets initial values in `scene`."""
+    """Return the parameters to recover, or the reason why they cannot be. Sets initial values in `scene`."""
     from reslrb_cli.scene.parameters import select_parameters
 
     try:
@@ -339,7 +339,7 @@ def select(config: Config, scene: Any) -> Selection | str:
 
 
 def edges_of(scene: Any, selection: Selection) -> list[str]:
-    """The shapes that the configuration moves whose edges move, too."""
+    """Return the ids of moving shapes that have moving edges."""
     from reslrb_cli.scene.deformation import where_moved
 
     moved = where_moved(selection.params, selection.scene_keys)
@@ -347,9 +347,9 @@ def edges_of(scene: Any, selection: Selection) -> list[str]:
 
 
 def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[PlanRow] | str:
-    """Plan a step for the first sensor that is used; return the reason where there is no plan.
+    """Plan a step for the first sensor in use; return the reason if there is no plan.
 
-    The selected parameters of `scene` track derivatives from then on.
+    Afterwards the selected parameters of `scene` track derivatives.
     """
     import drjit as dr
 
@@ -362,10 +362,10 @@ def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[
     if isinstance(selection, str):
         return selection
     if config.integrator.type != "reslrb":
-        return f"integrator.type is {config.integrator.type}; `reslrb` alone plans its kernels"
+        return f"integrator.type is {config.integrator.type}; only `reslrb` has a plan"
     options = config.integrator.options()
     if options.get("estimator") == "auto":
-        options["estimator"] = "stack"  # `auto` is chosen by a run
+        options["estimator"] = "stack"  # a run chooses for `auto`
     reasons = {}
     for feature, option in ((GUIDED, "guiding"), (SEQUENCE, "sequence"), (PIXELS, "pixels")):
         options[option], reasons[feature] = sampling_of(subject, option)
@@ -384,7 +384,7 @@ def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[
         rows = plan_rows(integrator.plan(scene, scene.sensors()[sensor], params))
     except (ConfigError, UnsupportedScene) as error:
         return str(error)
-    if integrator.paths == "camera":  # where nothing begins at a light, nothing is left to a run
+    if integrator.paths == "camera":  # a run chooses the other features for light paths only
         reasons = {feature: reasons.get(feature, "") for feature in (PATHS_FROM, PIXELS)}
     for feature, why in reasons.items():
         rows = with_reason(rows, feature, why) if why else rows
@@ -392,7 +392,7 @@ def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[
 
 
 def sides_of(subject: Subject, options: dict[str, Any], reasons: dict[str, str]) -> dict[str, Any]:
-    """`integrator.paths` and `light_share` as they are in a run, or before one; adds to the `reasons` of features."""
+    """Return `paths` and `light_share` of a run, or the values before a run; add to the `reasons` of features."""
     from reslrb_cli.config.integrators import UNDECIDED
     from reslrb_cli.integrators.plan_report import PATHS_FROM
     from reslrb_cli.records.decisions import PathsRecord
@@ -410,8 +410,7 @@ def sides_of(subject: Subject, options: dict[str, Any], reasons: dict[str, str])
 
 
 def sampling_of(subject: Subject, option: str) -> tuple[str, str]:
-    """`integrator.guiding`, `sequence`, or `pixels`, as it is, and why, where that was or is left to a run (else
-    empty)."""
+    """Return the value of `guiding`, `sequence` or `pixels`, and the reason if a run chooses it (otherwise empty)."""
     from reslrb_cli.config.integrators import UNDECIDED
     from reslrb_cli.records.decisions import GuidedRecord, PaidRecord, PixelsRecord, SequenceRecord
 

@@ -1,4 +1,4 @@
-"""`reslrb lens`: an experiment that shapes a lens or a mirror which throws a picture."""
+"""`reslrb lens`: write an experiment that shapes a lens or a mirror whose caustic shows a picture."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from reslrb_cli.records.atomic import write_atomically, writing
 if TYPE_CHECKING:
     import numpy as np
 
-#: Of a picture's longer side, what the film sees about it: light that goes beside the picture counts.
+#: Margin around the picture on the film, as a fraction of its longer side; light in it counts as lost.
 MARGIN = 0.125
 #: Texels and pixels along the longer side.
 PIXELS = 256
 ITERATIONS = 100
-#: Vertices of the face per cell of the start, along each side, as long as they are no more than so many.
+#: Vertices of the face per cell of the initial face, along each side, and the maximum along one side.
 FINER, MOST_VERTICES = 3, 1024
-#: What options are called where a setting of the face goes by another name.
+#: Options whose names differ from those of the face's settings.
 _OPTIONS = {"picture_size": "--picture-size", "light_distance": "--light-distance"}
 
 
 def read_luminance(path: Path) -> np.ndarray:
     """Return the linear luminance (H, W) of an image file, upright. Raises ConfigError.
 
-    Transparent parts are white, as viewers show them; black where all would be white otherwise.
+    Transparent parts are white, as in image viewers, or black if the whole image would be white otherwise.
     """
     import numpy as np
 
@@ -132,17 +132,17 @@ def command(
     if floor is not None and not 0 <= floor < 1:
         raise ConfigError("--floor", "", f"is {floor:g}; it must be from 0 to below 1")
     if not 0 <= sun < 10:
-        raise ConfigError("--sun", "", f"is {sun:g} degrees; it must be from 0 to below 10, 0.53 of the sun itself")
+        raise ConfigError("--sun", "", f"is {sun:g} degrees; it must be from 0 to below 10 (the sun: 0.53)")
     if not 0 <= margin <= 1:
-        raise ConfigError("--margin", "", f"is {margin:g}; it must be from 0 to 1, as far as the receiver reaches")
+        raise ConfigError("--margin", "", f"is {margin:g}; it must be from 0 to 1, the extent of the receiver")
     if not all(-80 <= angle <= 80 for angle in tilt):
         raise ConfigError("--tilt", "", f"is {tilt[0]:g} and {tilt[1]:g} degrees; both must be between -80 and 80")
     if sun and light_distance is not None:
-        raise ConfigError("--sun", "", "is of parallel light, and --light-distance of a point; leave one out")
+        raise ConfigError("--sun", "", "needs parallel light, --light-distance a point light; remove one")
     if both and mirror:
-        raise ConfigError("--both", "", "goes with a lens: a mirror has one face")
+        raise ConfigError("--both", "", "needs a lens: a mirror has one face")
     if incidence is not None and not mirror:
-        raise ConfigError("--incidence", "", "goes with --mirror: light comes to a lens straight")
+        raise ConfigError("--incidence", "", "needs --mirror: a lens is lit along its axis")
     if output.exists() and not output.is_dir():
         raise ConfigError("--output", "", f"{output} is a file; name a folder")
     names = ("lens.yaml", "scene.xml", "face.ply", "back.ply", "target.exr", "picture.exr", "start.exr")
@@ -159,12 +159,12 @@ def command(
         image = resized(image, (max(1, round(image.shape[0] * pixels / longer)),
                                 max(1, round(image.shape[1] * pixels / longer))))  # fmt: skip
     if is_even(image) and not is_even(whole):
-        raise ConfigError("--pixels", "", f"is {pixels}, at which {picture} is of one colour: its pattern is finer; "
-                          f"it has {longer} pixels")  # fmt: skip
+        raise ConfigError("--pixels", "", f"is {pixels}, too few for the fine pattern of {picture}, which has "
+                          f"{longer} pixels")  # fmt: skip
     rows, columns = image.shape
     if outline == "round" and light_distance is not None and (mirror or rows != columns):
-        raise ConfigError("--outline", "", "round goes with parallel light, or with a point light and a lens for a "
-                          "square picture: a lamp's cone meets no other face all round")  # fmt: skip
+        raise ConfigError("--outline", "", "round needs parallel light, or a point light, a lens and a square picture: "
+                          "the cone of a point light fits no other face")  # fmt: skip
     share = np.array([columns, rows]) / max(rows, columns)
     setting = Setting(
         kind="mirror" if mirror else "lens",

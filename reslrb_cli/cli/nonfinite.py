@@ -1,4 +1,4 @@
-"""`reslrb inspect --nonfinite`: where a run first met a value that is not finite."""
+"""`reslrb inspect --nonfinite`: find the first value of a run that is not finite."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ OPTION = "--nonfinite"
 
 
 def show_offenders(config: Config, as_json: bool) -> int:
-    """Print where the run of `config` first met a value that is not finite; exit code 1 where it does not again."""
+    """Print the origin of the run's first value that is not finite; return exit code 1 if all values are finite now."""
     run = config.source.parent
     if read_manifest(run) is None:
         raise ConfigError(config.source, OPTION, "is not in a run folder; give the config.yaml of a run")
     if not (RunFolder(run).checkpoint / NONFINITE_FILE_NAME).exists():
-        raise ConfigError(config.source, OPTION, "this run met no value that was not finite")
+        raise ConfigError(config.source, OPTION, "all values of this run were finite")
     if config.codes:
-        raise ConfigError(config.source, OPTION, f"runs no code of your own, which {next(iter(config.codes))} names")
+        raise ConfigError(config.source, OPTION, f"does not run your own code, which {next(iter(config.codes))} names")
     from reslrb_cli.measure.nonfinite_trace import find_offenders
     from reslrb_cli.runs.resume import problem_before_nonfinite
 
@@ -43,13 +43,13 @@ def show_offenders(config: Config, as_json: bool) -> int:
         click.echo(json.dumps(finite(report, str), indent=2, allow_nan=False))
     else:
         lines = [line for entry in found for line in offender_lines(entry, iteration)]
-        for line in lines or [f"iteration {iteration}: all is finite this time"]:
+        for line in lines or [f"iteration {iteration}: all values are finite now"]:
             echo(line)
     return ExitCode.DONE if found else ExitCode.CHECK_FAILED
 
 
 def offender_lines(offender: Offender, iteration: int) -> list[str]:
-    """One view's offender, in lines."""
+    """Return lines about the first value of one view that is not finite."""
     place = "" if offender.pixel is None else f", pixel {offender.pixel}"
     value = f": {_numbers(offender.value)}" if offender.value else ""
     lines = [f"iteration {iteration}, sensor {offender.sensor}{place}", f"  {offender.quantity}{value}"]

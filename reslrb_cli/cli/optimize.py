@@ -1,6 +1,6 @@
-"""`reslrb optimize`: from a configuration to recovered parameters, or from a run to more of it.
+"""`reslrb optimize`: recover the parameters of a configuration, or continue a run.
 
-With `--dry-run` it prints the forecast of a run (`show_forecast`, `templates/forecast.txt.j2`).
+`--dry-run` prints the forecast of a run (`show_forecast`, `templates/forecast.txt.j2`).
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 
 
 def show_forecast(config: Config) -> None:
-    """Print the expected time and memory of a run of `config`, by a few measured steps.
+    """Measure a few steps of `config` and print the expected time and memory of a run.
 
-    A variant must be set. Writes nothing but the caches of kernels and decisions, which a run then finds.
+    A variant must be set. Writes only the caches of kernels and decisions, which a later run uses.
     """
     from reslrb_cli.backend.memory import resident_bytes
     from reslrb_cli.measure.missing import check_missing
@@ -56,7 +56,7 @@ def show_forecast(config: Config) -> None:
     click.echo(text, nl=False)
 
 
-NOTICE = "stopping after this iteration; once more, and it ends at once"
+NOTICE = "stopping after this iteration; a second signal stops at once"
 logger = logging.getLogger(__name__)
 
 
@@ -101,24 +101,24 @@ def command(
     workers = None if cluster is None else Place.parse(cluster)
     if resumed is not None:
         if force:
-            raise click.UsageError("--force replaces a run, --resume goes on with one; give one of the two")
+            raise click.UsageError("--force replaces a run, --resume continues one; give only one of them")
         if dry_run:
-            raise click.UsageError("--dry-run is of a run that begins, --resume goes on with one; give one of the two")
+            raise click.UsageError("--dry-run is for a new run, --resume continues one; give only one of them")
         return _resume(resumed, config_file, overrides, allow_code, workers, quiet)
     if dry_run and workers is not None:
-        raise click.UsageError("--dry-run measures steps of this process; leave out --cluster")
+        raise click.UsageError("--dry-run measures only this process; leave out --cluster")
     if config_file is None:
         raise click.UsageError("Missing argument 'CONFIG'")
     return _begin(config_file, overrides, force, dry_run, allow_code, workers, quiet)
 
 
 def _check_shards(config: Config, workers: Place | None) -> None:
-    """Raise ConfigError where a step has nothing to share out."""
+    """Raise ConfigError if a step has no shards to distribute."""
     if workers is not None and config.shards == 1:
-        reason = "a step is one shard, which --cluster has nothing to share out of; set run.shards to auto, or a number"
+        reason = "--cluster needs more than one shard; set run.shards to auto, or to a number above 1"
         raise ConfigError(config.source, "run.shards", reason)
     if workers is not None and config.run.stages:
-        raise ConfigError(config.source, "run.stages", "does not go with --cluster yet; leave one of the two out")
+        raise ConfigError(config.source, "run.stages", "cannot be combined with --cluster yet; remove one of them")
 
 
 def _begin(
@@ -168,12 +168,12 @@ def _resume(
             workers.check()
         variant = start_variant(config.model_copy(update={"variant": earlier.settled.variant}))
         begun = earlier.begin(variant, logger.info, logger.warning)
-        logger.info(f"going on with {run} after {earlier.iteration} of {config.run.iterations} iterations")
+        logger.info(f"continuing {run} after {earlier.iteration} of {config.run.iterations} iterations")
         return _run(begun, workers, quiet)
 
 
 def _run(begun: PreparedRun, workers: Place | None, quiet: bool) -> int:
-    """Run it in the folder, which is not made before signals are watched: from then on it is to say how it ended."""
+    """Run in the folder. Signals are handled before it is created, so that it always records how the run ended."""
     if workers is not None:
         from reslrb_cli.cluster.engine import engine_at
 
@@ -201,7 +201,7 @@ def _run(begun: PreparedRun, workers: Place | None, quiet: bool) -> int:
     page = place.path / "report.html"
     echo(last_line(status.value, manifest.results, tallies, os.path.relpath(page if page.exists() else place.path)))
     if not quiet and status is Status.INTERRUPTED:
-        echo(f"next: `reslrb optimize --resume {os.path.relpath(place.path)}` goes on from here")
+        echo(f"next: `reslrb optimize --resume {os.path.relpath(place.path)}` continues this run")
     if not quiet and status is Status.FINISHED and course.problem.config.fabrication is not None:
-        echo(f"next: `reslrb export {os.path.relpath(place.path)} -o FOLDER` makes the solid")
+        echo(f"next: `reslrb export {os.path.relpath(place.path)} -o FOLDER` writes the solid")
     return ExitCode.DONE if status is Status.FINISHED else ExitCode.INTERRUPTED

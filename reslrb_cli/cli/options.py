@@ -1,7 +1,7 @@
-"""The options and arguments that commands about one experiment share, and the way from a file to a variant.
+"""Options and arguments that commands share, and the loading of configurations and variants.
 
-Measuring commands keep with `Keeper` what they have measured so far: the file of `--json` says what
-measured, then has one object a line, and stands on the disk while they go on.
+Commands that measure save their results with `Keeper`: the file of `--json` names the device and the variant, then
+has one object per line, and is updated while the command runs.
 """
 
 from __future__ import annotations
@@ -46,15 +46,16 @@ if TYPE_CHECKING:
 
 
 def origin_of(variant: str) -> Origin:
-    """What this process measures on, under `variant`."""
+    """Return the device and the variant on which this process measures."""
     return Origin(device_name(variant), variant)
 
 
 class Keeper:
-    """Keeps a JSON file, and the samples beside it, so that a process that is killed loses seconds.
+    """Writer of a JSON file and the samples beside it, so that a killed process loses only seconds of work.
 
-    `origin` is the first line, `final` has the other ones that no later one changes, `provisional` the rest, as of now;
-    `kept` what a later session needs, None where there is nothing yet. Where no file is asked for nothing is done.
+    `origin` is the first line, `final` returns the lines that will not change, and `provisional` the others in their
+    current state. `kept` returns the data that a later session needs, or None if there is none yet. Does nothing
+    without a file.
     """
 
     def __init__(
@@ -74,30 +75,30 @@ class Keeper:
         self._live = LivePage(lambda: self._write(self._final(), self._provisional()), "the file of --json")
 
     def refresh(self) -> None:
-        """Write, if it is time to: every few seconds, and no more than a small share of the time. Between steps."""
+        """Write every few seconds, within a small share of the time. Call it between steps."""
         if self._file is None:
             return
-        if self._file.is_stream:  # which has lines as they come
+        if self._file.is_stream:  # a stream gets only final lines
             self._file.write([self._origin, *self._final()])
         else:
             self._live.refresh()
 
     def finish(self, lines: Sequence[Line]) -> None:
-        """Write all `lines`, none of which changes any more. Raises OSError."""
+        """Write all `lines` in their final state. Raises OSError."""
         if self._file is not None:
             if not self._write(lines):
-                echo("the samples are too large to be kept: the same command would measure all of it again")
+                echo("the samples are too large to save: the same command will measure everything again")
             self._file.close()
 
     def _write(self, final: Sequence[Line], provisional: Sequence[Line] = ()) -> bool:
-        """Write both files; whether what there is to be kept is."""
+        """Write both files; return whether the samples were small enough to save."""
         assert self._file is not None
         kept = None if self._samples is None else self._kept()
         fits = kept is None or are_kept(kept[1])
         if self._samples is not None:
             if kept is not None and fits:
                 write_samples(self._samples, *kept)
-            else:  # what may lie there is not of these lines
+            else:  # an existing file belongs to other lines
                 self._samples.unlink(missing_ok=True)
         self._file.write([self._origin, *final], provisional)
         return fits
@@ -111,10 +112,10 @@ def measuring(
     kind: type[A], plan: Measurement, json_file: Path | None, began: float, of: str,
     say: Callable[[str], None] = echo,
 ) -> Iterator[tuple[A, Interrupts]]:  # fmt: skip
-    """A session that measures `plan`, and the user's wish to stop; neither its folder nor its workers outlive it.
+    """Yield a session that measures `plan`, and its interrupts; removes its folder and workers at the end.
 
-    It goes on from the samples of `json_file`, if any. `began` is when the command was called, by `monotonic`; rounds
-    are made `of` what allowance names. Raises ConfigError.
+    The session continues from the samples of `json_file`, if any. `began` is the `monotonic` time of the command's
+    call, and `of` the unit of `plan.rounds` in the message. Raises ConfigError.
     """
     from reslrb_cli.measure.processes import abandon_all
 
@@ -133,22 +134,22 @@ def measuring(
 
 
 def read_earlier(kind: str, json_file: Path | None, now: Mapping[str, Any] | None = None) -> Earlier | None:
-    """Return the samples on file, as `Earlier.read` has them, and say that they count."""
+    """Return the saved samples (`Earlier.read`), and print that they are used."""
     from reslrb_cli.measure.resume_store import Earlier
 
     earlier = Earlier.read(kind, json_file, now)
     if earlier is not None:
-        echo(f"samples in {samples_file(earlier.source)} count, and are not taken again")
+        echo(f"using the samples in {samples_file(earlier.source)}")
     return earlier
 
 
 def look_at(path: Path) -> None:
-    """Say where a picture is, or a folder of them."""
+    """Print the path of an image, or of a folder of images."""
     echo(f"look at {os.path.relpath(path)}")
 
 
 def exit_code(interrupted: bool, done: bool, states: set[BenchStatus]) -> ExitCode:
-    """A comparison in which something could be measured is `done`; else what kept it from that decides."""
+    """Return the exit code of a comparison: `done` if anything was measured, otherwise by the reason."""
     if interrupted:
         return ExitCode.INTERRUPTED
     memory = states == {BenchStatus.OUT_OF_MEMORY}
@@ -156,14 +157,14 @@ def exit_code(interrupted: bool, done: bool, states: set[BenchStatus]) -> ExitCo
 
 
 def read_recovered(run: Path, overrides: tuple[str, ...]) -> Config:
-    """The experiment of a run with what it recovered (`records.run_folder.recovered`). Raises ConfigError."""
+    """Return the experiment of a run with its recovered values (`records.run_folder.recovered`). Raises ConfigError."""
     from reslrb_cli.records.run_folder import recovered
 
     return recovered(run, overrides)
 
 
 class FolderPath(click.Path):
-    """A path of which a shell completes folders; what it is in truth, who opens it says."""
+    """Path for which a shell completes folders; the code that opens it checks its type."""
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
         return [CompletionItem(incomplete, type="dir")]
@@ -199,7 +200,7 @@ def _keys(schema: Mapping[str, Any], definitions: Mapping[str, Any], at: str) ->
         yield from _keys(value, definitions, key)
 
 
-#: Type of an option that counts something: samples, depths, seeds. As in a configuration, 31 bits.
+#: Type of a count, such as samples, depths or seeds: 31 bits, as in a configuration.
 COUNT = click.IntRange(min=1, max=2**31 - 1)
 
 
@@ -212,7 +213,7 @@ class Counts(click.ParamType):
         parts: list[Any] = str(value).split(",")
         counts = [COUNT.convert(part, param, ctx) for part in parts]
         if len(set(counts)) < len(counts):
-            self.fail(f"`{value}` names a number twice", param, ctx)
+            self.fail(f"`{value}` has a number twice", param, ctx)
         return tuple(counts)
 
 
@@ -225,17 +226,17 @@ class Size(click.ParamType):
         try:
             return memory_bytes(str(value))
         except ValueError:
-            self.fail(f"`{value}` is no size; write it as in 2GiB or 500MB", param, ctx)
+            self.fail(f"`{value}` is not a size; write 2GiB or 500MB", param, ctx)
 
 
-#: What to do in place of an option that was removed.
+#: Replacements of removed options.
 REMOVED = {
-    "--runs": "was removed; compare whole runs by `reslrb sweep CONFIG --seeds N --set run.max_seconds=S "
+    "--runs": "was removed; compare whole runs with `reslrb sweep CONFIG --seeds N --set run.max_seconds=S "
     "--vary 'integrator=[prb, reslrb:stack]'`",
-    "--markdown": "was removed; `reslrb report FILE -o page.html` has the table of what --json FILE wrote",
-    "--plot": "was removed; `reslrb report FILE -o page.html` draws what --json FILE wrote",
-    "--resume": "was removed here; name the file with --json, which goes on from what is in it",
-    "--rates": "was removed; try learning rates by `reslrb sweep CONFIG --vary 'optimizer.learning_rate=[0.03, 0.1]'`",
+    "--markdown": "was removed; `reslrb report FILE -o page.html` shows the table of results of --json FILE",
+    "--plot": "was removed; `reslrb report FILE -o page.html` plots results of --json FILE",
+    "--resume": "was removed here; --json FILE continues from the results in FILE",
+    "--rates": "was removed; compare rates with `reslrb sweep CONFIG --vary 'optimizer.learning_rate=[0.03, 0.1]'`",
 }
 
 budget_option = click.option(
@@ -276,7 +277,7 @@ def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def cluster_option(what: str, result: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Add `--cluster` (`cluster`) to a command, with `what` workers do and the `result` in its help."""
+    """Add `--cluster` (`cluster`) to a command; its help says `what` the workers do, and the `result`."""
     where = "local:N, N processes on this machine, or tls://HOST:PORT, the workers of a dask scheduler"
     return click.option(
         "--cluster", metavar="WHERE", help=f"{what}: {where}; {result}. Needs `pip install reslrb[cluster]`."
@@ -284,7 +285,7 @@ def cluster_option(what: str, result: str) -> Callable[[Callable[..., Any]], Cal
 
 
 def allow_code_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add `--allow-code` (`allow_code`) to a command that calls what users have written."""
+    """Add `--allow-code` (`allow_code`) to a command that runs users' own code."""
     return click.option(
         "--allow-code",
         is_flag=True,
@@ -294,10 +295,10 @@ def allow_code_option(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def allowance(budget_s: float, number: int | None, of: str) -> str:
-    """What ends a measurement, in words: its budget, or a `number` of what it is made `of`."""
+    """Return what ends a measurement, in words: its time limit, or a `number` of units `of` work."""
     if number is not None:
-        return f"{number} {of}{'' if number == 1 else 's'}, whatever time that takes"
-    return f"budget {budget_s:g} s for the whole, loading and compiling included"
+        return f"{number} {of}{'' if number == 1 else 's'}, without a time limit"
+    return f"budget {budget_s:g} s, including loading and compiling"
 
 
 def experiment_arguments(function: Callable[..., Any], required: bool = True) -> Callable[..., Any]:
@@ -308,12 +309,12 @@ def experiment_arguments(function: Callable[..., Any], required: bool = True) ->
 
 
 def optional_experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same for a command that has a scene of its own: `config_file` is None where CONFIG is left out."""
+    """Add the same to a command in which CONFIG is optional; `config_file` is None without it."""
     return experiment_arguments(function, required=False)
 
 
 def is_given(name: str) -> bool:
-    """Whether the user gave an option of the command that runs, by its parameter's name."""
+    """Whether the user gave the option with this parameter name to the current command."""
     return click.get_current_context().get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
 
 
@@ -323,7 +324,7 @@ def read_config(config_file: Path, overrides: tuple[str, ...]) -> Config:
 
 
 def read_or_box(config_file: Path | None, overrides: tuple[str, ...]) -> Config:
-    """The configuration, or that of the built-in Cornell box where no file is given. Raises ConfigError."""
+    """Load the configuration, or that of the built-in Cornell box if no file is given. Raises ConfigError."""
     if config_file is not None:
         return read_config(config_file, overrides)
     from reslrb_cli.measure.scenes import small
@@ -332,21 +333,21 @@ def read_or_box(config_file: Path | None, overrides: tuple[str, ...]) -> Config:
 
 
 def start_variant(config: Config) -> str:
-    """Set the Mitsuba variant that `config` asks for; return its name. Raises BackendError."""
+    """Set the Mitsuba variant of `config`; return its name. Raises BackendError."""
     from reslrb_cli.backend.variant import set_variant
 
     return set_variant(config.variant)
 
 
 def check_writable(option: str, path: Path | None) -> None:
-    """Raise ConfigError, located by the option, where the file `path` cannot be written; it is left as it was."""
+    """Raise ConfigError, located by the option, if the file `path` cannot be written; leave the file unchanged."""
     if path is None:
         return
     existed = os.path.lexists(path)
-    try:  # without waiting: a pipe that nobody reads from would make wait for ever
+    try:  # O_NONBLOCK, because opening a pipe without a reader would wait forever
         os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK, 0o666))
     except (OSError, ValueError) as error:
-        reason = "nobody reads from that pipe" if getattr(error, "errno", None) == errno.ENXIO else None
+        reason = "the pipe has no reader" if getattr(error, "errno", None) == errno.ENXIO else None
         raise ConfigError(
             option, "", f"cannot write {path}: {reason or getattr(error, 'strerror', None) or error}"
         ) from None

@@ -1,4 +1,4 @@
-"""Progress of an optimisation, and of reading long files: a bar on a terminal, plain lines elsewhere."""
+"""Progress of an optimisation and of reading long files: a bar on a terminal, plain lines otherwise."""
 
 from __future__ import annotations
 
@@ -16,31 +16,30 @@ from reslrb_cli.records.metrics import Record
 from reslrb_cli.report.format import shorten
 from reslrb_cli.report.run_summary import BESIDE_A_BAR, descriptions
 
-#: Without a terminal a line is written after each tenth of the iterations, and when this many seconds have passed.
+#: Without a terminal, a line is written after each tenth of the iterations and after this many seconds.
 SECONDS_PER_LINE = 10.0
 
-#: What takes less has no bar.
+#: Minimum duration, in seconds, for a bar.
 LEAST_SECONDS = 1.0
 
-#: Cells that the bar has at least; what would leave it fewer is said in fewer words.
+#: Minimum width of the bar; the text beside it is shortened for this.
 LEAST_BAR = 8
 
-#: The line around the bar, the most telling first; `{desc}` is what `descriptions` says.
+#: Formats of the line around the bar, from long to short; `{desc}` is a text of `descriptions`.
 FRAMES = (
     "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}] {desc}",
     "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}, {remaining} left, {desc}",
     "{percentage:3.0f}%|{bar}| {desc}",
 )
 
-#: Where there is no room for any of them.
+#: Format if none of them fits.
 LEAST_FRAME = "{percentage:3.0f}%|{bar}|"
 
 
 class Progress:
-    """Shows each record of `total` on standard error; as a context manager it tidies the terminal up at the end.
+    """Progress on standard error of a run with `total` iterations; as a context manager it closes the bar at the end.
 
-    `done` of them were before, in a run that goes on.
-    `meter` is what measured the parameters' errors.
+    `done` iterations were finished before a resumed run. `meter` measures the parameters' errors.
     """
 
     def __init__(self, total: int, quiet: bool, meter: ErrorMeter, done: int = 0) -> None:
@@ -59,7 +58,7 @@ class Progress:
             )
 
     def show(self, record: Record) -> None:
-        """Show that the iteration of `record` is done; a terminal that has gone ends no run."""
+        """Show that the iteration of `record` is done. A closed terminal does not end the run."""
         with contextlib.suppress(OSError):
             self._show(record)
 
@@ -67,7 +66,7 @@ class Progress:
         if self._bar is not None:
             self._fit(descriptions(record, self._meter))
             self._bar.update()
-            if record.iteration + 1 == self._total:  # what follows is no iteration
+            if record.iteration + 1 == self._total:  # no iterations follow
                 self._bar.close()
             return
         done, now = record.iteration + 1, time.monotonic()
@@ -79,10 +78,10 @@ class Progress:
         click.echo(f"{done}/{self._total}: {text}, {record.elapsed_s:.1f} s", file=self._stream)
 
     def _fit(self, texts: list[str]) -> None:
-        """Give the bar the first combination of frame and text that leaves it room.
+        """Choose the longest combination of format and text that leaves room for the bar.
 
-        Numbers change their lengths from one iteration to the next: as long as the terminal keeps its width, a longer
-        combination is not tried again, so that the line does not flicker.
+        The lengths of numbers vary between iterations. To avoid flicker, a longer combination is tried again only when
+        the width of the terminal changes.
         """
         facts = self._bar.format_dict
         full, *short = texts
@@ -109,10 +108,9 @@ class Progress:
 
 
 class Reading:
-    """Shows how far the reading of long files has come, on standard error: called as `records.reading.Tell` is.
+    """Progress on standard error of reading long files; callable like `records.reading.Tell`.
 
-    As a context manager it tidies the terminal up, and says, where reading took long, that what follows takes its time
-    too.
+    As a context manager it closes the bar and, after a long reading, prints that drawing follows.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""`reslrb render`: one image of an experiment's scene."""
+"""`reslrb render`: render one image of an experiment's scene."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from reslrb_cli.config.views import ViewSpec
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.atomic import writing
 
-#: Formats that hold linear values; the others of `FORMATS` are written in 8-bit sRGB.
+#: Formats with linear values; the other `FORMATS` are 8-bit sRGB.
 FLOAT_FORMATS = (".exr", ".hdr", ".pfm")
 FORMATS = (*FLOAT_FORMATS, ".png", ".jpg", ".jpeg")
 
@@ -40,7 +40,7 @@ class Exposure(click.ParamType):
     def convert(
         self, value: str | float | None, param: click.Parameter | None, ctx: click.Context | None
     ) -> float | None:
-        """The factor."""
+        """Return the factor."""
         if value == "auto" or value is None:
             return None
         try:
@@ -99,10 +99,10 @@ def command(
 ) -> None:
     """Render the scene of CONFIG, or of a run (--run RUN), with its integrator."""
     if run is not None and is_given("initial"):
-        raise click.UsageError("--run renders the values that the run recovered; leave out --initial and --scene")
+        raise click.UsageError("--run renders the recovered values; remove --initial or --scene")
     linear = output.suffix.lower() in FLOAT_FORMATS
     if linear and is_given("exposure") and (run is None or exposure != 1):
-        raise click.UsageError(f"{output.suffix} holds light as it is; --exposure is for PNG and JPG")
+        raise click.UsageError(f"{output.suffix} is linear; --exposure is for PNG and JPG")
     config = _read(config_file, run, overrides).with_code(allow_code)
     check_image_path(output)
     start_variant(config)
@@ -133,13 +133,13 @@ def command(
     hint = "" if suits == 1 or is_given("exposure") else f"; --exposure auto: {exposure_words(suits)}"
     if np.any(applied != 1):
         shown = " ".join(f"{value:.4g}" for value in np.ravel(applied))
-        words.append(f"times {shown}, the run's exposure (--exposure 1 leaves it out)")
+        words.append(f"times {shown}, the run's exposure (--exposure 1 ignores it)")
         hint = ""
     echo(f"{output}: {', '.join(words)}{hint}")
 
 
 def _suiting(image: Any, scene: Any, sensor: Any) -> float:
-    """The exposure that suits an image of a scene."""
+    """Return the exposure that suits an image of a scene."""
     from reslrb_cli.report.tonemap import exposure_for
     from reslrb_cli.scene.needs import unsupported_part
     from reslrb_cli.scene.visibility import sees_lamps
@@ -148,7 +148,7 @@ def _suiting(image: Any, scene: Any, sensor: Any) -> float:
 
 
 def _read(config_file: Path | None, run: Path | None, overrides: tuple[str, ...]) -> Config:
-    """The configuration of the scene to render: that of a file, or of a run with what it recovered."""
+    """Return the configuration to render: that of a file, or of a run with its recovered values."""
     if config_file is not None and run is not None:
         raise click.UsageError("give CONFIG or --run RUN, not both")
     if run is not None:
@@ -159,11 +159,11 @@ def _read(config_file: Path | None, run: Path | None, overrides: tuple[str, ...]
 
 
 def _of_sensor(config: Config, sensor: int) -> Config:
-    """The experiment seen by one sensor alone, whether its view was trained on or held out."""
+    """Return the experiment with one sensor only, whether its view is held out or not."""
     return config.model_copy(
         update={
             "views": [ViewSpec(sensor=sensor)],
-            # An image has no use for what is said of several views.
+            # One image does not need the settings of several views.
             "target": config.target.model_copy(update={"exposure": 1.0}),
             "run": config.run.model_copy(update={"held_out": [], "views_per_iteration": None}),
         }
@@ -171,14 +171,14 @@ def _of_sensor(config: Config, sensor: int) -> Config:
 
 
 def check_image_path(path: Path) -> None:
-    """Raise ConfigError where no image can be written at `path`: an unknown format, or no place to write it to."""
+    """Raise ConfigError if no image can be written to `path`, because of its format or its folder."""
     if path.suffix.lower() not in FORMATS:
-        raise ConfigError("--output", "", f"{path} has no known image format; end it in {', '.join(FORMATS)}")
+        raise ConfigError("--output", "", f"{path} has no known image format; use {', '.join(FORMATS)}")
     if path.is_dir() or not path.absolute().parent.is_dir():
         raise ConfigError("--output", "", f"{path} is a folder, or in a folder that does not exist")
     if os.path.lexists(path) and not path.is_file():
         raise ConfigError("--output", "", f"{path} is not a regular file")
     check_writable("--output", path)
-    # for the file that takes the place of that one when it is complete
+    # the image is written to a temporary file first, which then replaces `path`
     with writing("--output", path), tempfile.TemporaryFile(dir=path.resolve().parent):
         pass

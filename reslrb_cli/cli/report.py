@@ -12,7 +12,7 @@ from reslrb_cli.cli.options import check_writable
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.errors import ConfigError, ExitCode
 
-#: Runs and files on one page, at most: each has its images in it.
+#: Maximum number of runs and files on one page, which contains their images.
 MOST_SOURCES = 100
 
 
@@ -30,7 +30,7 @@ def command(paths: tuple[Path, ...], output: Path | None) -> int:
     """
     from reslrb_cli.backend.installation import load_packages
 
-    load_packages()  # images are read by Mitsuba
+    load_packages()  # Mitsuba reads the images
     from reslrb_cli.cli.progress import Reading
     from reslrb_cli.records.sweeps import PAGE_FILE
     from reslrb_cli.report.page import write_page
@@ -39,13 +39,13 @@ def command(paths: tuple[Path, ...], output: Path | None) -> int:
 
     if len(paths) > MOST_SOURCES:
         raise ConfigError("RUN", "", f"{len(paths)} are given; a page shows at most {MOST_SOURCES}")
-    gc.collect()  # what has been done with, as a scene, is not to be frozen with the rest
+    gc.collect()  # so that unused objects, such as a scene, are not frozen below
     with Reading() as tell:
         sources = read_sources(paths, tell)
-    gc.freeze()  # Python's search for cycles would go through millions of numbers while it draws
+    gc.freeze()  # otherwise Python searches millions of numbers for cycles during drawing
     if output is None:
         if len(sources) != 1 or not isinstance(sources[0], Run | SweepRuns):
-            raise ConfigError("--output", "", "is missing; give the page to write, as in -o page.html")
+            raise ConfigError("--output", "", "is missing; give a file to write, e.g. -o page.html")
         output = sources[0].path / ("report.html" if isinstance(sources[0], Run) else PAGE_FILE)
     check_writable("--output", output)
     write_page([with_seen_errors(source) for source in sources], output)

@@ -1,7 +1,7 @@
-"""`reslrb sweep`: runs of one experiment at several settings and seeds, one after the other, and a table of them.
+"""`reslrb sweep`: run an experiment with several settings and seeds, one run after the other, and tabulate the results.
 
-Each run is `reslrb optimize` in a process of its own, so that none has the memory, the kernels or the end of another.
-It does not outlive this one (`follow`), so that a sweep that was killed can be gone on with at once.
+Each run is `reslrb optimize` in its own process, so that runs do not share memory, kernels or failures. The process
+ends with this one (`follow`), so that a killed sweep can be continued at once.
 """
 
 from __future__ import annotations
@@ -49,20 +49,20 @@ if TYPE_CHECKING:
     from reslrb_cli.runs.sweep import Plan
 
 logger = logging.getLogger(__name__)
-NOTICE = "stopping after this iteration of the run at work; once more, and it ends at once"
+NOTICE = "stopping after this iteration of the current run; a second signal stops at once"
 
-#: How long a run is waited for that was told to end at once.
+#: Maximum wait, in seconds, for the end of a run that must end at once.
 END_SECONDS = 5.0
 
 _POLL_SECONDS = 0.1
 
-#: The times as long as the last page took that pass until the next one, at least: a run waits for it.
+#: Minimum time between two pages, as a multiple of the time for the last page, because runs wait for it.
 PAGE_SHARE = 5.0
 
-#: Lines of a run that are looked at for what it ended by; and how those of its progress begin.
+#: Number of last lines of a run in which its error is searched; start of a line of progress.
 MOST_LINES, _PROGRESS = 200, re.compile(r"\d+/\d+: ")
 
-#: The program, in a process that does not outlive the one of this number.
+#: The program, in a process that ends with the process of the given number.
 _PROGRAM = "sys.argv[0] = 'reslrb'; from reslrb_cli.cli.sweep import follow; follow(int(sys.argv.pop(1)))"
 
 
@@ -142,8 +142,8 @@ def command(
     if resumed is not None:
         given = [name for name in ("config_file", "overrides", "vary", "folder", "dry_run") if is_given(name)]
         if given:
-            raise click.UsageError("--resume goes on with a sweep as it began; of others it takes --seeds, --retry, "
-                                   "--allow-code and --json alone")  # fmt: skip
+            raise click.UsageError("--resume continues a sweep with its own settings; add only --seeds, --retry, "
+                                   "--allow-code or --json")  # fmt: skip
         folder = resumed
     elif config_file is None:
         raise click.UsageError("Missing argument 'CONFIG'")
@@ -159,11 +159,11 @@ def command(
 
 
 def _run(folder: Path, sweep: Sweep, json_file: Path | None, quiet: bool, verbose: bool) -> int:
-    """Do what is left of the sweep, keep its page, and say what it came to."""
+    """Run the remaining runs of the sweep, update its page, and print the results."""
     from reslrb_cli.backend.installation import load_packages
     from reslrb_cli.config.loader import load
 
-    load_packages()  # images are read by Mitsuba
+    load_packages()  # Mitsuba reads the images
     from reslrb_cli.records.measurement_files import LineFile, LivePage
     from reslrb_cli.records.sweeps import PAGE_FILE, Failure, config_file, label, run_name
     from reslrb_cli.report.page import write_page
@@ -182,7 +182,7 @@ def _run(folder: Path, sweep: Sweep, json_file: Path | None, quiet: bool, verbos
 
     page = LivePage(refresh, "the sweep's page", PAGE_SHARE)
     runs, interrupted = list(sweep.runs), False
-    go_on = f"`reslrb sweep --resume {os.path.relpath(folder)}` goes on"
+    go_on = f"`reslrb sweep --resume {os.path.relpath(folder)}` continues"
     with Interrupts(notice=None if quiet else NOTICE) as interrupts:
         for number, (combination, seed) in enumerate(runs, 1):
             name = run_name(combination, seed)
@@ -216,7 +216,7 @@ def _run(folder: Path, sweep: Sweep, json_file: Path | None, quiet: bool, verbos
         echo(line)
     done, failed = sum(run.is_done for run in records), sum(run.status == "failed" for run in records)
     ended = "interrupted" if interrupted else "finished"
-    more = f"; {go_on}" if interrupted else "; --retry tries those that failed again" if failed else ""
+    more = f"; {go_on}" if interrupted else "; --retry repeats failed runs" if failed else ""
     which = f"{done} of {len(records)} runs done" + (f", {failed} failed" if failed else "")
     echo(f"{ended}, {which}; look at {os.path.relpath(folder / PAGE_FILE)}{more}")
     if interrupted:
@@ -225,7 +225,7 @@ def _run(folder: Path, sweep: Sweep, json_file: Path | None, quiet: bool, verbos
 
 
 def _json_lines(source: SweepRuns) -> list[Line]:
-    """What each run and each combination came to, and which is the best, behind what measured them."""
+    """Return the lines of the JSON file: the device, the results of runs and combinations, and the best of them."""
     from reslrb_cli.records.measurement_files import Origin
     from reslrb_cli.report.sweep import best_records, row_records, run_records
 
@@ -241,11 +241,11 @@ def _json_lines(source: SweepRuns) -> list[Line]:
 def call(
     arguments: Sequence[str], interrupts: Interrupts, verbose: bool = False, fresh: bool = False
 ) -> tuple[int, str]:
-    """Call `reslrb` with these arguments in a process of its own; its exit code, and the line that says how it ended.
+    """Run `reslrb` with these arguments in its own process; return its exit code and its last line.
 
-    The first signal that `interrupts` notes is passed on to it; one more, and it ends with this process. What it says
-    is shown with `verbose`, and else its warnings are in its folder. A `fresh` process finds no kernels and no
-    decisions of earlier runs: runs of equal time pay for their own.
+    The first signal in `interrupts` is passed on to the process; a second one ends it with this process. `verbose`
+    shows its output; otherwise its warnings are in its folder. A `fresh` process has no kernels or decisions of earlier
+    runs, so that runs of equal time all pay for their own.
     """
     if fresh:
         with tempfile.TemporaryDirectory(prefix="reslrb-sweep-", ignore_cleanup_errors=True) as folder:
@@ -301,20 +301,20 @@ def _call(
                 stream.close()
     if code < 0:
         name = signal.Signals(-code).name
-        memory = " (the system ends so what takes too much memory)" if -code == signal.SIGKILL else ""
+        memory = " (often sent when memory runs out)" if -code == signal.SIGKILL else ""
         return (ExitCode.INTERRUPTED if told else code), f"ended by {name}{memory}: {last_words(chr(10).join(said))}"
-    return code, said[-1] if said else f"ended with exit code {code}, and said nothing"
+    return code, said[-1] if said else f"ended with exit code {code}, without a message"
 
 
 def _show(line: str) -> None:
-    """Show the progress of a run in the last line of the terminal, if there is one, in place of what stood there."""
+    """Replace the last line of the terminal, if there is one, by the progress of a run."""
     if sys.stderr.isatty():
         text = shorten(f"  {line}" if line else "", shutil.get_terminal_size().columns - 1)
         click.echo(f"\r\x1b[K{text}", err=True, nl=False)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End the process of a run at once, by a second signal, which has its manifest say so."""
+    """End the process of a run at once by a second signal, so that its manifest records this."""
     with contextlib.suppress(OSError, subprocess.TimeoutExpired):
         process.send_signal(signal.SIGTERM)
         process.send_signal(signal.SIGTERM)
@@ -324,10 +324,10 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def follow(parent: int) -> None:
-    """The program `reslrb` in a process that ends with the process `parent`, however that ends."""
+    """Run the program `reslrb` in a process that ends with the process `parent` in any case."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, int(signal.SIGKILL))  # PR_SET_PDEATHSIG
-        if os.getppid() != parent:  # it ended before
+        if os.getppid() != parent:  # the parent has ended already
             os._exit(ExitCode.INTERRUPTED)
     else:
         threading.Thread(target=_end_with_input, daemon=True).start()
@@ -337,7 +337,7 @@ def follow(parent: int) -> None:
 
 
 def _end_with_input() -> None:
-    """Where the system does not see to it: the other end of standard input is closed as its process ends."""
+    """End this process when the parent's end closes standard input; for systems without PR_SET_PDEATHSIG."""
     os.read(0, 1)
     os._exit(ExitCode.INTERRUPTED)
 
@@ -346,7 +346,7 @@ def _end_with_input() -> None:
 
 
 def _forecast(plan: Plan) -> int:
-    """Print how many runs there are, and what those of each combination will take; nothing is written."""
+    """Print the number of runs, and the time and memory for each combination; write nothing."""
     from reslrb_cli.config.files import duration, in_words
     from reslrb_cli.optimization.forecast import make_forecast
     from reslrb_cli.records.cache import PilotCache

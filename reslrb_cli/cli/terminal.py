@@ -1,19 +1,17 @@
-"""The terminal: what is printed on it, what an error comes to, and signals.
+"""Output on the terminal, error messages, and signals.
 
-What commands print and log (`echo`, `LogLines`): keys, names and paths are a user's or a file's, and must not
-command the terminal.
+- `echo`, `LogLines`: print and log lines. Keys, names and paths come from users and files, so control characters in
+  them are escaped.
+- `tell`: turns an error into a line and an exit code, for errors of arguments and all others (`errors.tell`).
+- `Interrupts`: handles SIGINT, SIGTERM and SIGHUP.
 
-What an error comes to on the command line (`tell`): those of its own arguments, and all others (`errors.tell`).
+A signal handler never raises an exception. An exception inside Mitsuba or Dr.Jit would cause a crash (a module that is
+half imported) or an unrelated error (a recording without its end). The first signals therefore only set a flag, which
+is checked where it is safe to stop. One signal more ends the process at once, after its last message.
 
-SIGINT, SIGTERM and SIGHUP (`Interrupts`) are the wish to stop, and the end at once. Nothing is ever raised out of a
-signal handler: an exception that comes up in the midst of what Mitsuba and Dr.Jit are doing ends in a crash (a module
-that is half imported), or in an error that names something else (a recording without its end). So the first signals
-only leave a mark, which is looked at where it is safe to stop; and one too many ends the process where it stands, after
-what has to be said has been said.
-
-Python runs its handlers in the main thread, between two of its instructions, and takes two signals that come while a
-kernel runs for one. The signals are therefore counted by a thread of their own, which gets each of them from the
-descriptor that Python's C code writes to. It can do its work while a kernel runs, but not while one is compiled.
+Python runs signal handlers in the main thread, between two instructions, and merges two signals that arrive while a
+kernel runs. A separate thread therefore counts the signals, from the descriptor that Python's C code writes to. It runs
+while a kernel runs, but not while one is compiled.
 """
 
 from __future__ import annotations
@@ -36,18 +34,17 @@ from reslrb_cli import errors
 from reslrb_cli.errors import ExitCode, one_line, printable
 from reslrb_cli.records.atomic import remove_unfinished
 
-#: What a terminal sends for Ctrl-C, what `kill` and batch systems send, and what a terminal sends when it is closed.
+#: Signals of Ctrl-C, of `kill` and batch systems, and of a terminal that closes.
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 _LEAVE = b"\0"  # no signal has the number 0
 
 
 class Interrupts:
-    """While entered, `requested` tells whether there was a signal; the one after `tolerated` of them ends the process.
+    """Context manager in which `requested` tells whether a signal came. Signals after `tolerated` ones end the process.
 
-    That prints `interrupted`, calls `last_act` before, removes files that are not finished, and exits with 130; it
-    happens in another thread than the main one. `notice` is printed at the first signal that is tolerated. Signals that
-    the program was started to ignore (`nohup`) are ignored. May be entered within another, whose place it takes; in
-    another thread than the main one it does nothing.
+    To end it, a thread calls `last_act`, removes unfinished files, prints `interrupted`, and exits with 130.
+    `notice` is printed at the first tolerated signal. Signals that were ignored at the start of the program (`nohup`)
+    stay ignored. An inner context replaces an outer one. Outside of the main thread it does nothing.
     """
 
     def __init__(
@@ -81,7 +78,7 @@ class Interrupts:
         self._stop()
 
     def ignore(self) -> None:
-        """Ignore the signals from now on, in place of leaving: what is left to do is over in a moment."""
+        """Ignore the signals from now on, because the program ends in a moment."""
         for number in self._before:
             signal.signal(number, signal.SIG_IGN)
         self._before = {}
@@ -101,7 +98,7 @@ class Interrupts:
         self.requested = True
 
     def _watch(self) -> None:
-        """Count the signals, in a thread of their own."""
+        """Count the signals; runs in a separate thread."""
         assert self._pipe is not None
         while True:
             for number in os.read(self._pipe[0], 64):
@@ -127,20 +124,20 @@ class Interrupts:
 
 
 def _say(line: str) -> None:
-    """Print a line on standard error, past Python's buffers and locks, unless that would have to wait."""
+    """Print a line on standard error without Python's buffers and locks, unless this would block."""
     with contextlib.suppress(OSError, ValueError):
         if select.select([], [2], [], 0)[1]:
-            start = "\n" if os.isatty(2) else ""  # behind a progress bar, or the ^C that a terminal shows
+            start = "\n" if os.isatty(2) else ""  # after a progress bar or the terminal's ^C
             os.write(2, f"{start}{line}\n".encode())
 
 
 def echo(line: object) -> None:
-    """Print one line on standard output, with what is not printable in it escaped."""
+    """Print one line on standard output; escape characters that are not printable."""
     click.echo(printable(line))
 
 
 def fill(template: str, filters: Mapping[str, Callable[..., object]], **values: object) -> str:
-    """The text of a template in `templates/`; what is not printable in `values` is escaped, and ends no line."""
+    """Fill in a template of `templates/`; escape characters in `values` that are not printable, and line breaks."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     loader = FileSystemLoader(Path(__file__).with_name("templates"))
@@ -153,8 +150,7 @@ def fill(template: str, filters: Mapping[str, Callable[..., object]], **values: 
 
 
 class LogLines(logging.Handler):
-    """Writes each message as a line on what is the standard error at that moment, above a progress bar where there is
-    one, with what is not printable in it escaped."""
+    """Handler that writes messages on the current standard error, above a progress bar, with escapes as in `echo`."""
 
     def emit(self, record: logging.LogRecord) -> None:
         try:
@@ -168,7 +164,7 @@ class LogLines(logging.Handler):
 
 
 def tell(error: BaseException) -> tuple[str, int] | None:
-    """The line and the exit code for `error`; None for a fault of ours, whose traceback is wanted."""
+    """Return the line and the exit code for `error`; None for a bug in reslrb, which needs a traceback."""
     if isinstance(error, click.Abort):
         return "interrupted", ExitCode.INTERRUPTED
     if isinstance(error, click.ClickException):

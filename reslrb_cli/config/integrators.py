@@ -34,16 +34,16 @@ from reslrb_cli.config.files import CAPACITY, LOCAL_ENTRIES, PASS_PATHS, PASS_SA
 _DEPTH = must(
     lambda depth: depth <= PATH_LENGTH,
     lambda depth: (
-        f"must be at most {PATH_LENGTH} segments, or -1 for no limit, not {depth}: Russian roulette ends a path "
-        "long before, so that this limits nothing"
+        f"must be at most {PATH_LENGTH} segments, or -1 for no limit, not {depth}: Russian roulette ends "
+        "paths long before"
     ),
 )
 
 _RECORD = must(
     lambda depth: depth < LOCAL_ENTRIES,
     lambda depth: (
-        f"must be less than {LOCAL_ENTRIES}, not {depth}: the record of a path has room for as many vertices, "
-        "and thread-local memory has no more places; reslrb needs no such record"
+        f"must be less than {LOCAL_ENTRIES}, not {depth}: the record of a path has one entry for each "
+        "vertex, and thread-local memory is limited; use reslrb, which needs no record"
     ),
 )
 
@@ -192,13 +192,13 @@ class Reslrb(AttachingTracer):
         if self.paths == "camera" and self.estimator not in ("auto", "stack"):
             raise located(
                 "estimator",
-                f"`{self.estimator}` chooses among the connections of light paths, of which paths: camera has none; "
-                "leave it out, or take stack",
+                f"`{self.estimator}` needs the connections of light paths, and paths: camera has none; "
+                "remove it, or use stack",
             )
         _check_share(self.paths, self.light_share)
         for option in sorted(self._foreign() & self.model_fields_set):
             owners = " or ".join(f"`{name}`" for name, options in ESTIMATOR_OPTIONS.items() if option in options)
-            raise located(option, f"has no effect with estimator `{self.estimator}`, but with {owners}; remove it")
+            raise located(option, f"has no effect with estimator `{self.estimator}`, only with {owners}; remove it")
         return self
 
     @model_serializer(mode="wrap")
@@ -296,7 +296,7 @@ AnyIntegrator = Annotated[Reslrb | Ptracer | Prb | PrbProjective | WalkAd | Traj
 
 def _check_share(paths: str, light_share: float | str) -> None:
     if light_share not in ("auto", UNDECIDED["light_share"]) and paths in ("light", "camera"):
-        raise located("light_share", f"has no effect with paths: {paths}, but with both; remove it")
+        raise located("light_share", f"has no effect with paths: {paths}, only with both; remove it")
 
 
 def passes_obstacle(spp: int, per_pass: int | None, pixels: int, splits: bool = True) -> str | None:
@@ -311,11 +311,11 @@ def passes_obstacle(spp: int, per_pass: int | None, pixels: int, splits: bool = 
     most = largest_pass(spp, pixels)
     if paths > PASS_PATHS:
         advice = f"set integrator.samples_per_pass to {most}, or lower run.spp" if splits and most else "lower run.spp"
-        advice = advice if PASS_PATHS >= pixels else "take a smaller film"
-        return f"makes {paths} light paths in one pass, and no pass has more than {PASS_PATHS}: {advice}"
+        advice = advice if PASS_PATHS >= pixels else "use a smaller film"
+        return f"makes {paths} light paths in one pass, above the limit of {PASS_PATHS}; {advice}"
     if spp // unit * parts > PASSES:
         advice = f"set integrator.samples_per_pass to {most}" if most and spp // most <= PASSES else "lower run.spp"
-        return f"makes {spp // unit * parts} passes of a step, and no step has more than {PASSES}: {advice}"
+        return f"makes {spp // unit * parts} passes of a step, above the limit of {PASSES}; {advice}"
     return None
 
 

@@ -61,7 +61,7 @@ def _parse_location(path: str, label: str) -> Location:
     while position < len(path):
         match = _PART.match(path, position)
         if match is None:
-            raise ConfigError(label, "", f"`{one_line(path, 100)}` is no key; write it as in parameters[0].bounds")
+            raise ConfigError(label, "", f"`{one_line(path, 100)}` is not a key; write e.g. parameters[0].bounds")
         index, name = match.groups()
         location.append(int(index[:9]) if index else name)
         position = match.end()
@@ -91,7 +91,7 @@ def _put(at: Any, override: Override, depth: int) -> Any:
         if isinstance(part, str) and part.isdecimal():
             part = int(part[:9])
         if not isinstance(part, int):
-            raise ConfigError(override.label, name, f"is a list; name an entry, such as {name}[0]")
+            raise ConfigError(override.label, name, f"is a list; give an entry, such as {name}[0]")
         if part > len(at):
             has = "1 entry" if len(at) == 1 else f"{len(at)} entries"
             raise ConfigError(override.label, name, f"has {has}; there is no [{part}]")
@@ -99,7 +99,7 @@ def _put(at: Any, override: Override, depth: int) -> Any:
     if not isinstance(at, dict):
         raise ConfigError(override.label, name, "is a single value; replace it as a whole")
     if isinstance(part, int):
-        raise ConfigError(override.label, name, "is no list; name a key of it, not an index")
+        raise ConfigError(override.label, name, "is not a list; give a key, not an index")
     return {**at, part: _put(at.get(part), override, depth + 1)}
 
 
@@ -120,19 +120,19 @@ def loads(text: str, path: Path | str, overrides: Sequence[str | Override] = ())
 def replaces(location: Location, earlier: Mapping[str, Location]) -> str | None:
     """What is wrong with a setting at `location` that leaves nothing of one of the `earlier` ones; None without one."""
     name = next((name for name, other in earlier.items() if other[: len(location)] == location), None)
-    return None if name is None else f"replaces what {name} sets; give it first, or leave one of them out"
+    return None if name is None else f"replaces what {name} sets; give it first, or remove one of them"
 
 
 def overrides_of(given: Mapping[str, object] | None) -> list[Override]:
     """The overrides of a script: keys as `--set` has them, values as YAML would have made them. Raises ConfigError,
     also for one that leaves nothing of another before it."""
     if given is not None and not isinstance(given, Mapping):
-        reason = f'is {one_line(repr(given), 60)}, not values by key, such as {{"run.iterations": 5}}'
+        reason = f'is {one_line(repr(given), 60)}, not a mapping such as {{"run.iterations": 5}}'
         raise ConfigError(OVERRIDDEN, "", reason)
     found: dict[str, Override] = {}
     for key, value in (given or {}).items():
         if not isinstance(key, str) or not key:
-            raise ConfigError(OVERRIDDEN, "", f"has the key {one_line(repr(key), 40)}; keys are text, as run.spp")
+            raise ConfigError(OVERRIDDEN, "", f"has the key {one_line(repr(key), 40)}; keys are text, e.g. run.spp")
         location = _parse_location(key, OVERRIDDEN)
         if reason := replaces(location, {name: other.location for name, other in found.items()}):
             raise ConfigError(OVERRIDDEN, key, reason)
@@ -204,7 +204,7 @@ def check_code(config: Config, codes: Mapping[str, Custom | Own] | None = None) 
     experiment's. Nothing is loaded."""
     for key, one in (config.codes if codes is None else codes).items():
         if one.file is None and config.own_loss is None:
-            reason = "missing: FILE.py:NAME, or in Python a function that is handed over, as it was when the run began"
+            reason = "missing; give FILE.py:NAME, or in Python the same function as at the start of the run"
             raise ConfigError(config.source, key, reason)
         if one.file is not None and not config.allows_code:
             reason = f"would run the code of {one.path}, with all your rights; --allow-code has it run"

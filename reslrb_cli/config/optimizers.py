@@ -118,13 +118,13 @@ def _loss_kind(value: Any) -> str:
 def _check_list(losses: list[Loss]) -> list[Loss]:
     for place, loss in enumerate(losses):
         if loss.scale != losses[0].scale:
-            raise located(f"[{place}].scale", "must be the same in all entries of a list: all are fitted, or none is")
+            raise located(f"[{place}].scale", "must be the same in all entries of a list")
     return losses
 
 
 def _check_single(loss: Loss) -> Loss:
     if "weight" in loss.model_fields_set:
-        raise located("weight", "goes with a list of losses, `loss: [{type: l2, weight: 1}, ...]`; remove it")
+        raise located("weight", "needs a list of losses, `loss: [{type: l2, weight: 1}, ...]`; remove it")
     return loss
 
 
@@ -209,7 +209,7 @@ class Optimizer(Choice):
     @model_validator(mode="after")
     def _check_scale(self) -> Self:
         if self.scale == "curvature" and self.type != "sgd":
-            raise located("scale", f"curvature goes with type: sgd; steps of {self.type} do not grow with gradients")
+            raise located("scale", f"curvature needs type: sgd; steps of {self.type} do not grow with gradients")
         return self
 
     @model_serializer(mode="wrap")
@@ -279,8 +279,8 @@ def check_stages(stages: list[Stage]) -> None:
     """Raise a located error if stages are out of order, or one is coarser than the stage before it."""
     for place, (before, stage) in enumerate(pairwise(stages), 1):
         if stage.until <= before.until:
-            raise located(f"run.stages[{place}].until", f"must be above {before.until:g}, that of the stage before it")
+            raise located(f"run.stages[{place}].until", f"must be above {before.until:g}, that of the previous stage")
         for name in ("resolution", "film"):
             if getattr(stage, name) < getattr(before, name):
-                reason = f"must be at least {getattr(before, name):g}, that of the stage before it"
+                reason = f"must be at least {getattr(before, name):g}, that of the previous stage"
                 raise located(f"run.stages[{place}].{name}", reason)

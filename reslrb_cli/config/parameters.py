@@ -457,16 +457,16 @@ class ParameterSpec(Section):
         if not has:
             raise located("", "must have one of `key`, `heightmap` and `motion`")
         if len(has) > 1:
-            raise located(has[1], f"cannot stand beside `{has[0]}`; make two parameters of them")
+            raise located(has[1], f"cannot be combined with `{has[0]}`; make two parameters")
         if len(self.keys) > 1:
             if len(set(self.keys)) < len(self.keys):
-                raise located("key", "must name each once")
+                raise located("key", "must list each key once")
             if self.resolution is not None:
-                raise located("resolution", "goes with one key alone, not with a list that ties several together")
+                raise located("resolution", "needs a single key, not a list of tied keys")
         if self.heightmap is not None and self.resolution is not None:
-            raise located("resolution", "belongs into `heightmap`, which has its own; remove it here")
+            raise located("resolution", "has no effect here; set `heightmap.resolution` instead")
         if self.motion is not None and self.resolution is not None:
-            raise located("resolution", "has no effect on a motion, which is no texture; remove it")
+            raise located("resolution", "has no effect on a motion; remove it")
         if self.motion is not None and self.precondition is not None:
             raise located("precondition", "has no effect on a motion; remove it")
         return self
@@ -478,17 +478,17 @@ class ParameterSpec(Section):
             value = getattr(self, option)
             if isinstance(value, ByWord):
                 if self.motion is None:
-                    raise located(option, "is a mapping by the words of a motion, and this is none")
+                    raise located(option, "is a mapping for a motion, but this is not a motion")
                 for word in value.words():
                     if word not in free:
-                        raise located(f"{option}.{word}", f"has no effect: `motion.free` has {', '.join(free)} alone")
+                        raise located(f"{option}.{word}", f"has no effect: `motion.free` has only {', '.join(free)}")
             elif isinstance(value, ImageFile) and self.motion is not None:
-                raise located(option, "is an image file, and a motion is no texture; give numbers")
+                raise located(option, "is an image file, but a motion needs numbers")
             elif value in (None, "scene") or isinstance(value, RunValue):
                 continue
             elif len(free) > 1 and option in ("initial", "bounds"):
                 words = ", ".join(f"{word}: ..." for word in free)
-                raise located(option, f"must be a mapping by what is free, {{{words}}}")
+                raise located(option, f"must be a mapping for `motion.free`, {{{words}}}")
         return self
 
     @model_validator(mode="after")
@@ -502,7 +502,7 @@ class ParameterSpec(Section):
                 has = "has none" if said.bounds is None else f"has [{low:g}, {high:g}]"
                 raise located(at("transform"), f"sigmoid maps to finite `bounds`, [low, high]; this parameter {has}")
             if said.transform in ("log", "softplus") and high <= 0:
-                reason = f"leave no positive value, and transform: {said.transform} yields nothing else"
+                reason = f"exclude positive values, but transform: {said.transform} yields only these"
                 raise located(at("bounds"), reason)
             numbers = [said.initial] if isinstance(said.initial, float) else said.initial
             for number in numbers if isinstance(numbers, list) else ():

@@ -38,11 +38,11 @@ def check_name(name: str) -> str:
     """Return `name` if it can name a run. Raises an error that says what is wrong otherwise."""
     folder = folder_name(name)
     if _PATH.search(name.strip()):
-        raise wrong("must be a name and not a path; run.output says where the run's folder is")
+        raise wrong("must be a name and not a path; set run.output to choose the folder")
     if not folder:
-        raise wrong("must hold a letter or a digit")
+        raise wrong("must contain a letter or a digit")
     if _RESERVED.fullmatch(folder):
-        raise wrong(f"must be another name: {folder} is a device on Windows, and not a folder's name there")
+        raise wrong(f"must be another name: {folder} is a device on Windows, not a folder")
     if len(folder.encode()) > NAME_BYTES:
         raise wrong(f"must have at most {NAME_BYTES} bytes in UTF-8, not {len(folder.encode())}")
     return name
@@ -66,7 +66,7 @@ def memory_bytes(value: int | float | str) -> int:
     elif not isinstance(value, bool):
         number = float(value) if abs(value) < 2**63 else float("inf")  # larger integers overflow a float
     if unit not in _UNITS or not 1 <= number * _UNITS[unit] < 2**63:
-        raise ValueError(f"{value!r} is no amount of memory")
+        raise ValueError(f"{value!r} is not an amount of memory")
     return int(number * _UNITS[unit])
 
 

@@ -317,7 +317,7 @@ class Config(Section):
                 if places.setdefault((option, name), i) < i:
                     at = option if j is None else f"{option}[{j}]"
                     raise located(
-                        f"parameters[{i}].{at}", f"`{name}` stands in parameters[{places[option, name]}] already"
+                        f"parameters[{i}].{at}", f"`{name}` is already in parameters[{places[option, name]}]"
                     )
         self._check_samples()
         self._check_standing()
@@ -325,13 +325,13 @@ class Config(Section):
         if self.run.adjoint == "correlated" and self.integrator.options().get("weight") == "adjoint":
             raise located(
                 "integrator.weight",
-                "`adjoint` needs dL/dI before the paths are traced, which run.adjoint: correlated does not have; "
-                "leave that at auto, or set the weight to luminance",
+                "`adjoint` needs dL/dI before the paths are traced; run.adjoint: correlated has it later; "
+                "set run.adjoint to auto, or the weight to luminance",
             )
         if self.run.memory_budget is not None:
             if not isinstance(self.integrator, ReslrbConfig):
                 raise located(
-                    "run.memory_budget", f"goes with integrator `reslrb` alone, not with `{self.integrator.type}`"
+                    "run.memory_budget", f"needs integrator `reslrb`, not `{self.integrator.type}`"
                 )
             if self.integrator.samples_per_pass is not None:
                 raise located("integrator.samples_per_pass", "is chosen by run.memory_budget; remove one of the two")
@@ -345,10 +345,10 @@ class Config(Section):
         """Raise a located error if the settings of `run.stop` or `run.max_seconds` contradict others."""
         stop = self.run.stop
         if stop is not None and self.run.held_out and stop.patience < 20:
-            reason = f"must be at least 20, not {stop.patience}: held-out views are looked at every 10 iterations"
+            reason = f"must be at least 20, not {stop.patience}: held-out views are rendered every 10 iterations"
             raise located("run.stop.patience", reason)
         if self.run.max_seconds is not None and self.run.stages:
-            reason = "does not go with run.stages, which are shares of run.iterations; remove one"
+            reason = "cannot be combined with run.stages, fractions of run.iterations; remove one"
             raise located("run.max_seconds", reason)
 
     def _check_samples(self) -> None:
@@ -360,7 +360,7 @@ class Config(Section):
             if obstacle is not None:
                 raise located("run.spp", obstacle)
         if "batches" in self.run.model_fields_set and self.run.adjoint not in ("auto", "batched", "others"):
-            raise located("run.batches", f"has no effect with run.adjoint: {self.run.adjoint}, but with batched")
+            raise located("run.batches", f"has no effect with run.adjoint: {self.run.adjoint}, only with batched")
         if self.run.adjoint == "batched":
             spp, what = self.share_spp, "run.spp" if self.shares == 1 else "the samples of a shard"
             if spp % self.run.batches:
@@ -378,24 +378,24 @@ class Config(Section):
         if asked > views and asked % views:
             raise located(
                 "run.shards",
-                f"is {asked}; of the {views} views of an iteration it must be at most {views}, or a multiple of that",
+                f"is {asked}; with {views} views in an iteration it must be at most {views}, or a multiple of {views}",
             )
         if spp % self.shares:
-            raise located("run.shards", f"{self.shares} for each view, which do not divide run.spp, {spp}")
+            raise located("run.shards", f"{self.shares} per view do not divide run.spp, {spp}")
         _check_passes(self.integrator, self.share_spp, "integrator", "the samples of a shard")
 
     def _check_halves(self) -> None:
         """Raise a located error if samples cannot be halved, or two settings scale the brightness of a view."""
         sets = (self.run.batches if self.adjoint == "batched" else 1) * self.shares
         if self.run.spp % (2 * sets):
-            reason = f"must be a multiple of {2 * sets}, not {self.run.spp}: loss.scale: fitted takes samples in halves"
+            reason = f"must be a multiple of {2 * sets}, not {self.run.spp}: loss.scale: fitted halves the samples"
             raise located("run.spp", reason)
         _check_passes(self.integrator, self.set_spp, "integrator", f"run.spp / {2 * sets}, by loss.scale: fitted")
         exposures = {f"views[{number}].exposure": view.exposure for number, view in enumerate(self.views or ())}
         for by, exposure in {"target.exposure": self.target.exposure, **exposures}.items():
             if isinstance(exposure, str):
                 key, _ = loss_keys("scale", self.loss)[0]
-                raise located(key, f"cannot be fitted beside {by}, which is recovered: both scale the image")
+                raise located(key, f"cannot be fitted while {by} is recovered: both scale the image")
 
 
 def _passes_divide(integrator: Integrator, spp: int) -> bool:

@@ -76,7 +76,7 @@ def _view_mask(value: Any) -> Any:
     if isinstance(value, dict) and {**value, "file": None} == {**dict.fromkeys(_KINDS, False), "file": None}:
         return value  # as in the config.yaml of a run
     if not isinstance(value, (str, Path, Mask)) or value == "auto":
-        raise wrong("must be `none` or the path of an image of weights; which kinds are left out is in `target.mask`")
+        raise wrong("must be `none` or the path of an image of weights (`target.mask` sets the kinds)")
     return _mask(value)
 
 
@@ -163,9 +163,9 @@ class TargetConfig(Section):
         if self.file is not None and self.render is not None:
             raise located("", "must have exactly one of `file` and `render`, and has both")
         if self.render is not None and self.color_space != "auto":
-            raise located("color_space", "has no effect on a rendered target; it goes with `file`")
+            raise located("color_space", "has no effect on a rendered target; remove it")
         if self.render is not None and self.truth:
-            raise located("truth", "is known of a rendered target; it goes with files")
+            raise located("truth", "has no effect on a rendered target, which has it; remove it")
         return self
 
     @model_serializer(mode="wrap")
@@ -196,10 +196,10 @@ def check_views(views: list[ViewSpec], scene: Any, target: TargetConfig) -> None
     places: dict[int, int] = {}
     for number, view in enumerate(views):
         if places.setdefault(view.sensor, number) < number:
-            raise located(f"views[{number}].sensor", f"{view.sensor} stands in views[{places[view.sensor]}] already")
+            raise located(f"views[{number}].sensor", f"{view.sensor} is already in views[{places[view.sensor]}]")
         if view.target is None and target.render is None and scene.cameras is None:
-            raise located(f"views[{number}].target", "missing; name an image, or have all rendered by target.render")
+            raise located(f"views[{number}].target", "missing; give an image, or render all targets with target.render")
     if target.file is not None:
         raise located("target.file", "has no effect beside `views`; give each view its own target")
     if target.render is not None and all(view.target is not None for view in views):
-        raise located("target.render", "has no effect: every view has a target of its own")
+        raise located("target.render", "has no effect: every view has its own target")

@@ -49,7 +49,7 @@ class Loader(yaml.SafeLoader):
 def _construct_text(loader: Loader, node: yaml.ScalarNode) -> str:
     text: str = loader.construct_scalar(node)
     if any("\ud800" <= c <= "\udfff" for c in text):
-        raise loader.fail(node.start_mark, f"{text!r} holds half of a surrogate pair, which is no character")
+        raise loader.fail(node.start_mark, f"{text!r} contains half of a surrogate pair; remove it")
     return text
 
 
@@ -59,7 +59,7 @@ def _construct_integer(loader: Loader, node: yaml.ScalarNode) -> int:
         value = int(text, {"0o": 8, "0x": 16}.get(text[:2], 10))
     except ValueError:
         if not INTEGER.match(text):
-            raise loader.fail(node.start_mark, f"{text} is no integer, as its tag !!int has it") from None
+            raise loader.fail(node.start_mark, f"{text} has the tag !!int but is not an integer") from None
         value = INTEGER_END  # more digits than Python converts
     if abs(value) >= INTEGER_END:
         raise loader.fail(node.start_mark, f"the integer {text[:20]}... has more than 64 bits; write it as in 1e30")
@@ -71,12 +71,12 @@ def _construct_float(loader: Loader, node: yaml.ScalarNode) -> float:
     try:
         return float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
     except ValueError:
-        raise loader.fail(node.start_mark, f"{text} is no number, as its tag !!float has it") from None
+        raise loader.fail(node.start_mark, f"{text} has the tag !!float but is not a number") from None
 
 
 def _refuse(loader: Loader, node: yaml.Node) -> None:
     tag = node.tag.replace(_TAG, "!!")
-    raise loader.fail(node.start_mark, f"not valid YAML: the tag {tag} stands for nothing that a configuration holds")
+    raise loader.fail(node.start_mark, f"not valid YAML: the tag {tag} is not allowed in a configuration")
 
 
 Loader.add_implicit_resolver(f"{_TAG}null", re.compile(r"(~|null|Null|NULL)?$"), ["~", "n", "N", ""])
@@ -152,7 +152,7 @@ def _problem(error: yaml.MarkedYAMLError, text: str, example: Callable[[str], st
     if word is not None and "alias" in problem:
         quoted = f'"{word[0]}"'
         mended = quoted if example is None else example(text[: word.start()] + quoted + text[word.end() :])
-        return f"{word[0]} is an alias in YAML, and names nothing here; text that begins with * wants quotes: {mended}"
+        return f"{word[0]} is an alias in YAML, but undefined; put text that begins with * in quotes: {mended}"
     if "'\\t' that cannot start any token" in problem:
         return "not valid YAML: a tab; YAML allows only spaces for indentation and after a colon"
     hint = "; put text that begins with it in quotes" if "cannot start any token" in problem else ""

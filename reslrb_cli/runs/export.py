@@ -58,12 +58,12 @@ Say = Callable[[str], None]
 def check_export(config: Config, output: Path, tolerances: bool) -> None:
     """Raise ConfigError if the export cannot be written to `output`, a folder or the file of a solid."""
     if tolerances and (config.fabrication is None or output.suffix.lower() in WRITERS):
-        raise ConfigError("--tolerances", "", "goes with a folder, and a run whose configuration has a section "
+        raise ConfigError("--tolerances", "", "needs a folder as output, and a configuration with a section "
                           "`fabrication`")  # fmt: skip
     if output.suffix.lower() in WRITERS:
         check_file(output, config)
     elif output.suffix.lower() in _OTHER_SOLIDS:
-        raise ConfigError("--output", "", f"{output}: {output.suffix} is not written; name a folder, or a file that "
+        raise ConfigError("--output", "", f"{output}: {output.suffix} is not supported; give a folder, or a file that "
                           f"ends in {', '.join(WRITERS)}")  # fmt: skip
     else:
         check_folder(output)
@@ -115,18 +115,18 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
         how = (
             "fabrication.thickness=25" if faces == ["face"] else f"'fabrication={{thickness: 25, faces: [{faces[0]}]}}'"
         )
-        say(f"no solid was made of `{faces[0]}`: --set {how} makes one of that thickness, where the scene is in mm")
+        say(f"no solid was made of `{faces[0]}`: --set {how} makes one of that thickness if the scene is in mm")
     if plan is not None:
         tell_solid(output / f"{plan.kind}.stl", plan, sheets, solid, say)
         if light:
             inside, aside, beyond = (100 * light[name] for name in ("inside", "beside", "beyond"))
-            say(f"of the light that leaves it {inside:.4g} % goes into the picture, {aside:.2g} % beside it on the "
-                f"film, {beyond:.2g} % beyond")  # fmt: skip
+            say(f"of the light that leaves it, {inside:.4g} % falls in the picture, {aside:.2g} % beside it on the "
+                f"film, {beyond:.2g} % outside")  # fmt: skip
         if loss:
             how = f"{loss['integrator']} ({loss['spp']} samples per pixel, seed {loss['seed']})"
-            say(f"mean squared difference from the target is {loss['l2']:.4g}: that of the solid, too, by {how}")
+            say(f"mean squared difference from the target is {loss['l2']:.4g}, also for the solid, by {how}")
         if f"{plan.kind}.3mf" not in beside:
-            say(f"{plan.kind}.3mf is left out, since lib3mf is missing: pip install 'reslrb[fabrication]'")
+            say(f"{plan.kind}.3mf is not written: lib3mf is missing; pip install 'reslrb[fabrication]'")
     if off:
         keep_tolerances(config, run, off, say)
 
@@ -180,14 +180,14 @@ def keep_tolerances(config: Config, run: Path, off: dict[str, dict[str, Any]], s
     try:
         with opened(run):
             if load(run / "config.yaml").fabrication != config.fabrication:
-                raise ValueError("they are of other settings than the run's `fabrication`")
+                raise ValueError("`fabrication` differs from that of the run")
             numbers = json.loads((run / FABRICATION_FILE).read_text())
             _write_numbers(run, numbers | {"tolerances": off})
             write_report(run)
     except (ConfigError, OSError, ValueError) as error:
         say(f"{run}: the page does not show the tolerances: {error}")
     else:
-        say(f"{run / 'report.html'}: has them, too")
+        say(f"{run / 'report.html'}: shows the tolerances")
 
 
 def _write_numbers(run: Path, numbers: dict[str, Any]) -> None:
@@ -224,20 +224,20 @@ def picture_of(solid: Solid) -> Array:
 def check_folder(path: Path) -> None:
     """Raise ConfigError if `path` exists and is not an empty folder."""
     if os.path.lexists(path) and not (path.is_dir() and not path.is_symlink() and not any(path.iterdir())):
-        raise ConfigError("--output", "", f"{path} exists; name a folder that does not exist yet, or is empty")
+        raise ConfigError("--output", "", f"{path} exists; give a new or empty folder")
 
 
 def check_file(path: Path, config: Config) -> None:
     """Raise ConfigError if no solid can be written to the file `path`."""
     if config.fabrication is None:
-        raise ConfigError("--output", "", f"{path}: name a folder; of a scene a solid is made where the configuration "
-                          "has a section `fabrication`, which `reslrb lens` writes; or add "
+        raise ConfigError("--output", "", f"{path}: a solid needs a section `fabrication` in the configuration, which "
+                          "`reslrb lens` writes; give a folder, or add "
                           "--set fabrication.thickness=25")  # fmt: skip
     if os.path.lexists(path):
-        raise ConfigError("--output", "", f"{path} exists; name a file that does not exist yet")
+        raise ConfigError("--output", "", f"{path} exists; give a new file")
     if path.suffix.lower() == ".3mf" and not _writes_3mf():
         raise ConfigError("--output", "", f"{path}: 3MF needs lib3mf, which is missing: "
-                          "pip install 'reslrb[fabrication]'; .stl, .obj and .ply need nothing")  # fmt: skip
+                          "pip install 'reslrb[fabrication]'; .stl, .obj and .ply work without")  # fmt: skip
 
 
 def _writes_3mf() -> bool:
@@ -268,7 +268,7 @@ def read_target(config: Config, sensor: mi.Sensor, needed: bool) -> Array | None
     """
     file = config.target.file
     if file is None:
-        reason = "what is thrown is compared with target.file, which is missing"
+        reason = "the caustic is compared with target.file, which is missing"
     else:
         target = read_photo(file).image[:, :, :3]
         width, height = (int(n) for n in sensor.film().crop_size())

@@ -111,7 +111,7 @@ def check_changes(found: Mapping[str, Change], blame: Callable[[str], object], r
         raise ConfigError(
             blame(wrong[0]),
             wrong[0],
-            f"is {first}{also}; {run} goes on as it began, but for iterations and learning rates",
+            f"is {first}{also}; {run} may change only iterations and learning rates",
         )
     return {key: change for key, change in found.items() if key not in _PLACE}
 

@@ -210,7 +210,7 @@ class Recording:
     def _where(self) -> str:
         """Return a hint how to find the cause of a value that is not finite."""
         if self.problem.config.codes:
-            return "look at what your own code returns, which `reslrb inspect --nonfinite` does not run"
+            return "check what your own code returns; `reslrb inspect --nonfinite` does not run it"
         return f"where: reslrb inspect {shlex.quote(os.path.relpath(self.folder.path / 'config.yaml'))} --nonfinite"
 
     def _end(self, status: Status, failure: BaseException | None) -> Status:
@@ -227,10 +227,10 @@ class Recording:
         if failure is not None:
             status = Status.FAILED
         elif status is Status.FINISHED:  # an interrupt must not wait; `reslrb report` finds the image errors, too
-            self._add("how certain the values are was", self._measure_certainty)
-            self._add("errors as people see them were", self._measure_seen_errors)
+            self._add("the certainty of the values was", self._measure_certainty)
+            self._add("perceptual errors were", self._measure_seen_errors)
             if self.problem.config.fabrication is not None:
-                self._add("what a maker has to know of the solid was", self._measure_solid)
+                self._add("the fabrication data of the solid were", self._measure_solid)
         # Only files of the run folder are written here, and the folder was writable when the run started.
         if isinstance(failure, OSError) or (failure is not None and is_machine_fault(failure)):
             failure = MachineError(f"{describe(failure)}; {self._kept()}")
@@ -242,7 +242,7 @@ class Recording:
             write_report(self.folder.path)
         except Exception as error:
             if failure is None:
-                logger.warning("the page was not written: %s; all else is in %s", describe(error), self.folder.path)
+                logger.warning("the page was not written: %s; the rest is in %s", describe(error), self.folder.path)
             with contextlib.suppress(OSError):  # the previous page shows the run as still running
                 (self.folder.path / "report.html").unlink(missing_ok=True)
         remove_parts(self.folder.path)
@@ -280,9 +280,9 @@ class Recording:
         if last is None or self.done < LEAST_ITERATIONS or not config.run.certainty:
             return
         if not config.by_pixel:
-            logger.info("how certain the values are is not measured: it takes a loss of each pixel by itself")
+            logger.info("the certainty of the values is not measured: it needs a loss of separate pixels")
             return
-        logger.info("measuring how certain the values are")
+        logger.info("measuring the certainty of the values")
         measured = self.course.certainty.measure(self.done, last.elapsed_s, self._stop)
         self.certainty = measured and measured.without_derivatives(
             [record.parameter for record in incomplete_records(self.manifest.incomplete)]
@@ -294,7 +294,7 @@ class Recording:
     def _measure_seen_errors(self) -> None:
         pixels = sum(view.target.shape[0] * view.target.shape[1] for view in self.problem.views)
         if pixels > MANY_PIXELS:
-            logger.info(f"comparing images of {pixels / 1e6:.2g} million pixels as people see them")
+            logger.info(f"measuring perceptual errors of {pixels / 1e6:.2g} million pixels")
         self.seen = finite(seen_errors(self.folder.path, self.manifest.results, self.manifest.views))
 
     def _measure_solid(self) -> None:
@@ -356,8 +356,8 @@ class Recording:
     def _kept(self) -> str:
         """Return a line about the saved state of the run."""
         if self._saved is None or newest_checkpoint(self.folder.checkpoint) is None:
-            return "nothing of the run was kept"
-        return f"kept: the state after {self._saved} of {self.done} iterations, in {self.folder.checkpoint}"
+            return "nothing of the run was saved"
+        return f"saved: the state after {self._saved} of {self.done} iterations, in {self.folder.checkpoint}"
 
     def _save_last_checkpoint(self) -> None:
         """Save the state unless it is saved already, so that `previous.npz` remains an earlier state."""

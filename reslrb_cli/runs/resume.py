@@ -92,7 +92,7 @@ class OpenedRun:
         if stopped:
             more = f"run.max_seconds{equals}NUMBER" if stopped.startswith(OUT_OF_TIME) else f"run.stop{equals}null"
         done = f"{self.iteration} of {iterations} iterations"
-        return f"{self.folder.path}: is finished, after {done}; {option} {more} goes on"
+        return f"{self.folder.path}: is finished, after {done}; {option} {more} continues it"
 
     def begin(self, variant: str, say: Say, warn: Say) -> PreparedRun:
         """Assemble the problem of the run and restore its state; a variant must be set.
@@ -120,7 +120,7 @@ class OpenedRun:
         others = {name: [version, here.get(name)] for name, version in earlier.items() if version != here.get(name)}
         if others:
             names = ", ".join(f"{name} {was} then, {is_} now" for name, (was, is_) in others.items())
-            self.said.append(f"other versions than those that the run began with: {names}; it may go on differently")
+            self.said.append(f"versions have changed since the run began: {names}; results may differ")
         manifest.resumed.append(
             {
                 "iteration": self.iteration,
@@ -222,7 +222,7 @@ def _read_state(folder: RunFolder, said: list[str]) -> Stored:
             continue
         if failures or name == PREVIOUS_FILE_NAME:
             why = str(failures[0]) if failures else f"{folder.checkpoint / STATE_FILE}: is missing"
-            said.append(f"{why}; going on from the state before, after {stored.read(State).iteration} iterations")
+            said.append(f"{why}; continuing from the previous state, after {stored.read(State).iteration} iterations")
         return stored
     if failures:
         raise failures[0]
@@ -246,8 +246,8 @@ def _check_files(before: Mapping[str, str], config: Config, run: Path) -> None:
     here = digests(config)
     for key, digest in before.items():
         if here.get(key) != digest:
-            what = "has changed" if key in here else "has gone"
-            raise ConfigError(config.source, key, f"{what} since {run} began; put it back, or begin anew")
+            what = "has changed" if key in here else "is missing"
+            raise ConfigError(config.source, key, f"{what} since {run} began; put it back, or start a new run")
 
 
 @contextlib.contextmanager
@@ -256,5 +256,5 @@ def _written(folder: RunFolder) -> Iterator[None]:
         yield
     except OSError as error:
         if is_machine_fault(error):
-            raise MachineError(f"{folder.path}: {error.strerror}; the run did not go on") from None
+            raise MachineError(f"{folder.path}: {error.strerror}; the run was not continued") from None
         raise

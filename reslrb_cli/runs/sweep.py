@@ -52,9 +52,9 @@ _SEED_BYTES = len(f"-seed={SEED_END}")
 
 #: Settings that the sweep itself chooses.
 OWN: dict[Location, str] = {
-    ("run", "seed"): "--seeds N has N of them",
+    ("run", "seed"): "use --seeds N",
     ("run", "name"): "runs are named by their settings",
-    ("run", "output"): "-o FOLDER says it",
+    ("run", "output"): "use -o FOLDER",
 }
 
 
@@ -82,14 +82,14 @@ def parse_vary(text: str) -> Varied:
     if not isinstance(given.value, list) or not given.value:
         raise ConfigError(given.label, "", f"must be a list of values, such as {key}=[16, 32]")
     if reason := OWN.get(given.location[:2]):
-        raise ConfigError(given.label, "", f"is not varied: {reason}")
+        raise ConfigError(given.label, "", f"cannot be varied: {reason}")
     overrides = [
         Override(f"--vary {one_line(f'{key}={in_words(value)}', 100)}", given.location, value) for value in given.value
     ]
     seen: list[str] = []
     for value in given.value:
         if (kept := json.dumps(value, sort_keys=True)) in seen:
-            raise ConfigError(given.label, "", f"names {one_line(in_words(value), 100)} twice")
+            raise ConfigError(given.label, "", f"has {one_line(in_words(value), 100)} twice")
         seen.append(kept)
     return Varied(key, given.location, tuple(overrides))
 
@@ -114,7 +114,7 @@ def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[s
     text = read_text(path, str(path))
     first = _with_chosen(text, path, overrides, [each.overrides[0] for each in varied], allow_code).run.seed
     if first + seeds > SEED_END:
-        raise ConfigError("--seeds", "", f"leads beyond {SEED_END - 1}, from run.seed: {first} on")
+        raise ConfigError("--seeds", "", f"exceeds the last seed, {SEED_END - 1}, from run.seed: {first}")
     combinations, configs = [], {}
     names = _names(varied)
     for name, chosen in zip(names, itertools.product(*(each.overrides for each in varied)), strict=True):
@@ -122,7 +122,7 @@ def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[s
         check_code(config)
         open_file(config.scene.file).close()
         if config.run.seed != first:
-            reason = f"is {config.run.seed}, and {first} in the first combination; {OWN['run', 'seed']}"
+            reason = f"is {config.run.seed}, but {first} in the first combination; {OWN['run', 'seed']}"
             raise ConfigError("--vary", "run.seed", reason)
         settings = {each.key: override.value for each, override in zip(varied, chosen, strict=True)}
         combinations.append(Combination(name, settings))
@@ -205,7 +205,7 @@ def opened(
     if plan is not None:
         _make(folder)
     elif not folder.is_dir():
-        raise ConfigError(folder, "", "no such folder; a sweep makes its own: `reslrb sweep CONFIG --vary ...`")
+        raise ConfigError(folder, "", "no such folder; start a sweep by `reslrb sweep CONFIG --vary ...`")
     try:
         lock = FolderLock(folder.resolve())
     except InUse:
@@ -243,15 +243,15 @@ def _make(folder: Path) -> None:
 
 def _unwritable(folder: Path, error: OSError) -> ConfigError | MachineError:
     if is_machine_fault(error):
-        return MachineError(f"{folder}: {error.strerror}; the sweep did not go on")
-    return ConfigError("-o", "", f"cannot write to {folder} ({error.strerror}); give a folder that can be written to")
+        return MachineError(f"{folder}: {error.strerror}; the sweep has stopped")
+    return ConfigError("-o", "", f"cannot write to {folder} ({error.strerror}); give another folder")
 
 
 def _begin(folder: Path, plan: Plan) -> None:
     """Write the configurations; the plan is written after them, so it exists only if all of them do."""
     # a sweep that was killed at its start has written only configurations
     if others := sorted(path.name for path in folder.iterdir() if path.name != "configs"):
-        reason = f"{folder} has {one_line(others[0], 60)!r} in it, and no sweep; give a folder that is new, or empty"
+        reason = f"{folder} contains {one_line(others[0], 60)!r}, but no sweep; give a new or empty folder"
         raise ConfigError("-o", "", reason)
     try:
         for combination in plan.sweep.combinations:
@@ -268,12 +268,12 @@ def _put(text: bytes, file: IO[bytes]) -> None:
 
 def _check_same(folder: Path, kept: Sweep, plan: Plan) -> None:
     """Raise ConfigError, which names the first difference, if the sweep in `folder` differs from the plan."""
-    advice = "give another folder with -o, or go on with that one: --resume"
+    advice = "give another folder with -o, or continue that sweep with --resume"
     there = [(each.name, each.settings) for each in kept.combinations]
     here = [(each.name, each.settings) for each in plan.sweep.combinations]
     if there != here:
         what = ", ".join(dict.fromkeys([*kept.keys, *plan.sweep.keys])) or "nothing"
-        raise ConfigError(folder, "", f"has a sweep of other settings or values ({what}); {advice}")
+        raise ConfigError(folder, "", f"has a sweep with other settings or values ({what}); {advice}")
     if kept.seeds[0] != plan.sweep.seeds[0]:
         reason = f"is {plan.sweep.seeds[0]}, and {kept.seeds[0]} in the sweep in {folder}; {advice}"
         raise ConfigError(plan.sweep.config, "run.seed", reason)
@@ -299,7 +299,7 @@ def _check_files(folder: Path, kept: Sweep, allowed: bool) -> None:
             reason = f"would run the code of {file}, with all your rights; --allow-code has it run"
             raise ConfigError(folder, "", reason)
         if digest_of(Path(file)) != digest:
-            reason = f"has changed since the sweep in {folder} began; put it back, or begin another: -o"
+            reason = f"has changed since the sweep in {folder} began; put it back, or start another with -o"
             raise ConfigError(file, "", reason)
 
 
@@ -335,7 +335,7 @@ def command(folder: Path, sweep: Sweep, combination: Combination, seed: int) -> 
     run, end = folder / name, time.monotonic() + RELEASE_SECONDS
     while (read_manifest(run) or {}).get("status") == Status.RUNNING:
         if time.monotonic() > end:
-            raise ConfigError(run, "", "is in use by a run of its own; end that first")
+            raise ConfigError(run, "", "is in use by another run; end that first")
         time.sleep(_POLL_SECONDS)
     if newest_checkpoint(run / "checkpoint") is not None and read_manifest(run) is not None:
         return ["optimize", "--resume", str(run), *allowed]

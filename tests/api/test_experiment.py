@@ -92,11 +92,11 @@ def test_paths_of_a_mapping_are_relative_to_base(folder: Path, monkeypatch: pyte
         (lambda: rl.load(experiment() | {"run": 3}), "<dict>: run: "),
         (lambda: rl.load({}), "<dict>: scene: "),
         (lambda: rl.load("tiny.yaml", {"run.spq": 3}), "overrides: run.spq: unknown key; did you mean `spp`?"),
-        (lambda: rl.load("tiny.yaml", {"run..spp": 3}), "overrides: `run..spp` is no key"),
+        (lambda: rl.load("tiny.yaml", {"run..spp": 3}), "overrides: `run..spp` is not a key"),
         (lambda: rl.load("tiny.yaml", {"run.spp": {1, 2}}), "overrides: run.spp: is {1, 2}; YAML has no such value"),
         (lambda: rl.load("tiny.yaml", {3: 4}), "overrides: has the key 3; keys are text"),  # type: ignore[dict-item]
         (lambda: rl.load("tiny.yaml", {"": 4}), "overrides: has the key ''; keys are text"),
-        (lambda: rl.load("tiny.yaml", ["run.spp=4"]), "overrides: is ['run.spp=4'], not values by key"),  # type: ignore[arg-type]
+        (lambda: rl.load("tiny.yaml", ["run.spp=4"]), "overrides: is ['run.spp=4'], not a mapping"),  # type: ignore[arg-type]
         (
             lambda: rl.load("tiny.yaml", {"run.spp": 4, "run": {"iterations": 6}}),
             "overrides: run: replaces what run.spp sets; give it first",
@@ -358,7 +358,7 @@ def test_an_export_is_that_of_the_command(folder: Path) -> None:
     assert scene == Path("mine/scene.xml")
     assert scene.read_bytes() == Path("command/scene.xml").read_bytes()
     assert tiny.files(Path("mine")) == tiny.files(Path("command"))
-    with pytest.raises(rl.ConfigError, match="folder: mine exists; name a folder that does not exist yet"):
+    with pytest.raises(rl.ConfigError, match="folder: mine exists; give a new or empty folder"):
         rl.export(run.folder, "mine")
     # and a run's folder is an experiment, which begins where that is
     assert np.array_equal(rl.render(run.folder, spp=8)[0], rl.render("tiny.yaml", 8, run.parameters)[0])

@@ -207,7 +207,7 @@ def test_a_run_is_gone_on_with_from_its_folder(experiment: Path, caplog: pytest.
 
     assert caplog.messages == []
     done = rl.optimize(resume="mine")
-    left = "mine: is finished, after 6 of 6 iterations; the override run.iterations: NUMBER goes on"
+    left = "mine: is finished, after 6 of 6 iterations; the override run.iterations: NUMBER continues it"
     assert [record.message for record in caplog.records if record.levelname == "WARNING"] == [left]
     assert (done.status, list(done), done.folder) == ("finished", [], Path("mine"))
     assert values_equal(done.parameters, again.parameters)
@@ -273,7 +273,7 @@ def test_errors_are_located(experiment: Path) -> None:
         with pytest.raises(rl.ConfigError, match="mine: is in use by a run"):
             rl.optimize(resume="mine")
         del loop
-    with pytest.raises(rl.ConfigError, match=r"overrides: run.seed: is 5, 0 in the run; mine goes on as it began"):
+    with pytest.raises(rl.ConfigError, match=r"overrides: run.seed: is 5, 0 in the run; mine may change only"):
         rl.optimize(resume="mine", overrides={"run.seed": 5})
 
 

@@ -82,7 +82,7 @@ def test_a_scene_from_end_to_end(
     assert call("tiny.yaml", *args) == 0
     assert read(folder / "out/c.jsonl") == lines
     again = capsys.readouterr().out.splitlines()
-    assert "samples in out/c.samples.npz count, and are not taken again" in again
+    assert "using the samples in out/c.samples.npz" in again
     assert again[-1] == printed[-1]
 
 
@@ -126,13 +126,13 @@ def test_a_budget_that_is_too_small_says_so(folder: Path, capsys: pytest.Capture
         (("--set", "run.spp=0"), "run.spp"),
         (("--spp", "4,x"), "'x' is not a valid integer range"),
         (("--spp", "4,0"), "0 is not in the range"),
-        (("--spp", "4,4"), "`4,4` names a number twice"),
+        (("--spp", "4,4"), "`4,4` has a number twice"),
         (("--spp", "3", "--set", "integrator.samples_per_pass=2"), "integrator.samples_per_pass: 2 does not divide"),
         (("--integrators", "prb(rr_depth=x)"), "integrator.rr_depth"),
-        (("--runs", "3"), "--runs was removed; compare whole runs by `reslrb sweep CONFIG --seeds N --set run.max_sec"),
+        (("--runs", "3"), "--runs was removed; compare whole runs with `reslrb sweep CONFIG --seeds N --set run.max"),
         (
             ("--rates=1,3",),
-            "--rates was removed; try learning rates by `reslrb sweep CONFIG --vary 'optimizer.learning",
+            "--rates was removed; compare rates with `reslrb sweep CONFIG --vary 'optimizer.learning",
         ),
         (("--integrators", "reslrb:auto"), "`auto` is for whole runs; take `stack`"),
     ],

@@ -141,8 +141,8 @@ def test_what_comes_before_the_iterations_is_measured_once(
         (2**20, None, 2**12, None),  # four passes of 2^18 samples
         (2**20, None, 2**14 + 1, "set integrator.samples_per_pass to 131072"),
         (2**20, 2**17, 2**15 + 1, "set integrator.samples_per_pass to 65536"),
-        (2**20, 4, 2**12, "makes 262144 passes of a step, and no step has more than 65536: set integrator.samples_per"),
-        (7, None, 2**32, "take a smaller film"),
+        (2**20, 4, 2**12, "makes 262144 passes of a step, above the limit of 65536; set integrator.samples_per"),
+        (7, None, 2**32, "use a smaller film"),
         (1_000_003, None, 2**15, "lower run.spp"),  # a prime number
     ],
 )

@@ -46,7 +46,7 @@ def test_a_signal_ends_a_run_after_the_iteration(optimize, during, number):
     assert read_content(RUN)["results"]["iterations"] == len(read_metrics(RUN)) == 2
     *_, ending, advice = out.splitlines()
     assert ending.startswith("interrupted after 2 iterations")
-    assert advice == f"next: `reslrb optimize --resume {RUN}` goes on from here"
+    assert advice == f"next: `reslrb optimize --resume {RUN}` continues this run"
 
 
 @pytest.mark.parametrize(("name", "call"), [("write_image", 0), ("write_parameters", 2), ("write_image", 2)])
@@ -139,7 +139,7 @@ def test_a_part_that_fails_leaves_the_others_alone(optimize, monkeypatch, part):
     [line] = lines(err)
     assert line == content["error"]
     kept = 0 if part == "checkpoint" else 5
-    assert line.startswith(f"runs/tiny/x: No space left on device; kept: the state after {kept} of 5 iterations, in ")
+    assert line.startswith(f"runs/tiny/x: No space left on device; saved: the state after {kept} of 5 iterations, in ")
     with np.load(RUN / "checkpoint" / "state.npz") as state:
         assert int(state["iteration"]) == kept
 
@@ -435,7 +435,7 @@ def test_what_is_in_a_folder_is_removed_and_what_can_be_kept_is(optimize, during
     assert (code, faults(RUN, code, err), out) == (6, [], "")
     [line] = lines(err)
     assert "runs/tiny/metrics.jsonl: has been removed while the run went on; " in line
-    assert "; kept: the state after 3 of 3 iterations, in " in line
+    assert "; saved: the state after 3 of 3 iterations, in " in line
     assert line.endswith("runs/tiny/checkpoint")
     content = read_content(RUN)
     assert (content["status"], content["error"], content["results"]["iterations"]) == ("failed", line, 3)

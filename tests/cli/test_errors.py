@@ -190,12 +190,12 @@ REFUSED = {
     "smaller film": (["scene.size=[20000, 20000]"], "scene.size: must have at most 134217728 pixels, not 400000000: "),
     "samples": (
         ["scene.size=[256, 256]", "run.spp=1000000000"],
-        "run.spp: 1000000000 makes 17174036480 light paths in one pass, and no pass has more than 4294967295: set "
+        "run.spp: 1000000000 makes 17174036480 light paths in one pass, above the limit of 4294967295; set "
         "integrator.samples_per_pass to 62500, or lower run.spp",
     ),
     "passes": (
         ["scene.size=[8, 8]", "run.spp=1000000000", "integrator.samples_per_pass=1000"],
-        "run.spp: 1000000000 makes 250000 passes of a step, and no step has more than 65536: set "
+        "run.spp: 1000000000 makes 250000 passes of a step, above the limit of 65536; set "
         "integrator.samples_per_pass to 250000",
     ),
     "capacity": (
@@ -208,7 +208,7 @@ REFUSED = {
     ),
     "record": (
         [f"integrator={TRAJECTORY}"],
-        "integrator.max_depth: must be less than 65536, not 70000: the record of a path has room for as many vertices",
+        "integrator.max_depth: must be less than 65536, not 70000: the record of a path has one entry for each vertex",
     ),
 }
 

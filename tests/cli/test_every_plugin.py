@@ -76,7 +76,7 @@ def check(row: Row, folder: Path, to_the_end: bool) -> None:
     if row.refused:
         assert "cannot be rendered: " in inspected
         assert row.light in inspected
-        assert "change what cannot be rendered" in inspected
+        assert "change the scene so that it can be rendered" in inspected
         assert row.light in said("init", "scene.xml", "-o", "c.yaml", code=2)
         assert not (folder / "c.yaml").exists()
         return

@@ -125,7 +125,7 @@ def test_renderings_of_a_run_have_its_exposure_and_its_exported_scene_names_it(
     words = " ".join(f"{value:.4g}" for value in np.ravel(factor))
     for suffix in (".exr", ".png"):
         result = reslrb("render", "--run", run, "--spp", 4, "-o", tmp_path / f"with{suffix}")
-        assert f"times {words}, the run's exposure (--exposure 1 leaves it out)" in result.output
+        assert f"times {words}, the run's exposure (--exposure 1 ignores it)" in result.output
         plain = reslrb("render", "--run", run, "--spp", 4, "--exposure", 1, "-o", tmp_path / f"without{suffix}")
         assert plain.exit_code == 0
         assert "times" not in plain.output
@@ -161,7 +161,7 @@ def test_mitsuba_renders_what_was_exported_as_the_run_does(folder: Path) -> None
     [
         ((), "Missing argument 'CONFIG'"),
         (("tiny.yaml", "--run", "runs/tiny"), "not both"),
-        (("--run", "runs/tiny", "--scene"), "leave out --initial and --scene"),
+        (("--run", "runs/tiny", "--scene"), "remove --initial or --scene"),
         (("--run", "runs/none"), "no such folder"),
         (("--run", "tiny.yaml"), "is a file, not the folder of a run"),
         (("--run", "runs"), "has no manifest.json"),

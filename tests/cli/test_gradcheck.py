@@ -95,12 +95,12 @@ def test_what_fails_is_named(
         (["--json", "/nowhere/a.jsonl"], "--json: cannot write /nowhere/a.jsonl"),
         (["--images", f"{__file__}/here"], f"--images: cannot write into {__file__}"),
         (["nothing.yaml"], "nothing.yaml: no such file"),
-        (["--case", "furnace"], "--case: names a case of a suite; take --suite extreme with it"),
+        (["--case", "furnace"], "--case: names a case of a suite; add --suite extreme"),
         (["--suite", "extrem"], "--suite"),
         (["--suite", "extreme", "a.yaml"], "--suite: CONFIG has no effect on a suite"),
         (["--suite", "extreme", "--spp", "4"], "--suite: --spp has no effect on a suite"),
         (["--suite", "extreme", "--estimators", "stak"], "--estimators: `stak` is no estimator; there are reservoir"),
-        (["--suite", "extreme", "--estimators", "event(capacity=2)"], "a suite takes names without options"),
+        (["--suite", "extreme", "--estimators", "event(capacity=2)"], "a suite allows no option except paths"),
     ],
 )
 def test_wrong_calls_are_one_located_line(args: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:

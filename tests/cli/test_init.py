@@ -160,8 +160,8 @@ def test_a_texture_of_8_bits_is_offered_recovered_and_exported(folder: Path) -> 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("room/scene.xml", "--recover", "lamp.*", "--recover", "wal.*"), "--recover: `wal.*` is nothing that can be "),
-        (("room/scene.xml", "--target", "wide.png"), "is 16x8 pixels, and the scene's film 8x8, of another ratio"),
+        (("room/scene.xml", "--recover", "lamp.*", "--recover", "wal.*"), "--recover: `wal.*` matches no recoverable "),
+        (("room/scene.xml", "--target", "wide.png"), "is 16x8 pixels, the scene's film 8x8, with another aspect ratio"),
         (("room/scene.xml", "--target", "wide.png"), "such as 8x8"),
         (("room/scene.xml", "--target", "none.png"), "none.png: no such file"),
         (("room/scene.xml", "--target", "room/scene.xml"), "is not an image that can be read"),
@@ -325,12 +325,12 @@ def choices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_of_several_sensors_one_is_named(choices: Path) -> None:
     first = reslrb("init", "hall.xml")
-    assert "sensor 0 (floor); --sensor takes another: 1 (ball)" in first.output
+    assert "sensor 0 (floor); --sensor selects another: 1 (ball)" in first.output
     config = load(choices / "hall.yaml")
     assert [view.sensor for view in config.views] == [0]
     assert config.parameters[0].keys == ["Rectangle_1.bsdf.reflectance.value"]
     other = reslrb("init", "hall.xml", "--sensor", 1, "--target", write_noise(choices / "photo.png", 12, 8), "--force")
-    assert "sensor 1 (ball); --sensor takes another: 0 (floor)" in other.output
+    assert "sensor 1 (ball); --sensor selects another: 0 (floor)" in other.output
     config = load(choices / "hall.yaml")
     assert [view.sensor for view in config.views] == [1]
     assert config.scene.size is None  # that one's film is as large as the photograph
@@ -402,7 +402,7 @@ def test_what_a_scene_leaves_open_is_named_and_can_be_set(choices: Path) -> None
     assert "at 20x20 pixels" in made.output
     assert load(choices / "hall.yaml").scene.options == {"side": 20}
     for setting, message in (("scene.options.width=3", "$width: is set in scene.options, but the scene file does not"),
-                             ("run.spp=4", "--set run.spp=4: init takes scene.options.NAME=VALUE alone"),
+                             ("run.spp=4", "--set run.spp=4: init takes only scene.options.NAME=VALUE"),
                              ("scene.options.side=[3]", "scene.options.side")):  # fmt: skip
         refused = reslrb("init", "hall.xml", "--set", setting, "--force")
         assert refused.exit_code == 2

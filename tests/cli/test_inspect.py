@@ -108,7 +108,7 @@ def test_a_scene_file_by_itself(scene):
     assert others[0] == "others: 25; --all lists them"
     assert "4 is recovered as a motion" in others
     assert sum(int(line.split()[0]) for line in others[1:]) == 25
-    assert found[-1] == "next: `reslrb init scene.xml --target PHOTO` writes a configuration of it"
+    assert found[-1] == "next: `reslrb init scene.xml --target PHOTO` writes a configuration"
     assert "plan" not in found
 
 
@@ -192,7 +192,7 @@ def test_sections_can_be_given_on_the_command_line(scene):
             "$nothing: is set in scene.options, but the scene file does",
         ),
         (["scene.xml", "--set", "scene.filee=1"], "--set scene.filee=1: scene.filee: unknown key"),
-        (["scene.xml", "--conditioning"], "scene.xml: target: missing; --conditioning measures a complete experiment"),
+        (["scene.xml", "--conditioning"], "scene.xml: target: missing; --conditioning needs a complete experiment"),
         (["empty.yaml"], "empty.yaml: is empty; it needs at least scene"),
         (["run.yaml"], "run.yaml: scene: missing; it has no default"),
     ],

@@ -242,7 +242,7 @@ def test_what_was_done_is_kept(spoilt_experiment, capsys, monkeypatch):
     calls.clear()
     monkeypatch.setitem(losses.LOSSES, "l2", losses.l2)
     code, out, _ = reslrb_nonfinite(capsys, "inspect", "runs/config/config.yaml", "--nonfinite")
-    assert (code, out) == (1, "iteration 1: all is finite this time\n")
+    assert (code, out) == (1, "iteration 1: all values are finite now\n")
 
 
 def test_the_last_line_counts(spoilt_experiment, capsys, monkeypatch):
@@ -276,7 +276,7 @@ def test_there_must_be_something_to_show(spoilt_experiment, capsys):
     optimize(capsys, code=0)
     code, _, err = reslrb_nonfinite(capsys, "inspect", "runs/config/config.yaml", "--nonfinite")
     assert code == 2
-    assert "met no value that was not finite" in err
+    assert "all values of this run were finite" in err
 
 
 def test_the_run_s_own_step_is_traced_again(spoilt_experiment, capsys):
@@ -284,7 +284,7 @@ def test_the_run_s_own_step_is_traced_again(spoilt_experiment, capsys):
     optimize(capsys, STOP, "scene.options={wall: spoilt.exr}")
     command = ("inspect", "runs/config/config.yaml", "--nonfinite")
     code, _, err = reslrb_nonfinite(capsys, *command, "--set", "run.spp=4")
-    assert (code, err) == (2, "--set: does not go with --nonfinite, which traces the run's own step again\n")
+    assert (code, err) == (2, "--set: has no effect with --nonfinite, which repeats a step of the run\n")
     wall = Path("spoilt.exr").read_bytes()
     Path("spoilt.exr").write_bytes(Path("wall.exr").read_bytes())
     code, _, err = reslrb_nonfinite(capsys, *command)

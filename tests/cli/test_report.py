@@ -242,5 +242,5 @@ def test_errors_that_cannot_be_measured_end_no_run(optimize, monkeypatch):
 
     monkeypatch.setattr(recording, "seen_errors", fail)
     err = optimize("--set", "run.iterations=1")
-    assert "errors as people see them were not measured: " in err
+    assert "perceptual errors were not measured: " in err
     assert "seen" not in read_content(RUN)["results"]

@@ -184,7 +184,7 @@ def test_a_small_disk(experiment: Path, disk: Path, kib: int) -> None:
     assert read_manifest(run)["status"] in ("failed", "interrupted")  # the latter if there was no room to say so
     if (run / "checkpoint" / "state.npz").exists():
         with np.load(run / "checkpoint" / "state.npz") as state:
-            assert f"kept: the state after {int(state['iteration'])} of " in line
+            assert f"saved: the state after {int(state['iteration'])} of " in line
 
 
 @pytest.mark.usefixtures("llvm")

@@ -123,17 +123,17 @@ def test_names_are_short_safe_and_different(folder):
         (["--vary", "run.spp"], "--vary run.spp: must be KEY=[VALUE, ...], such as run.spp=[16, 32]"),
         (["--vary", "run.spp=4"], "--vary run.spp=4: must be a list of values, such as run.spp=[16, 32]"),
         (["--vary", "run.spp=[]"], "--vary run.spp=[]: must be a list of values"),
-        (["--vary", "run.spp=[4, 4]"], "--vary run.spp=[4, 4]: names 4 twice"),
+        (["--vary", "run.spp=[4, 4]"], "--vary run.spp=[4, 4]: has 4 twice"),
         (["--vary", "run.spq=[4, 8]"], "--vary run.spq=4: run.spq: unknown key; did you mean `spp`"),
         (["--vary", "run.spp=[4, eight]"], "--vary run.spp=eight: run.spp: must be"),
         (["--vary", "run.spp=[4, {}]"], "--vary run.spp={}: run.spp: must be"),
         (["--vary", "run.spp=[4", "--seeds", "2"], "--vary run.spp=[4: not valid YAML"),
-        (["--vary", "run.seed=[1, 2]"], "--vary run.seed=[1, 2]: is not varied: --seeds N has N of them"),
-        (["--vary", "run=[{spp: 4}, {seed: 3}]"], "--vary: run.seed: is 3, and 0 in the first combination"),
+        (["--vary", "run.seed=[1, 2]"], "--vary run.seed=[1, 2]: cannot be varied: use --seeds N"),
+        (["--vary", "run=[{spp: 4}, {seed: 3}]"], "--vary: run.seed: is 3, but 0 in the first combination"),
         (["--vary", "run.spp=[4]", "--vary", "run=[{spp: 4}]"], "--vary run: replaces what --vary run.spp sets"),
         (["--vary", "run.spp=[4]", "--vary", "run.spp=[8]"], "--vary run.spp: replaces what --vary run.spp sets"),
         (["--vary", "run.spp=[4, 8]", "--seeds", "501"], "2 x 501 seeds are 1002 runs; a sweep has at most 1000"),
-        (["--set", f"run.seed={2**32 - 1}", "--seeds", "2"], "--seeds: leads beyond 4294967295, from run.seed"),
+        (["--set", f"run.seed={2**32 - 1}", "--seeds", "2"], "--seeds: exceeds the last seed, 4294967295"),
         (["--set", "run.spq=3"], "--set run.spq=3: run.spq: unknown key"),
         # two values of which each is right with the others
         (["--vary", "run.spp=[4, 6]", "--vary", "run.adjoint=[independent, batched]"], "run.adjoint"),
@@ -146,7 +146,7 @@ def test_names_are_short_safe_and_different(folder):
         (["--resume", "gone"], "gone: no such folder"),
         (["--resume", "."], ".: is no sweep's folder: it has no sweep.json"),
         (["-o", "tiny.yaml"], "-o: tiny.yaml is a file, not the folder of a sweep"),
-        (["-o", "."], "in it, and no sweep; give a folder that is new, or empty"),
+        (["-o", "."], ", but no sweep; give a new or empty folder"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_said_before_anything_runs(folder, arguments, line):
@@ -310,7 +310,7 @@ def test_ctrl_c_ends_it_after_the_iteration_with_folders_complete(folder, monkey
     words = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", RATES, "-o", "s"]
     result = reslrb(*words)
     assert result.exit_code == 130
-    assert "interrupted, 0 of 2 runs done; look at s/sweep.html; `reslrb sweep --resume s` goes on" in result.output
+    assert "interrupted, 0 of 2 runs done; look at s/sweep.html; `reslrb sweep --resume s` continues" in result.output
     run = Path("s/learning_rate=0.02-seed=0")
     assert tiny.faults(run, 130, "") == []
     assert "finished, 2 of 2 runs done" in tiny.done(*words).output
@@ -356,9 +356,9 @@ def wait_for(happened, seconds=60.0):
 def test_a_process_that_crashes_is_told_by_its_last_words(monkeypatch):
     for end, code, said in (
         ("print('>>> no room'); print('x'); sys.stdout.flush(); os.kill(os.getpid(), 9)", -9,
-         "ended by SIGKILL (the system ends so what takes too much memory): no room"),
+         "ended by SIGKILL (often sent when memory runs out): no room"),
         ("print('a.yaml: wrong'); sys.exit(2)", 2, "a.yaml: wrong"),
-        ("sys.exit(4)", 4, "ended with exit code 4, and said nothing"),
+        ("sys.exit(4)", 4, "ended with exit code 4, without a message"),
         ("time.sleep(60)", 130, "ended by SIGTERM: "),
     ):  # fmt: skip
         monkeypatch.setattr(sweep, "_PROGRAM", f"import os, sys, time; {end}")
@@ -405,7 +405,7 @@ def test_a_run_that_another_goes_on_with_is_waited_for(folder, monkeypatch):
     with FolderLock(Path("s/seed=0")):
         result = reslrb(*words)
     assert (result.exit_code, result.output.splitlines()[-1]) == (
-        2, f"{Path('s/seed=0').absolute()}: is in use by a run of its own; end that first")  # fmt: skip
+        2, f"{Path('s/seed=0').absolute()}: is in use by another run; end that first")  # fmt: skip
     assert "finished, 1 of 1 runs done" in tiny.done(*words).output
 
 

@@ -122,7 +122,7 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
     ),
     "log of nothing positive": (
         parameter("transform: log, bounds: [-1, 0]"),
-        "parameters[0].bounds: leave no positive value",
+        "parameters[0].bounds: exclude positive values",
         "log",
     ),
     "unknown scale": (GOOD + "optimizer: {scale: 1e6}\n", "optimizer.scale: must be", "auto"),
@@ -153,7 +153,7 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
         target("{render: {}, color_space: srgb}"),
         "target.color_space: has no effect",
     ),
-    "truth of a rendered target": (target("{render: {}, truth: true}"), "target.truth: is known of a rendered target"),
+    "truth of a rendered target": (target("{render: {}, truth: true}"), "target.truth: has no effect on a rendered"),
     "colour space unknown": (
         target("{file: a.png, color_space: sRGB}"),
         "target.color_space: must be one of auto, linear, srgb (did you mean srgb?)",
@@ -183,11 +183,11 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
     ),
     "option of another estimator": (
         GOOD + "integrator: {estimator: gather, capacity: 2}\n",
-        "integrator.capacity: has no effect with estimator `gather`, but with `reservoir`",
+        "integrator.capacity: has no effect with estimator `gather`, only with `reservoir`",
     ),
     "estimator's option left at its default": (
         GOOD + "integrator: {capacity: 1}\n",
-        "integrator.capacity: has no effect with estimator `auto`, but with `reservoir` or `event`",
+        "integrator.capacity: has no effect with estimator `auto`, only with `reservoir` or `event`",
     ),
     "unknown estimator": (
         GOOD + "integrator: {estimator: gater}\n",
@@ -211,7 +211,7 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
     "memory budget of nothing": (GOOD + "run: {memory_budget: 0}\n", "run.memory_budget: must be a number"),
     "memory budget of a baseline": (
         GOOD + "integrator: {type: ptracer}\nrun: {memory_budget: 64}\n",
-        "run.memory_budget: goes with integrator `reslrb` alone, not with `ptracer`",
+        "run.memory_budget: needs integrator `reslrb`, not `ptracer`",
     ),
     "memory budget and passes": (
         GOOD + "integrator: {samples_per_pass: 4}\nrun: {memory_budget: 64}\n",
@@ -265,7 +265,7 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
         GOOD + "run: {adjoint: correlate}\n",
         "run.adjoint: must be one of auto, correlated, independent, batched",
     ),
-    "name without letters": (GOOD + "run: {name: '---'}\n", "run.name: must hold a letter or a digit"),
+    "name without letters": (GOOD + "run: {name: '---'}\n", "run.name: must contain a letter or a digit"),
     "variant": (GOOD + "variant: scalar_rgb\n", "variant: must be one of auto, llvm_ad_rgb"),
     "key that looks like a tag": (GOOD + "<script>: 1\n", "<script>: unknown key; known here: variant"),
     "key that looks like pydantic's": (GOOD + '"[key]": 1\n', "[key]: unknown key; known here: variant"),
@@ -284,7 +284,7 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
     "glob without quotes": (
         changed("floor.reflectance.data", "*.data"),
         ":4: *.data is an alias in YAML",
-        'wants quotes: "*.data"',
+        'in quotes: "*.data"',
     ),
     "long name": (GOOD + f"run: {{name: {'a' * 300}}}\n", "run.name: must have at most 200 bytes", "not 300"),
     "name of many bytes": (GOOD + f"run: {{name: {'ü' * 101}}}\n", "run.name: must have", "not 202"),
@@ -309,7 +309,7 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
 OVERRIDES: dict[str, tuple[str, ...]] = {
     "novalue": ("--set novalue: must be KEY=VALUE",),
     "=3": ("--set =3: must be KEY=VALUE",),
-    "a..b=3": ("--set a..b=3: `a..b` is no key",),
+    "a..b=3": ("--set a..b=3: `a..b` is not a key",),
     "run.spp=[1,": ("--set run.spp=[1,: not valid YAML",),
     "run.spp=many": ("--set run.spp=many: run.spp: must be an integer, not the text 'many'",),
     "run.spp=": ("--set run.spp=: run.spp: must be an integer, not null",),
@@ -319,15 +319,15 @@ OVERRIDES: dict[str, tuple[str, ...]] = {
     "parameters[0].bounds=[1,0]": ("--set parameters[0].bounds=[1,0]: parameters[0].bounds: must be [low, high]",),
     "parameters.0.bounds=[1,0]": ("--set parameters.0.bounds=[1,0]: parameters[0].bounds: must be [low, high]",),
     "parameters[2].bounds=[0,1]": (": parameters: has 1 entry; there is no [2]",),
-    "parameters.bounds=[0,1]": (": parameters: is a list; name an entry, such as parameters[0]",),
+    "parameters.bounds=[0,1]": (": parameters: is a list; give an entry, such as parameters[0]",),
     "scene.file.name=x": (": scene.file: is a single value",),
-    "scene[0]=x": (": scene: is no list",),
+    "scene[0]=x": (": scene: is not a list",),
     "scene=null": ("--set scene=null: scene: missing",),
     "parameters[0].key=*.data": (
         "--set parameters[0].key=*.data: *.data is an alias in YAML",
-        """wants quotes: --set 'parameters[0].key="*.data"'""",
+        """in quotes: --set 'parameters[0].key="*.data"'""",
     ),
-    "parameters=[{key: *.data}]": ("""wants quotes: --set 'parameters=[{key: "*.data"}]'""",),
+    "parameters=[{key: *.data}]": ("""in quotes: --set 'parameters=[{key: "*.data"}]'""",),
     "a" + ".a" * 3000 + "=1": ("is nested too deeply",),
     "run.name=\udcff": (
         "--set run.name=\\udcff: not valid YAML: holds a control character, or bytes that are not UTF-8",
@@ -350,7 +350,7 @@ def test_file_errors_are_located(case: str, tmp_path: Path) -> None:
 
 def test_the_mended_override_is_right(tmp_path: Path) -> None:
     line = line_of(tmp_path, GOOD, ("parameters[0].key=*.data",))
-    option, mended = shlex.split(line.partition("wants quotes: ")[2])
+    option, mended = shlex.split(line.partition("in quotes: ")[2])
     assert option == "--set"
     assert load(tmp_path / "x.yaml", [mended]).parameters[0].key == "*.data"
 

@@ -295,16 +295,16 @@ MAP = "heightmap: {mesh: a, resolution: [4, 4]}"
 #: What stands in `parameters[0]`, and where the error is and what it holds.
 WRONG = {
     "nothing": ("{initial: 1}", ("parameters[0]: must have one of `key`, `heightmap` and `motion`",)),
-    "two kinds": (f"{{key: a, {LENS}}}", ("parameters[0].motion: cannot stand beside `key`",)),
+    "two kinds": (f"{{key: a, {LENS}}}", ("parameters[0].motion: cannot be combined with `key`",)),
     "key is a number": ("{key: 3}", ("parameters[0].key: must be text",)),
     "no keys": ("{key: []}", ("parameters[0].key: must have at least one entry",)),
-    "key twice": ("{key: [a, a]}", ("parameters[0].key: must name each once",)),
-    "tied and resampled": ("{key: [a, b], resolution: [4, 4]}", ("parameters[0].resolution: goes with one key",)),
+    "key twice": ("{key: [a, a]}", ("parameters[0].key: must list each key once",)),
+    "tied and resampled": ("{key: [a, b], resolution: [4, 4]}", ("parameters[0].resolution: needs a single key",)),
     "moved twice": (
         f"{{{LENS}}}\n  - {{motion: {{of: [x, lens]}}}}",
-        ("parameters[1].motion.of[1]: `lens` stands in",),
+        ("parameters[1].motion.of[1]: `lens` is already in",),
     ),
-    "mesh twice": (f"{{{MAP}}}\n  - {{{MAP}}}", ("parameters[1].heightmap.mesh[0]: `a` stands in parameters[0]",)),
+    "mesh twice": (f"{{{MAP}}}\n  - {{{MAP}}}", ("parameters[1].heightmap.mesh[0]: `a` is already in parameters[0]",)),
     "nothing moves": ("{motion: {of: []}}", ("parameters[0].motion.of: must have at least one entry",)),
     "nothing free": ("{motion: {of: a, free: []}}", ("parameters[0].motion.free: must have at least one entry",)),
     "unknown word": ("{motion: {of: a, free: [shear]}}", ("parameters[0].motion.free[0]: must be one of", "rotation")),
@@ -318,7 +318,7 @@ WRONG = {
     "no resolution": ("{heightmap: {mesh: a}}", ("parameters[0].heightmap.resolution: missing",)),
     "resolution of one": ("{heightmap: {mesh: a, resolution: [1, 4]}}", ("heightmap.resolution: must be at least",)),
     "huge": ("{heightmap: {mesh: a, resolution: [99999, 99999]}}", ("heightmap.resolution: must be at least",)),
-    "resolution outside": (f"{{{MAP}, resolution: [4, 4]}}", ("parameters[0].resolution: belongs into `heightmap`",)),
+    "resolution outside": (f"{{{MAP}, resolution: [4, 4]}}", ("parameters[0].resolution: has no effect here",)),
     "motion with a resolution": (f"{{{LENS}, resolution: [4, 4]}}", ("parameters[0].resolution: has no effect",)),
     "word misspelt": (
         f"{{{LENS}, bounds: {{rotaton: [0, 1]}}}}",
@@ -330,12 +330,12 @@ WRONG = {
     ),
     "words without a motion": (
         "{key: a, bounds: {scale: [0, 1]}}",
-        ("parameters[0].bounds: is a mapping by the words",),
+        ("parameters[0].bounds: is a mapping for a motion",),
     ),
     "one bound for two units": (f"{{{LENS}, bounds: [0, 1]}}", ("parameters[0].bounds: must be a mapping by what is",)),
     "one value for two units": (
         f"{{{LENS}, initial: 0}}",
-        ("parameters[0].initial: must be a mapping by what is free",),
+        ("parameters[0].initial: must be a mapping for `motion.free`",),
     ),
     "start that is text": (
         "{key: a, initial: grey}",
@@ -411,8 +411,8 @@ def test_paths_that_an_estimator_named_leaves_to_nobody() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"paths": "camera", "estimator": "gather"}, "chooses among the connections of light paths"),
-        ({"paths": "light", "light_share": 0.3}, "has no effect with paths: light, but with both"),
+        ({"paths": "camera", "estimator": "gather"}, "needs the connections of light paths"),
+        ({"paths": "light", "light_share": 0.3}, "has no effect with paths: light, only with both"),
         ({"paths": "both", "light_share": 1.5}, "less than or equal to 1"),
         ({"paths": "sideways"}, "'auto', 'light', 'camera' or 'both'"),
     ],
@@ -424,7 +424,7 @@ def test_paths_that_cannot_be(options: dict[str, Any], words: str) -> None:
 
 def test_naive_differentiation_has_the_paths_that_it_is_told() -> None:
     assert WalkAd().options()["paths"] == "light"
-    with pytest.raises(ValueError, match="has no effect with paths: camera, but with both"):
+    with pytest.raises(ValueError, match="has no effect with paths: camera, only with both"):
         WalkAd(paths="camera", light_share=0.3)
 
 

@@ -99,7 +99,7 @@ def test_a_picture_of_black_and_white_becomes_a_lens(
 def test_a_pattern_that_is_finer_than_the_pixels_is_named(tmp_path: Path) -> None:
     Image.fromarray((255 * (np.indices((64, 64)).sum(axis=0) % 2)).astype(np.uint8)).save(tmp_path / "p.png")
     result = CliRunner().invoke(command, [str(tmp_path / "p.png"), "-o", str(tmp_path / "lens"), "--pixels", "32"])
-    assert str(result.exception).startswith(f"--pixels: is 32, at which {tmp_path}/p.png is of one colour")
+    assert str(result.exception).startswith(f"--pixels: is 32, too few for the fine pattern of {tmp_path}/p.png")
     assert not (tmp_path / "lens").exists()
 
 
@@ -138,10 +138,10 @@ BAD = {
     "thickness": (["--thickness", "0.5"], "--thickness: the relief,"),
     "light": (["--light-distance", "20"], "--light-distance: is 20 mm, from where no lens was found"),
     "sun": (["--sun", "40"], "--sun: is 40 degrees; it must be from 0 to below 10"),
-    "sun of a point": (["--sun", "0.5", "--light-distance", "300"], "--sun: is of parallel light"),
-    "two faces": (["--mirror", "--both"], "--both: goes with a lens"),
+    "sun of a point": (["--sun", "0.5", "--light-distance", "300"], "--sun: needs parallel light"),
+    "two faces": (["--mirror", "--both"], "--both: needs a lens"),
     "margin": (["--margin", "2"], "--margin: is 2; it must be from 0 to 1"),
-    "round": (["--mirror", "--outline", "round", "--light-distance", "300"], "--outline: round goes with parallel"),
+    "round": (["--mirror", "--outline", "round", "--light-distance", "300"], "--outline: round needs parallel"),
     "one colour": ([], "p.exr: is of one colour"),
     "dithered": ([], "p.exr: is of one colour"),
     "one pixel": ([], "p.exr: is 1 x 1"),
@@ -157,7 +157,7 @@ BAD = {
     "no glass": (["--ior", "9"], "--ior: is 9; glass and plastics"),
     "floor": (["--floor", "1"], "--floor: is 1; it must be from 0 to below 1"),
     "tilt": (["--tilt", "0", "85"], "--tilt: is 0 and 85 degrees; both must be between"),
-    "incidence of a lens": (["--incidence", "10"], "--incidence: goes with --mirror"),
+    "incidence of a lens": (["--incidence", "10"], "--incidence: needs --mirror"),
     "grazing": (["--mirror", "--incidence", "85"], "--incidence: is 85 degrees; it must be between"),
     "total reflection": (
         ["--ior", "1.1", "--distance", "60", "--picture-size", "200"],

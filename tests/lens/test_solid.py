@@ -231,7 +231,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
     done("lens", folder / "p.exr", "-o", folder / "lens", "--pixels", "16")
     sets = [f"run.output={folder}/runs", "run.iterations=1", "run.spp=4", "run.final_spp=4", "run.certainty=false"]
     said = done("optimize", folder / "lens/lens.yaml", *(word for line in sets for word in ("--set", line))).output
-    assert "runs/lens -o FOLDER` makes the solid" in said  # what comes next
+    assert "runs/lens -o FOLDER` writes the solid" in said  # what comes next
     return folder / "runs/lens"
 
 
@@ -312,7 +312,7 @@ def test_the_solid_that_is_read_back_throws_what_the_run_s_scene_shows(kind: str
     # As told: of as many samples as it says.
     loss = told["loss"]
     assert loss["integrator"] == "ptracer"
-    assert f"difference from the target is {loss['l2']:.4g}: that of the solid, too" in said
+    assert f"difference from the target is {loss['l2']:.4g}, also for the solid" in said
     again = np.array(mi.render(solid, spp=loss["spp"], seed=loss["seed"]))
     assert loss["l2"] == pytest.approx(float(np.mean((again - target) ** 2)), rel=0.02)
     # Light goes in once and out once wherever it passes: nothing crosses.
@@ -365,9 +365,9 @@ def test_files_that_cannot_be_are_refused_in_one_line(
     (tmp_path / "there.stl").write_bytes(b"")
     monkeypatch.setattr(export, "_writes_3mf", lambda: False)
     for name, settings, line in (
-        ("there.stl", (), "there.stl exists; name a file that does not exist yet"),
-        ("a.step", (), "a.step: .step is not written; name a folder, or a file that ends in .stl"),
-        ("a.stl", ("fabrication=null",), "a.stl: name a folder; of a scene a solid is made where"),
+        ("there.stl", (), "there.stl exists; give a new file"),
+        ("a.step", (), "a.step: .step is not supported; give a folder, or a file that ends in .stl"),
+        ("a.stl", ("fabrication=null",), "a.stl: a solid needs a section `fabrication`"),
         ("a.3mf", (), "a.3mf: 3MF needs lib3mf, which is missing: pip install 'reslrb[fabrication]'"),
         ("a.stl", ("fabrication.thickness=1",), "fabrication.thickness: 1 mm: front and back cross, by"),
         ("out", ("fabrication.thickness=1",), "fabrication.thickness: 1 mm: front and back cross, by"),
@@ -387,6 +387,6 @@ def test_files_that_cannot_be_are_refused_in_one_line(
     assert trimesh.load(tmp_path / "b.stl").is_watertight
     # A folder has what can be written, and the line says what is missing.
     said = done("export", run, "-o", tmp_path / "out").output
-    assert "lens.3mf is left out, since lib3mf is missing" in said
+    assert "lens.3mf is not written: lib3mf is missing" in said
     assert {"lens.stl", "lens.obj", "lens.ply"} < {path.name for path in (tmp_path / "out").iterdir()}
     assert not (tmp_path / "out/lens.3mf").exists()

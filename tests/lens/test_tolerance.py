@@ -260,14 +260,14 @@ def test_the_command_tells_all_of_them(folder: Path) -> None:
     ]  # fmt: skip
     said = (folder / "said.txt").read_text()
     light = json.loads((folder / "out/fabrication.json").read_text())["light"]
-    assert f"of the light that leaves it {100 * light['inside']:.4g} % goes into the picture" in said
+    assert f"of the light that leaves it, {100 * light['inside']:.4g} % falls in the picture" in said
     assert all(f"{name}: SSIM {entry['ssim']:.3f}, " in said for name, entry in told.items())
     # Light that is turned goes the distance times the angle aside: 200 mm, pixels of 100 / 32 mm.
     for axis in "xy":
         shift = told[f"light turned by {tolerance.TURN:g} degree about {axis}"]["shift"]
         assert np.hypot(*shift) == pytest.approx(200 * np.tan(np.radians(1)) / (100 / 32), abs=0.15)
     result = reslrb("export", folder / "runs/lens", "-o", folder / "a.stl", "--tolerances")
-    assert "goes with a folder" in f"{result.output}{result.exception}"
+    assert "needs a folder as output" in f"{result.output}{result.exception}"
 
 
 def test_the_page_of_a_run_has_what_a_maker_wants_to_know(
@@ -307,7 +307,7 @@ def test_the_page_of_a_run_has_what_a_maker_wants_to_know(
     monkeypatch.setattr(export, "read_photo", lambda file: (called.append(file), read(file))[1])
     monkeypatch.setattr(mi, "render", lambda *given, **how: (called.append("image"), render(*given, **how))[1])
     result = done("export", run, "-o", tmp_path / "made", "--tolerances", *settings("run.final_spp=8"))
-    assert "has them, too" in result.output
+    assert ": shows the tolerances" in result.output
     found = json.loads((run / "fabrication.json").read_text())
     off = found.pop("tolerances")
     assert off.keys() >= {"as planned", "distance +2 %", "index -0.005"}

@@ -400,10 +400,10 @@ def test_usual_values() -> None:
 @pytest.mark.parametrize(
     ("args", "line"),
     [
-        (("--sweep", "film", "--max-depth", "4"), "--max-depth: goes with --sweep depth; take --set integrator.max"),
-        (("--values", "2", "--max-depth", "4"), "--max-depth: does not go with --values"),
+        (("--sweep", "film", "--max-depth", "4"), "--max-depth: needs --sweep depth; use --set integrator.max"),
+        (("--values", "2", "--max-depth", "4"), "--max-depth: has no effect with --values"),
         (("--sweep", "size"), "'size' is not one of 'depth', 'spp', 'film', 'texture'"),
-        (("--sweep", "spp", "--values", "4,4"), "`4,4` names a number twice"),
+        (("--sweep", "spp", "--values", "4,4"), "`4,4` has a number twice"),
         (("--sweep", "spp", "--integrators", "ptracer(max_depth=3)"), "all share one max_depth"),
     ],
 )

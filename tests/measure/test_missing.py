@@ -239,9 +239,9 @@ def test_the_command_and_more_seeds(
     ("arguments", "message"),
     [
         (["--missing"], "--missing: needs a CONFIG"),
-        (["CONFIG", "--missing", "--estimators", "stack"], "--estimators: does not go with --missing"),
+        (["CONFIG", "--missing", "--estimators", "stack"], "--estimators: has no effect with --missing"),
         (["CONFIG", "--missing", "--markdown", "a.md"], "--markdown was removed; `reslrb report FILE"),
-        (["CONFIG", "--directions", "2"], "--directions: goes with --missing alone"),
+        (["CONFIG", "--directions", "2"], "--directions: needs --missing"),
     ],
 )
 def test_what_does_not_go_together(

@@ -134,7 +134,7 @@ def test_cases_of_the_suite_are_calls(tmp_path: Path, capsys: pytest.CaptureFixt
     [
         (["--cluster", "local:2"], "--cluster: a budget of seconds says nothing of other machines"),
         (["--cluster", "2", "--seeds", "4"], "--cluster: must be local:N"),
-        (["--cluster", "local:2", "--missing"], "--cluster: does not go with --missing"),
+        (["--cluster", "local:2", "--missing"], "--cluster: has no effect with --missing"),
         (["--cluster", "local:2", "--seeds", "4", "--set", "integrator.guiding=on"], "integrator.guiding: "),
         (["--cluster", "tls://127.0.0.1:9", "--seeds", "4"], "distributed.comm.tls.ca-file: is not set"),
     ],

@@ -219,7 +219,7 @@ def test_a_run_is_resumed_to_the_same_end(folder, monkeypatch):
 
 
 @pytest.mark.parametrize(("sets", "line"), [
-    (["loss.scale=fitted", "target.exposure=auto"], "loss.scale: cannot be fitted beside target.exposure"),
+    (["loss.scale=fitted", "target.exposure=auto"], "loss.scale: cannot be fitted while target.exposure"),
     (["loss.scale=fitted", "run.spp=3"], "run.spp: must be a multiple of 2"),
     (["loss.scale=fitted", "run.spp=4", "run.adjoint=batched"], "run.spp: must be a multiple of 8"),
 ])  # fmt: skip

@@ -197,7 +197,7 @@ def test_a_file_that_cannot_be_run(experiment: Path, capsys: pytest.CaptureFixtu
 @pytest.mark.parametrize(
     ("file", "words"),
     [("own.py", "must be FILE.py:NAME"), ("own.txt:own", "must be FILE.py:NAME"),
-     ("'own.py:a b'", "must be FILE.py:NAME"), ("gone.py:own", "no such file"), ("null", "missing: FILE.py:NAME")],
+     ("'own.py:a b'", "must be FILE.py:NAME"), ("gone.py:own", "no such file"), ("null", "missing; give FILE.py:NAME")],
 )  # fmt: skip
 def test_a_name_that_is_none(experiment: Path, capsys: pytest.CaptureFixture[str], file: str, words: str) -> None:
     assert run(f"{{type: custom, file: {file}}}", "--allow-code") == 2
@@ -227,11 +227,11 @@ def test_a_later_nan_is_a_run_s_own_affair(experiment: Path, capsys: pytest.Capt
     assert json.loads(Path("runs/a/manifest.json").read_text())["status"] == "failed"
     [line] = [each for each in lines(capsys.readouterr().err) if "not finite" in each]
     assert f"the loss (your own `{experiment}/own.py:own`); dL/dI" in line
-    assert "look at what your own code returns, which `reslrb inspect --nonfinite` does not run" in line
+    assert "check what your own code returns; `reslrb inspect --nonfinite` does not run it" in line
     with pytest.raises(SystemExit) as ended:
         main(["inspect", "runs/a/config.yaml", "--nonfinite"])
     assert ended.value.code == 2
-    assert "--nonfinite: runs no code of your own, which loss.file names" in capsys.readouterr().err
+    assert "--nonfinite: does not run your own code, which loss.file names" in capsys.readouterr().err
 
 
 def test_a_later_nan_of_a_function_names_it_and_leaves_the_folder_whole(experiment: Path) -> None:

@@ -228,7 +228,7 @@ def test_a_rate_of_one_ends_at_the_bottom_and_three_leaves_it(rate, ends):
 
 
 def test_curvature_is_for_gradient_descent_alone():
-    with pytest.raises(ConfigError, match=r"optimizer\.scale: curvature goes with type: sgd"):
+    with pytest.raises(ConfigError, match=r"optimizer\.scale: curvature needs type: sgd"):
         load(CONFIG, ["optimizer={type: adam, scale: curvature}"])
     assert load(CONFIG, ["optimizer={type: sgd, scale: curvature}"]).optimizer.learning_rate == 0.5
 

@@ -304,8 +304,8 @@ def test_shards_follow_from_the_settings(folder, sets, settled):
 BAD = [
     (["run.shards=0"], "run.shards"),
     (["run.shards=some"], "run.shards: must be a number of shards, or `auto`"),
-    (["run.spp=6", "run.shards=4"], "run.shards: 4 for each view, which do not divide run.spp, 6"),
-    ([VIEWS, "run.shards=4"], "run.shards: is 4; of the 3 views of an iteration it must be at most 3, or a multiple"),
+    (["run.spp=6", "run.shards=4"], "run.shards: 4 per view do not divide run.spp, 6"),
+    ([VIEWS, "run.shards=4"], "run.shards: is 4; with 3 views in an iteration it must be at most 3, or a multiple"),
     (["run.spp=8", "run.shards=4", "run.adjoint=batched"], "run.batches: 4 does not divide the samples of a shard"),
     (["run.spp=12", "run.shards=4", "loss.scale=fitted"], "run.spp: must be a multiple of 8, not 12"),
     (["run.spp=8", "run.shards=4", "integrator.samples_per_pass=4"], None),

@@ -157,7 +157,7 @@ def test_a_run_that_stopped_goes_on_where_it_is_asked_to(experiment: Path, capsy
     stop = ["--set", "run.stop={patience: 5, relative: 0.9}", "--set", "run.iterations=24"]
     assert optimize("tiny.yaml", "--quiet", *SETS, *stop) == 0
     assert optimize("--resume", "runs/tiny", "--quiet") == 0
-    assert "is finished, after 20 of 24 iterations; --set run.stop=null goes on" in capsys.readouterr().out
+    assert "is finished, after 20 of 24 iterations; --set run.stop=null continues it" in capsys.readouterr().out
     assert optimize("--resume", "runs/tiny", "--quiet", "--set", "run.stop=null") == 0
     assert optimize("tiny.yaml", "--quiet", *SETS, "--set", "run.iterations=24", "--set", "run.name=whole") == 0
     assert len(read_metrics("runs/tiny")) == 24
@@ -175,7 +175,7 @@ def test_a_run_whose_time_was_up_goes_on_with_more(experiment: Path, capsys: pyt
     assert (results["iterations"], manifest("runs/tiny")["status"]) == (1, "finished")
     assert results["stopped"].startswith("the time is up, after ")
     assert optimize("--resume", "runs/tiny", "--quiet", "--set", "run.iterations=2000000") == 0
-    assert "after 1 of 2000000 iterations; --set run.max_seconds=NUMBER goes on" in capsys.readouterr().out
+    assert "after 1 of 2000000 iterations; --set run.max_seconds=NUMBER continues it" in capsys.readouterr().out
     limit = results["elapsed_s"] + 0.5
     assert optimize("--resume", "runs/tiny", "--quiet", "--set", f"run.max_seconds={limit}") == 0
     results = manifest("runs/tiny")["results"]
@@ -185,7 +185,7 @@ def test_a_run_whose_time_was_up_goes_on_with_more(experiment: Path, capsys: pyt
 
 @pytest.mark.parametrize(
     ("more", "line"),
-    [("run.stages=[{until: 0.5, film: 0.5}]", "run.max_seconds: does not go with run.stages")],
+    [("run.stages=[{until: 0.5, film: 0.5}]", "run.max_seconds: cannot be combined with run.stages")],
 )  # fmt: skip
 def test_what_counts_iterations_does_not_go_with_a_time(tmp_path: Path, more: str, line: str) -> None:
     with pytest.raises(ConfigError, match=line):

@@ -56,10 +56,10 @@ def test_what_a_view_says_stands_in_place_of_what_all_have(folder):
 
 
 BAD = [
-    ("views=[{sensor: 0}, {sensor: 0}]", "views[1].sensor", "stands in views[0] already"),
+    ("views=[{sensor: 0}, {sensor: 0}]", "views[1].sensor", "is already in views[0]"),
     ("views=[{sensor: 7}]", "views[0].sensor", "3 sensors"),
     ("views=[{sensor: 0, target: missing.exr}, {sensor: 1}]", "views[0].target", "no such file"),
-    ("views=[{sensor: 0, target: a.exr}]", "target.render", "every view has a target of its own"),
+    ("views=[{sensor: 0, target: a.exr}]", "target.render", "every view has its own target"),
     ("run.held_out=[2]", "run.held_out[0]", "the sensor of no view"),
     ("run.held_out=[0]", "run.held_out", "no view to train on"),
     ("run.views_per_iteration=2", "run.views_per_iteration", "views that are trained on: 1"),

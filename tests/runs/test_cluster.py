@@ -490,8 +490,8 @@ BAD = [
     (["--cluster", "tls://here"], "--cluster: must be local:N"),
     (["--cluster", "local:0"], "--cluster: must be local:N"),
     (["--cluster", "tls://127.0.0.1:9", "--set", "run.shards=4"], "distributed.comm.tls.ca-file: is not set"),
-    (["--cluster", "local:2"], "run.shards: a step is one shard"),
-    (["--cluster", "local:2", "--dry-run"], "--dry-run measures steps of this process"),
+    (["--cluster", "local:2"], "run.shards: --cluster needs more than one shard"),
+    (["--cluster", "local:2", "--dry-run"], "--dry-run measures only this process"),
 ]
 
 

@@ -106,7 +106,7 @@ def test_the_state_before_is_taken_and_that_is_said(run: Path, capsys: pytest.Ca
     assert optimize("--resume", str(run)) == 0
     err = capsys.readouterr().err
     assert "state.npz: is damaged, cut off, or not written by reslrb" in err
-    assert "going on from the state before, after 3 iterations" in err
+    assert "continuing from the previous state, after 3 iterations" in err
     assert [record["iteration"] for record in records_of(run)] == list(range(6))
     assert int(state_of(run)["iteration"]) == 6
     with np.load(run / PREVIOUS) as previous:  # not the damaged one
@@ -161,7 +161,7 @@ def test_a_run_that_is_done_says_so(run: Path, capsys: pytest.CaptureFixture[str
     before = (run / "manifest.json").read_bytes()
     capsys.readouterr()
     assert optimize("--resume", str(run)) == 0
-    assert "is finished, after 6 of 6 iterations; --set run.iterations=NUMBER goes on" in capsys.readouterr().out
+    assert "is finished, after 6 of 6 iterations; --set run.iterations=NUMBER continues it" in capsys.readouterr().out
     assert (run / "manifest.json").read_bytes() == before
     assert "run.iterations: is 5; the run has done 6 already" in told(capsys, run, "--set", "run.iterations=5")
 
