@@ -316,9 +316,7 @@ class Config(Section):
             for option, j, name in spec.objects():
                 if places.setdefault((option, name), i) < i:
                     at = option if j is None else f"{option}[{j}]"
-                    raise located(
-                        f"parameters[{i}].{at}", f"`{name}` is already in parameters[{places[option, name]}]"
-                    )
+                    raise located(f"parameters[{i}].{at}", f"`{name}` is already in parameters[{places[option, name]}]")
         self._check_samples()
         self._check_standing()
         check_stages(self.run.stages)
@@ -330,9 +328,7 @@ class Config(Section):
             )
         if self.run.memory_budget is not None:
             if not isinstance(self.integrator, ReslrbConfig):
-                raise located(
-                    "run.memory_budget", f"needs integrator `reslrb`, not `{self.integrator.type}`"
-                )
+                raise located("run.memory_budget", f"needs integrator `reslrb`, not `{self.integrator.type}`")
             if self.integrator.samples_per_pass is not None:
                 raise located("integrator.samples_per_pass", "is chosen by run.memory_budget; remove one of the two")
         if self.target.render is not None:

@@ -379,8 +379,8 @@ def test_a_photograph_is_taken_as_a_person_sees_it(choices: Path) -> None:
     photograph(12, 8, 5)
     refused = init()
     assert refused.exit_code == 2
-    assert "is 8x12 pixels, and the scene's film 12x8" in refused.output
-    assert "cut it to what the film sees, such as 8x5" in refused.output
+    assert "is 8x12 pixels, the scene's film 12x8" in refused.output
+    assert "crop it to the film's view, such as 8x5" in refused.output
 
 
 def test_a_scene_that_hides_its_lights_keeps_hiding_them(choices: Path) -> None:

@@ -324,7 +324,7 @@ def test_samples_that_are_too_large_are_not_kept_and_that_is_said(
     measured = Measurement(tmp_path / "c.jsonl")
     measured.rows = np.ones(13)
     measured.keeper.finish(lines("a"))
-    assert "the same command would measure all of it again" in capsys.readouterr().out
+    assert "the same command will measure everything again" in capsys.readouterr().out
     assert not measurement_files.samples_file(tmp_path / "c.jsonl").exists()
 
 

@@ -172,7 +172,7 @@ def test_a_folder_has_one_sweep(folder):
     more = tiny.done("sweep", "--resume", "s", "--seeds", 2)
     assert "2 of 2 runs done" in more.output
     assert "--seeds: is 1; the sweep has 2 seeds already" in reslrb("sweep", "--resume", "s", "--seeds", 1).output
-    assert "takes --seeds, --retry" in reslrb("sweep", "--resume", "s", "--vary", "run.spp=[4]").output
+    assert "add only --seeds, --retry" in reslrb("sweep", "--resume", "s", "--vary", "run.spp=[4]").output
 
 
 def test_what_is_damaged_is_located(folder):
@@ -274,7 +274,7 @@ def test_a_run_that_fails_is_told_in_its_row(folder, monkeypatch):
     result = reslrb(*words, "--json", "s.jsonl")
     assert result.exit_code == 1
     for line in ("1 of 2, 1 failed", "learning_rate=0.02-seed=1 failed: the loss is not finite",
-                 "finished, 2 of 4 runs done, 2 failed; look at s/sweep.html; --retry tries"):  # fmt: skip
+                 "finished, 2 of 4 runs done, 2 failed; look at s/sweep.html; --retry repeats"):  # fmt: skip
         assert line in result.output
     assert "lowest median" not in result.output  # what is left of those that failed are the lucky ones
     kinds = [json.loads(line)["kind"] for line in Path("s.jsonl").read_text().splitlines()]

@@ -311,7 +311,7 @@ WRONG = {
     "an axis twice": ("{motion: {of: a, free: [translation, x]}}", ("motion.free: has both `translation` and",)),
     "bounds of an axis that is held": (
         "{motion: {of: a, free: [x, y]}, bounds: {z: [0, 1]}}",
-        ("parameters[0].bounds.z: has no effect: `motion.free` has x, y alone",),
+        ("parameters[0].bounds.z: has no effect: `motion.free` has only x, y",),
     ),
     "pivot of two": ("{motion: {of: a, pivot: [1, 2]}}", ("motion.pivot: must be a point, [x, y, z], not",)),
     "unknown key of a motion": ("{motion: {of: a, about: [1, 2, 3]}}", ("parameters[0].motion.about: unknown key",)),
@@ -332,7 +332,10 @@ WRONG = {
         "{key: a, bounds: {scale: [0, 1]}}",
         ("parameters[0].bounds: is a mapping for a motion",),
     ),
-    "one bound for two units": (f"{{{LENS}, bounds: [0, 1]}}", ("parameters[0].bounds: must be a mapping by what is",)),
+    "one bound for two units": (
+        f"{{{LENS}, bounds: [0, 1]}}",
+        ("parameters[0].bounds: must be a mapping for `motion.free`",),
+    ),
     "one value for two units": (
         f"{{{LENS}, initial: 0}}",
         ("parameters[0].initial: must be a mapping for `motion.free`",),
@@ -442,7 +445,7 @@ def test_amounts_of_memory(written: int | float | str, bytes_: int) -> None:
 
 @pytest.mark.parametrize("written", ["", "512", "-1 MiB", "1 XiB", "0 B", 0, -3, float("nan"), float("inf"), True])
 def test_what_is_no_amount_of_memory(written: int | float | str) -> None:
-    with pytest.raises(ValueError, match="no amount of memory"):
+    with pytest.raises(ValueError, match="not an amount of memory"):
         memory_bytes(written)
 
 

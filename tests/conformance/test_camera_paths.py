@@ -381,7 +381,7 @@ def test_a_share_that_leaves_one_side_has_nothing_of_the_other():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"paths": "camera", "estimator": "gather"}, "needs the connections of light paths"),
+        ({"paths": "camera", "estimator": "gather"}, "chooses among the connections of light paths"),
         ({"paths": "both", "light_share": 1.5}, "must lie in"),
         ({"paths": "sideways"}, "must be one of light, camera, both"),
     ],

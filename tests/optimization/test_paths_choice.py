@@ -311,5 +311,5 @@ def test_a_memory_budget_knows_of_pixels_that_are_shared_out():
 
 
 def test_paths_that_cannot_be_are_located():
-    with pytest.raises(ConfigError, match=r"integrator.estimator: `gather` chooses"):
+    with pytest.raises(ConfigError, match=r"integrator.estimator: `gather` needs the connections"):
         load("tiny.yaml", ["integrator.paths=camera", "integrator.estimator=gather"])

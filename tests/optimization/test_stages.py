@@ -137,7 +137,10 @@ def test_a_run_that_is_to_have_more_iterations_does_not_go_back(experiment: Path
         ("[{until: 0.5, film: 0.75}]", r"run.stages\[0\].film: 0.75 of 8x8 pixels has no whole ones"),
         ("[{until: 1}]", r"run.stages\[0\].until: must be below 1"),
         ("[{until: 0.5}, {until: 0.5}]", r"run.stages\[1\].until: must be above 0.5"),
-        ("[{until: 0.5}, {until: 0.6, film: 0.5}]", r"run.stages\[1\].film: must be at least 1, that of the stage bef"),
+        (
+            "[{until: 0.5}, {until: 0.6, film: 0.5}]",
+            r"run.stages\[1\].film: must be at least 1, that of the previous stage",
+        ),
     ],
 )
 def test_stages_that_cannot_be_are_refused(experiment: Path, stages: str, message: str) -> None:
