@@ -1,8 +1,8 @@
-"""Whether the gradients of an experiment can be trusted: each estimator against everything that counts as a reference.
+"""Check of an experiment's gradients: each estimator is compared with every valid reference.
 
-The objective is sum(G * I) with a fixed random image G, some of it negative, so that every integrator estimates the
-same gradient; the configuration's loss would have each add a bias of its own, which the noise of its image makes. All
-comparisons are of estimates at equal seeds, one after the other, each as soon as it has what it needs.
+The objective is sum(G * I) with a fixed random image G, partly negative, so that all integrators estimate the same
+gradient. The configuration's own loss would add a bias to each, from the noise of its image. Comparisons are made one
+by one at equal seeds, each as soon as its samples are available.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ ALONG_DIRECTIONS = (Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE)
 
 @dataclass(frozen=True)
 class GradientMaps:
-    """Of a texture: mean gradient and reference (H, W, C), and z (H, W) of the sums over channels."""
+    """Maps of a texture: mean gradient and reference (H, W, C), and z-scores (H, W) of the sums over channels."""
 
     gradient: np.ndarray
     reference: np.ndarray
@@ -52,7 +52,7 @@ class GradientMaps:
 
 @dataclass(frozen=True)
 class CheckResult:
-    """A record; `maps` where the parameter is a texture and the reference has all its texels."""
+    """A record, with `maps` if the parameter is a texture and the reference has all its texels."""
 
     record: GradcheckRecord
     maps: GradientMaps | None = None
@@ -60,8 +60,9 @@ class CheckResult:
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison to be made: of the parameter `key` (None: the image) by the integrator `label`, whose paths are
-    `way`."""
+    """One comparison to be made: of the parameter `key` (None: the image) for the integrator `label` with the paths
+    `way`.
+    """
 
     key: str | None
     label: str
@@ -71,12 +72,12 @@ class Row:
 
     @property
     def place(self) -> str:
-        """The parameter, by way, as `Participants` has what belongs to it."""
+        """The parameter's name by way, the key of its data in `Participants`."""
         return self.way.named(str(self.key))
 
 
 class Gradcheck:
-    """A check of one experiment, which goes on from an `earlier` one; `participants` have its scene."""
+    """The check of one experiment with the scene of `participants`. It continues an `earlier` session, if given."""
 
     def __init__(
         self, settings: CheckSettings, now: Callable[[], float] = time.monotonic, earlier: Earlier | None = None
@@ -85,12 +86,12 @@ class Gradcheck:
         self.participants = self._sampling.participants
 
     def sample_with(self, engine: Engine) -> None:
-        """Have samples taken by `engine`, where their number is given."""
+        """Let `engine` take the samples if the numbers of seeds are given."""
         self._sampling.engine = engine
 
     @cached_property
     def rows(self) -> list[Row]:
-        """What is compared, in the order of the table: last, what needs naive AD, which compiles for longest."""
+        """The comparisons in the order of the table. Those with naive AD, which takes longest to compile, come last."""
         parts = self.participants
         found = [
             Row(None, "reslrb", reference, Kind.IMAGE, way)
@@ -120,7 +121,7 @@ class Gradcheck:
         return sorted(found, key=lambda row: row.key is not None and row.reference.value in NAIVE)
 
     def conditions(self) -> str:
-        """What is measured, in one line."""
+        """Describe the measurement in one line."""
         parts, integrator = self.participants, self.settings.config.integrator
         width, height = parts.film
         plays = not 0 <= integrator.max_depth <= integrator.rr_depth
@@ -131,21 +132,21 @@ class Gradcheck:
         )
 
     def expected(self) -> list[GradcheckRecord]:
-        """A record of every line of the table to come, without figures."""
+        """Return a record without results for every line of the table."""
         return [self._record(row, Comparison(Verdict.NOT_MEASURED), 0) for row in self.rows] + [
             result.record for result in self._without_reference()
         ]
 
     def kept(self, settings: dict[str, Any]) -> Kept | None:
-        """What a later session, of the same `settings`, needs to go on; None where nothing has been sampled."""
+        """Return the state for a later session with the same `settings`; None if there are no samples."""
         return self._sampling.kept(settings)
 
     def run(
         self, stop: Callable[[], bool], say: Callable[[str], None], between: Callable[[], None] = lambda: None
     ) -> Iterator[CheckResult]:
-        """Measure and compare, row by row; once `stop()`, only what has been measured is compared.
+        """Measure and compare, row by row. After `stop()`, compare only what has been measured.
 
-        Of what the budget did not suffice for the records say so. `between` is called after each sample.
+        If the budget is too small for a comparison, its record says so. `between` is called after each sample.
         """
         self._sampling.between = between
         self._sampling.expect(name for row in self.rows for name in self._needs(row))
@@ -165,7 +166,9 @@ class Gradcheck:
             say(f"the fewest seeds of everything take {enough}; allow that with --budget")
 
     def _needs(self, row: Row) -> list[Name]:
-        """The samples that a comparison is made of: of ours, and of the reference where that is not exact."""
+        """Return the names of the samples that a comparison needs: the estimator's, and the reference's unless it is
+        exact.
+        """
         naive = row.way.named("walk_ad")
         if row.key is None:
             return [("image", naive if row.label == "reslrb" else row.label), ("image", row.reference.value)]
@@ -230,7 +233,7 @@ class Gradcheck:
         )  # fmt: skip
 
     def _without_reference(self) -> Iterator[CheckResult]:
-        """Say so where no stock integrator counts."""
+        """Yield records for parameters without a stock reference."""
         parts = self.participants
         rows = []
         for way in parts.each_way:
@@ -246,7 +249,7 @@ class Gradcheck:
 
 
 def _draws_plainly(config: Config) -> bool:
-    """Whether paths are those of naive AD at equal seeds: it draws them by nothing that it learned, nor evenly."""
+    """Whether paths equal those of naive AD at equal seeds: no guiding, and no quasi-random sequence."""
     options = config.integrator.options()
     usual = {"guiding": "off", "sequence": "independent", "pixels": "even"}
     return all(options.get(name, value) == value for name, value in usual.items())

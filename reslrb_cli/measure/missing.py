@@ -1,17 +1,17 @@
-"""The part of a derivative that attached gradients lack: silhouettes, edges of shadows, light that leaves the film.
+"""Missing terms of derivatives: attached gradients lack silhouettes, shadow edges, and light that leaves the film.
 
-Differences of the image at common random numbers have all of it (`Missing`). Along each of K directions, with F_k the
-difference and g_k the attached gradient's,
+Finite differences of the image at common random numbers contain these terms (`Missing`). Let F_k be the difference and
+g_k the attached gradient along direction k of K. Then
 
     m_k = F_k - g_k,   share = sqrt(sum_k m_k^2 / sum_k F_k^2)
 
-Two steps cancel what a difference is wrong by: E(h), `extrapolated`. Steps are halved, and the step around which E
-changes least is taken. At larger steps E is truncated. At smaller ones it is lost in rounding, which is the same for
-all seeds where it is the scene that is rounded, or in paths that flip. By how much E changes there counts as error
-where it stands out of its noise. What noise adds to the squares is subtracted; the standard error is that of the mean
-over seeds. `MissingCheck` is `gradcheck --missing` on an experiment.
+Two steps cancel the leading error of a difference: E(h), `extrapolated`. Steps are halved, and the step around which E
+changes least is used. At larger steps E has truncation errors. At smaller ones it has rounding errors, which are the
+same for all seeds if the scene's geometry is rounded, or errors of paths that change discontinuously. The remaining
+change of E counts as an error if it exceeds the noise. The contribution of noise to the squares is subtracted. The
+standard error is that of the mean over seeds. `MissingCheck` is `gradcheck --missing` on an experiment.
 
-`check_missing` measures the same share before a run's first iteration, of the run's own samples, by a step or two.
+`check_missing` measures the same share before a run's first iteration, with the run's samples and one or two steps.
 """
 
 from __future__ import annotations
@@ -64,9 +64,9 @@ HALVINGS = 8
 
 @dataclass
 class Missing:
-    """Samples of the derivatives of one parameter along K directions: `ours` N times (K,), `differences` (3, K).
+    """Samples of the derivatives of one parameter along K directions: N times `ours` (K,), and `differences` (3, K).
 
-    Of the differences the first are by the step of the direction, the others by twice and four times that.
+    The first differences have the direction's step, the others twice and four times that step.
     """
 
     directions: list[Direction]
@@ -75,11 +75,11 @@ class Missing:
 
     @staticmethod
     def of(case: Case, differenced: Any, directions: Sequence[Direction], spp: int) -> Missing:
-        """With a step for each direction."""
+        """Create an empty collection with a step for each direction."""
         return Missing([_with_step(case, differenced, direction, spp) for direction in directions])
 
     def take(self, case: Case, tracer: Any, differenced: Any, seed: int, spp: int, step: Callable) -> None:
-        """One more seed; `step` is the gradient step that knows dL/dI."""
+        """Add one seed. `step` is the gradient step with known dL/dI."""
         gradient = case.gradient(tracer, seed, spp, step=step)
         along = self.directions
         self.ours.append(np.array([gradient @ one.vector for one in along]))
@@ -88,11 +88,11 @@ class Missing:
 
     @property
     def count(self) -> int:
-        """Seeds so far."""
+        """The number of seeds."""
         return len(self.ours)
 
     def share(self) -> tuple[float, float] | None:
-        """The share and its standard error; None where the differences are not told from 0."""
+        """Return the share and its standard error; None if the differences are not significantly different from 0."""
         near, far, farthest = np.stack(self.differences, 1)
         whole = extrapolated(near, far)
         missing = whole - np.stack(self.ours)
@@ -102,8 +102,11 @@ class Missing:
 
 
 def share_of(whole: np.ndarray, missing: np.ndarray, left: np.ndarray) -> tuple[float, float] | None:
-    """Return the share of `missing` in `whole`, (N, K) samples each, and its standard error; None where the whole is
-    not told from 0. `left` (K,) are squares of what the whole may be wrong by in all seeds."""
+    """Return the share of `missing` in `whole`, both (N, K) samples, and its standard error.
+
+    Returns None if `whole` is not significantly different from 0. `left` (K,) are squares of errors of `whole` that are
+    the same in all seeds.
+    """
     mean, error = _mean(whole)
     size = np.square(mean).sum() - np.square(error).sum()
     if size <= NOTHING**2 * np.square(error).sum():
@@ -120,7 +123,9 @@ def share_of(whole: np.ndarray, missing: np.ndarray, left: np.ndarray) -> tuple[
 
 
 def _ratio(missing: np.ndarray, whole: np.ndarray) -> float:
-    """Root of the mean square of (N, K) samples of the part over that of the whole, without what noise adds."""
+    """Return the ratio of the root mean squares of (N, K) samples, `missing` over `whole`, without the part due to
+    noise.
+    """
     squares = [np.square(mean).sum() - np.square(error).sum() for mean, error in (_mean(missing), _mean(whole))]
     return float(np.sqrt(max(squares[0], 0.0) / squares[1]))
 
@@ -142,7 +147,7 @@ def _differences(
 
 
 def _mean(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (K,) of samples (N, K), and its standard error."""
+    """Return the mean (K,) of samples (N, K), and its standard error."""
     return samples.mean(0), samples.std(0, ddof=1) / np.sqrt(len(samples))
 
 
@@ -157,10 +162,10 @@ ESTIMATOR = "stack"
 
 
 class MissingCheck:
-    """The experiment, loaded; a variant must be set. dL/dI is that of its loss at the initial values, held fixed.
+    """The measurement of missing terms on a loaded experiment. A variant must be set.
 
-    With an `earlier` session seeds are added to its own; `count` is then that of all. Raises ConfigError and
-    UnsupportedScene.
+    dL/dI is that of the experiment's loss at the initial values, and stays fixed. With an `earlier` session, new seeds
+    are added, and `count` is the total number. Raises ConfigError and UnsupportedScene.
     """
 
     def __init__(
@@ -186,12 +191,12 @@ class MissingCheck:
         self._found: dict[str, Missing] = {} if earlier is None else self._restore(earlier)
 
     def conditions(self) -> str:
-        """What is measured, in one line."""
+        """Describe the measurement in one line."""
         height, width, _ = self.case.weights.shape
         return f"{self.source}, film {width}x{height}, {self.spp} spp, dL/dI of the loss at the initial values"
 
     def run(self, stop: Callable[[], bool], between: Callable[[], None] = lambda: None) -> Iterator[MissingRecord]:
-        """Measure each parameter for its share of the budget; once `stop()`, no more. `between`: after each seed."""
+        """Measure each parameter for its share of the budget until `stop()`. `between` is called after each seed."""
         for place, key in enumerate(self.case.keys):
             if stop():
                 return
@@ -201,12 +206,12 @@ class MissingCheck:
             yield self._record(key)
 
     def known(self) -> list[MissingRecord]:
-        """What has been found of each parameter that has seeds enough for it, in their order."""
+        """Return the results for all parameters with enough seeds, in their order."""
         least = min(FEWEST, self._count or FEWEST)
         return [self._record(key) for key, found in self._found.items() if found.count >= least]
 
     def kept(self, settings: Mapping[str, Any]) -> Kept | None:
-        """What a later session, of the same `settings`, needs to go on; None where nothing has been sampled."""
+        """Return the state for a later session with the same `settings`; None if there are no samples."""
         taken = {key: found for key, found in self._found.items() if found.count}
         steps = {key: [direction.step for direction in found.directions] for key, found in taken.items()}
         samples = {("ours", key): found.ours for key, found in taken.items()}
@@ -214,7 +219,7 @@ class MissingCheck:
         return kept(KIND, settings, samples, steps=steps)
 
     def _restore(self, earlier: Earlier) -> dict[str, Missing]:
-        """Return what an earlier session has found, around its own steps."""
+        """Return the results of an earlier session, with its own steps."""
         found, samples = {}, earlier.samples
         for key, steps in earlier.head["steps"].items():
             along = [replace(one, step=float(h)) for one, h in zip(self._directions[key], steps, strict=True)]
@@ -260,9 +265,10 @@ MOST_SEEDS, MOST_VIEWS = 64, 4
 
 
 def check_missing(problem: Problem, warn: Callable[[str], None]) -> list[MissingRecord]:
-    """Measure what share of the loss's derivative is missing, by parameter that moves light, before a run begins.
+    """Measure the missing share of the loss's derivative before a run, for each parameter that moves light.
 
-    Calls `warn` with one line where any is. Raises ConfigError where more than half is, unless the run accepts that.
+    Calls `warn` with one line if something is missing. Raises ConfigError if more than half is missing, unless the run
+    accepts incomplete derivatives.
     """
     config, found = problem.config, measure_missing(problem)
     told = [record for record in found if record.is_incomplete]
@@ -279,10 +285,10 @@ def check_missing(problem: Problem, warn: Callable[[str], None]) -> list[Missing
 
 
 def measure_missing(problem: Problem) -> list[MissingRecord]:
-    """Measure the share by parameter that moves light, where the parameters stand, for `run.measuring` of the run's
-    samples. A parameter that there is no time for has a record without a share.
+    """Measure the missing share by parameter that moves light, for at most `run.measuring` of the run's samples.
 
-    Heightmaps whose share is not known are left out: their rims hardly move. Leaves neither gradient nor change behind.
+    The parameters keep their values. A parameter without enough time has a record without a share. Heightmaps with an
+    unknown share are left out, because their rims hardly move. Restores the scene, and leaves no gradients.
     """
     selection, kind = problem.selection, problem.config.integrator.type
     moving = [key for key in selection.keys if key not in selection.factors and moves_light(selection.params, key)]
@@ -298,7 +304,7 @@ def measure_missing(problem: Problem) -> list[MissingRecord]:
 
 
 class _Short:
-    """Samples of the derivatives of a run's loss along each of `keys`, by the run's own integrator."""
+    """Samples of the derivatives of a run's loss along each of `keys`, with the run's own integrator."""
 
     def __init__(self, problem: Problem, keys: Sequence[str]) -> None:
         self.problem, self.keys, run = problem, keys, problem.config.run
@@ -320,7 +326,7 @@ class _Short:
         return self.problem.selection.params
 
     def _directions(self, key: str) -> list[np.ndarray]:
-        """All entries one by one of a small parameter, two smooth directions of a large one; among zeros."""
+        """Return the directions of a parameter: each entry of a small one, two smooth directions of a large one."""
         case = self._cases[0]
         size, value = case.initial[key].size, case.values.value(key)
         if size > MOST_ENTRIES:
@@ -330,7 +336,7 @@ class _Short:
         return [embed(case, key, row) for row in rows]
 
     def measure(self) -> list[MissingRecord]:
-        """Measure all parameters by the shorter step, and those whose share is not known then by the longer one."""
+        """Measure all parameters with the shorter step, and those with an unknown share again with the longer step."""
         image_spp, fewest = 2 * self.problem.config.run.spp, seeds(FEWEST)
         along = sum(map(len, self._rows.values()))
         if image_spp + FEWEST * (1 + 2 * along) * self._spp > self._left or not self._weigh(image_spp):
@@ -344,7 +350,7 @@ class _Short:
         return list(records.values())
 
     def _look_longer(self, key: str, short: list[np.ndarray]) -> MissingRecord:
-        """The share by more seeds, and by the longer step, if the two steps agree."""
+        """Measure the share with more seeds, and with the longer step if the two steps agree."""
         long = [self._difference(key, LONG, seed) for seed in seeds(FEWEST)]
         change, noise = _mean(np.array(long) - np.array(short))
         agree = np.square(change).sum() <= NOTHING**2 * np.square(noise).sum()
@@ -358,7 +364,7 @@ class _Short:
         return record
 
     def _record(self, key: str, samples: list[np.ndarray] | None) -> MissingRecord:
-        """The record of a parameter with these (K,) samples of differences; None: there are none."""
+        """Return the record of a parameter with these (K,) samples of differences; None: there are no samples."""
         share = None
         if samples is not None:
             for seed in seeds(MOST_SEEDS)[len(self._ours) : len(samples)]:
@@ -374,14 +380,14 @@ class _Short:
         return MissingRecord(source, key, value, error, along, len(samples or ()))
 
     def _difference(self, key: str, step: float, seed: int) -> np.ndarray:
-        """Differences of the loss along all directions of a parameter, (K,)."""
+        """Return the differences of the loss along all directions of a parameter, (K,)."""
         rows = self._rows[key]
         self._left -= 2 * len(rows) * self._spp
         return np.sum([[case.difference(self._integrator, row, seed, self._spp, step) for row in rows]
                        for case in self._cases], axis=0)  # fmt: skip
 
     def _weigh(self, spp: int) -> bool:
-        """Have the cases weigh by the loss's dL/dI; return whether there is any."""
+        """Set dL/dI of the loss as the weights of the cases; return whether any is not zero."""
         problem, weights = self.problem, []
         for case, view in zip(self._cases, self._views, strict=True):
             gradient = problem.image_gradient(view, problem.render(view.sensor, spp, 0, "missing"))

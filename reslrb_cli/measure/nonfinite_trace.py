@@ -1,8 +1,8 @@
-"""The trace of a value that is not finite: the path, its vertex and the factor, or the loss's pixel.
+"""Search for the origin of a value that is not finite: the path, its vertex and the factor, or the pixel of the loss.
 
-The paths of the step that came upon it are traced again from their seeds (`find_offenders`), and every factor is looked
-at (`SearchHooks`), with its derivative in the direction in which all entries of the parameters grow alike: what is not
-finite in one direction is not in this one.
+`find_offenders` traces the paths of the step again from their seeds, and `SearchHooks` checks every factor. It also
+checks the factor's derivative in the direction in which all entries of the parameters grow equally: a derivative that
+is not finite in some direction is not finite in this one.
 """
 
 from __future__ import annotations
@@ -41,11 +41,13 @@ from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
 @dataclass(frozen=True)
 class PathVertex:
-    """A vertex of a path, and all that the path can be traced again from.
+    """A vertex of a path, with all that is needed to trace the path again.
 
-    `samples` says which of the step's samples it belongs to, `seed` is their sampler's, `path` its index among `paths`.
-    `vertex` counts from where the path begins, 0: the emitter, or of camera paths, which `samples` names, the sensor;
-    `position` is in world space; `surface` is the id of the shape there.
+    - `samples`: which of the step's samples the path belongs to; `seed`: their sampler's seed; `path`: its index among
+      `paths`.
+    - `vertex`: the number of the vertex. Vertex 0 is on the emitter, or on the sensor for camera paths, which `samples`
+      names.
+    - `position`: in world space; `surface`: the shape's id.
     """
 
     samples: str
@@ -59,11 +61,11 @@ class PathVertex:
 
 @dataclass(frozen=True)
 class Offender:
-    """The first value that is not finite of one view, in the order of the paths and of their vertices.
+    """The first value of a view that is not finite, in the order of paths and of their vertices.
 
-    `quantity` is what it is, `value` one number a channel, none for a derivative of the loss. `pixel`, (x, y), is where
-    it reaches the film. `where` is None for a derivative of the loss; `image` and `target`, what the loss compares
-    there, are None for a path.
+    `quantity` names the value, and `value` has one number per channel, none for a derivative of the loss. `pixel` (x,
+    y) is its place on the film. `where` is None for a derivative of the loss. `image` and `target`, the values that the
+    loss compares there, are None for a path.
     """
 
     sensor: int
@@ -76,9 +78,9 @@ class Offender:
 
 
 class Witness(Guiding):
-    """What another has learned, which goes on learning, and notes which tables samples are drawn from.
+    """A wrapper of another guide that continues learning, and notes from which tables samples are drawn.
 
-    `drawn` are the tables of the samples so far, in order, those of samples that were learned from left out.
+    `drawn` are the tables of the samples so far, in order, without samples that were only drawn for learning.
     """
 
     def __init__(self, other: Guiding) -> None:
@@ -88,20 +90,21 @@ class Witness(Guiding):
         self.drawn: list[Table] = []
 
     def table(self, number: int, purpose: Purpose, delta: mi.TensorXf | None = None) -> Table:
-        """What samples for sensor `number` are drawn from."""
+        """Return the table from which samples for sensor `number` are drawn."""
         found = super().table(number, purpose, delta)
         self.drawn.append(found)
         return found
 
     def learn(self, number: int, paths: int, said: Said) -> None:
-        """Have the table of a sensor learn from paths that were drawn for this alone."""
+        """Update the table of a sensor from paths drawn only for learning."""
         self.drawn.pop()
         super().learn(number, paths, said)
 
 
 def purposes(problem: Problem, view: View) -> list[tuple[int, str, Purpose]]:
-    """What a step, or a shard, draws samples for, in order: the place of each among `sample_sets`, a word to its name,
-    what for."""
+    """Return the purposes of a step's or shard's samples, in order: the index in `sample_sets`, a word, and the
+    purpose.
+    """
     options = problem.config.step_options(shard=True)
     gradient = Purpose.GRADIENT if problem.on_samples(view) is None else Purpose.BOTH
     if options["adjoint"] == "correlated":
@@ -137,7 +140,7 @@ _E, _DE, _S, _DS, _PRODUCT, _C, _DC, _CONTRIBUTION, _L, _DL = range(1, len(QUANT
 
 @dataclass
 class Suspect:
-    """A value (C,), its kind (0: none), and the vertex at which it stands."""
+    """A value (C,) that is not finite, its kind (0: none), and its vertex."""
 
     kind: Any
     vertex: Any
@@ -147,22 +150,22 @@ class Suspect:
 
     @staticmethod
     def none() -> Suspect:
-        """Nothing found."""
+        """Return a suspect without a value."""
         return Suspect(mi.UInt32(0), mi.UInt32(0), mi.Point3f(0), mi.UInt32(0), mi.Spectrum(0))
 
     def otherwise(self, other: Suspect, active: Any) -> Suspect:
-        """This, or where there is none, in `active` lanes, `other` if it is not finite."""
+        """Return this suspect; in `active` lanes without one, return `other` if its value is not finite."""
         take: Suspect = dr.select((self.kind == 0) & active & is_bad(other.value), other, self)
         return take
 
 
 def is_bad(value: Any) -> Any:
-    """Lanes in which a channel of `value` (C,) is not finite."""
+    """Return the lanes in which a channel of `value` (C,) is not finite."""
     return ~dr.all(dr.isfinite(value))
 
 
 def reaches(film: Film, u: Any, pixel: tuple[int, int] | None) -> Any:
-    """Lanes whose film position `u` is within the filter's reach of `pixel`."""
+    """Return the lanes whose film position `u` is within the filter's radius of `pixel`."""
     if pixel is None:
         return mi.Bool(False)
     centre = mi.Point2f(pixel[0] + 0.5, pixel[1] + 0.5)
@@ -173,9 +176,9 @@ def reaches(film: Film, u: Any, pixel: tuple[int, int] | None) -> Any:
 class Search:
     """Loop state.
 
-    `first` is the first suspect of the path so far, and `found` the one that was first when a connection took it to
-    film position `u`: the first such connection, or, where there is one, the first whose pixel is the wanted one
-    (`there`). `largest` is the largest contribution (its `value`), which lands at `largest_u`.
+    `first` is the first suspect of the path so far. `found` is the first suspect of the first connection that reached
+    the film with one, at position `u`; a connection that reaches the wanted pixel (`there`) takes precedence. `largest`
+    is the largest contribution, which lands at `largest_u`.
     """
 
     first: Suspect
@@ -187,11 +190,10 @@ class Search:
 
 
 class SearchHooks(Hooks):
-    """Looks at every factor that a connection passes on, at its derivative along the parameters' tangents, and at the
-    product of them all."""
+    """Checks every factor of a connection, its derivative along the parameters' tangents, and the product of all."""
 
     def __init__(self, samples: Samples, emission: Any, derivative: Any, pixel: tuple[int, int] | None) -> None:
-        """`emission` is a ray of each path, with E; `derivative` is dE (C,); `pixel` the one that is wanted, if any."""
+        """`emission` is a ray of each path with E, `derivative` is dE (C,), and `pixel` the wanted pixel, if any."""
         self.samples, self.emission, self.derivative, self.pixel = samples, emission, derivative, pixel
 
     def start(self, product: Product) -> Search:
@@ -237,7 +239,7 @@ class SearchHooks(Hooks):
 
 
 class CameraSearch(CameraHooks):
-    """The same of camera paths: at every factor that light is found behind, and at what is found."""
+    """The same for camera paths: checks each factor before an emitter, and the emission."""
 
     def __init__(self, samples: Samples) -> None:
         self.samples = samples
@@ -295,7 +297,9 @@ Array = np.ndarray[Any, Any]
 
 @dataclass
 class Found:
-    """The offender of the first path that has one, whether it reaches the wanted pixel, the largest contribution."""
+    """The offender of the first path that has one, whether it reaches the wanted pixel, and the largest
+    contribution.
+    """
 
     offender: Offender | None
     there: bool
@@ -303,7 +307,7 @@ class Found:
 
 
 def search_paths(samples: Samples, sensor: int, label: str, pixel: tuple[int, int] | None) -> Found:
-    """Look at every path of these samples; those that reach `pixel` come first. Parameters have their tangents set."""
+    """Check every path of these samples. Paths that reach `pixel` come first. The parameters must have tangents."""
     plan, describe = samples.plan, partial(_describe, samples, sensor, label)
     with dr.suspend_grad():
         if plan.camera:
@@ -335,9 +339,9 @@ def search_paths(samples: Samples, sensor: int, label: str, pixel: tuple[int, in
 
 
 def _seen_emission(samples: Samples) -> Iterator[tuple[Suspect, mi.Spectrum, mi.Point2f, mi.Bool]]:
-    """What the sensor sees of lamps, by primary rays, then of points on lamps that are smaller than a pixel.
+    """Yield emission that the sensor sees directly: by primary rays, then for emitters smaller than a pixel.
 
-    Radiance (C,), its tangent, film positions, and the active lanes.
+    Each item has radiance (C,) with its tangent, film positions, and active lanes.
     """
     plan, tangent = samples.plan, mi.Spectrum(0)
     primary = primary_ray(samples)
@@ -360,7 +364,7 @@ def _seen_emission(samples: Samples) -> Iterator[tuple[Suspect, mi.Spectrum, mi.
 
 
 def _first(bad: Array, there: Array) -> tuple[int | None, bool]:
-    """The first of the bad lanes, of those that are `there` if any are; and whether it is."""
+    """Return the first bad lane, preferably one that is `there`, and whether it is `there`."""
     lanes = np.flatnonzero(bad)
     preferred = np.flatnonzero(bad & there)
     if preferred.size:
@@ -371,7 +375,7 @@ def _first(bad: Array, there: Array) -> tuple[int | None, bool]:
 def _describe(
     samples: Samples, sensor: int, label: str, suspect: Suspect, u: Any, lane: int, quantity: str | None = None
 ) -> Offender:
-    """The record of one lane's suspect."""
+    """Return the record of one lane's suspect."""
 
     def number(value: Any) -> Any:
         return np.array(value).ravel()[lane % dr.width(value)]
@@ -398,7 +402,7 @@ def _shape_name(scene: Any, index: int) -> str | None:
 
 
 def find_offenders(problem: Problem, iteration: int) -> list[Offender]:
-    """The first value that is not finite of each view in which there is any; the parameters are those of `problem`."""
+    """Return the first value that is not finite of each view that has one. The parameters are those of `problem`."""
     found: list[Offender] = []
     apart = problem.config.shards != 1
     views = {view.sensor: view for view in problem.views}
@@ -419,8 +423,10 @@ def find_offenders(problem: Problem, iteration: int) -> list[Offender]:
 
 
 def _of_view(problem: Problem, view: View, step_seed: int, word: str) -> Offender | None:
-    """The same of one view's samples, or of those of a shard, which its `word` names; of `others` dL/dI is not at the
-    mean image of the others, but at one of samples of its own."""
+    """Return the same for one view, from its samples or those of the shard that `word` names.
+
+    For independent dL/dI, the check uses dL/dI at one of the sample sets instead of the mean image of the others.
+    """
     guiding = guiding_of(problem)
     witness = None if guiding is None else Witness(guiding)
     if witness is not None and problem.config.shards != 1:
@@ -447,9 +453,9 @@ def _of_view(problem: Problem, view: View, step_seed: int, word: str) -> Offende
 def _parts(
     problem: Problem, view: View, step_seed: int, witness: Witness | None = None
 ) -> Iterator[tuple[Samples, int, str]]:
-    """The samples of a step, pass by pass, with the sensor's index and a name; light paths are those of the run.
+    """Yield a step's samples pass by pass, with the sensor's index and a name. Light paths are those of the run.
 
-    Of a guided one the `witness` knows what it was drawn from.
+    The `witness` of a guided step supplies the tables from which samples were drawn.
     """
     scene, sensor = problem.scene, problem.scene.sensors()[view.sensor]
     given = problem.config.integrator.options()
@@ -486,7 +492,7 @@ def _parts(
 
 
 def _set_tangents(problem: Problem) -> None:
-    """Give every entry of every parameter the tangent 1, as far as what of the scene holds it."""
+    """Give every entry of every parameter the tangent 1, as far as the scene uses it."""
     params, keys = problem.selection.params, problem.selection.keys
     keys = [key for key in keys if key in params]  # an exposure is no part of any path
     for key in keys:
@@ -501,7 +507,7 @@ def _set_tangents(problem: Problem) -> None:
 
 @dataclass
 class TracedStep:
-    """Image (H, W, C) and gradients of a step, and the first entry (x, y, channel) of dL/dI that was refused."""
+    """Image (H, W, C) and gradients of a step, and the first refused entry of dL/dI, (x, y, channel)."""
 
     image: Array
     gradients: dict[str, Array]
@@ -509,7 +515,7 @@ class TracedStep:
 
 
 def _take_step(problem: Problem, view: View, step_seed: int) -> TracedStep:
-    """The view's step, as the run took it; leaves no gradient behind."""
+    """Repeat the view's step as the run took it. Leaves no gradients."""
     optimizer, keys = problem.optimizer, problem.selection.keys
     step = gradient_step(
         problem.integrator, problem.scene, view.sensor, view.objective,
@@ -523,7 +529,9 @@ def _take_step(problem: Problem, view: View, step_seed: int) -> TracedStep:
 
 
 def _of_step(step: TracedStep, view: View, largest: Offender | None) -> Offender | None:
-    """What is left where no path has anything: the loss, sums that overflow, or paths that were not looked at."""
+    """Return the remaining explanation if no path has one: the loss, overflow of sums, or paths that were not
+    checked.
+    """
     image, target = step.image, np.array(view.target)
     if step.refused is not None:
         x, y, channel = step.refused

@@ -1,14 +1,14 @@
-"""Where to look in an integrator of a user's own that `gradcheck` found wrong, derived from measurements.
+"""Diagnosis of a user's own integrator that `gradcheck` found wrong, derived from measurements.
 
-What it estimates is compared with what `reslrb` does by the same kind of paths, as a ratio: of gradients along the
-reference's own direction,
+The integrator is compared with `reslrb` with the same kind of paths, as a ratio. For gradients, along the reference's
+own direction,
 
     r = E<g, u> / E<G, u>,      u from other seeds of G than the denominator,
 
-with its standard error; of images of their sums. The ratios are taken for paths of 1, 2, 3, ... segments, without
-Russian roulette, and for each parameter. Images are linear in emission: so that at each seed sum(dL/dE E) is the image
-itself, where both passes trace the same paths and add the same at their vertices. Each finding rules out places where a
-fault may be, and the sentence is made of those that are left. It says what was measured, and is no proof.
+with its standard error; for images, the ratio of their sums. Ratios are measured for paths of 1, 2, 3, ... segments
+without Russian roulette, and for each parameter. Images are linear in emission, so at each seed sum(dL/dE E) equals the
+image if both passes trace the same paths and add the same terms. Each measurement rules out possible faults, and the
+message names those that remain. It reports what was measured, and is no proof.
 """
 
 from __future__ import annotations
@@ -61,18 +61,18 @@ CONSTANTS = {"2": 2.0, "1/2": 0.5, "pi": np.pi, "1/pi": 1 / np.pi, "2 pi": 2 * n
 
 @dataclass(frozen=True)
 class Ratio:
-    """What is estimated over what it should be; None where the reference is too noisy to say."""
+    """An estimate divided by its correct value; None if the reference is too noisy."""
 
     value: float
     error: float
 
     @property
     def wrong(self) -> bool:
-        """Whether it is not 1."""
+        """Whether the ratio differs significantly from 1."""
         return not np.isfinite(self.value) or abs(self.value - 1) > max(ERRORS * self.error, LEAST)
 
     def same(self, other: Ratio) -> bool:
-        """Whether it may be the other."""
+        """Whether the ratio agrees with another within the errors."""
         return abs(self.value - other.value) <= max(ERRORS * np.hypot(self.error, other.error), LEAST)
 
     def __str__(self) -> str:
@@ -82,8 +82,10 @@ class Ratio:
 def look_into(
     check: Gradcheck, records: Sequence[GradcheckRecord], stop: Callable[[], bool], say: Callable[[str], None]
 ) -> Iterator[str]:
-    """What is to be said of each of the user's own integrators, after its `records`: how noisy and dear it is, and,
-    where it is wrong, where to look. Raises KeyboardInterrupt once `stop()`; `say` is told what is being measured."""
+    """Yield messages for each of the user's own integrators, after its `records`: noise and time, and likely faults.
+
+    Raises KeyboardInterrupt after `stop()`. `say` receives the name of the current measurement.
+    """
     for listed in check.participants.listed:
         if listed.type != "custom":
             continue
@@ -95,7 +97,7 @@ def look_into(
 
 
 def _cost(check: Gradcheck, label: str, stop: Callable[[], bool]) -> str:
-    """Noise and time of a gradient beside those of `reslrb` by the same paths."""
+    """Compare noise and time of a gradient with those of `reslrb` with the same paths."""
     parts = check.participants
     ours = _ours(parts, label)
     figures, measured = [], SEEDS
@@ -125,13 +127,13 @@ def _check(stop: Callable[[], bool]) -> None:
 
 
 def _ours(parts: Participants, label: str, **other: int) -> StepIntegrator:
-    """The reference: `reslrb` by the same kind of paths, with `other` depths."""
+    """Return the reference: `reslrb` with the same kind of paths, and `other` depths."""
     options = parts.options_of(label) | other
     return make_integrator("reslrb", estimator="stack", **parts.ways[label].options, **options)
 
 
 class Looking:
-    """What is measured of one integrator, `label`, once it failed."""
+    """The measurements for one integrator, `label`, that failed."""
 
     def __init__(
         self, parts: Participants, label: str, stop: Callable[[], bool], say: Callable[[str], None]
@@ -146,11 +148,11 @@ class Looking:
     # --- measuring ----------------------------------------------------------------------------------------------------
 
     def _pair(self, **other: int) -> tuple[StepIntegrator, StepIntegrator]:
-        """The integrator and the reference, with `other` depths."""
+        """Return the integrator and the reference, with `other` depths."""
         return self.parts.own_with(self.label, **other), _ours(self.parts, self.label, **other)
 
     def images(self, **other: int) -> Ratio:
-        """Of images, weighted alike in all pixels."""
+        """Return the ratio of the images, with equal weights in all pixels."""
         return _over(*self._sums(**other))
 
     def _sums(self, **other: int) -> tuple[Array, Array]:
@@ -162,7 +164,7 @@ class Looking:
         return mine, ours
 
     def gradients(self, **other: int) -> dict[str, Ratio]:
-        """Of each parameter that the reference has a gradient of."""
+        """Return the ratio for each parameter of which the reference has a gradient."""
         self._measure("gradients", other)
         own, ours = self._pair(**other)
         reference = np.stack([self.parts.gradient(ours, seed) for seed in self._each(2 * self._seeds, 6)])
@@ -181,10 +183,12 @@ class Looking:
     def emission(
         self, depth: int | None = None, seen: int | None = None, even: bool = False
     ) -> tuple[Ratio, float] | None:
-        """The derivative by all emission, times emission, over the image, which it has to equal: images are linear in
-        it. And by how much that scatters between seeds, at each of which both are of the same paths; None where some
-        light is not a number (`.value`, `scale`). Of paths of `depth` segments, over an image of `seen`; `even`: with
-        dL/dI of 1 in all pixels and channels."""
+        """Return the ratio of sum(dL/dE E) to the image, which must be 1 because images are linear in emission.
+
+        Also returns how much the ratio varies between seeds; at each seed both terms have the same paths. Returns None
+        if some light is not given by a number (`.value`, `scale`). The paths have `depth` segments. The image is
+        `seen`. `even`: dL/dI is 1 in all pixels and channels.
+        """
         depth = self.depth if depth is None else depth
         keys = self._lamps()
         if not keys:
@@ -196,7 +200,7 @@ class Looking:
     def _by_emission(
         self, keys: list[str], max_depth: int, seen: int | None = None, even: bool = False, **other: int
     ) -> tuple[Array, Array]:
-        """The derivative by emission, times emission, and the image that it has to equal, at each seed."""
+        """Return sum(dL/dE E) and the image that must equal it, at each seed."""
         depths = max_depth, max_depth if seen is None else seen
         own, image = (self.parts.own_with(self.label, max_depth=n, **other) for n in depths)
         case = Case(self.parts.case.scene, keys, self.parts.case.sensor)
@@ -213,13 +217,15 @@ class Looking:
         return derivatives, images
 
     def _lamps(self) -> list[str]:
-        """What all light is linear in; nothing where some is not a number (`.value`, `scale`)."""
+        """Return the keys in which all light is linear; empty if some light is not given by a number (`.value`,
+        `scale`).
+        """
         params = mi.traverse(self.parts.case.scene)
         keys = [key for key, _ in params if parameter_kind(params, key) == "emitter" and key.endswith(LINEAR)]
         return keys if len(keys) == len(self.parts.case.scene.emitters()) else []
 
     def _surfaces(self) -> list[str]:
-        """What light that is scattered once is linear in, all of it; nothing where a BSDF is not."""
+        """Return the keys in which all light scattered once is linear; empty if some BSDF is not linear."""
         params = mi.traverse(self.parts.case.scene)
         graph = SceneGraph.of(self.parts.case.scene)
         bsdfs = dict.fromkeys(each for bsdf in graph.surface_bsdfs() for each in graph.nested_bsdfs(bsdf))
@@ -228,7 +234,7 @@ class Looking:
         return keys if set(kinds) <= SCALING and len(keys) == kinds.count("SmoothDiffuse") else []
 
     def _of_length(self, at: int, sums: Callable[..., tuple[Array, Array]]) -> Ratio:
-        """Of the light of paths of `at` segments, and of no others; `sums`: both sides of a ratio, by depths."""
+        """Return the ratio for paths of exactly `at` segments. `sums` are both terms of a ratio by depth."""
         own, reference = sums(max_depth=at, rr_depth=NEVER)
         if at > 1:
             shorter = sums(max_depth=at - 1, rr_depth=NEVER)
@@ -236,8 +242,9 @@ class Looking:
         return _over(own, reference)
 
     def _limited(self, at: int, sums: Callable[..., tuple[Array, Array]], before: Ratio) -> str:
-        """A word on what is limited from above: with darker lamps, or surfaces, paths of `at` segments are less wrong
-        than they were `before`."""
+        """Describe an upper limit on values: with darker lamps or surfaces, paths of `at` segments are less wrong than
+        `before`.
+        """
         if not np.isfinite(before.value):
             return ""
         scene, sensor = self.parts.case.scene, self.parts.case.sensor
@@ -259,13 +266,13 @@ class Looking:
         return ""
 
     def _measure(self, what: str, options: Mapping[str, int]) -> None:
-        """Tell what is being measured."""
+        """Report the current measurement."""
         where = ", ".join(f"{name} {value}" for name, value in options.items() if value != NEVER)
         without = "without roulette" if NEVER in options.values() else ""
         self._say(f"looking into {self.label}: {', '.join(filter(None, [what, where, without]))}")
 
     def _each(self, count: int, block: int) -> Iterator[int]:
-        """Seeds, as long as the user wants to know."""
+        """Yield seeds until the user stops."""
         for seed in seeds(count, block):
             _check(self._stop)
             yield seed
@@ -273,7 +280,7 @@ class Looking:
     # --- saying -------------------------------------------------------------------------------------------------------
 
     def sentence(self, failing: Iterable[GradcheckRecord]) -> str:
-        """Where to look."""
+        """Return the sentence that says where to look."""
         if self.parts.attached:
             return (
                 "wrong where light moves: look at derivatives of silhouettes, of edges of shadows, and of where light "
@@ -328,7 +335,7 @@ class Looking:
         return f"its image holds; of the reference's gradient it has {_list(wrong)}{beside}"
 
     def _narrowed(self, wrong: dict[str, Ratio]) -> list[str]:
-        """What is left: passes that do not agree, roulette, derivatives from some depth on, lobes."""
+        """Return the remaining faults: passes that differ, roulette, derivatives from some depth on, or lobes."""
         worst = max(wrong, key=lambda key: abs(wrong[key].value - 1) / max(wrong[key].error, 1e-12))
         passes = self._of_passes(wrong)
         if passes is not None:
@@ -357,7 +364,9 @@ class Looking:
         return [each for each in said if each]
 
     def _of_passes(self, wrong: dict[str, Ratio]) -> str | None:
-        """Why the pass that differentiates is not that of the image: what it adds, or its paths; None where it is."""
+        """Return why the differentiated pass differs from that of the image: its terms or its paths. None if it does
+        not.
+        """
         measured = self.emission()
         if measured is None:
             return None
@@ -388,12 +397,12 @@ class Looking:
         return "; ".join(filter(None, said))
 
     def _right_if_even(self) -> bool:
-        """Whether it is dL/dI alone that is wrong in the pass that differentiates: where that is even, all is right."""
+        """Whether only dL/dI is wrong in the differentiated pass: with a constant dL/dI everything is right."""
         found = self.emission(even=True)
         return found is not None and not found[0].wrong and found[1] <= SAME_PATHS
 
     def _too_short(self) -> bool:
-        """Whether the pass that differentiates paths of three segments has those of two alone."""
+        """Whether the differentiated pass, for paths of three segments, has only paths of two."""
         found = self.emission(3, 2) if self.deepest >= 3 else None
         return found is not None and not found[0].wrong and found[1] <= SAME_PATHS
 
@@ -401,7 +410,7 @@ class Looking:
         return not 0 <= self.depth <= self._options["rr_depth"]
 
     def _from_depth(self, ratio: Callable[[int], Ratio | None]) -> tuple[int | None, bool]:
-        """The least length of paths with which it is wrong, and whether shorter ones were seen to be right."""
+        """Return the least length of wrong paths, and whether shorter paths were measured as right."""
         seen = False
         for depth in range(1, self.deepest + 1):
             found = ratio(depth)
@@ -411,7 +420,7 @@ class Looking:
         return None, seen
 
     def _lobes(self, key: str) -> str:
-        """A word on the lobes of the BSDF that the parameter belongs to, where it has several."""
+        """Name the lobes of the parameter's BSDF if it has several."""
         for bsdf in self.parts.bsdfs_of(key):
             if bsdf.component_count() > 1 and bsdf.class_name() != "TwoSidedBRDF":
                 return (
@@ -434,7 +443,7 @@ def _from(depth: int, before: bool) -> str:
 
 
 def _segments(depth: int, hides: bool, before: bool = True) -> str:
-    """What paths of so many segments have that shorter ones do not."""
+    """Describe what paths with this number of segments have that shorter ones do not."""
     what = "throughput, and the BSDF's value over its density"
     if depth == 1:
         hidden = " (hide_emitters is on here)" if hides else ""
@@ -448,8 +457,9 @@ def _segments(depth: int, hides: bool, before: bool = True) -> str:
 
 
 def _over(own: Array, reference: Array) -> Ratio:
-    """The ratio of two means, with its standard error; 1 where there is nothing in either, infinite where there should
-    be nothing."""
+    """Return the ratio of two means with its standard error: 1 if both are zero, infinite if only the reference is
+    zero.
+    """
     if not reference.any():
         return Ratio(np.inf if own.any() else 1.0, 0.0)
     value = own.mean() / reference.mean()

@@ -1,4 +1,4 @@
-"""An experiment whose gradients are to be checked: its scene, the integrators that take part, and one seed of each."""
+"""An experiment whose gradients are checked: the scene, the compared integrators, and one sample of each."""
 
 from __future__ import annotations
 
@@ -73,11 +73,11 @@ PILOT_SEEDS = 2
 
 @dataclass(frozen=True)
 class CheckSettings:
-    """What is checked. `seeds` and `spp` are None where they are to be chosen.
+    """Settings of a check. `seeds` and `spp` are None if they are chosen automatically.
 
-    `named`: the user named the integrators; otherwise those that cannot take part are left out. Of the budget `spent_s`
-    have gone before. `initial` are the values of parameters, as `Selection.array` has them, in place of those of
-    `config`.
+    - `named`: the user named the integrators. Otherwise those that cannot take part are left out.
+    - `spent_s`: the part of the budget that earlier sessions used.
+    - `initial`: values of parameters, as `Selection.array` returns them, that replace those of `config`.
     """
 
     config: Config
@@ -95,7 +95,7 @@ class CheckSettings:
         return self.config.adjoint != "correlated"
 
     def configs(self) -> dict[str, Config]:
-        """The experiment with each integrator, by its label. Raises ConfigError where one cannot be."""
+        """Return the experiment with each integrator, by label. Raises ConfigError if one is invalid."""
         depth = self.config.integrator.max_depth
         return {case.label: case.at(self.config, depth, self.known) for case in self.integrators}
 
@@ -104,10 +104,9 @@ def settings_of(
     config: Config, estimators: str | None, budget_s: float, seeds: int | None, spp: int | None, spent_s: float,
     integrators: str | None = None,
 ) -> CheckSettings:  # fmt: skip
-    """What is checked of `config`: the lists of `estimators`, as `--estimators` has it, and of a user's own
-    `integrators`, as `--integrators` has it; all estimators where there is neither.
+    """Return the settings of a check of `config`, from the lists `estimators` and `integrators` of the command line.
 
-    Raises ConfigError where one cannot be.
+    Without either, all estimators are checked. Raises ConfigError if one is invalid.
     """
     listed = [] if estimators is None else parse_estimators(estimators)
     listed += [] if integrators is None else parse_own(integrators)
@@ -119,14 +118,14 @@ def settings_of(
 
 @dataclass(frozen=True)
 class Way:
-    """Which paths there are, and the share of light paths in them: what is seen, and what naive AD has to trace."""
+    """The kinds of paths and the share of light paths. They decide what is visible, and what naive AD must trace."""
 
     paths: str = "light"
     light_share: float = 0.5
 
     @classmethod
     def of(cls, config: Config) -> Way:
-        """That of an integrator; whoever leaves nobody a choice has light paths."""
+        """Return the paths of an integrator; light paths if it has no such option."""
         options = config.integrator.options()
         paths, share = options.get("paths", "light"), options.get("light_share", "auto")
         share = 0.5 if share == "auto" else share
@@ -136,25 +135,27 @@ class Way:
 
     @property
     def options(self) -> dict[str, Any]:
-        """What integrators are told; of light paths nothing."""
+        """The options for integrators; empty for light paths."""
         share = {"light_share": self.light_share} if self.paths == "both" else {}
         return {} if self.paths == "light" else {"paths": self.paths} | share
 
     def named(self, name: str) -> str:
-        """What is called `name` of light paths, of these."""
+        """Return the name for these paths of an item that is called `name` for light paths."""
         words = {"light": "", "camera": ", paths: camera", "both": f", paths: both, light_share: {self.light_share:g}"}
         return name + words[self.paths]
 
 
 class Participants:
-    """The scene, loaded, and every integrator by its label; a variant must be set.
+    """The loaded scene with every integrator by its label. A variant must be set.
 
-    `ways` say which paths each estimator has, by its label, and in all dictionaries whose keys are said to be by way
-    stand, behind the names of what light paths have, those of the others (`Way.named`). `stock` holds the stock
-    reference of each parameter's gradient, or None, and `why` the reasons for what is not one; `images` those of the
-    image, by way, and `exact` gradients that are known in closed form. `listed` are the estimators that take part:
-    where `attached` derivatives are asked for, those that have them, on light paths. Raises ConfigError and
-    UnsupportedScene.
+    - `ways`: the paths of each estimator, by its label. Dictionaries "by way" have the names for light paths first,
+      then those for other paths (`Way.named`).
+    - `stock`: the stock reference of each parameter's gradient, or None; `why`: the reasons against the others.
+    - `images`: references of the image, by way; `exact`: gradients in closed form.
+    - `listed`: the estimators that take part. If derivatives are attached, these are the estimators with attached
+      derivatives on light paths.
+
+    Raises ConfigError and UnsupportedScene.
     """
 
     def __init__(self, settings: CheckSettings) -> None:
@@ -239,7 +240,7 @@ class Participants:
         self.exact = {key: value for key, value in known.items() if value is not None}
 
     def _able(self, settings: CheckSettings, configs: dict[str, Config], problem: Problem) -> list[Listed]:
-        """The estimators that can take part. Raises ConfigError where one was named that cannot, or where none is."""
+        """Return the estimators that can take part. Raises ConfigError if a named one cannot, or if none can."""
         listed = self._with_paths(settings, configs, problem)
         others = [case for case in listed if case.type == "reslrb" and not _attaches(case)]
         able = [case for case in listed if case not in others]
@@ -251,7 +252,9 @@ class Participants:
         return able
 
     def _with_paths(self, settings: CheckSettings, configs: dict[str, Config], problem: Problem) -> list[Listed]:
-        """The estimators whose paths can render the scene and, where light moves, have derivatives; raises as above."""
+        """Return the estimators whose paths can render the scene and, if light moves, differentiate it. Raises
+        ConfigError.
+        """
         if self._situation.moved:
             ours = [case for case in settings.integrators if case.type == "reslrb"]
             told = [case for case in ours if case.options.get("paths", "light") != "light"]
@@ -272,7 +275,7 @@ class Participants:
         return listed
 
     def _configured(self, configs: dict[str, Config]) -> dict[str, StepIntegrator]:
-        """The integrators by label, and, where derivatives are attached, with what references ask for."""
+        """Return the integrators by label, with the options that references need if derivatives are attached."""
         made: dict[str, StepIntegrator] = {}
         for label, config in configs.items():
             kind, options = config.integrator.type, config.integrator.options()
@@ -295,22 +298,22 @@ class Participants:
         return made
 
     def options_of(self, label: str) -> dict[str, Any]:
-        """`max_depth`, `rr_depth` and `hide_emitters` of an integrator."""
+        """Return `max_depth`, `rr_depth` and `hide_emitters` of an integrator."""
         options = self._configs[label].integrator.options()
         return {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
 
     def own_with(self, label: str, **other: int) -> StepIntegrator:
-        """The user's own integrator of this label with `other` depths."""
+        """Return the user's own integrator of this label with `other` depths."""
         config = self._configs[label]
         return OwnIntegrator(**config.integrator.options() | other, allowed=config.allows_code)
 
     def bsdfs_of(self, key: str) -> list[mi.BSDF]:
-        """The BSDFs that a parameter belongs to, nested ones and those around them; none of what is no BSDF's."""
+        """Return the BSDFs that a parameter belongs to, nested and enclosing ones; empty if it belongs to none."""
         is_bsdf = key in self.case.params.properties and parameter_kind(self.case.params, key) == "bsdf"
         return bsdfs_of(self._situation, key) if is_bsdf else []
 
     def of_own(self, key: str, way: Way) -> list[Reference]:
-        """What a user's own integrator is compared with: all that the scene allows for the gradient of `key`."""
+        """Return the references for a user's own integrator: all that the scene allows for the gradient of `key`."""
         if self._situation.moved:  # derivatives of camera paths are ours to no longer than light rests
             return [Reference.FINITE_DIFFERENCE]
         stock = self.stock[way.named(key)]
@@ -319,19 +322,20 @@ class Participants:
         return [*found, Reference.WALK_AD, Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE]
 
     def sampled(self, label: str, reference: Reference) -> str:
-        """Return the integrator whose gradients stand for those of `label` beside this reference (`ALIKE`)."""
+        """Return the integrator whose gradients stand for those of `label` in comparisons with this reference
+        (`ALIKE`).
+        """
         alike = _alike(label, reference)
         return alike if alike in self.integrators else label
 
     def _are_unlike(self, references: set[Reference | None]) -> bool:
-        """Whether something here loses light along the film's border, and something else does not."""
+        """Whether some references lose light along the film's border and others do not."""
         sides = {reference in CAMERA_PATHS for reference in references if reference is not None}
         return len(sides | {divides_by_film(way.paths) for way in self.each_way}) > 1
 
     def _weigh(self, inside: bool) -> None:
-        """Random weights of mean 1, so that entries do not cancel, a sixth negative; with `inside` 0 at the border.
-
-        Where light moves, smooth ones.
+        """Set random weights of mean 1, a sixth of them negative. `inside`: 0 at the border. If light moves, they are
+        smooth.
         """
         shape = tuple(self.case.weights.shape)
         if self._situation.moved:
@@ -343,7 +347,7 @@ class Participants:
         self.case.weigh(weights)
 
     def shape(self, key: str) -> tuple[int, ...]:
-        """Shape of a parameter."""
+        """Return the shape of a parameter."""
         return value_shape(self.case.values.value(key))
 
     def choose_steps(self, of: str) -> None:
@@ -353,11 +357,12 @@ class Participants:
         self.directions[of] = [choose_step(self.case, image, d, pilot, self.spp) for d in self.directions[of]]
 
     def sample(self, kind: str, of: str, seed: int) -> np.ndarray:
-        """One sample in a row: by an integrator, `gradient` or `image`, or along the directions of a parameter, `of`.
+        """Return one sample in a row: `gradient` or `image` of an integrator, or along the directions of a parameter,
+        `of`.
 
-        Gradients are of all parameters, by a step such as the experiment takes; images are black along the border where
-        they are compared with one that loses no light there. Along directions, which are by way, there are finite
-        `differences`, and `tangents`, forward derivatives, which are the same for all estimators of the same paths.
+        Gradients contain all parameters, from a step as in the experiment. Images are black along the border if they
+        are compared with images that lose no light there. Along directions, by way, there are finite `differences` and
+        `tangents`. Tangents are forward derivatives, which are the same for all estimators of the same paths.
         """
         if kind == "gradient":
             if of in (_alike(label, Reference.UNGUIDED) for label in self.unguided):
@@ -377,12 +382,12 @@ class Participants:
         return np.array([self.case.tangent(tracer, d.vector, seed, self.spp) for d in self.directions[of]])
 
     def gradient(self, integrator: StepIntegrator, seed: int) -> np.ndarray:
-        """Return the gradient of all parameters in a row, by a step such as the experiment takes."""
+        """Return the gradient of all parameters in a row, from a step as in the experiment."""
         options = {"step": self.case.known_step} if self.known else {}
         return self.case.gradient(integrator, seed, self.spp, **options)
 
     def _teach(self, of: str) -> None:
-        """Teach the tables of a guided integrator once, and hold them: each sample depends on its seed alone."""
+        """Learn the tables of a guided integrator once and keep them, so that each sample depends only on its seed."""
         tracer = self.integrators[of]
         assert isinstance(tracer, LightTracer)
         guiding = tracer.preparation.guiding
@@ -393,7 +398,7 @@ class Participants:
 
 
 def _attaches(case: Listed) -> bool:
-    """Whether this is an estimator of ours with derivatives of what moves light."""
+    """Whether this is one of our estimators with attached derivatives."""
     return case.type == "reslrb" and case.options["estimator"] in ATTACHED
 
 
@@ -402,5 +407,5 @@ def _alike(label: str, reference: Reference) -> str:
 
 
 def _samples(film: tuple[int, int], most: int, multiple: int | None) -> int:
-    """Samples per pixel of one gradient: as many paths as PATHS, no more than in a step of the run."""
+    """Return the samples per pixel of one gradient: about PATHS paths, at most those of a step of the run."""
     return multiple_of(max(min(PATHS // (film[0] * film[1]), most), 1), multiple)

@@ -1,8 +1,8 @@
-"""Workers as they are from without: each in a process of its own, whose end is seen, and said, and ends nothing else.
+"""Worker processes as seen from outside. The end of a worker is detected and reported, and ends nothing else.
 
-- `Process`: one worker, asked and answered by lines of JSON (`workers.py` is its other end).
-- `Contestant`: one of several that are measured side by side, and how it came to its end; `Stepping`: that takes steps.
-- `Pace`: how the time of a sweep is spent: so much for each depth, and as many rounds there as fit.
+- `Process`: one worker, which exchanges lines of JSON with `workers.py`.
+- `Contestant`: one of several workers that are compared, and how it ended. `Stepping` takes steps.
+- `Pace`: divides the time of a sweep among depths and rounds.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _CRASHES = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS)
 
 
 class Ended(Exception):
-    """A process ended before it answered; `status` and `reason` say how."""
+    """A process ended before it answered. `status` and `reason` say how."""
 
     def __init__(self, status: BenchStatus | str, reason: str) -> None:
         super().__init__(reason)
@@ -52,7 +52,7 @@ class Stopped(Exception):
 
 
 class Refused(ReslrbError):
-    """A process could not begin, for a reason that holds for all of them."""
+    """A process could not start, for a reason that holds for all processes."""
 
     def __init__(self, line: str, exit_code: int) -> None:
         super().__init__(line)
@@ -60,7 +60,7 @@ class Refused(ReslrbError):
 
 
 class Process:
-    """One worker. `first` is its first message; `memory_limit` (bytes, or None) is in it too."""
+    """One worker. `first` is its first message, which includes `memory_limit` (bytes, or None)."""
 
     def __init__(self, first: dict[str, Any], command: list[str]) -> None:
         self.limit: int | None = first["memory_limit"]
@@ -81,14 +81,14 @@ class Process:
         self.ask(first | {"cache": self._folder.name})
 
     def ask(self, question: dict[str, Any]) -> None:
-        """Send a message; an end of the process shows when the answer is waited for."""
+        """Send a message. `answer` reports if the process has ended."""
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.write(json.dumps(question).encode() + b"\n")
             self._process.stdin.flush()
 
     def answer(self, stop: Callable[[], bool]) -> dict[str, Any]:
-        """Wait for the next answer. Raises Ended, Stopped once `stop()`, and Refused."""
+        """Wait for the next answer. Raises Ended, Refused, and, after `stop()`, Stopped."""
         assert self._process.stdout is not None
         with selectors.DefaultSelector() as selector:
             selector.register(self._process.stdout, selectors.EVENT_READ)
@@ -110,7 +110,7 @@ class Process:
         return answer
 
     def close(self) -> None:
-        """End the process and remove what it leaves."""
+        """End the process and remove its files."""
         self._process.kill()
         self._process.wait()
         for stream in (self._process.stdin, self._process.stdout):
@@ -153,9 +153,9 @@ _making = threading.Lock()
 
 
 def abandon_all() -> None:
-    """End all processes and remove their folders, in a program that is about to end; from any thread.
+    """End all processes and remove their folders when the program ends. Can be called from any thread.
 
-    None is made from then on.
+    No process can be started afterwards.
     """
     _making.acquire(timeout=ABANDON_SECONDS)
     for process in list(_at_work):
@@ -166,7 +166,7 @@ def abandon_all() -> None:
 
 
 def last_words(text: str) -> str:
-    """The line of a process's standard error that says most: Dr.Jit's `>>>` line, or the last one."""
+    """Return the most informative line of a process's standard error: Dr.Jit's `>>>` line, or the last line."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     marked = [line for line in lines if line.startswith(">>>")]
     return (marked[-1].lstrip("> ") if marked else lines[-1] if lines else "")[:300]
@@ -174,9 +174,9 @@ def last_words(text: str) -> str:
 
 @dataclass(kw_only=True)
 class Contestant:
-    """One of several that are measured side by side; whoever may not refuse ends the whole where it does.
+    """One of several workers that are compared. A failure ends the measurement if the worker may not refuse.
 
-    `process` is None where none is under way, `peak_mib` the memory that it holds.
+    `process` is None if none is running, and `peak_mib` the memory that it uses.
     """
 
     process: Any
@@ -188,18 +188,18 @@ class Contestant:
 
     @property
     def alive(self) -> bool:
-        """Whether it can be asked for more."""
+        """Whether the process can take more questions."""
         return self.process is not None and self.end is None and self.refusal is None and not self.late
 
     def ask(
         self, question: dict[str, Any], stop: Callable[[], bool], over: Callable[[], bool] = lambda: False
     ) -> dict[str, Any] | None:
-        """One answer; None where the process ended over it, or time was up. Raises Stopped once `stop()`."""
+        """Ask and wait for one answer; None if the process ended or the time was up. Raises Stopped after `stop()`."""
         self.process.ask(question)
         return self.answer(stop, over)
 
     def answer(self, stop: Callable[[], bool], over: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
-        """The next answer, as of `ask`; the first is what a process says without being asked."""
+        """Wait for the next answer, as `ask` does. A process sends the first answer without a question."""
         try:
             result: dict[str, Any] = self.process.answer(lambda: stop() or over())
             return result
@@ -217,7 +217,7 @@ class Contestant:
         return None
 
     def close(self) -> None:
-        """End its process, if one is under way."""
+        """End the process, if one is running."""
         if self.process is not None:
             self.process.close()
             self.process = None
@@ -229,20 +229,24 @@ MAX_WARM_UPS = 4
 
 @dataclass(kw_only=True)
 class Stepping(Contestant):
-    """One that takes steps in rounds once it is warm; `cold` is what its first step took, which compiles."""
+    """A contestant that takes steps in rounds after its warm-up. `cold` is the first step, which includes
+    compilation.
+    """
 
     cold: dict[str, Any] | None = None
 
     def question(self, round: int | None) -> dict[str, Any]:
-        """What asks for the steps of a round; None: for one that counts for nothing."""
+        """Return the question for a round's steps; None: for a step that is not counted."""
         raise NotImplementedError
 
     def keep(self, round: int, answer: dict[str, Any]) -> None:
-        """Take note of the steps of a round."""
+        """Store the steps of a round."""
         raise NotImplementedError
 
     def warm_up(self, tight: Callable[[], bool], stop: Callable[[], bool], over: Callable[[], bool]) -> dict | None:
-        """Take a cold step, then others until nothing is compiled any more; the last answer, None where it ended."""
+        """Take a cold step, then others until nothing is compiled. Return the last answer, or None if the process
+        ended.
+        """
         answer = self.ask(self.question(None) | {"cold": True, "release": False}, stop, over)
         if answer is not None:
             self.cold, self.peak_mib = answer, answer["peak_mib"]
@@ -254,7 +258,7 @@ class Stepping(Contestant):
         return answer
 
     def turn(self, round: int, release: bool, stop: Callable[[], bool]) -> None:
-        """Take the steps of a round, and `release` memory afterwards. Raises Stopped."""
+        """Take the steps of a round, then `release` memory. Raises Stopped."""
         answer = self.ask(self.question(round) | {"cold": False, "release": release}, stop)
         if answer is not None:
             self.keep(round, answer)
@@ -271,10 +275,10 @@ NO_TIME = "the budget was spent; allow more with --budget"
 
 
 class Pace:
-    """Divides the time among depths, each of which gets GROWTH times as much as the one before it.
+    """Divides the time among depths. Each depth gets GROWTH times as much as the one before.
 
-    What a depth leaves is for the others. None gets fewer than MIN_ROUNDS rounds while there is time at all, whatever
-    its own share, nor more than `most`. With `rounds` time does not count. Rounds of earlier sessions count.
+    Time that one depth leaves goes to the others. While there is time, each depth gets at least MIN_ROUNDS rounds, and
+    at most `most`. With `rounds`, time does not count. Rounds of earlier sessions count.
     """
 
     def __init__(
@@ -292,12 +296,12 @@ class Pace:
 
     @property
     def spent_s(self) -> float:
-        """Seconds since the beginning."""
+        """Seconds since the start of the measurement."""
         return self._now() - self._start
 
     @property
     def depth_s(self) -> float:
-        """Seconds since the depth began."""
+        """Seconds since the start of the depth."""
         return self._now() - self._depth_start
 
     def over(self) -> bool:
@@ -305,21 +309,21 @@ class Pace:
         return self._rounds is None and self._now() >= self._end
 
     def fits(self, seconds: float) -> bool:
-        """Whether there is so much time left."""
+        """Whether this many seconds are left."""
         return self._rounds is not None or self._now() + seconds <= self._end
 
     def begin_depth(self) -> None:
-        """A depth begins."""
+        """Start a depth."""
         now = self._depth_start = self._now()
         self._depth_end = now + (self._end - now) / sum(GROWTH**k for k in range(self._left))
         self._left -= 1
 
     def begin_rounds(self, before: int = 0) -> None:
-        """Its processes are warm; `before` rounds were done by earlier sessions."""
+        """Start the rounds after the warm-up. Earlier sessions have done `before` rounds."""
         self._rounds_start, self._before = self._now(), before
 
     def another(self, done: int) -> bool:
-        """Whether there is time for another round after `done` of them in this session."""
+        """Whether there is time for another round after `done` rounds of this session."""
         if self._rounds is not None:
             return self._before + done < self._rounds
         if self._before + done >= self._most:

@@ -1,11 +1,10 @@
-"""Stock integrators that count as references: of images `ptracer`, `path` and `prb`, of gradients `ptracer` and `prb`.
+"""Stock integrators as references: `ptracer`, `path` and `prb` for images, `ptracer` and `prb` for gradients.
 
-Each public function after `of_gradient` returns why one does not count, or None where it does. docs/method.md,
-Baselines, has the reasons.
+Each public function after `of_gradient` returns the reason against a reference, or None if it is valid. The section
+Baselines of docs/method.md explains the reasons.
 
-Two things come before. Light tracing loses along the film's border what samples just outside of the film would have
-added; `divides_by_film` says whose pixels lose nothing. `known_gradient` recognises scenes whose gradient is known in
-closed form.
+Light tracing loses light along the film's border, from samples just outside of the film. `divides_by_film` tells which
+images lose none. `known_gradient` recognises scenes whose gradient is known in closed form.
 """
 
 from __future__ import annotations
@@ -30,14 +29,16 @@ CAMERA_PATHS = (Reference.PRB, Reference.PATH)
 
 
 def divides_by_film(paths: str) -> bool:
-    """Whether images by these paths (`loading.paths_of`) lose nothing along the film's border, as those of `path`."""
+    """Whether images by these paths (`loading.paths_of`) lose no light along the film's border, like those of
+    `path`.
+    """
     return paths != "light"
 
 
 def known_gradient(at: Situation, sensor: mi.Sensor, key: str, weights: np.ndarray) -> np.ndarray | None:
-    """Gradient of sum(image * weights), in a row, with respect to the parameter `key`; None where it is not known.
+    """Return the gradient of sum(image * weights) by `key` in a row; None if it is not known in closed form.
 
-    Known is the furnace: a sphere around the sensor that emits and reflects diffusely, everywhere the same.
+    It is known for the furnace: a sphere around the sensor with constant emission and constant diffuse reflectance.
     `weights` are (H, W, C).
     """
     shapes, emitters = at.graph.shapes(), at.scene.emitters()
@@ -78,10 +79,10 @@ _ROUGHNESS = ("alpha", "alpha_u", "alpha_v")
 
 @dataclass(frozen=True)
 class Situation:
-    """What decides: a scene as one sensor sees it, the paths' greatest depth, and whether emitters are hidden.
+    """The conditions for references: a scene seen by one sensor, the maximum depth, and whether emitters are hidden.
 
-    `attached`: derivatives are; `moved` are the scene's parameters that move light and are recovered. `paths` (`light`,
-    `camera`, `both`) make what is judged: a reference sees no more and no less than they do.
+    `attached`: derivatives are attached; `moved`: the recovered parameters that move light. `paths` (`light`, `camera`,
+    `both`) are those of the estimator; a valid reference sees exactly the same light.
     """
 
     scene: Any
@@ -100,13 +101,13 @@ class Situation:
         cls, scene: Any, sensor: Any, params: Any, max_depth: int, hide_emitters: bool, attached: bool = False,
         moved: tuple[str, ...] = (), paths: str = "light",
     ) -> Situation:  # fmt: skip
-        """The situation of a loaded scene, whose `mi.traverse` is `params`."""
+        """Return the situation of a loaded scene, whose `mi.traverse` is `params`."""
         graph, needs, view = SceneGraph.of(scene), scene_needs(scene, sensor), look(scene, sensor)
         return cls(scene, params, graph, needs, view, max_depth, hide_emitters, attached, moved, paths)
 
     @classmethod
     def of_problem(cls, problem: Problem, sensor: int) -> Situation:
-        """That of a problem, as the sensor of this index sees it."""
+        """Return the situation of a problem for the sensor of this index."""
         params, options = problem.selection.params, problem.config.integrator.options()
         moved = tuple(key for key in problem.selection.scene_keys if moves_light(params, key))
         attached, seen = options.get("attached") is True or bool(moved), problem.scene.sensors()[sensor]
@@ -117,23 +118,25 @@ class Situation:
 
     @property
     def has_pointlike(self) -> bool:
-        """Whether any light comes from a point, or along one direction."""
+        """Whether any light comes from a point or from a single direction."""
         return any(int(emitter.flags()) & int(mi.EmitterFlags.Delta) for emitter in self.scene.emitters())
 
 
 def choose(reasons: Mapping[Reference, str | None]) -> tuple[Reference | None, str]:
-    """The first reference that no reason speaks against, and, in words, why others do not count."""
+    """Return the first reference without a reason against it, and a text with the reasons against the others."""
     refused = [f"not {name.value}: {reason}" for name, reason in reasons.items() if reason is not None]
     return next((name for name, reason in reasons.items() if reason is None), None), "; ".join(refused)
 
 
 def of_image(at: Situation) -> dict[Reference, str | None]:
-    """Why stock integrators are no reference of the image; first the one that treats the film's border alike."""
+    """Return the reasons against each stock integrator as reference of the image. The one with an equal border comes
+    first.
+    """
     return _alike_first(at, {Reference.PTRACER: ptracer_image(at), Reference.PRB: prb_image(at)})
 
 
 def of_gradient(at: Situation, key: str) -> dict[Reference, str | None]:
-    """Why stock integrators are no reference of the gradient with respect to the parameter `key`, in the same order."""
+    """Return the reasons against each stock integrator as reference of the gradient by `key`, in the same order."""
     return _alike_first(at, {Reference.PTRACER: ptracer_gradient(at, key), Reference.PRB: prb_gradient(at, key)})
 
 
@@ -143,7 +146,7 @@ def _alike_first(at: Situation, reasons: dict[Reference, str | None]) -> dict[Re
 
 
 def ptracer_image(at: Situation) -> str | None:
-    """Of the image, by stock light tracing without roulette."""
+    """Check stock light tracing without roulette as reference of the image."""
     if any(_is_turned(emitter) for emitter in at.scene.emitters()):
         return "it emits wrongly from a turned environment map"
     if at.needs.has_null:
@@ -169,19 +172,19 @@ def ptracer_image(at: Situation) -> str | None:
 
 
 def ends(max_depth: int) -> bool:
-    """Whether paths are short enough without roulette."""
+    """Whether all paths end soon without roulette."""
     return 0 <= max_depth <= DEEPEST
 
 
 def path_image(at: Situation) -> str | None:
-    """Of the image, by `path`."""
+    """Check `path` as reference of the image."""
     if at.needs.has_null and (at.needs.environment is None or at.hide_emitters):
         return "it drops what masks reflect where nothing stands behind them"
     return prb_image(at)
 
 
 def prb_image(at: Situation) -> str | None:
-    """Of the image, by paths from the sensor."""
+    """Check `prb` as reference of the image."""
     if any(emitter.class_name() == "DirectionalArea" for emitter in at.scene.emitters()):
         return "camera paths cannot find a `directionalarea` emitter"
     if at.has_pointlike and at.needs.has_null:
@@ -199,7 +202,7 @@ def prb_image(at: Situation) -> str | None:
 
 
 def ptracer_gradient(at: Situation, key: str) -> str | None:
-    """Of the gradient with respect to the parameter `key`, by stock light tracing under naive AD."""
+    """Check stock light tracing under naive AD as reference of the gradient by `key`."""
     reason = ptracer_image(at)
     if reason is not None:
         return reason
@@ -218,7 +221,7 @@ def ptracer_gradient(at: Situation, key: str) -> str | None:
 
 
 def _ptracer_motion(at: Situation, keys: tuple[str, ...]) -> str | None:
-    """Of the gradient with respect to what these parameters of the scene move."""
+    """Check stock light tracing as reference of the gradient by moving parameters."""
     for key in keys:
         node = at.params.properties[key][2]
         if not isinstance(node, mi.Shape) or node.is_emitter():
@@ -229,7 +232,7 @@ def _ptracer_motion(at: Situation, keys: tuple[str, ...]) -> str | None:
 
 
 def prb_gradient(at: Situation, key: str) -> str | None:
-    """Of the gradient with respect to the parameter `key`, by path replay backpropagation from the sensor."""
+    """Check path replay backpropagation from the sensor as reference of the gradient by `key`."""
     if moves_light(at.params, key):
         return "it has no derivatives of what moves light"
     reason = prb_image(at)
@@ -245,7 +248,7 @@ def prb_gradient(at: Situation, key: str) -> str | None:
 
 
 def bsdfs_of(at: Situation, key: str) -> list[Any]:
-    """The BSDFs that a parameter belongs to, nested ones and those around them."""
+    """Return the BSDFs that a parameter belongs to, nested and enclosing ones."""
     node = at.params.properties[key][2]
     if isinstance(node, mi.Shape):  # an attribute, which some texture of its BSDF reads
         return at.graph.nested_bsdfs(node.bsdf())
@@ -253,7 +256,7 @@ def bsdfs_of(at: Situation, key: str) -> list[Any]:
 
 
 def _is_turned(emitter: Any) -> bool:
-    """Whether this is an environment map with a transformation other than the identity."""
+    """Whether the emitter is an environment map with a transformation other than the identity."""
     if emitter.class_name() != "EnvironmentMapEmitter":
         return False
     matrix = np.array(mi.traverse(emitter)["to_world"].matrix, np.float64).reshape(4, 4)
@@ -261,7 +264,7 @@ def _is_turned(emitter: Any) -> bool:
 
 
 def _is_mirrored(shape: mi.Shape) -> bool:
-    """Whether most faces of a mesh look away from its own normals, as they do where `to_world` mirrors it."""
+    """Whether most faces of a mesh point against its normals, as if `to_world` mirrored it."""
     params = mi.traverse(shape)
     if "vertex_normals" not in params or not shape.has_vertex_normals():
         return False
@@ -272,7 +275,7 @@ def _is_mirrored(shape: mi.Shape) -> bool:
 
 
 def _all_zero_somewhere(value: Any) -> bool:
-    """Whether a texel, or a colour, is 0 in all channels."""
+    """Whether a texel or colour is 0 in all channels."""
     array = np.array(value)
     texels = array.reshape(-1, array.shape[-1]) if array.ndim == 3 else array.reshape(1, -1)
     return bool(np.any(np.all(texels == 0, axis=1)))

@@ -1,4 +1,4 @@
-"""Samples on file: what an earlier call measured of the same experiment, in the same way, is not measured again."""
+"""Stored samples: samples of an earlier call, for the same experiment and settings, are not taken again."""
 
 from __future__ import annotations
 
@@ -36,7 +36,9 @@ _SHOWN = 60
 
 @functools.cache
 def program() -> dict[str, str]:
-    """Return the versions that a figure depends on, and a digest of this program's code, which may be under work."""
+    """Return the versions that results depend on, and a digest of this program's code, which may be under
+    development.
+    """
     code = hashlib.blake2b(digest_size=16)
     for path in sorted(Path(__file__).parent.parent.rglob("*.py")):
         code.update(path.read_bytes())
@@ -44,10 +46,10 @@ def program() -> dict[str, str]:
 
 
 def settings(config: Config, codes: Mapping[str, Path], variant: str, device: str, **options: Any) -> dict[str, Any]:
-    """Return what has to be the same in all sessions of a measurement, as JSON has it.
+    """Return the settings that must be the same in all sessions of a measurement, as JSON.
 
-    `codes` are the files of integrators that the command names, `options` those of the command. Files count by their
-    contents. What computes counts too, since times of all sessions stand beside each other.
+    `codes` are the files of integrators that the command names, and `options` the command's options. Files are compared
+    by their contents. The variant and the device count too, because times of all sessions are compared.
     """
     from reslrb_cli.scene.files import file_digests, files_of  # which loads Mitsuba
 
@@ -62,9 +64,9 @@ def settings(config: Config, codes: Mapping[str, Path], variant: str, device: st
 
 
 class Earlier:
-    """Samples that lie beside the file of `--json`, `source`: a `head`, which JSON can hold, and `arrays`.
+    """Samples stored beside the file of `--json`, `source`: a `head` as JSON, and `arrays`.
 
-    Raises ConfigError where they are of another `kind` of measurement, or were written by another version.
+    Raises ConfigError if they belong to another `kind` of measurement, or another version wrote them.
     """
 
     def __init__(self, kind: str, source: Path, head: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
@@ -75,16 +77,16 @@ class Earlier:
             raise self.other(f"it is of `{head.get('kind')}`, this is `{kind}`")
 
     def check(self, now: Mapping[str, Any]) -> None:
-        """Raise ConfigError, which names the first difference, where the `settings` are not those of this session."""
+        """Raise ConfigError, with the first difference, unless the `settings` are those of this session."""
         found = first_difference(self.head["settings"], now)
         if found is not None:
             raise self.other(found)
 
     @classmethod
     def read(cls, kind: str, json_file: Path | None, now: Mapping[str, Any] | None = None) -> Earlier | None:
-        """Return the samples beside a JSON file that an earlier call wrote; None where there are none.
+        """Return the stored samples beside a JSON file; None if there are none.
 
-        Raises ConfigError, also where their settings are not those of `now`, if these are known yet.
+        Raises ConfigError, also if their settings differ from `now`, unless `now` is not known yet.
         """
         if json_file is None or not json_file.is_file() or not samples_file(json_file).exists():
             return None
@@ -99,20 +101,20 @@ class Earlier:
         return {tuple(name): self.arrays[f"samples/{number}"] for number, name in enumerate(self.head["samples"])}
 
     def other(self, reason: str) -> ConfigError:
-        """Return the error of samples of another measurement, which are not overwritten."""
+        """Return the error for samples of another measurement, which must not be overwritten."""
         advice = "remove the file, or name another one"
         return ConfigError("--json", "", f"{self.source} is of another measurement: {reason}; {advice}")
 
 
 def head(kind: str, settings: Mapping[str, Any], **content: Any) -> dict[str, Any]:
-    """The head of what is kept."""
+    """Return the head of stored samples."""
     return {"version": VERSION, "kind": kind, "settings": settings, **content}
 
 
 def kept(
     kind: str, settings: Mapping[str, Any], samples: Mapping[Any, Sequence[np.ndarray]], **content: Any
 ) -> Kept | None:
-    """Return what a file keeps of samples, by `Name` and in the order of their seeds; None where there are none."""
+    """Return the data to store for samples, by `Name`, in the order of their seeds; None if there are none."""
     import numpy as np  # whoever asks for help of a command has no need of it
 
     taken = {name: rows for name, rows in samples.items() if len(rows)}
@@ -121,7 +123,7 @@ def kept(
 
 
 def first_difference(there: Any, here: Any, place: str = "") -> str | None:
-    """The first entry in which two nested mappings differ, in words; None where they are equal."""
+    """Describe the first entry in which two nested mappings differ; None if they are equal."""
     if isinstance(there, Mapping) and isinstance(here, Mapping):
         for key in dict.fromkeys([*there, *here]):
             inner = str(key) if place in ("", "config") else f"{place}.{key}"

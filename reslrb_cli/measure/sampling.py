@@ -1,7 +1,7 @@
-"""Samples of what takes part in a gradcheck, taken when they are first needed, until they are enough or time is up.
+"""Samples of the participants of a gradcheck, taken on demand until they suffice or the time is up.
 
-A session may go on from the samples that an earlier one has taken, with the seeds after theirs. What takes the samples
-may be another process (`Engine`): each is a function of who takes part, of the steps of differences, and of its seed.
+A session can continue from the samples of an earlier one, with the following seeds. An `Engine` can take samples in
+another process: a sample depends only on the participants, the steps of differences, and its seed.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ Engine = Callable[[Participants, Callable[..., Any], Sequence[tuple[Any, ...]]],
 
 
 def take_sample(participants: Participants, kind: str, of: str, seed: int) -> np.ndarray:
-    """One sample (`Participants.sample`)."""
+    """Return one sample (`Participants.sample`)."""
     return participants.sample(kind, of, seed)
 
 
 def steps_of(participants: Participants, keys: Iterable[str]) -> dict[str, list[Step]]:
-    """The steps of finite differences of parameters, by way, one of each direction."""
+    """Return the steps of finite differences of parameters, by way, one for each direction."""
     return {key: [(one.step, one.truncation) for one in participants.directions[key]] for key in keys}
 
 
 def step_as(participants: Participants, steps: Mapping[str, Sequence[Step]]) -> None:
-    """Have finite differences take these steps."""
+    """Set the steps of finite differences."""
     for key, chosen in steps.items():
         along = zip(participants.directions[key], chosen, strict=True)
         participants.directions[key] = [replace(one, step=step, truncation=error) for one, (step, error) in along]
 
 
 def settings(checked: CheckSettings, variant: str, device: str) -> dict[str, Any]:
-    """What has to be the same in all sessions."""
+    """Return the settings that must be the same in all sessions."""
     labels, codes = [case.label for case in checked.integrators], code_files(checked.integrators)
     return resume_store.settings(checked.config, codes, variant, device, estimators=labels, spp=checked.spp)
 
@@ -76,14 +76,14 @@ MEMORY = 2**30
 
 
 class Sampling:
-    """Samples by kind and name; `now` is the clock that the budget is measured with, from the beginning.
+    """Samples by kind and name. `now` is the clock for the budget, which starts at the beginning.
 
-    The budget covers loading and compiling. Its rest is shared among what is still to be sampled, and what one leaves
-    is for the others. Only what runs already is waited for: nothing is begun whose first sample, which compiles, would
-    take longer than is left, by those of its kind so far, or, of the first of its kind, by the others'.
+    The budget includes loading and compilation. Its rest is divided among the remaining samples; time that one leaves
+    goes to the others. Only running samples are waited for. A first sample, which includes compilation, is not started
+    if it would take longer than the rest, judged by earlier samples of its kind, or by those of other kinds.
 
-    What an `earlier` session has sampled counts, and seeds go on behind its own. The samples of a name are taken by
-    `engine`; within a budget by this process, since it is its time.
+    Samples of an `earlier` session count, and new seeds follow its seeds. The `engine` takes the samples of a name.
+    With a budget this process takes them, because the budget is its own time.
     """
 
     engine: Engine = staticmethod(serially)
@@ -111,18 +111,18 @@ class Sampling:
         self._first_s: dict[tuple[str, bool], float] = {}  # how long a first sample took, at most, by kind
 
     def expect(self, names: Iterable[Name]) -> None:
-        """Say what will be asked for, so that each has its share of the time."""
+        """Announce names, so that each gets its share of the time."""
         self._expected = list(dict.fromkeys(names))
         self._to_do = list(self._expected)
 
     def kept(self, settings: dict[str, Any]) -> Kept | None:
-        """What a later session, of the same `settings`, needs to go on; None where nothing has been sampled."""
+        """Return the state for a later session with the same `settings`; None if there are no samples."""
         return resume_store.kept(KIND, settings, self._samples, steps=steps_of(self.participants, self._chosen))
 
     def take(self, name: Name, stop: Callable[[], bool], say: Callable[[str], None]) -> bool:
-        """Take the samples of `name`, where that was not done yet; whether there are enough to compare.
+        """Take the samples of `name` unless this was done. Return whether there are enough for a comparison.
 
-        Ends with what is done once `stop()`.
+        After `stop()`, ends with the samples taken so far.
         """
         if name not in self._taken and not stop():
             self._taken.add(name)
@@ -131,7 +131,7 @@ class Sampling:
         return len(self._samples.get(name, [])) >= FEWEST
 
     def of(self, name: Name) -> np.ndarray:
-        """The samples, (N, P): of gradients and images, or (N, directions) of differences and tangents."""
+        """Return the samples: (N, P) of gradients and images, (N, directions) of differences and tangents."""
         return np.stack(self._samples[name]).astype(np.float64)
 
     def _measure(self, name: Name, stop: Callable[[], bool], say: Callable[[str], None]) -> None:
@@ -168,7 +168,9 @@ class Sampling:
             say(f"{kind} {name[1]}: seeds {len(samples)}, {now - begin:.1f} s, of which the first {first_s:.1f} s")
 
     def needed_s(self) -> float | None:
-        """About how long the fewest samples of everything take, what has been sampled included; None if none has."""
+        """Return the estimated time for the minimum number of all samples, including those taken; None if none was
+        taken.
+        """
         if not self._first_s:
             return None
         lacking = [name for name in self._expected if len(self._samples.get(name, ())) < FEWEST]
@@ -178,14 +180,15 @@ class Sampling:
         return self._now() - self._start + firsts_s + len(lacking) * later_s
 
     def _expected_s(self, name: Name) -> float:
-        """What a first sample may take, by those that were taken."""
+        """Return the estimated time of a first sample, from earlier samples."""
         return self._first_s.get(_kind(name), max(self._first_s.values(), default=0.0))
 
     def _ends(self, name: Name, now: float) -> list[tuple[float, float]]:
-        """Until when samples of `name` are taken while there are fewer than so many.
+        """Return the times until which samples of `name` are taken, each with the number of samples up to which it
+        applies.
 
-        Those without which there is no comparison have all the time. Others leave what is still to be sampled the time
-        of its first samples, and what goes beyond the least has a share of what then remains.
+        Samples that a comparison needs have all the time. The others leave time for the first samples of all remaining
+        names. Samples beyond the minimum have a share of the rest.
         """
         kept = self._end - sum(self._expected_s(other) for other in self._to_do)
         own = self._share(name)
@@ -196,11 +199,13 @@ class Sampling:
         return LARGE_SHARE if self._is_cheap(name) else SMALL_SHARE
 
     def _is_cheap(self, name: Name) -> bool:
-        """Whether more than LEAST_SEEDS are taken: of estimators and stock references, which have the most noise."""
+        """Whether more than LEAST_SEEDS are taken: for estimators and stock references, which have the most noise."""
         return name[0] == "image" or (name[0] == "gradient" and not name[1].startswith("walk_ad"))
 
     def _most(self, name: Name) -> int:
-        """Seeds of `name`, at most; within a budget, as many more as there would be without an earlier session."""
+        """Return the maximum number of seeds of `name`. With a budget, an earlier session does not reduce the
+        new ones.
+        """
         if self.settings.seeds is not None:
             return self.settings.seeds
         return self._before.get(name, 0) + self._most_more(name)
@@ -220,6 +225,6 @@ class Sampling:
 
 
 def _kind(name: Name) -> tuple[str, bool]:
-    """What takes as long to compile as others of its kind: the kind, and whether it is naive AD."""
+    """Return the kind of samples that take equally long to compile, and whether it is naive AD."""
     kind, of = name
     return kind, kind == "gradient" and of.startswith(NAIVE)

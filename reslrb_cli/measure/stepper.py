@@ -1,4 +1,4 @@
-"""Steps of one experiment, measured one by one (`Steps`), and films and textures of other sizes to measure with."""
+"""Single measured steps of one experiment (`Steps`), and changes of film and texture sizes."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from reslrb_cli.seeds import seed
 
 
 def multiple_of(spp: int, unit: int | None) -> int:
-    """The greatest multiple of a pass's samples up to `spp`, at least one."""
+    """Return the greatest multiple of `unit` up to `spp`, at least one unit."""
     unit = unit or 1
     return max(spp // unit, 1) * unit
 
 
 def shrink(scene: Any, sensor: int, pixels: int) -> None:
-    """Make the film of a sensor, given by its index, no larger than about so many pixels; its view stays the same.
+    """Reduce the film of a sensor, given by its index, to about this number of pixels, with the same view.
 
     A crop window shrinks with it.
     """
@@ -43,7 +43,9 @@ def shrink(scene: Any, sensor: int, pixels: int) -> None:
 
 
 def scale(scene: Any, sensor: int, factor: float) -> None:
-    """Make the film of a sensor, given by its index, so many times as wide and as high, its crop window with it."""
+    """Multiply width and height of a sensor's film, and of its crop window, by `factor`. The sensor is given by its
+    index.
+    """
     params = mi.traverse(scene.sensors()[sensor])
 
     def scaled(name: str, least: int) -> list[int]:
@@ -58,9 +60,9 @@ def scale(scene: Any, sensor: int, factor: float) -> None:
 
 
 def with_textures(problem: Problem, width: int) -> Config:
-    """The experiment of `problem` with textures, and heightmaps, that wide, as high as their shapes ask for.
+    """Return the experiment of `problem` with textures and heightmaps of this width, with their own aspect ratios.
 
-    What several keys share keeps its size. Raises ConfigError where there is no texture to be resampled.
+    Parameters with several keys keep their size. Raises ConfigError if no texture can be resampled.
     """
     parameters, found = [], False
     for spec in problem.config.parameters:
@@ -81,7 +83,7 @@ def with_textures(problem: Problem, width: int) -> Config:
 
 
 def _shape_of(spec: ParameterSpec, problem: Problem) -> tuple[int, ...] | None:
-    """The shape of the first texture that a parameter of the configuration names, alone or by a glob."""
+    """Return the shape of the first texture that a parameter of the configuration names, alone or by a glob."""
     for key, shape in texture_shapes(problem).items():
         if any(name == key or fnmatchcase(key, name) for name in spec.names):
             return shape
@@ -89,13 +91,13 @@ def _shape_of(spec: ParameterSpec, problem: Problem) -> tuple[int, ...] | None:
 
 
 def texture_shapes(problem: Problem) -> dict[str, tuple[int, ...]]:
-    """Shapes (H, W, C) of the parameters that are textures or heightmaps, by key."""
+    """Return the shapes (H, W, C) of all parameters that are textures or heightmaps, by key."""
     shapes = {key: problem.selection.array(key).shape for key in problem.selection.keys}
     return {key: shape for key, shape in shapes.items() if len(shape) == 3}
 
 
 class Steps:
-    """Steps of an experiment through its first sensor, timed; the parameters keep their initial values."""
+    """Timed steps of an experiment with its first sensor. The parameters keep their initial values."""
 
     def __init__(self, config: Config, scene: Any = None) -> None:
         self.problem, self.clock = assemble_scene(config.with_exposures_fixed(), scene), StepClock()
@@ -104,7 +106,7 @@ class Steps:
     def gradient(
         self, seed: int, given: mi.TensorXf | Callable[[mi.TensorXf], mi.Float], spp: int
     ) -> tuple[dict[str, Any], StepTimes]:
-        """The gradients by key; what they took is of the step alone. `given` is dL/dI, or the loss of an image."""
+        """Return the gradients by key, and times of the step alone. `given` is dL/dI, or the loss of an image."""
         problem = self.problem
         problem.apply()
         for key in problem.selection.keys:
@@ -121,7 +123,9 @@ class Steps:
         return gradients, times
 
     def told(self, answer: dict[str, Any], cold: bool, release: bool) -> dict[str, Any]:
-        """An answer, of a `cold` step with the peak of Dr.Jit's arrays; `release` gives the allocator's cache back."""
+        """Return the answer for a step. A `cold` step has the peak of Dr.Jit's arrays; `release` frees the allocator's
+        cache.
+        """
         if cold:
             answer["peak_mib"] = peak_mib(dr.backend_v(mi.Float))
         self.clock.history = []
@@ -131,11 +135,11 @@ class Steps:
 
 
 class Stepper(Steps):
-    """Steps as `bench` measures them.
+    """The steps of `bench`.
 
-    `objective` is `fixed`, sum(G * I) with a fixed image G, known before the image I, or `l2`, the mean of (I - G)^2
-    with `run.adjoint`. G is noise: what it shows costs nothing. `film_width` and `texture_width`, in pixels and texels,
-    are those of the film and of all textures that are parameters, where they are not to be the scene's own.
+    `objective` is `fixed`, sum(G * I) with an image G known before the image I, or `l2`, the mean of (I - G)^2 with
+    `run.adjoint`. G is noise, since its content does not affect the time. `film_width` in pixels, and `texture_width`
+    in texels, replace the widths of the film and of all textures that are parameters.
     """
 
     def __init__(
@@ -156,9 +160,10 @@ class Stepper(Steps):
         self._given = image if objective == "fixed" else lambda seen: dr.mean(dr.square(whole_of(seen) - image).array)
 
     def step(self, round: int, cold: bool, release: bool) -> dict[str, Any]:
-        """Take one step and measure it, `cold` ones also their memory; others are taken twice, and the second counts.
+        """Take one step and measure it, with memory if it is `cold`. Other steps are taken twice, and the second
+        counts.
 
-        `release` gives the allocator's cache back afterwards.
+        `release` frees the allocator's cache afterwards.
         """
         run, new_kernels = self.problem.config.run, 0
         at = seed(run.seed, round, self.sensor, "image")
@@ -181,7 +186,7 @@ class Stepper(Steps):
 
 
 def begin_steps(first: dict[str, Any]) -> Begun:
-    """Begin the process. It says the size of film and textures first; questions and answers are those of a step."""
+    """Start the process. It first reports the size of film and textures; questions and answers are about steps."""
     config = told(first)
     stepper = Stepper(config, first["objective"], first.get("film_width"), first.get("texture_width"))
     size = {"width": stepper.size[0], "height": stepper.size[1], "texels": stepper.texels}
@@ -189,14 +194,14 @@ def begin_steps(first: dict[str, Any]) -> Begun:
 
 
 def _load(config: Config) -> Any:
-    """The scene of an experiment, which may be the built-in one."""
+    """Load the scene of an experiment, which may be the built-in one."""
     if config.scene.file == small.FILE:
         return small.build(config.scene.options)
     return load_configured(config)
 
 
 def _noise(width: int, height: int, channels: int) -> Any:
-    """An image (H, W, C) of positive noise; nothing in an alpha channel."""
+    """Return an image (H, W, C) of positive noise, with zeros in the alpha channel."""
     values = np.random.default_rng(1).uniform(0.5, 1.5, (height, width, channels)).astype(np.float32)
     if channels in (2, 4):
         values[:, :, -1] = 0

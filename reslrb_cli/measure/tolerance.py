@@ -1,8 +1,8 @@
-"""What a finished lens or mirror throws: where its light goes, and what becomes of the picture where things are not as
-planned: its light, its place, its glass, its tool.
+"""Images of a finished lens or mirror: where its light goes, and how errors of light, position, glass or tool change
+it.
 
-Of the latter each is a rendering of the scene with what it is about really moved, by the integrator that Mitsuba has
-for it. Where turning moves the picture as a whole the shift is told, and taken out before the picture is compared.
+Each error is a rendering of a scene with the changed part, by a stock integrator of Mitsuba. If a rotation shifts the
+whole picture, the shift is reported, and removed before images are compared.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ _DIRECTIONS = [(0.0, 0.0), *((np.cos(a) * (7 / 12) ** 0.5, np.sin(a) * (7 / 12) 
 
 
 def closed_by_ball(heights: Array, pitch: Sequence[float], radius: float) -> Array:
-    """Heights (ny, nx) that a ball of this `radius` leaves, coming from above: their grey closing by it.
+    """Return heights (ny, nx) as a ball-end cutter of this `radius` leaves them: their grey closing by the ball.
 
-    `pitch`: of columns and of rows, in the unit of the heights.
+    `pitch`: the distance of columns and of rows, in the unit of the heights.
     """
     relief = float(np.ptp(heights))
     widest = radius if relief >= radius else (2 * radius * relief - relief**2) ** 0.5  # what can touch anything
@@ -50,11 +50,11 @@ def closed_by_ball(heights: Array, pitch: Sequence[float], radius: float) -> Arr
 
 
 def figures(image: Array, target: Array) -> dict[str, float]:
-    """Of luminances (H, W): SSIM, L1 and contrast (standard deviation over mean) within the picture, the `contrast` of
-    the target there, and the part of the light on the film that goes there.
+    """Compare luminances (H, W) within the picture: SSIM, L1 and contrast (standard deviation over mean).
 
-    The picture is the rectangle about what of the target is not black. Each image is divided by its mean there; SSIM is
-    scikit-image's, data_range the target's maximum.
+    Also returns the target's `contrast`, and the share of the film's light that falls into the picture. The picture is
+    the bounding rectangle of the target's nonzero pixels. Both images are divided by their mean there. SSIM is from
+    scikit-image, with data_range the target's maximum.
     """
     from skimage.metrics import structural_similarity
 
@@ -71,7 +71,7 @@ def figures(image: Array, target: Array) -> dict[str, float]:
 
 
 def picture_within(target: Array) -> tuple[slice, slice]:
-    """Rows and columns of the picture in a target (H, W): the rectangle about what of it is not black."""
+    """Return rows and columns of the picture in a target (H, W): the bounding rectangle of its nonzero pixels."""
     rows, columns = (np.flatnonzero(np.any(target > 0, axis=axis)) for axis in (1, 0))
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
@@ -79,12 +79,13 @@ def picture_within(target: Array) -> tuple[slice, slice]:
 def where_light_goes(
     scene: mi.Scene, sensor: mi.Sensor, plan: Fabrication, target: Array, seed: int = 0
 ) -> dict[str, float]:
-    """Of the light that leaves the front face, what goes `inside` of the picture, `beside` it on the film, and
-    `beyond`, elsewhere on the receiver or past it: shares of `RAYS` rays.
+    """Return shares of the light that leaves the front face: `inside` the picture, `beside` it on the film, and
+    `beyond`.
 
-    Rays from the lamps, by Mitsuba's own samples of BSDFs, reflections inside of the glass among them. The picture is
-    where the luminance `target` (H, W) is not black. What a lens throws back towards its light does not count, nor what
-    passes it by. All are 0 where no light leaves it.
+    `beyond` is elsewhere on the receiver, or past it. The shares are of `RAYS` rays from the lamps, with Mitsuba's own
+    BSDF samples, including reflections in the glass. The picture consists of the nonzero pixels of the luminance
+    `target` (H, W). Light reflected back to the lamp, and light past the lens, do not count. All shares are 0 if no
+    light leaves the lens.
     """
     rows, columns = picture_within(target)
     shapes = {shape.id(): shape for shape in scene.shapes()}
@@ -131,14 +132,14 @@ def _any_of(shape: mi.ShapePtr, others: Sequence[mi.ShapePtr]) -> mi.Bool:
 
 
 def shift_between(image: Array, reference: Array) -> Array:
-    """By how many (rows, columns) `image` lies farther on than `reference`, to a tenth of a pixel."""
+    """Return the shift (rows, columns) of `image` relative to `reference`, to a tenth of a pixel."""
     from skimage.registration import phase_cross_correlation
 
     return -np.asarray(phase_cross_correlation(reference, image, upsample_factor=10)[0])
 
 
 class OpticalBench:
-    """A scene whose parts can be moved, and put back; `params` are those of its own."""
+    """A scene whose parts can be moved and restored. `params` are the scene's parameters."""
 
     def __init__(
         self, scene: mi.Scene, params: mi.SceneParameters, plan: Fabrication, integrator: mi.Integrator, sensor: int
@@ -151,7 +152,7 @@ class OpticalBench:
             raise ConfigError("", "fabrication.receiver", f"there is no `{plan.receiver}` in the scene with a to_world")
 
     def render(self, spp: int, seed: int = 0) -> Array:
-        """Luminance (H, W)."""
+        """Render the luminance (H, W)."""
         image = np.array(mi.render(self.scene, integrator=self._integrator, sensor=self.sensor, spp=spp, seed=seed))
         return luminance(image.reshape(*image.shape[:2], -1))
 
@@ -169,7 +170,7 @@ class OpticalBench:
             self.params.update()
 
     def moved(self, ids: Sequence[str], by: mi.ScalarTransform4f) -> dict[str, Any]:
-        """The parameters of what has these ids, where `by` puts them."""
+        """Return the parameters of the objects with these ids, moved by `by`."""
         values: dict[str, Any] = {}
         for id in ids:
             if (key := f"{id}.vertex_positions") in self.params.properties and f"{id}.to_world" not in (
@@ -183,18 +184,18 @@ class OpticalBench:
         return values
 
     def turned(self, ids: Sequence[str], axis: Sequence[float], degrees: float) -> dict[str, Any]:
-        """The same, turned about an axis through the face's middle."""
+        """Return the parameters of the objects with these ids, rotated about an axis through the face's centre."""
         return self.moved(ids, mi.ScalarTransform4f().rotate(list(axis), degrees))
 
     def farther(self, part: float) -> dict[str, Any]:
-        """Receiver and camera, farther along the way to the receiver by that part of it."""
+        """Return receiver and camera, farther away by this share of the receiver's distance."""
         key = f"{self.plan.receiver}.to_world"
         middle = np.ravel(self.params[key] @ mi.Point3f(0)).astype(float)
         way = mi.ScalarTransform4f().translate((part * middle).tolist())
         return self.moved([self.plan.receiver, self.camera], way)
 
     def denser(self, by: float) -> dict[str, Any]:
-        """The index of the glass."""
+        """Return the refractive index of the glass, changed by `by`."""
         found = {}
         for key in self.params.properties:
             if key.endswith(".eta"):
@@ -205,11 +206,11 @@ class OpticalBench:
         return found
 
     def solid_parts(self) -> list[str]:
-        """Ids of the faces, and of the flat back."""
+        """Return the ids of the faces and of the flat back."""
         return [*self.plan.faces, *(["back"] if "back" not in self.plan.faces else [])]
 
     def tooled(self, sheets: Sequence[Sheet], radius: float) -> dict[str, Any]:
-        """The faces as a ball of this radius leaves them."""
+        """Return the faces as a ball-end cutter of this radius leaves them."""
         values = {}
         for sheet, side in zip(sheets, (1, -1), strict=False):
             pitch = [float(np.diff(line).mean()) for line in (sheet.x, sheet.y)]
@@ -225,12 +226,12 @@ class OpticalBench:
         return values
 
     def image(self, values: dict[str, Any], spp: int, seed: int = 0) -> Array:
-        """The scene with these parameters, rendered."""
+        """Render the scene with these parameters."""
         with self._changed(values):
             return self.render(spp, seed)
 
     def sun(self, spp: int) -> Array:
-        """What light as wide as `plan.sun` throws: the mean over its directions."""
+        """Render light with the angular diameter `plan.sun`: the mean over its directions."""
         half, images = self.plan.sun / 2, []
         for i, (x, y) in enumerate(_DIRECTIONS):  # each with noise of its own, so that it averages out
             angle = float(np.hypot(x, y))
@@ -247,9 +248,9 @@ def tolerances(
     spp: int,
     say: Callable[[str], None] = lambda _: None,
 ) -> dict[str, dict[str, Any]]:
-    """`figures` against the luminance `target` (H, W) of the `planned` one, and where that is off, by what is.
+    """Return `figures` against the luminance `target` (H, W) for the `planned` scene and for each error, by name.
 
-    `shift` (columns, rows; pixels) is that of the whole picture where something was turned; it is taken out first.
+    `shift` (columns, rows; pixels) is the shift of the whole picture due to a rotation, and is removed first.
     """
     plan, both = bench.plan, bench.solid_parts()
     found: dict[str, dict[str, Any]] = {}

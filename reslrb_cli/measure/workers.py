@@ -1,7 +1,7 @@
-"""Workers as they are from within: processes that measure, started and told what to do by `processes.py`.
+"""Worker processes as seen from inside: measuring processes that `processes.py` starts and controls.
 
-Each (`run`) reads one JSON object a line from standard input and answers each with one on standard output. The first
-describes the case; each other one asks for a step. What else is printed goes to standard error.
+A worker (`run`) reads one JSON object per line from standard input, and answers each with one on standard output. The
+first describes the case, and each further one asks for a step. Other output goes to standard error.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _PTX_ARRAY = re.compile(r"\.local \.align \d+ \.[a-z]+(\d+) arr_\w+\[(\d+)\]")
 
 
 def scratch_bytes(history: Iterable[dict[str, Any]]) -> int:
-    """The most thread-local bytes that a path has in any kernel of a `dr.kernel_history()`; `dr.Local` makes them."""
+    """Return the largest thread-local memory of a path in bytes, over all kernels of a `dr.kernel_history()`."""
     texts = [entry["ir"] for entry in history if entry.get("ir") is not None]
     return max((_of_kernel(text if isinstance(text, str) else str(text.getvalue())) for text in texts), default=0)
 
@@ -51,14 +51,14 @@ Begin = Callable[[dict[str, Any]], Begun]
 
 
 class Warnings(logging.Handler):
-    """Keeps what is warned of: every process loads the same scene, and the one that asks says it once."""
+    """Collects warnings. All processes load the same scene, and the controlling process prints each warning once."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
         self.lines: list[str] = []
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep one line."""
+        """Store one line."""
         self.lines.append(record.getMessage())
 
 
@@ -86,7 +86,7 @@ def _serve(first: dict[str, Any], load: Callable[[], Begin], questions: IO[str],
 
 
 def _limit(memory_limit: int | None) -> None:
-    """Bound the address space, what is in use already included."""
+    """Limit the address space to `memory_limit` plus the memory in use."""
     if memory_limit is not None:
         import resource
 
@@ -117,7 +117,9 @@ def _answer(answers: IO[str], message: dict[str, Any]) -> None:
 
 
 def run(load: Callable[[], Begin]) -> None:
-    """Answer until standard input ends, or until something fails, which the last answer says; and end the process."""
+    """Answer questions until standard input ends, or until a failure, which the last answer describes; then end the
+    process.
+    """
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     limited, code = False, 0

@@ -28,9 +28,9 @@ CASES = {case.name: case for case in LISTED}
 def run_suite(
     names: Iterable[str] | None = None, estimators: Iterable[str] | None = None, seeds: int | None = None
 ) -> Iterator[GradcheckRecord]:
-    """Run the cases of these names (all by default), one record for each comparison.
+    """Run the named cases, by default all, and yield one record per comparison.
 
-    Raises KeyError where there is no such case.
+    Raises KeyError if a case does not exist.
     """
     for name in CASES if names is None else names:
         yield from run_case(CASES[name], estimators, seeds)
@@ -39,5 +39,5 @@ def run_suite(
 def case_records(
     stop: Callable[[], bool], name: str, estimators: Iterable[str] | None, seeds: int | None
 ) -> list[GradcheckRecord]:
-    """The records of one case, of which some are missing once `stop()`."""
+    """Return the records of one case. Some are missing if `stop()` became true."""
     return list(takewhile(lambda _: not stop(), run_suite([name], estimators, seeds)))

@@ -1,4 +1,4 @@
-"""Cases of the extreme suite: glass, motion, places and roughness at the ends of their range."""
+"""Cases of the extreme suite: glass, motion, positions and roughness at the ends of their ranges."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ OPACITY = "veil.bsdf.opacity.value"
 
 
 def veiled(opacity: Any, **changes: Any) -> dict:
-    """A sheet between lamp and floor, and between camera and wall."""
+    """A partly opaque sheet between lamp and floor, and one between camera and wall."""
     bsdf = {"type": "mask", "opacity": opacity, "id": "veil_bsdf",
             "bsdf": {"type": "twosided", "bsdf": diffuse(0.7, 0.6, 0.3)}}  # fmt: skip
     veil = rectangle(bsdf, translate=[0.1, 0.2, 0.2], rotate=([1, 0, 0], -80), scale=0.5)
@@ -51,7 +51,7 @@ def veiled(opacity: Any, **changes: Any) -> dict:
 
 
 def nested() -> dict:
-    """A ball of glass in a ball of water, out of the camera's view of the floor below."""
+    """A ball of glass in a ball of water, outside of the camera's view of the floor below."""
     water = glass(1.33, specular_transmittance=rgb(0.9, 0.8, 0.7))
     inner = glass(1.5, 1.33, specular_transmittance=rgb(0.7, 0.8, 0.9), specular_reflectance=rgb(0.9, 0.6, 0.8))
     return {
@@ -65,8 +65,10 @@ def nested() -> dict:
 
 
 def critical() -> dict:
-    """A beam in a medium of index 1.5 that meets its flat surface, y = 0, at the critical angle, and the bottom that
-    total reflection lights."""
+    """A beam in a medium of index 1.5 that meets the medium's flat surface, y = 0, at the critical angle.
+
+    The camera sees the bottom, which total reflection lights.
+    """
     theta = float(np.arcsin(1 / 1.5))
     start = [-float(np.sin(theta)), -float(np.cos(theta)), 0.0]
     below = [4 * float(np.tan(theta)), -4.0, 0.0]
@@ -124,13 +126,13 @@ Moves = Callable[[Any], Sequence[Move]]
 
 
 def beam(origin: tuple[float, float], target: tuple[float, float], half: float, scale: float = 1) -> dict:
-    """Parallel light in the plane z = 0, from (x, y) to (x, y), with a square cross-section."""
+    """Parallel light in the plane z = 0 with a square cross-section. `origin` and `target` are (x, y)."""
     start, end = ([scale * x, scale * y, 0.0] for x, y in (origin, target))
     return _parallel(start, end, scale * half, rgb(9, 8, 7))
 
 
 def steep(scale: float = 1) -> dict:
-    """Light from above, at twenty degrees."""
+    """Light from above, at 20 degrees to the vertical."""
     return beam((0.5, 3), (0.05, 1.8), 0.25, scale)
 
 
@@ -138,10 +140,10 @@ def pool(
     bsdf: dict, light: dict, slope: float = 1, height: float = 1.8, thickness: float = 0, scale: float = 1,
     cells: int = 128,
 ) -> dict:  # fmt: skip
-    """A receiver in glass, whose surface has waves; with a `thickness` it is a slab, and the receiver below it.
+    """A receiver in glass with a wavy surface. With a `thickness`, the glass is a slab above the receiver.
 
-    `slope` is that of the waves, as a multiple of one tenth. Everything is `scale` times as large. The faces of its
-    `cells` leave an error of their own, which falls with the square of their number (docs/method.md).
+    `slope` is the slope of the waves in units of 0.1, and `scale` the size of everything. The flat faces of the `cells`
+    cause an error that falls with the square of their number (docs/method.md).
     """
     seen = pinhole([0, scale, 0], [0, 0, 0], [0, 0, -1], 90, SIZE, rfilter=FILTER)
     positions, faces, uv = grid(cells, lambda x, z: height + slope * waves(x, z), 2.5)
@@ -159,7 +161,7 @@ def pool(
 
 
 def bending(size: float = 1, scale: float = 1) -> Moves:
-    """The surface, by three smooth displacements of this size."""
+    """Three smooth displacements of the surface, of this size."""
 
     def moves(scene: Any) -> Sequence[Move]:
         fields = size * scale * smooth_fields(vertices(scene, "top") / scale, 3, 1.0)
@@ -169,12 +171,12 @@ def bending(size: float = 1, scale: float = 1) -> Moves:
 
 
 def sliding(scene: Any) -> Sequence[Move]:
-    """The surface, within itself."""
+    """Motion of the surface within itself."""
     return [Displacement(TOP, smooth_fields(vertices(scene, "top"), 3, 1.0) * np.array([1, 0, 1]))]
 
 
 def with_lamp(scene: Any) -> Sequence[Move]:
-    """The surface, and the lamp."""
+    """Motion of the surface and of the lamp."""
     return [*bending()(scene), Pose("lamp.to_world", ("tx", "rz"), (0.5, 3, 0))]
 
 
@@ -183,12 +185,12 @@ def moving_slab(slope: float = 1, thickness: float = 0.2, scale: float = 1) -> C
 
 
 def surface(ior: float = 1.5, slope: float = 1, **rough: Any) -> Callable[[], dict]:
-    """A receiver in smooth glass, or in rough."""
+    """A receiver in smooth or in rough glass."""
     return lambda: pool(glass(ior) | rough, steep(), slope)
 
 
 def grazing(degrees: float) -> dict:
-    """Light at so many degrees from the surface's normal."""
+    """Light at this angle from the surface's normal."""
     theta = float(np.deg2rad(degrees))
     at = -1.2 * float(np.tan(np.arcsin(np.sin(theta) / 1.5)))
     start = (at - 2 * float(np.sin(theta)), 1.2 + 2 * float(np.cos(theta)))
@@ -227,7 +229,7 @@ AWAY = [60.0, 60.0, 52.9]  # 100 from the origin
 
 
 def placed(scale: float = 1, offset: Any = (0, 0, 0)) -> dict:
-    """The room, scaled about the origin and then moved; radiance makes its image the same."""
+    """The room, scaled about the origin and then moved. The radiance is scaled so that the image stays the same."""
     scene = room()
     move = transform(translate=list(offset), scale=scale)
     for name, item in scene.items():
@@ -240,7 +242,7 @@ def placed(scale: float = 1, offset: Any = (0, 0, 0)) -> dict:
 
 
 def turned_panes() -> dict:
-    """Two sheets that scatter on one side: one turns its back on the camera, the other on the lamp."""
+    """Two sheets that scatter on one side only: one shows its back to the camera, the other to the lamp."""
 
     def pane(tilt: float, **place: Any) -> dict:
         return rectangle(diffuse(0.8, 0.6, 0.7), **place, rotate=([1, 0, 0], tilt), scale=0.35)
@@ -249,7 +251,7 @@ def turned_panes() -> dict:
 
 
 def octahedron(*reflectance: float) -> dict:
-    """A solid of eight flat faces that is shaded as a sphere."""
+    """A solid of eight flat faces, shaded as a sphere."""
     properties = mi.Properties()
     properties["mesh_bsdf"] = mi.load_dict(diffuse(*reflectance))
     mesh = mi.Mesh("solid", 6, 8, has_vertex_normals=True, props=properties)
@@ -264,14 +266,14 @@ def octahedron(*reflectance: float) -> dict:
 
 
 def normal_map() -> dict:
-    """A floor whose normals lean by up to 60 degrees."""
+    """A floor with a normal map whose normals lean by up to 60 degrees."""
     random = np.random.default_rng(5)
     lean = np.concatenate([random.uniform(0.2, 0.8, (4, 4, 2)), np.full((4, 4, 1), 0.75)], -1)
     return room(floor={"type": "normalmap", "normalmap": bitmap(lean, "bilinear"), "bsdf": diffuse(0.7, 0.5, 0.6)})
 
 
 def vertical_light() -> dict:
-    """A lamp that stands on the floor's edge: nearly all its light on the floor arrives at grazing angles."""
+    """A lamp that stands upright on the floor's edge. Nearly all its light arrives on the floor at grazing angles."""
     place = transform(translate=[0, -0.99, 0.999], rotate=([0, 1, 0], 180), scale=[1, 0.01, 1])
     return room(lamp=lit_square(rgb(9, 8, 7), place))
 
@@ -303,7 +305,7 @@ RECEIVER = "floor.bsdf.reflectance.value"
 
 
 def reflected(bsdf: dict) -> dict:
-    """A lamp shines on an upright plate, which reflects it on the floor."""
+    """A lamp whose light an upright plate reflects to the floor."""
     return {
         "type": "scene",
         "camera": pinhole([0, 0.9, 0], [0, 0, 0], [0, 0, -1], 60),
@@ -314,7 +316,7 @@ def reflected(bsdf: dict) -> dict:
 
 
 def transmitted(bsdf: dict) -> dict:
-    """A lamp shines through a horizontal plate on the floor; the camera stands between the two."""
+    """A lamp that shines through a horizontal plate on the floor. The camera is between plate and floor."""
     return reflected(bsdf) | {
         "plate": rectangle(bsdf, translate=[0, 1, 0], rotate=UP, scale=2),
         "lamp": lit_square(rgb(5, 6, 4), translate=[0, 1.8, 0], rotate=DOWN, scale=0.5),
@@ -322,7 +324,7 @@ def transmitted(bsdf: dict) -> dict:
 
 
 def close() -> dict:
-    """A narrow beam that falls on the floor, and a camera that looks at nothing else."""
+    """A narrow beam that falls on the floor, and a camera that sees only its spot."""
     return {
         "camera": pinhole([0, 0.9, 0], [0, 0, 0], [0, 0, -1], 4),
         "lamp": lit_square(rgb(5, 6, 4), None, "directionalarea", translate=[0, 1.8, 0], rotate=DOWN, scale=0.01),
@@ -340,7 +342,7 @@ KINDS: dict[str, tuple[Callable[[dict], dict], dict, str, str, bool]] = {
 
 
 def plate(kind: str, roughness: str) -> dict:
-    """Light by way of a plate with a BSDF of this kind."""
+    """Light that passes a plate with a BSDF of this kind."""
     around, options, colour, own, _ = KINDS[kind]
     return around({"type": kind, own: float(roughness), colour: rgb(0.9, 0.7, 0.5), **options})
 
@@ -353,7 +355,7 @@ NOISE = "the noise of a roughness's derivative grows as 1 / roughness: equal see
 
 
 def followed(kind: str, roughness: str) -> str:
-    """Name of the case in which light follows a roughness."""
+    """Return the name of the case in which roughness moves light."""
     return f"{kind}_{roughness}_followed"
 
 
@@ -371,10 +373,10 @@ def _case(kind: str, roughness: str) -> ExtremeCase:
 
 
 def _followed(kind: str, roughness: str) -> ExtremeCase:
-    """The derivative by the roughness, of light that follows it: quiet, and known by finite differences.
+    """The derivative by a roughness that moves light. It has little noise, and finite differences give the reference.
 
-    What nearly smooth glass blurs is less than a pixel of the camera above, and next to nothing of its derivative is
-    left: a closer one looks at a narrow beam.
+    Nearly smooth glass blurs by less than a pixel of the usual camera, which leaves almost no derivative. This camera
+    is closer and sees a narrow beam.
     """
 
     def scene() -> dict:

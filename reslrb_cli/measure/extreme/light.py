@@ -1,4 +1,4 @@
-"""Cases of the extreme suite: colours, films, light and losses at the ends of their range."""
+"""Cases of the extreme suite: colours, films, light and losses at the ends of their ranges."""
 
 from __future__ import annotations
 
@@ -38,23 +38,23 @@ LAMP = "lamp.emitter.radiance.value"
 
 
 def columns(*texels: tuple[float, ...]) -> dict:
-    """A texture of these columns, two rows high, which is the least that Mitsuba takes."""
+    """A texture of these columns, two rows high, the minimum in Mitsuba."""
     row = np.array(texels, float).reshape(1, len(texels), -1)
     return bitmap(np.repeat(row, 2, 0))
 
 
 def matte(reflectance: Any) -> dict:
-    """Diffuse on both sides."""
+    """A diffuse two-sided BSDF."""
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": reflectance}}
 
 
 def dark(value: float) -> dict:
-    """The room, with a floor of which one texel is black, or nearly."""
+    """The room, with one black or nearly black texel on the floor."""
     return room(floor=matte(columns((value, value, value), (0.6, 0.3, 0.5))))
 
 
 def bright(value: float) -> dict:
-    """The room, with a floor and a wall that are white, or nearly."""
+    """The room, with a white or nearly white floor and wall."""
     return room(floor=matte(columns((value, value, value), (value, 0.3, value))), wall=matte(rgb(value, value, value)))
 
 
@@ -98,7 +98,7 @@ COLOURS_CASES = [
 
 
 def seen(camera: dict, **change: Any) -> dict:
-    """The room with a texture on its floor, of 2 x 2 texels, the least that Mitsuba takes."""
+    """The room with a texture of 2 x 2 texels on its floor, the minimum in Mitsuba."""
     return room(camera=camera, floor=matte(texture(2, 2) | change))
 
 
@@ -126,7 +126,7 @@ FILMS_CASES = [
 
 
 def lit(scale: float) -> dict:
-    """The room under a lamp of so many times its usual radiance."""
+    """The room with the lamp's radiance multiplied by `scale`."""
     return room(lamp=lamp(radiance=rgb(3 * scale, 4 * scale, 5 * scale)))
 
 
@@ -137,7 +137,7 @@ def two_lamps() -> dict:
 
 
 def small_lamp(radiance: float) -> dict:
-    """A lamp of side 1e-4."""
+    """A lamp with sides of length 1e-4."""
     tiny = transform(translate=[0.2, 1.6, 0.2], rotate=([1, 0, 0], 90), scale=0.5e-4)
     return room(lamp=lamp(radiance=rgb(radiance, 2 * radiance, radiance)) | {"to_world": tiny})
 
@@ -150,14 +150,14 @@ def sun() -> dict:
 
 
 def skimming() -> dict:
-    """Parallel light at half a degree over the floor."""
+    """Parallel light at half a degree to the floor."""
     height = float(np.tan(np.deg2rad(0.5)))
     light = {"type": "directional", "direction": [-0.9, -height, -0.43], "irradiance": rgb(90, 80, 70)}
     return room(lamp=None, wall_shape=None, side_shape=None, light=light)
 
 
 def speck() -> dict:
-    """A hall lit by a beam on a speck that stands before the lens, at a ten thousandth of the walls' distance."""
+    """A hall lit by a beam on a speck close to the camera, at 1e-4 of the walls' distance."""
 
     def facing(origin: list, target: list, half: float) -> Any:
         return look_at(origin, target, [0, 1, 0]) @ transform(scale=half)
@@ -174,17 +174,17 @@ def speck() -> dict:
 
 
 def away() -> dict:
-    """The camera looks into the void."""
+    """A camera that sees nothing."""
     return room(camera=camera() | {"to_world": look_at([1.2, 0.6, 4], [2.5, 1.4, 8], [0, 1, 0])})
 
 
 def grey(max_depth: int, size: int = 8) -> KnownScene:
-    """A furnace whose light has a limit."""
+    """A furnace whose radiance converges."""
     return furnace_scene((0.5, 0.8, 0.9), (1, 2, 0.5), max_depth, size)
 
 
 def white_box() -> dict:
-    """A closed white box that holds a white cube, behind which the camera does not see."""
+    """A closed white box with a white cube. The camera does not see behind the cube."""
     view = look_at([0.8, 0.7, 0.8], [-0.2, -0.2, -0.2], [0, 1, 0])
     return {
         "type": "scene",
@@ -235,12 +235,12 @@ LIT_FLOOR = "floor.brdf_0.reflectance.value"
 
 
 def mixed(weights: np.ndarray) -> np.ndarray:
-    """Of either sign, by channel and pixel, with a mean that is not zero."""
+    """Weights of either sign by channel and pixel, with a mean that is not zero."""
     return weights * np.random.default_rng(4).choice([-1.0, 1.0], weights.shape, p=[0.35, 0.65]).astype(np.float32)
 
 
 def spoilt(value: float) -> Any:
-    """`value` in one channel each of three pixels."""
+    """Weights with `value` in one channel of each of three pixels."""
 
     def spoil(weights: np.ndarray) -> np.ndarray:
         weights = weights.copy()
@@ -252,7 +252,7 @@ def spoilt(value: float) -> Any:
 
 
 def _sums(name: str, spp: int) -> ExtremeCase:
-    """A furnace seen by a film of one pixel, so that all samples go into the same few sums."""
+    """A furnace with a film of one pixel, so that all samples are added to the same few sums."""
     return exact(name, f"{spp:.0e} samples in one pixel, in single precision", lambda: grey(2, 1), FURNACE, 2, image="",
                  spp=spp, seeds=1, naive=False, equal=5e-3)  # fmt: skip
 
@@ -276,7 +276,7 @@ TEXELS = {"albedo": PLANE, "texels": f"{RADIANCE}.data"}
 
 
 def spots() -> KnownScene:
-    """Three bright texels of sixteen, all others black."""
+    """A lamp with three bright texels and thirteen black ones."""
     texels = np.zeros((4, 4, 3))
     texels[0, 0], texels[1, 2], texels[2, 2] = (9, 8, 7), (3, 4, 5), (30, 20, 10)
     return texels_over_plane(texels)

@@ -1,7 +1,7 @@
-"""The extreme suite: what a case is (`ExtremeCase`), and how its estimators are run against references (`run_case`).
+"""The extreme suite: `ExtremeCase` describes a case, and `run_case` compares its estimators with references.
 
-Beside the estimators on light paths each case has camera paths (`WAYS`), against the same references but for the film's
-border (`_seen_by`), and against naive AD of the same paths.
+Besides light paths, each case is run with camera paths (`WAYS`). Their references are the same except at the film's
+border (`_seen_by`), and naive AD of the same paths is one more.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ Scene = Callable[[], dict]
 
 @dataclass(frozen=True)
 class ReferenceGradients:
-    """A reference's gradients: (N, P) of seeds of its own, (N, P) of ours (`paired`), or (P,) exact values.
+    """Gradients of a reference: (N, P) at seeds of its own, (N, P) at the estimator's seeds (`paired`), or exact, (P,).
 
-    `along` (K, P) are directions in which alone it knows the derivative; None: all entries. By `bias` the reference
-    may be wrong itself.
+    `along` (K, P) are the directions along which the derivative is known; None: all entries. `bias` bounds the error of
+    the reference itself.
     """
 
     values: np.ndarray
@@ -50,7 +50,9 @@ class ReferenceGradients:
 
 @dataclass(frozen=True)
 class Stock:
-    """A stock integrator in the same scene. Where roulette is on, the reference goes without it: see docs/method.md."""
+    """A stock integrator in the same scene. If Russian roulette is on, the reference does not use it; see
+    docs/method.md.
+    """
 
     name: str
 
@@ -65,9 +67,9 @@ class Stock:
 
 @dataclass(frozen=True)
 class Twin:
-    """`ptracer` in another scene, whose gradients are known multiples of this one's.
+    """`ptracer` in another scene, whose gradients are known multiples of this scene's gradients.
 
-    `factors` are by parameter; those that are not named are 1.
+    `factors` are the multiples by parameter; the default is 1.
     """
 
     scene: Scene
@@ -84,10 +86,10 @@ class Twin:
 
 @dataclass(frozen=True)
 class Differences:
-    """Finite differences of our image, without roulette, along random directions into the domain.
+    """Finite differences of our own image, without Russian roulette, along random directions into the domain.
 
-    At the gradient's own random numbers they are exact up to rounding where paths do not depend on the parameters and
-    the image is a polynomial of degree 2.
+    They use the random numbers of the gradient. They are exact up to rounding if paths do not depend on the parameters
+    and the image is a polynomial of degree 2.
     """
 
     step: float
@@ -106,10 +108,11 @@ class Differences:
 
 @dataclass(frozen=True)
 class Extrapolated:
-    """Finite differences of the image at the gradient's own random numbers, of each amplitude of what moves.
+    """Finite differences of the image by each amplitude of a motion, at the random numbers of the gradient.
 
-    Those of `step` are corrected by those of twice the step (`extrapolated`). A tenth of the correction may be wrong,
-    and `left` of their root mean square, which the faces of a mesh and higher powers of the step leave.
+    Differences of `step` are corrected by differences of twice the step (`extrapolated`). The assumed error is a tenth
+    of the correction, and `left` of the root mean square of the differences, for the faces of a mesh and higher powers
+    of the step.
     """
 
     step: float
@@ -128,7 +131,7 @@ class Extrapolated:
 
 @dataclass(frozen=True)
 class Exact:
-    """Values in closed form."""
+    """Exact values in closed form."""
 
     known: Callable[[], KnownScene]
     reference = Reference.ANALYTIC
@@ -139,7 +142,7 @@ class Exact:
 
 @dataclass(frozen=True)
 class Zero:
-    """No light path connects: every derivative is exactly zero."""
+    """No light path can connect, so every derivative is exactly zero."""
 
     reference = Reference.ANALYTIC
 
@@ -151,7 +154,7 @@ Source = Stock | Twin | Differences | Extrapolated | Exact | Zero
 
 
 def residual(case: ExtremeCase, setup: Case, seed: int = 1) -> Comparison:
-    """The root mean square of what is left, over that of S_0, as `relative_l2`."""
+    """Return the root mean square of the residual over that of S_0, as `relative_l2`."""
     import drjit as dr
     import mitsuba as mi
 
@@ -173,17 +176,19 @@ def residual(case: ExtremeCase, setup: Case, seed: int = 1) -> Comparison:
 
 @dataclass(frozen=True)
 class ExtremeCase:
-    """One case. `scene` is a function, since it needs Mitsuba; its first sensor counts.
+    """One case. `scene` is a function because it needs Mitsuba. The first sensor is used.
 
-    `source` is the reference of gradients beside naive AD of our own walk at equal seeds (`naive`: whether that fits
-    into memory), `image` the stock integrator that images are compared with ("": none can). `options` go to all
-    integrators, `ours` to `reslrb` and `walk_ad`. `weights` makes dL/dI of the usual one, of mean 1. `signed` cases
-    have derivatives of either sign; in the others nothing may be negative. `equal` limits the relative L2 distance at
-    equal seeds, and from exact values where there is one seed only. `residual`: what `gather`'s replay leaves of its
-    sum is looked at. `open_ended` names the parameters that no z-test can decide, and why; equal seeds decide there.
-    `elsewhere` names those that another case decides, and which: equal seeds alone are compared.
-    `moves` are what moves light, by amplitudes that are then the one parameter (`keys` is empty): estimators that do
-    not follow it are left out, and dL/dI is smooth.
+    - `source`: the reference of gradients besides naive AD at equal seeds. `naive`: whether naive AD fits into memory.
+    - `image`: the stock integrator for the reference image, or "" if none can render the scene.
+    - `options`, `ours`: options of all integrators, and of `reslrb` and `walk_ad` only.
+    - `weights`: makes dL/dI of the usual dL/dI of mean 1.
+    - `signed`: derivatives can have either sign; otherwise none may be negative.
+    - `equal`: the limit of the relative L2 distance at equal seeds, and from exact values if there is one seed only.
+    - `residual`: whether the residual of the replay of `gather` is checked.
+    - `open_ended`: parameters that no z-test can decide, with the reason. They are compared at equal seeds only.
+    - `elsewhere`: parameters that another case decides, with its name. They are compared at equal seeds only.
+    - `moves`: motions of light. Their amplitudes are then the only parameter (`keys` is empty), estimators without
+      attached derivatives are left out, and dL/dI is smooth.
     """
 
     name: str
@@ -207,11 +212,11 @@ class ExtremeCase:
 
     @property
     def way(self) -> dict[str, Any]:
-        """Those of its options that say which paths there are."""
+        """The options that set the kinds of paths."""
         return {name: self.ours[name] for name in ("paths", "light_share") if name in self.ours}
 
     def setup(self) -> Case:
-        """The scene, loaded, with its parameters."""
+        """Load the scene with its parameters."""
         if self.moves is None:
             return Case(self.scene(), self.keys)
         return moving_case(self.scene(), self.moves)
@@ -221,14 +226,16 @@ def exact(
     name: str, about: str, known: Callable[[], KnownScene], keys: Mapping[str, str], max_depth: int,
     rr_depth: int | None = None, **more: Any,
 ) -> ExtremeCase:  # fmt: skip
-    """A case whose image is known in closed form; `keys` are those of its parameters, `more` fields of the case."""
+    """Return a case whose image is known in closed form. `keys` are its parameters, and `more` other fields of the
+    case.
+    """
     options = {"max_depth": max_depth} | ({} if rr_depth is None else {"rr_depth": rr_depth})
     shared: dict[str, Any] = {"options": options, **more}
     return ExtremeCase(name, about, lambda: known().scene(), tuple(keys.values()), Exact(known), **shared)
 
 
 def without_roulette(case: ExtremeCase) -> dict[str, Any]:
-    """The options of a case, for integrators whose gradient roulette biases."""
+    """Return the options of a case for integrators whose gradients Russian roulette would bias."""
     return {key: value for key, value in case.options.items() if key != "rr_depth"}
 
 
@@ -240,7 +247,7 @@ KIND = "gradcheck --suite"
 
 
 def settings(estimators: Sequence[str] | None, seeds: int | None, variant: str, device: str) -> dict[str, Any]:
-    """What has to be the same in all sessions; None stands for what each case has of its own."""
+    """Return the settings that must be the same in all sessions. None stands for values that each case sets."""
     return {
         "--estimators": "all" if estimators is None else list(estimators),
         "--seeds": "as the cases have it" if seeds is None else seeds,
@@ -251,7 +258,7 @@ def settings(estimators: Sequence[str] | None, seeds: int | None, variant: str, 
 
 
 def restore(before: Earlier) -> dict[str, list[GradcheckRecord]]:
-    """The records of an earlier session, by case. Raises ConfigError where they are none."""
+    """Return the records of an earlier session by case. Raises ConfigError if they are invalid."""
     reader = TypeAdapter(dict[str, list[GradcheckRecord]])
     try:
         found: dict[str, list[GradcheckRecord]] = reader.validate_python(before.head["cases"])
@@ -261,7 +268,7 @@ def restore(before: Earlier) -> dict[str, list[GradcheckRecord]]:
 
 
 def kept(settings: Mapping[str, Any], cases: Mapping[str, Sequence[GradcheckRecord]]) -> Kept | None:
-    """What a later session needs to go on; None where no case is done."""
+    """Return the state for a later session; None if no case is finished."""
     if not cases:
         return None
     rows = {case: [asdict(record) for record in records] for case, records in cases.items()}
@@ -278,7 +285,7 @@ BELOW_ZERO = 1e-5
 def run_case(
     case: ExtremeCase, estimators: Iterable[str] | None = None, seeds: int | None = None
 ) -> Iterator[GradcheckRecord]:
-    """Run a case with these estimators (all of them by default); `seeds` replaces its own number."""
+    """Run a case with these estimators, by default all. `seeds` replaces the case's number of seeds."""
     case = case if seeds is None else replace(case, seeds=seeds)
     setup = case.setup()
     plain, groups = np.array(setup.weights), dict[str, list[tuple[str, dict[str, Any]]]]()
@@ -307,19 +314,19 @@ BOX = 0.5
 
 
 def split(label: str) -> tuple[str, dict[str, Any]]:
-    """The estimator of a label, such as `stack(paths=both)`, and its options. Raises ConfigError."""
+    """Split a label such as `stack(paths=both)` into estimator and options. Raises ConfigError."""
     [listed] = parse_estimators(label)
     options = dict(listed.options)
     return str(options.pop("estimator")), options
 
 
 def _loses_border(case: ExtremeCase, setup: Case) -> bool:
-    """Whether light paths lose what camera paths have along the film's border."""
+    """Whether light paths lose light along the film's border that camera paths have."""
     return bool(setup.scene.sensors()[0].film().rfilter().radius() > BOX)
 
 
 def _hidden_from(case: ExtremeCase, setup: Case) -> str | None:
-    """Why camera paths alone are left out: they find the light not at all, or too rarely for a z-test; else None."""
+    """Return the reason to leave out camera paths: they find no light, or too rarely for a z-test. Otherwise None."""
     depth, hidden = case.options["max_depth"], bool(case.options.get("hide_emitters", False))
     at = Situation.of(setup.scene, setup.scene.sensors()[0], setup.params, depth, hidden, paths="both")
     reason = prb_image(at)
@@ -329,7 +336,9 @@ def _hidden_from(case: ExtremeCase, setup: Case) -> str | None:
 
 
 def _seen_by(case: ExtremeCase, setup: Case, way: Mapping[str, Any]) -> ExtremeCase:
-    """The case with these paths: `prb` and `path` are its references where `ptracer` loses the film's border."""
+    """Return the case for these paths. If `ptracer` loses light at the film's border, `prb` and `path` are the
+    references.
+    """
     changed: dict[str, Any] = {"ours": {**case.ours, **way}}
     if _loses_border(case, setup) and case.source == Stock("ptracer"):
         changed |= {"source": Stock("prb"), "image": "path" if case.image else ""}
@@ -339,7 +348,7 @@ def _seen_by(case: ExtremeCase, setup: Case, way: Mapping[str, Any]) -> ExtremeC
 def _run_way(
     case: ExtremeCase, setup: Case, members: Sequence[tuple[str, Mapping[str, Any]]]
 ) -> Iterator[GradcheckRecord]:
-    """Run estimators that trace the same kinds of paths, by their labels and options."""
+    """Run estimators that trace the same kinds of paths. `members` are their labels and options."""
     weights = np.array(setup.weights) if case.weights is None else case.weights(np.array(setup.weights))
     # What is refused of dL/dI counts as zero; references are never shown it.
     setup.weights = type(setup.weights)(np.where(np.isfinite(weights), weights, 0))
@@ -377,7 +386,7 @@ def _record(
 
 
 def _steps(case: ExtremeCase, setup: Case, name: str) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Of an estimator's steps: gradients (N, P), images (N, H, W, 3), entries of dL/dI that were refused (N,)."""
+    """Return gradients (N, P), images (N, H, W, 3), and numbers of refused entries of dL/dI (N,) of an estimator."""
     images, refused = [], []
 
     def step(*arguments: Any, **options: Any) -> None:
@@ -393,7 +402,7 @@ def _steps(case: ExtremeCase, setup: Case, name: str) -> tuple[np.ndarray, np.nd
 
 
 def _refusals(weights: np.ndarray, refused: list[int]) -> Comparison:
-    """Whether every step counted just the entries of dL/dI that are not finite."""
+    """Compare the numbers of refused entries of dL/dI with the numbers of entries that are not finite."""
     expected, counts = int(np.count_nonzero(~np.isfinite(weights))), sorted(set(refused))
     message = f"refused {', '.join(map(str, counts))} entries of dL/dI, of {expected} not finite"
     return Comparison(Verdict.HOLDS if counts == [expected] else Verdict.FAILS, message=message)
@@ -426,14 +435,14 @@ def _comparisons(
 
 
 def _parameters(setup: Case) -> Iterator[tuple[str, slice, tuple[int, ...]]]:
-    """Each parameter: its name, where it stands in a gradient, and its shape."""
+    """Yield the name, the slice of a gradient, and the shape of each parameter."""
     for key, place in setup.places.items():
         shape, size = np.shape(setup.values.value(key)), len(setup.initial[key])
         yield key, place, shape if np.prod(shape, dtype=int) == size else (size,)
 
 
 def _settled(case: ExtremeCase, parameter: str | None, found: Comparison, ours: np.ndarray) -> Comparison:
-    """The comparison with what else has to hold; in a suite nothing is left open without a reason."""
+    """Return the comparison after the case's other conditions. A suite leaves no comparison open without a reason."""
     if found.verdict is Verdict.UNREACHED and (isinstance(case.source, Zero) or parameter in case.open_ended):
         message = "exactly zero" if isinstance(case.source, Zero) else "exactly zero, as the reference"
         return replace(found, verdict=Verdict.HOLDS, message=message)
@@ -446,7 +455,7 @@ def _settled(case: ExtremeCase, parameter: str | None, found: Comparison, ours: 
 
 
 def _not_negative(found: Comparison, ours: np.ndarray, share: float) -> Comparison:
-    """The comparison; it fails where an entry is below zero by more than this `share` of the largest."""
+    """Return the comparison, failed if an entry is negative by more than this `share` of the largest entry."""
     if found.verdict is Verdict.HOLDS and ours.min() < -share * np.abs(ours).max():
         return replace(found, verdict=Verdict.FAILS, message=f"negative: {ours.min():.3g}")
     return found

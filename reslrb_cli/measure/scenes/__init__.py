@@ -1,1 +1,1 @@
-"""Scenes that measurements bring along."""
+"""Built-in scenes of measurements."""

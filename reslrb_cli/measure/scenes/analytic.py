@@ -1,7 +1,7 @@
-"""Scenes whose images are known in closed form, with the derivatives of every pixel.
+"""Scenes with images in closed form, and with the derivatives of every pixel.
 
-An image is what a box filter gives: the mean radiance over each pixel. All parameters here are colours, and each
-channel of the image depends on the same channel of a parameter alone.
+Images are those of a box filter: the mean radiance over each pixel. All parameters are colours. A channel of the image
+depends only on the same channel of a parameter.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Known:
-    """An image (H, W, 3), and its derivative with respect to each parameter, (H, W, 3), by a name of its own."""
+    """An image (H, W, 3), and its derivative (H, W, 3) by each parameter, under a name of its own."""
 
     image: Array
     derivatives: dict[str, Array]
@@ -29,7 +29,7 @@ class Known:
 
 @dataclass(frozen=True)
 class KnownScene:
-    """A scene, its image, and which parameter key each derivative of the image belongs to."""
+    """A scene with its image, and the parameter key of each derivative."""
 
     scene: Callable[[], dict]
     known: Known
@@ -37,7 +37,7 @@ class KnownScene:
     max_depth: int
 
     def gradient(self, weights: Any) -> np.ndarray:
-        """Gradient of sum(image * weights) in a row, parameters in the order of `keys`; `weights` are (H, W, 3)."""
+        """Return the gradient of sum(image * weights) in a row, in the order of `keys`. `weights` are (H, W, 3)."""
         G = np.asarray(weights, np.float64)
         return np.concatenate([np.sum(G * self.known.derivatives[name], (0, 1)) for name in self.keys])
 
@@ -63,7 +63,7 @@ DOWN, UP = ([1, 0, 0], 90), ([1, 0, 0], -90)
 
 
 def furnace_scene(albedo: tuple, emission: tuple, max_depth: int, size: int = SIZE) -> KnownScene:
-    """The inside of a cube: Mitsuba's `path` is a quarter of a percent off in a sphere that it samples from inside."""
+    """The inside of a cube. (In a sphere sampled from inside, Mitsuba's `path` has an error of 0.25 %.)"""
 
     def scene() -> dict:
         walls = {"type": "cube", "flip_normals": True, "bsdf": diffuse(*albedo),
@@ -74,7 +74,7 @@ def furnace_scene(albedo: tuple, emission: tuple, max_depth: int, size: int = SI
 
 
 def refraction_scene(ior: float = 1.5) -> KnownScene:
-    """A point light over a pool, whose bottom a camera sees from inside of it."""
+    """A point light over a pool. The camera is in the water and sees the bottom."""
     intensity, tau, light = (9, 6, 5), (0.9, 0.8, 0.6), (0.3, 1.6, -0.2)
 
     def scene() -> dict:
@@ -91,7 +91,7 @@ def refraction_scene(ior: float = 1.5) -> KnownScene:
 
 
 def slab_scene(ior: float = 1.5, degrees: float = 40, max_depth: int = 6) -> KnownScene:
-    """A parallel beam through a slab on a plane far below it, seen from the side."""
+    """A parallel beam through a slab to a plane far below, seen from the side."""
     radiance, tau, reflectance = (2, 3, 4), (0.9, 0.8, 0.7), (0.9, 0.6, 0.8)
     distance, angle = 40.0, np.deg2rad(degrees)
     direction = np.array([np.sin(angle), -np.cos(angle), 0])
@@ -123,9 +123,9 @@ MIDDLE, HALF = (1.0, 0.8, -0.2), 0.3
 
 
 def covered(center: tuple[float, float], side: float, distance: float, size: int) -> Array:
-    """The share of each pixel, (H, W, 1), that a square of `side` covers, parallel to the film and so far away.
+    """Return the share of each pixel, (H, W, 1), covered by a square parallel to the film at this distance.
 
-    Its `center` is in world units, x to the right and y upwards. Similar triangles.
+    `center` is in world units, x to the right and y upwards. Uses similar triangles.
     """
     pixel = 2 * distance * np.tan(np.deg2rad(FOV) / 2) / size
     edges = np.arange(size + 1)
@@ -138,7 +138,7 @@ def covered(center: tuple[float, float], side: float, distance: float, size: int
 
 
 def speck_in_view(side: float, radiance: tuple = (3, 2, 4)) -> KnownScene:
-    """A square lamp across the border of two pixels, before a wall that it does not light."""
+    """A square lamp on the border of two pixels, before a wall that it does not light."""
     distance = 2.0
     pixel = 2 * distance * np.tan(np.deg2rad(FOV) / 2) / SIZE
     center = (pixel + 0.2 * side, 0.6 * pixel)  # 0.7 of it to the right of a border
@@ -158,11 +158,11 @@ def speck_in_view(side: float, radiance: tuple = (3, 2, 4)) -> KnownScene:
 
 
 def texels_over_plane(texels: ArrayLike) -> KnownScene:
-    """A square lamp with these texels, (N, N, 3), over a diffuse plane that a camera sees without the lamp.
+    """A square lamp with texels (N, N, 3) over a diffuse plane, seen by a camera that does not see the lamp.
 
         L(x) = rho / pi * sum_t Le_t int_t h^2 / d^4 dA
 
-    Lambert's law, with both surfaces horizontal, h apart; Gauss-Legendre nodes in pixels and in texels.
+    Lambert's law for horizontal surfaces at distance h, with Gauss-Legendre nodes in pixels and in texels.
     """
     radiance = np.asarray(texels, np.float64)
     count = len(radiance)
@@ -196,14 +196,14 @@ def texels_over_plane(texels: ArrayLike) -> KnownScene:
 
 
 def furnace(albedo: ArrayLike, emission: ArrayLike, max_depth: int, size: int) -> Known:
-    """A closed surface that emits `emission` and reflects `albedo` (3,) diffusely, everywhere the same, from inside.
+    """A closed surface, seen from inside, with constant emission `emission` and diffuse reflectance `albedo` (3,).
 
-    Radiance is the same everywhere, since the cosine-weighted directions of a hemisphere integrate to pi, and the
-    Neumann series of the rendering equation (J. T. Kajiya, The Rendering Equation, SIGGRAPH 1986) is geometric:
+    Radiance is constant, because the cosine-weighted directions of a hemisphere integrate to pi. The Neumann series of
+    the rendering equation (J. T. Kajiya, The Rendering Equation, SIGGRAPH 1986) is geometric:
 
         L = Le (1 + rho + ... + rho^(D-1)),   D = max_depth;   its limit is Le / (1 - rho)
 
-    `max_depth` -1 is the limit. Raises ValueError where that does not exist.
+    `max_depth` -1 is the limit. Raises ValueError if the limit does not exist.
     """
     rho, Le = (np.broadcast_to(np.asarray(value, np.float64), 3) for value in (albedo, emission))
     if max_depth == -1:
@@ -222,16 +222,17 @@ def point_through_surface(
     albedo: ArrayLike, intensity: ArrayLike, transmittance: ArrayLike, ior: float, light: ArrayLike, depth: float,
     camera_height: float, fov: float, size: int,
 ) -> Known:  # fmt: skip
-    """A point light at `light` (3,) over a medium of index `ior` whose flat surface is at y = `depth`, seen refracted
-    once on the diffuse bottom, y = 0, by a camera in the medium, straight above the origin.
+    """A point light at `light` (3,) over a medium of index `ior` with a flat surface at y = `depth`.
 
-    Light that leaves at an angle theta_1 from the vertical meets the bottom at x = h tan(theta_1) + depth tan(theta_2)
-    from below the light, sin(theta_1) = ior sin(theta_2). What passes through a ring of directions lands in a ring:
+    A camera in the medium, straight above the origin, sees the light on the diffuse bottom, y = 0, after one
+    refraction. Light that leaves at an angle theta_1 from the vertical meets the bottom at x = h tan(theta_1) + depth
+    tan(theta_2) from the point below the light, sin(theta_1) = ior sin(theta_2). Light through a ring of directions
+    lands in a ring:
 
         E = I (1 - R(theta_1)) tau sin(theta_1) / (x dx/dtheta_1),   L = rho / pi * E
 
     Snell's law, Fresnel's equations, conservation of flux (M. Born, E. Wolf, Principles of Optics, Sections 1.5, 3.1).
-    Light that the surface sends back to the bottom is left out, as with max_depth 3.
+    Light that the surface reflects back to the bottom is left out, as with max_depth 3.
     """
     points, weights = plane_points(camera_height, fov, size)
     light = np.asarray(light, np.float64)
@@ -257,15 +258,16 @@ def beam_through_slab(
 ) -> Known:  # fmt: skip
     """Parallel light through a parallel slab of index `ior`, on a diffuse plane parallel to it, away from its edges.
 
-    `angle` is that of incidence in radians, `radiance` what the beam carries through a plane across it. With the
-    reflectance R of one surface, factors tau of each refraction and r of each reflection, K pairs of inner reflections,
+    `angle` is the angle of incidence in radians, and `radiance` the irradiance on a plane perpendicular to the beam.
+    With the reflectance R of one surface, factors tau of each refraction and r of each reflection, and K pairs of inner
+    reflections,
 
         T = tau^2 (1 - R)^2 (1 + q + ... + q^K),   q = (r R)^2;   the limit is tau^2 (1 - R)^2 / (1 - q)
         L = rho / pi * E cos(theta) T
 
-    Incoherent sum of M. Born, E. Wolf, Principles of Optics, Section 7.6, of intensities, with the mean of both
-    polarisations at each surface, as renderers take it. A path of K pairs has 4 + 2 K edges. The plane is so far away
-    that what it sends back to the slab is nothing.
+    This is the incoherent sum of intensities of M. Born, E. Wolf, Principles of Optics, Section 7.6, with the mean of
+    both polarisations at each surface, as renderers use it. A path of K pairs has 4 + 2 K edges. The plane is so far
+    away that it reflects no light back to the slab.
     """
     rho, E, tau, r = (np.broadcast_to(np.asarray(v, float), 3) for v in (albedo, radiance, transmittance, reflectance))
     R = float(fresnel(np.array(angle), ior))
@@ -279,7 +281,7 @@ def beam_through_slab(
 
 
 def fresnel(theta: Array, ior: float) -> Array:
-    """Reflectance of unpolarised light at a flat surface of relative index `ior`, from the outside; Fresnel 1823."""
+    """Reflectance for unpolarised light at a flat surface of relative index `ior`, from outside (Fresnel, 1823)."""
     sin_2, cos_1 = np.sin(theta) / ior, np.cos(theta)
     cos_2 = np.sqrt(1 - sin_2**2)
     s = (cos_1 - ior * cos_2) / (cos_1 + ior * cos_2)
@@ -288,10 +290,10 @@ def fresnel(theta: Array, ior: float) -> Array:
 
 
 def plane_points(height: float, fov: float, size: int, order: int = 8) -> tuple[Array, Array]:
-    """Points of the plane y = 0 that a camera above it sees, for quadrature over pixels: (H, W, order^2, 3), weights.
+    """Return points of the plane y = 0 seen by a camera above it, (H, W, order^2, 3), and their quadrature weights.
 
-    The camera stands at (0, `height`, 0), looks down, and has -z at its upper edge; `fov` is in degrees. The film
-    position of a point is linear in x and z. Gauss-Legendre nodes; the weights (order^2,) sum to 1.
+    The camera is at (0, `height`, 0), looks down, and has -z at its upper edge. `fov` is in degrees. The film position
+    of a point is linear in x and z. The points are Gauss-Legendre nodes of the pixels; the weights (order^2,) sum to 1.
     """
     nodes, weights = np.polynomial.legendre.leggauss(order)
     half = height * np.tan(np.deg2rad(fov) / 2)
@@ -303,7 +305,7 @@ def plane_points(height: float, fov: float, size: int, order: int = 8) -> tuple[
 
 
 def _refracted_angle(offset: Array, height: float, depth: float, ior: float) -> Array:
-    """theta_1 of the light that reaches the bottom at `offset`: bisection, to double precision."""
+    """Return theta_1 of the light that reaches the bottom at `offset`, by bisection to double precision."""
     low, high = np.zeros_like(offset), np.full_like(offset, np.pi / 2 - 1e-9)
     for _ in range(60):
         middle = (low + high) / 2

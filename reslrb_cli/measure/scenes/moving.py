@@ -1,4 +1,4 @@
-"""Test scenes in which parameters move light: amplitudes, of which what moves is a function (`moving_case`)."""
+"""Test scenes in which parameters move light. The parameters are amplitudes of motions (`moving_case`)."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ WAVES = (((5.1, 2.3), 0.4, 0.0135), ((-3.7, 5.9), 1.9, 0.012), ((7.9, -4.6), 4.1
 
 
 def waves(x: Array, z: Array) -> Array:
-    """Heights of a surface with smooth waves."""
+    """Return the heights of a surface with smooth waves."""
     return sum((a * np.sin(kx * x + kz * z + phase) for (kx, kz), phase, a in WAVES), np.zeros_like(x))
 
 
 def mesh(positions: Array, faces: Array, bsdf: dict, texcoords: Array | None = None) -> Any:
-    """A mesh with interpolated normals, of vertices (V, 3) and triangles (F, 3)."""
+    """A mesh of vertices (V, 3) and triangles (F, 3) with interpolated normals."""
     properties = mi.Properties()
     properties["mesh_bsdf"] = mi.load_dict(bsdf)
     shape = mi.Mesh("mesh", len(positions), len(faces), has_vertex_normals=True,
@@ -45,9 +45,9 @@ def mesh(positions: Array, faces: Array, bsdf: dict, texcoords: Array | None = N
 
 def grid(cells: int, height: Callable[[Array, Array], Array], half: float = 1.0, wide: float = 0.0
          ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """A sheet over [-half, half]^2 in x and z that faces up: vertices, triangles, texture coordinates.
+    """A sheet over [-half, half]^2 in x and z that faces up. Returns vertices, triangles and texture coordinates.
 
-    With `wide` cells grow towards the rim, by the hyperbolic sine of up to so much: fine in the middle, and far out.
+    With `wide`, cells grow from the middle to the rim, by the hyperbolic sine of values up to `wide`.
     """
     at = np.linspace(-1, 1, cells + 1)
     axis = half * (np.sinh(wide * at) / np.sinh(wide) if wide else at)
@@ -60,9 +60,9 @@ def grid(cells: int, height: Callable[[Array, Array], Array], half: float = 1.0,
 
 
 def smooth_fields(positions: Array, count: int, span: float, seed: int = 5) -> Array:
-    """Random smooth displacements of unit size in all three directions: (count, V, 3).
+    """Return random smooth displacements of unit size in all three directions, (count, V, 3).
 
-    Each is a wave, a few of which have room in `span`, along a random direction.
+    Each is a wave along a random direction, with a few wavelengths within `span`.
     """
     random = np.random.default_rng(seed)
     found = []
@@ -75,7 +75,7 @@ def smooth_fields(positions: Array, count: int, span: float, seed: int = 5) -> A
 
 
 def vertices(scene: Any, name: str) -> np.ndarray:
-    """Positions (V, 3) of a mesh."""
+    """Return the positions (V, 3) of a mesh."""
     return np.array(mi.traverse(scene)[f"{name}.vertex_positions"], float).reshape(-1, 3)
 
 
@@ -92,7 +92,7 @@ DEGREES = 57.29577951308232
 
 @dataclass(frozen=True)
 class Displacement:
-    """The vertices of a mesh move by the sum of amplitude k times `fields[k]`, of shape (K, V, 3)."""
+    """Moves the vertices of a mesh by the sum of amplitude k times `fields[k]`, of shape (K, V, 3)."""
 
     key: str
     fields: np.ndarray
@@ -110,10 +110,9 @@ class Displacement:
 
 @dataclass(frozen=True)
 class Pose:
-    """A `to_world`, or a position, moves by these degrees of freedom, in their order.
+    """Moves a `to_world`, or a position, by these degrees of freedom, in their order.
 
-    They are `tx` `ty` `tz` (scene units), `rx` `ry` `rz` (radians) and `s` (scale, 1 + amplitude), the last two kinds
-    about `pivot`.
+    They are `tx` `ty` `tz` (scene units), and about `pivot`, `rx` `ry` `rz` (radians) and `s` (scale, 1 + amplitude).
     """
 
     key: str
@@ -144,7 +143,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Number:
-    """A number such as a roughness, to which the one amplitude is added."""
+    """Adds the only amplitude to a number such as a roughness."""
 
     key: str
     size: int = 1
@@ -160,7 +159,7 @@ Move = Displacement | Pose | Number
 
 @dataclass
 class Displaced:
-    """The `measure.values.Values` of a scene that `moves` move: AMPLITUDES, all of theirs in a row."""
+    """The `measure.values.Values` of a scene that `moves` change: AMPLITUDES, the amplitudes of all moves in a row."""
 
     scene: mi.Scene
     moves: Sequence[Move]
@@ -173,11 +172,11 @@ class Displaced:
         self._meshes = [shape for shape in SceneGraph.of(self.scene).shapes() if shape.is_mesh()]
 
     def value(self, key: str) -> Any:
-        """The amplitudes (K,)."""
+        """Return the amplitudes (K,)."""
         return self._amplitudes if key == AMPLITUDES else self.params[key]
 
     def hand_over(self, values: Mapping[str, Any]) -> None:
-        """Set the amplitudes, and move what they move."""
+        """Set the amplitudes, and apply the moves."""
         at, moved = 0, []
         self._amplitudes = values[AMPLITUDES]
         for move in self.moves:
@@ -190,13 +189,13 @@ class Displaced:
         dr.eval(moved, [mesh.vertex_normals_buffer() for mesh in self._meshes])
 
     def collect(self) -> None:
-        """Gradients of one step find their way back by themselves, and so do tangents."""
+        """Do nothing: within one step, gradients and tangents propagate by themselves."""
 
     push = collect
 
 
 def moving_case(description: dict, moves: Callable[[Any], Sequence[Move]]) -> Case:
-    """A scene, loaded, with the amplitudes of its `moves` as the one parameter; dL/dI is smooth."""
+    """Return a loaded scene with the amplitudes of its `moves` as the only parameter. dL/dI is smooth."""
     scene = load(description)
     case = Case(scene, [AMPLITUDES], values=Displaced(scene, moves(scene)))
     case.weigh(smooth_weights(*case.weights.shape))

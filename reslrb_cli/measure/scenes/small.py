@@ -1,7 +1,7 @@
-"""Small scenes to measure in, and to check gradients in: a Cornell box, and a corner of a room.
+"""Small scenes for measurements and gradient checks: a Cornell box, and a corner of a room.
 
-The Cornell box, with a texture on its white surfaces, is measured where no configuration is given (`build`). The corner
-of a room, and what to put into it, as `mi.load_dict` takes them, are to check gradients in (`room`).
+`build` returns the Cornell box with a texture on its white surfaces. Measurements without a configuration use it.
+`room` returns the corner of a room as a dictionary for `mi.load_dict`. Gradient checks add objects to it.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ run: {{spp: 16}}
 
 
 def build(options: dict[str, Any]) -> Any:
-    """The scene, with the options of CONFIG; its texels are random, between 0.2 and 0.9, its filter is a box.
+    """Return the scene with the options of CONFIG. Its texels are random, from 0.2 to 0.9, and its filter is a box.
 
-    Raises ConfigError where an option is unknown or no count.
+    Raises ConfigError if an option is unknown or is not a positive integer.
     """
     values = {"size": 128, "texture": 16} | options
     for name, value in values.items():
@@ -58,13 +58,13 @@ SIZE = 16
 
 
 def texture(height: int, width: int, low: float = 0.2, high: float = 0.8, seed: int = 1, channels: int = 3) -> dict:
-    """A bitmap of random texels, by nearest neighbour so that each texel is a parameter of its own."""
+    """A bitmap of random texels with nearest-neighbour filtering, so that texels are independent parameters."""
     data = np.random.default_rng(seed).uniform(low, high, (height, width, channels)).astype(np.float32)
     return bitmap(data)
 
 
 def bitmap(data: np.ndarray, filter_type: str = "nearest") -> dict:
-    """A bitmap texture that holds `data` (H, W, C) as it is."""
+    """A bitmap texture with unchanged `data` (H, W, C)."""
     return {"type": "bitmap", "data": mi.TensorXf(np.ascontiguousarray(data, np.float32)), "raw": True,
             "filter_type": filter_type, "wrap_mode": "clamp"}  # fmt: skip
 
@@ -80,12 +80,12 @@ def diffuse(*value: float) -> dict:
 
 
 def glass(ior: float = 1.5, outside: float = 1.0, **options: Any) -> dict:
-    """A smooth dielectric of this index."""
+    """A smooth dielectric with this index."""
     return {"type": "dielectric", "int_ior": ior, "ext_ior": outside, **options}
 
 
 def transform(**steps: Any) -> Any:
-    """A transform of `translate`, `rotate` (axis, angle) and `scale`, applied in reverse order of naming."""
+    """A transform of `translate`, `rotate` (axis, angle) and `scale`. The last one given applies first."""
     result = mi.ScalarTransform4f()
     for name, value in steps.items():
         if name == "rotate":
@@ -97,23 +97,23 @@ def transform(**steps: Any) -> Any:
 
 
 def look_at(origin: Sequence[float], target: Sequence[float], up: Sequence[float] = (0, 0, 1)) -> Any:
-    """A transform that takes the z axis from `origin` towards `target`."""
+    """A transform that points the z axis from `origin` to `target`."""
     return mi.ScalarTransform4f().look_at(origin=list(origin), target=list(target), up=list(up))
 
 
 def rectangle(bsdf: dict, to_world: Any = None, **place: Any) -> dict:
-    """A square of side 2 that faces along z, taken to its place by `to_world` or the steps of a `transform`."""
+    """A square of side 2 that faces along z, transformed by `to_world` or by the arguments of `transform`."""
     return {"type": "rectangle", "bsdf": bsdf, "to_world": transform(**place) if to_world is None else to_world}
 
 
 def lit_square(radiance: dict, to_world: Any = None, kind: str = "area", **place: Any) -> dict:
-    """A black `rectangle` that is an emitter: an `area` light, or a `directionalarea` one."""
+    """A black `rectangle` that is an emitter, `area` or `directionalarea`."""
     return rectangle(diffuse(0, 0, 0), to_world, **place) | {"emitter": {"type": kind, "radiance": radiance}}
 
 
 def pinhole(origin: Sequence[float], target: Sequence[float], up: Sequence[float], fov: float, size: int = SIZE,
             **film: Any) -> dict:  # fmt: skip
-    """A camera that sees from close by, whose image is a box filter's where `film` has no other `rfilter`."""
+    """A camera for short distances, with a box filter unless `film` has another `rfilter`."""
     return _camera("perspective", fov, look_at(origin, target, up), size, film) | {"near_clip": 1e-3}
 
 
@@ -130,9 +130,9 @@ def _camera(sensor: str, fov: float, to_world: Any, size: int, film: dict) -> di
 
 
 def room(**changes: Any) -> dict:
-    """A corner of a room, floor and two walls, under an area light that the camera does not see.
+    """A corner of a room: floor and two walls, under an area light that the camera does not see.
 
-    `changes` replace or add objects; None takes one away.
+    `changes` replace or add objects; None removes one.
     """
     scene = {
         "type": "scene",
@@ -150,11 +150,11 @@ def room(**changes: Any) -> dict:
 
 
 def lamp(**emitter: Any) -> dict:
-    """A square area light above the room that shines down into it; `emitter` are options of its `area` emitter."""
+    """A square area light above the room that shines down; `emitter` are options of its `area` emitter."""
     place = transform(translate=[0.2, 1.6, 0.2], rotate=([1, 0, 0], 90), scale=0.6)
     return rectangle(diffuse(0.0, 0.0, 0.0), place) | {"emitter": {"type": "area", **emitter}}
 
 
 def load(scene: dict) -> Any:
-    """The scene, its objects as they stand."""
+    """Load the scene without merging objects."""
     return mi.load_dict(scene, optimize=False)
