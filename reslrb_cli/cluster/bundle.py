@@ -1,10 +1,11 @@
-"""An experiment's files, as they are sent to who has none of them: its configuration, its scene as one file with
-nothing left to include, and all that the two name, beside them.
+"""The files of an experiment for processes that have none of them: the configuration, the scene, and their files.
 
-    folder/config.yaml     as resolved, with the paths below
-    folder/scene.xml       all includes and variables put in
-    folder/initial.npz     the values that parameters begin with, whatever they come from
-    folder/files/N-NAME    whatever is read: meshes, textures, spectra, cameras, images, code
+The scene is one file, without includes.
+
+    folder/config.yaml     resolved, with the paths below
+    folder/scene.xml       all includes and variables resolved
+    folder/initial.npz     initial values of the parameters
+    folder/files/N-NAME    all other files: meshes, textures, spectra, cameras, images, code
 """
 
 from __future__ import annotations
@@ -34,13 +35,13 @@ Values = Mapping[str, np.ndarray[Any, Any]]
 
 @dataclass
 class Bundle:
-    """The bytes of files, by their paths below the folder that they are to be in, with `/`."""
+    """The contents of files, by their paths below the folder to which they are written, with `/`."""
 
     files: dict[str, bytes] = field(default_factory=dict)
     _names: dict[Path, str] = field(default_factory=dict)
 
     def add(self, path: Path) -> str:
-        """Take a file, once, and return its path; its ending stays. Raises ConfigError where it cannot be read."""
+        """Add a file, once, and return its path with the same suffix. Raises ConfigError if it cannot be read."""
         path = path.absolute()
         if path not in self._names:
             name = self._names[path] = f"{FILES}/{len(self._names)}-{path.name}"
@@ -51,7 +52,7 @@ class Bundle:
         return self._names[path]
 
     def digest(self) -> str:
-        """What is in the files, in short."""
+        """Return a digest of all files."""
         found = hashlib.blake2b(digest_size=16)
         for name, data in sorted(self.files.items()):
             found.update(f"{name} {len(data)}\n".encode())
@@ -60,8 +61,10 @@ class Bundle:
 
 
 def bundle_of(config: Config, values: Values) -> Bundle:
-    """All files that a process without any needs to load what `config` names, but for targets, which are sent as
-    arrays; `values` are those that its parameters begin with (`Selection.array`). Raises ConfigError."""
+    """Return all files that a process needs to load `config`, except targets, which are sent as arrays.
+
+    `values` are the initial values of the parameters (`Selection.array`). Raises ConfigError.
+    """
     bundle, file = Bundle(), io.BytesIO()
     np.savez(file, **dict[str, Any](values))
     bundle.files[INITIAL_FILE] = file.getvalue()
@@ -87,7 +90,7 @@ def bundle_of(config: Config, values: Values) -> Bundle:
 
 
 def _scene_text(bundle: Bundle, config: Config) -> str:
-    """The scene as one file, which names files of the bundle."""
+    """Return the scene as one file with the bundle's paths."""
     description = read_description(config.scene.file, option_texts(config.scene.options))
     for element in description.root.walk():
         key = element.file_attribute
@@ -98,7 +101,7 @@ def _scene_text(bundle: Bundle, config: Config) -> str:
 
 
 def _packed(bundle: Bundle | None, value: Any) -> Any:
-    """Settings with the files that are there in the bundle, if there is one, and all other paths as text."""
+    """Return settings with the bundle's paths of files, or with paths as text if there is no bundle."""
     if isinstance(value, Mapping):
         return {key: _packed(bundle, each) for key, each in value.items()}
     if isinstance(value, (list, tuple)):
@@ -109,7 +112,7 @@ def _packed(bundle: Bundle | None, value: Any) -> Any:
 
 
 def _put(data: dict[str, Any], key: str, value: str) -> None:
-    """Put a value at a key such as `views[0].loss.file`."""
+    """Set the value of a key such as `views[0].loss.file`."""
     *way, last = key.replace("[", ".").replace("]", "").split(".")
     at: Any = data
     for part in way:
@@ -118,7 +121,7 @@ def _put(data: dict[str, Any], key: str, value: str) -> None:
 
 
 def unpack(files: Mapping[str, bytes], folder: Path) -> None:
-    """Write files into `folder`, which appears when it is whole; it may be there already. Raises MachineError."""
+    """Write files to `folder`, which appears only when it is complete, and may exist already. Raises MachineError."""
     if folder.is_dir():
         return
     try:
@@ -133,7 +136,7 @@ def unpack(files: Mapping[str, bytes], folder: Path) -> None:
 
 
 def read_bundle(folder: Path) -> tuple[Config, Values]:
-    """The experiment whose files are in `folder`, and the values that its parameters begin with. Raises ConfigError."""
+    """Return the experiment in `folder`, and the initial values of its parameters. Raises ConfigError."""
     text = (folder / CONFIG_FILE).read_text(encoding="utf-8")
     with np.load(folder / INITIAL_FILE) as values:
         return loads(text, folder / CONFIG_FILE), dict(values)

@@ -1,9 +1,9 @@
-"""The samples of `gradcheck`, and the cases of its suite, on workers (`crew.Crew`).
+"""Samples of `gradcheck`, and cases of its suite, on workers (`crew.Crew`).
 
-A sample is a function of who takes part, made of an experiment's files, of the steps of finite differences, which are
-chosen where `gradcheck` runs and nowhere else, and of its seed; a case is one of its name.
+A sample is a function of the participants, which are made from an experiment's files, of the steps of finite
+differences, which only the process of `gradcheck` chooses, and of its seed. A case is a function of its name.
 
-Imports dask: for those that `--cluster` has asked for it.
+Imports dask, so it is only imported for `--cluster`.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ Stop = Callable[[], bool]
 
 @dataclass(frozen=True)
 class Steps:
-    """The steps that finite differences take, by parameter and way (`sampling.steps_of`)."""
+    """The steps of finite differences, by parameter and way (`sampling.steps_of`)."""
 
     steps: Mapping[str, Sequence[Step]]
     #: Of them all, as they were written here: elsewhere NumPy may write numbers otherwise.
     digest: str
 
     def take(self, participants: Participants) -> None:
-        """Have finite differences take them."""
+        """Set these steps."""
         step_as(participants, self.steps)
 
 
@@ -51,7 +51,7 @@ class Steps:
 def participants_in(
     folder: Path, threads: int, variant: str, allows_code: bool, settings: Mapping[str, Any]
 ) -> tuple[Participants, dict[str, float]]:
-    """Return who takes part, of the experiment in `folder`; no kernel is warm. `settings`: further `CheckSettings`."""
+    """Return the participants of the experiment in `folder`, with further `CheckSettings`. No kernels are warm."""
     set_variant(variant)
     listed = [_with_file(case, lambda file: f"{folder / file}") for case in settings["integrators"]]
     config, initial = _read(folder)
@@ -62,7 +62,7 @@ def participants_in(
 
 
 def nothing_in(folder: Path, threads: int, variant: str) -> tuple[Stop, dict[str, float]]:
-    """What a case of the suite takes beside its name: whether it is to stop, which it is not."""
+    """Return the arguments of a case besides its name: a `stop` that is never true."""
     set_variant(variant)
     _with_threads(threads)
     return lambda: False, {}
@@ -79,7 +79,7 @@ def _read(folder: Path) -> tuple[Config, Values | None]:
 
 
 def _with_file(case: Listed, put: Callable[[str], str]) -> Listed:
-    """An integrator with the file of its code, if it has any, in another place."""
+    """Return an integrator with another path of its code file, if it has one."""
     if case.type != "custom":
         return case
     file, _, name = str(case.options["file"]).rpartition(":")
@@ -90,7 +90,7 @@ def _with_file(case: Listed, put: Callable[[str], str]) -> Listed:
 
 
 def check_shareable(settings: CheckSettings) -> None:
-    """Raise ConfigError where samples depend on who takes them, or when."""
+    """Raise ConfigError if samples depend on the process that takes them, or on time."""
     if settings.seeds is None:
         reason = "a budget of seconds says nothing of other machines; say how many seeds there are with --seeds"
         raise ConfigError("--cluster", "", reason)
@@ -104,7 +104,7 @@ def check_shareable(settings: CheckSettings) -> None:
 def samples_at(
     settings: CheckSettings, participants: Participants, place: Place, variant: str, threads: int | None = None
 ) -> Iterator[Callable[..., Any]]:
-    """What takes samples of `participants` (`sampling.Engine`) on the workers at a place; raises as `Crew.start`."""
+    """Take samples of `participants` (`sampling.Engine`) on the workers at a place. Raises as `Crew.start` does."""
     opening, bundle = _opening_of(settings, participants, variant, own=place.address is None)
     with _crew_at(place, opening, bundle.files, threads) as crew:
 
@@ -120,7 +120,7 @@ def samples_at(
 
 
 def _opening_of(settings: CheckSettings, participants: Participants, variant: str, own: bool) -> tuple[Opening, Bundle]:
-    """What workers need to have the same participants, `own`: which are this command's."""
+    """Return the data from which workers make the same participants. `own`: the workers belong to this command."""
     config = settings.config
     built_in = config.scene.file == small.FILE
     values = {key: participants.selection.array(key) for key in participants.selection.keys}
@@ -138,7 +138,9 @@ def _opening_of(settings: CheckSettings, participants: Participants, variant: st
 
 @contextlib.contextmanager
 def cases_at(place: Place, variant: str, threads: int | None = None) -> Iterator[Callable[..., Any]]:
-    """What runs cases (`extreme.case_records`, as `shards.serially`) on the workers at a place; raises as above."""
+    """Run cases (`extreme.case_records`, as `shards.serially`) on the workers at a place. Raises as `Crew.start`
+    does.
+    """
     with _crew_at(place, Opening(Bundle().digest(), nothing_in, (variant,)), {}, threads) as crew:
 
         def run(stop: Stop, function: Callable[..., Any], work: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:

@@ -1,8 +1,9 @@
-"""Where workers are: processes of this machine that dask starts, or a scheduler that others have joined (`--cluster`).
+"""Connections to workers: processes of this machine that dask starts, or a scheduler that others have joined
+(`--cluster`).
 
-Connections are by TLS alone. For `local:N` dask makes certificates for this run, which are never written down; for
-`tls://HOST:PORT` they are those of dask's own settings, `distributed.comm.tls`, which say what scheduler and workers
-were started with. Who holds such a certificate can run anything on the workers.
+All connections use TLS. For `local:N`, dask makes certificates for this run, which are never stored. For
+`tls://HOST:PORT`, the certificates are those of dask's settings `distributed.comm.tls`, with which scheduler and
+workers were started. The holder of such a certificate can run any code on the workers.
 """
 
 from __future__ import annotations
@@ -62,14 +63,14 @@ OWN_SETTINGS = {
 
 @dataclass(frozen=True)
 class Place:
-    """So many `workers` of this machine, or the scheduler at `address`."""
+    """A number of `workers` on this machine, or the scheduler at `address`."""
 
     workers: int = 0
     address: str | None = None
 
     @classmethod
     def parse(cls, text: str) -> Place:
-        """That of `local:N` or `tls://HOST:PORT`. Raises ConfigError where it is neither, or dask is not installed."""
+        """Parse `local:N` or `tls://HOST:PORT`. Raises ConfigError for other text, or if dask is not installed."""
         kind, _, count = text.partition(":")
         address = _ADDRESS.fullmatch(text)
         if address and 0 < int(address[2]) < 2**16:
@@ -89,7 +90,7 @@ class Place:
         return self.address or f"local:{self.workers}"
 
     def check(self) -> None:
-        """Raise ConfigError without certificates, and MachineError where the scheduler does not answer."""
+        """Raise ConfigError if certificates are missing, and MachineError if the scheduler does not answer."""
         if self.address is not None:
             with connected(self):
                 pass
@@ -97,9 +98,10 @@ class Place:
 
 @contextlib.contextmanager
 def connected(place: Place) -> Iterator[tuple[Client, Path]]:
-    """A client of the workers at a place, and a folder that is removed in the end.
+    """Connect to the workers at a place. Yields a client, and a folder that is removed at the end.
 
-    Raises MachineError where none can be started, or the scheduler does not answer; ConfigError without certificates.
+    Raises MachineError if no worker can be started or the scheduler does not answer, and ConfigError without
+    certificates.
     """
     import dask
     from distributed import Client
@@ -132,7 +134,9 @@ def connected(place: Place) -> Iterator[tuple[Client, Path]]:
 
 @contextlib.contextmanager
 def _started(workers: int, folder: Path) -> Iterator[tuple[object, object]]:
-    """A scheduler in this process and so many workers in their own, and what one connects by."""
+    """Start a scheduler in this process, and this many workers in processes of their own. Yields address and
+    security.
+    """
     from distributed import LocalCluster
 
     from reslrb_cli.backend.memory import free_bytes
@@ -154,7 +158,7 @@ def _started(workers: int, folder: Path) -> Iterator[tuple[object, object]]:
 
 
 def _extensions() -> dict[str, Any]:
-    """dask's extensions of a scheduler; the one that keeps a record of every call until the end keeps none."""
+    """Return dask's extensions of a scheduler. The one that records every call until the end is replaced."""
     from distributed.scheduler import DEFAULT_EXTENSIONS
     from distributed.spans import SpansSchedulerExtension
 
@@ -169,7 +173,7 @@ def _extensions() -> dict[str, Any]:
 
 
 def _certificates() -> object:
-    """What dask's settings say of certificates. Raises ConfigError where a file of them is not said or not there."""
+    """Return the certificates of dask's settings. Raises ConfigError if a file is not named or does not exist."""
     from distributed import Security
 
     try:
@@ -192,7 +196,7 @@ def _certificates() -> object:
 
 
 def _why_not(place: Place, error: Exception) -> str:
-    """Why a client did not come to be."""
+    """Describe why a client could not connect."""
     said = one_line(str(error.__cause__ or error), 200)
     return f"the scheduler at {place.address or 'this machine'} cannot be reached, or refuses this certificate: {said}"
 

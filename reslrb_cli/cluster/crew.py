@@ -1,10 +1,10 @@
-"""Calls on the workers of a dask scheduler: who is there, what comes back, and what becomes of those that fail.
+"""Calls on the workers of a dask scheduler: available workers, answers, and failures.
 
-dask hands calls out to the workers that are ready, and sends those again that a worker has died of. What is ours is to
-ask again: of a worker that says nothing for three times as long as calls take, another is asked, and the first answer
-counts; one that says nothing for much longer has dask start it anew. What a worker does: `worker.py`.
+dask distributes calls to workers that are ready, and repeats the calls of a worker that died. This module repeats calls
+of slow workers: if a worker does not answer within three times the usual time, another worker is asked, and the first
+answer counts. If it does not answer for much longer, dask restarts it. `worker.py` is the workers' side.
 
-Everything goes by way of the scheduler: nobody needs a way to a worker.
+All messages pass through the scheduler, so no direct connection to a worker is needed.
 """
 
 from __future__ import annotations
@@ -59,10 +59,14 @@ LOSSES = 100
 
 @dataclass
 class Spent:
-    """Seconds of a worker, or of all rounds of calls: `computing` and before that `standing`, being brought to where
-    calls are of, of a round the mean of its workers; `waiting`, which these did for the one that had most; `wall`, from
-    the first question to the last answer, of which the rest went into sending. `calls` were answered, `again` were
-    asked for once more."""
+    """Seconds of a worker, or of all rounds of calls.
+
+    - `computing`, and before it `standing` (setting the context of calls): the mean over a round's workers.
+    - `waiting`: time in which these waited for the worker with the most work.
+    - `wall`: from the first question to the last answer. The rest of it is communication.
+
+    `calls` were answered, and `again` of them were repeated.
+    """
 
     wall: float = 0.0
     computing: float = 0.0
@@ -74,7 +78,9 @@ class Spent:
 
 @dataclass
 class _Round:
-    """Calls that are being answered: what is `left`, by place, and for each future its place and who may answer."""
+    """The calls of a round: the indices `left` to answer, and for each future its index and the workers that may
+    answer.
+    """
 
     function: Callable[..., Any]
     context: Context
@@ -89,18 +95,18 @@ class _Round:
 
     @property
     def name(self) -> str:
-        """What calls that take about as long have in common."""
+        """The name under which calls take about equally long."""
         return self.function.__name__ if self.cold is None else f"{self.function.__name__} {self.cold}"
 
     def answerable(self, workers: Mapping[str, Any]) -> set[int]:
-        """The places that one of these workers may answer."""
+        """Return the indices that one of these workers may answer."""
         return {place for place, allowed in self.flying.values() if not allowed.isdisjoint(workers)}
 
 
 class Crew:
-    """The workers of a client that have come to what `opening` says; `files` are sent to those that have none.
+    """The workers of a client that have loaded `opening`. `files` are sent to workers that lack them.
 
-    `threads` is the number of each worker's, None: its share of the cores that it may use.
+    `threads` is the number of threads of each worker; None: its share of the cores that it may use.
     """
 
     def __init__(
@@ -126,14 +132,13 @@ class Crew:
 
     @property
     def ready(self) -> list[str]:
-        """The workers that are asked."""
+        """The workers that get calls."""
         return [worker for worker in self._heard if worker not in self._late] or [*self._heard]
 
     def start(self) -> None:
-        """Wait until one is ready, and some time for the others.
+        """Wait until one worker is ready, and some time for the others.
 
-        Raises MachineError where there is none, with what is wrong with those that are not, and what is wrong with the
-        experiment.
+        Raises MachineError if none is ready, with the failures of the others and errors of the experiment.
         """
         begin = time.monotonic()
         first_s: float | None = None
@@ -145,14 +150,14 @@ class Crew:
                 first_s = time.monotonic() - begin
 
     def _next(self, seconds: float) -> Future | None:
-        """The next future that is done, if one is within so many seconds."""
+        """Return the next finished future; None if none finishes within this many seconds."""
         try:
             return self._done.get(timeout=seconds)
         except queue.Empty:
             return None
 
     def _look(self) -> None:
-        """See who has come and gone; those that have come are opened. Raises MachineError where nobody is there."""
+        """Update the list of workers; new workers load the opening. Raises MachineError if there are none."""
         now = time.monotonic()
         if now - self._looked < LOOK_S:
             return
@@ -175,7 +180,7 @@ class Crew:
             raise MachineError(self._nobody())
 
     def _scheduler(self, call: Callable[[], T]) -> T:
-        """What the scheduler answers. Raises MachineError where it has gone."""
+        """Return the scheduler's answer. Raises MachineError if the scheduler has ended."""
         try:
             if self.client.status == "running" and self.client.scheduler is not None:
                 return call()
@@ -190,7 +195,7 @@ class Crew:
             self._opening.pop(worker)[0].release()
 
     def _open(self, workers: Sequence[str], here: Mapping[str, Any]) -> None:
-        """Have workers come to what they work on, each with its share of the cores that it may use."""
+        """Let workers load the opening, each with its share of the cores that it may use."""
         found: dict[str, tuple[str, tuple[int, ...]]] = {}
         if self._threads is None:
             found = self._scheduler(lambda: self.client.run(whereabouts, on_error="ignore", workers=[*here]))
@@ -221,7 +226,7 @@ class Crew:
         return self._names.get(worker, "a worker")
 
     def _take_opened(self, future: Future) -> bool:
-        """Note that a worker has come to what it works on, or what stands against it; False of another future."""
+        """Note that a worker has loaded the opening, or why it has not. Returns False for another kind of future."""
         worker = next((worker for worker, (own, _) in self._opening.items() if own is future), None)
         if worker is None:
             return False
@@ -245,7 +250,7 @@ class Crew:
         logger.warning(f"--cluster: {self._name(worker)} {reason}; it takes no part")
 
     def _start_anew(self, worker: str, reason: str) -> None:
-        """Have dask start a worker anew, which takes some time."""
+        """Let dask restart a worker, which takes some time."""
         name = self._name(worker)
         self._restarts[name] += 1
         if self._restarts[name] > RESTARTS:
@@ -271,10 +276,10 @@ class Crew:
     def run(
         self, function: Callable[..., Any], work: Sequence[Sequence[Any]], context: Context, cold: str | None = None
     ) -> Iterator[tuple[int, Any]]:
-        """Yields place and value of each call, as they come; raises what a call raised.
+        """Yield index and value of each call as they arrive. Raises the errors of calls.
 
-        `cold` names what no worker has warmed kernels for: the first call of each compiles, and nobody hangs who does.
-        Raises MachineError or OutOfMemory where worker after worker fails, or none is there.
+        `cold` names functions whose kernels no worker has compiled. Their first calls include compilation, and do not
+        count as hanging. Raises MachineError or OutOfMemory if workers fail repeatedly, or if there are none.
         """
         begin = time.monotonic()
         todo = _Round(function, context, dict(enumerate(work)), cold=cold, size=len(work))
@@ -303,7 +308,7 @@ class Crew:
         self.spent.waiting += max(both, default=0.0) - computing - standing
 
     def _submit(self, todo: _Round, places: Sequence[int]) -> None:
-        """Ask for calls, those that have come to the experiment; nothing where nobody has."""
+        """Submit calls to the workers that have loaded the opening, if there are any."""
         workers = self.ready
         for place in places if workers else ():
             future = self.client.submit(
@@ -314,7 +319,7 @@ class Crew:
             future.add_done_callback(self._done.put)
 
     def _take(self, todo: _Round, future: Future, beside: list[Future]) -> Iterator[tuple[int, Any]]:
-        """What comes of a future: the value of a call, or nothing; what has no answer then is asked for once more."""
+        """Yield the value of a call, or nothing, from a future. A call without an answer is repeated."""
         if self._take_opened(future):
             return
         place = todo.flying.pop(future, (None, None))[0]
@@ -357,14 +362,14 @@ class Crew:
             yield place, answer.value
 
     def _count_loss(self, todo: _Round) -> None:
-        """Count a call without an answer. Raises MachineError where there are too many."""
+        """Count a call without an answer. Raises MachineError if there are too many."""
         todo.losses += 1
         if todo.losses > LOSSES + todo.size:
             left = len(todo.left)
             raise MachineError(f"--cluster: asked again {todo.losses} times; calls without an answer: {left}")
 
     def _take_fault(self, todo: _Round, fault: Fault, place: int | None) -> None:
-        """Ask others, and have the worker started anew. Raises MachineError or OutOfMemory once that was of no use."""
+        """Ask other workers and restart this one. Raises MachineError or OutOfMemory if that has failed before."""
         if place is not None:
             todo.faults[place] += 1
             if todo.faults[place] >= FAULTS:
@@ -378,12 +383,12 @@ class Crew:
     # --- who says nothing ---------------------------------------------------------------------------------------------
 
     def _limit(self, todo: _Round, times: float, beside_s: float) -> float:
-        """Seconds that a worker may say nothing."""
+        """Return the seconds within which a worker must answer."""
         known = self._seconds.get(todo.name)
         return times * statistics.median(known) + beside_s if known else OPENING_S
 
     def _ask_again(self, todo: _Round) -> None:
-        """Ask others for what workers have that said nothing for too long; have those started anew that hang."""
+        """Repeat calls of workers that have not answered for too long, and restart workers that hang."""
         now = time.monotonic()
         late_s = self._limit(todo, LATE, LATE_S)
         silent = [worker for worker, heard in self._heard.items() if now - heard > late_s]
@@ -411,10 +416,9 @@ class Crew:
 
 
 def _reply(future: Future) -> Reply | None:
-    """What came back; None where it was lost with a worker. Raises what the call did.
+    """Return the answer; None if it was lost with a worker. Raises the error of a call.
 
-    What a worker has computed is lost with it until it is here: dask then takes the future for one that is to be
-    computed again.
+    Until an answer has arrived here, it is lost if its worker ends, and dask computes the call again.
     """
     try:
         for seconds in GATHER_S:

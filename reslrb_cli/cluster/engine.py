@@ -1,10 +1,10 @@
-"""The shards of a run's steps on workers (`crew.Crew`): what they assemble, and where its parameters stand.
+"""The shards of a run's steps on workers (`crew.Crew`): the problem that they load, and the values of its parameters.
 
-A call is a pure function of an experiment (files, by their digest), where its parameters and tables stand (`Standing`),
-a shard and its dL/dI, to NumPy arrays: which worker computes it, how often, and how many there are, is nothing to it.
-Optimiser, checkpoint and page stay where `optimize` runs.
+A call is a pure function of an experiment (files, by their digest), the values of its parameters and tables
+(`Standing`), a shard and its dL/dI. It returns NumPy arrays. The result does not depend on the worker, on repetitions,
+or on the number of workers. Optimiser, checkpoints and page stay in the process of `optimize`.
 
-Imports dask: for those that `--cluster` has asked for it.
+Imports dask, so it is only imported for `--cluster`.
 """
 
 from __future__ import annotations
@@ -45,8 +45,10 @@ TARGETS_FILE = "targets.npz"
 
 @dataclass(frozen=True)
 class Standing:
-    """Where a step's parameters and tables stand: values as the optimiser has them, and what guided emission has
-    learned (`Guiding.state`); `digest` is of both."""
+    """Parameters and tables of a step: values as in the optimiser, and the guide's learned state (`Guiding.state`).
+
+    `digest` covers both.
+    """
 
     digest: str
     values: dict[str, Array]
@@ -55,7 +57,7 @@ class Standing:
 
     @staticmethod
     def of(problem: Problem) -> Standing:
-        """That of a problem now."""
+        """Return the current parameters and tables of a problem."""
         guiding = guiding_of(problem)
         calls, learned = ({}, {}) if guiding is None else guiding.state()
         keys = problem.optimizer.keys()
@@ -63,7 +65,7 @@ class Standing:
         return Standing(_digest(repr(calls), values, learned), values, dict(calls), learned)
 
     def take(self, problem: Problem) -> None:
-        """Bring a problem there."""
+        """Set the parameters and tables of a problem."""
         for key, value in self.values.items():
             problem.optimizer.set_value(key, like(dr.detach(problem.optimizer[key]), value))
         wrong = restore_tables(problem, self.calls, self.learned)
@@ -85,8 +87,10 @@ def _digest(text: str, *mappings: Mapping[str, Array]) -> str:
 
 
 def assembled(folder: Path, threads: int, allows_code: bool) -> tuple[Problem, dict[str, float]]:
-    """The problem as the run has it, with its targets and what it has settled, from the experiment's files, with its
-    kernels warm; and the seconds that a shard then takes."""
+    """Load the run's problem with its targets and decisions from the experiment's files, and compile its kernels.
+
+    Also returns the seconds that a shard then takes.
+    """
     stored = Stored(folder / STATE_FILE)
     with np.load(folder / TARGETS_FILE) as targets:
         set_variant(stored.read(Settled).variant)
@@ -101,7 +105,7 @@ def assembled(folder: Path, threads: int, allows_code: bool) -> tuple[Problem, d
 
 
 def _warmed(problem: Problem) -> dict[str, float]:
-    """Compile, and record, what the shards of a step need; returns the seconds of one without that, by function."""
+    """Compile and record the kernels of a step's shards. Returns the seconds of each function without compilation."""
     task = make_tasks(problem, 0)[0]
     calls: list[tuple[Callable[..., Any], tuple[Task | Array, ...]]] = [(shard_gradient, (task,))]
     if problem.config.in_rounds:
@@ -120,9 +124,10 @@ def _warmed(problem: Problem) -> dict[str, float]:
 
 
 def opening_of(course: RunProgress, folder: Path, own: bool) -> tuple[Opening, Bundle]:
-    """What workers need of a run, `own`: which are this run's; `folder` is to write into.
+    """Return the data that workers need for a run. `own`: the workers belong to this run. `folder` is for temporary
+    files.
 
-    Raises OSError, and ConfigError where a file has changed since the run began.
+    Raises OSError, and ConfigError if a file has changed since the run began.
     """
     config, selection = course.problem.config, course.problem.selection
     bundle, here = bundle_of(config, {key: selection.array(key) for key in selection.keys}), digests(config)
@@ -138,7 +143,7 @@ def opening_of(course: RunProgress, folder: Path, own: bool) -> tuple[Opening, B
 
 
 class Engine:
-    """Computes shards on workers (`shards.Engine`), who are at a place that is called `where`."""
+    """Computes shards on workers (`shards.Engine`); `where` is the name of their place."""
 
     def __init__(self, crew: Crew, where: str) -> None:
         self.crew, self.where = crew, where
@@ -146,16 +151,16 @@ class Engine:
     def __call__(
         self, problem: Problem, function: Callable[..., Any], work: Sequence[tuple[Any, ...]]
     ) -> Iterator[tuple[int, Any]]:
-        """Yields place and result of each call as they come, and raises what one raised."""
+        """Yield index and result of each call as they arrive. Raises the errors of calls."""
         return self.crew.run(function, work, self.standing(problem))
 
     @staticmethod
     def standing(problem: Problem) -> Standing:
-        """What each worker is told before a round."""
+        """Return the parameters and tables that are sent to each worker before a round."""
         return Standing.of(problem)
 
     def spent(self) -> SharedTime:
-        """The time that it has taken by now."""
+        """Return the times so far."""
         rounds, workers = self.crew.spent, self.crew.by_worker.items()
         by_worker = {name: WorkerTime(one.calls, one.computing + one.standing, one.again) for name, one in workers}
         computing = rounds.computing + rounds.standing
@@ -164,9 +169,9 @@ class Engine:
 
 @contextlib.contextmanager
 def engine_at(course: RunProgress, place: Place, threads: int | None = None) -> Iterator[Engine]:
-    """The workers at a place, with a run's experiment; each with so many threads, or its share of the cores.
+    """Provide the workers at a place with a run's experiment. Each has `threads` threads, or its share of the cores.
 
-    Raises MachineError where there are none, or none that can be used.
+    Raises MachineError if there are no workers, or none that can be used.
     """
     with connected(place) as (client, folder):
         opening, bundle = opening_of(course, folder, own=place.address is None)

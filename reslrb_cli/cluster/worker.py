@@ -1,7 +1,7 @@
-"""What a worker does: it comes to what it works on, stands where a round of calls has it stand, and performs calls.
+"""The workers' side: a worker loads an `Opening`, sets the `Context` of a round of calls, and executes calls.
 
-A worker first comes to what it works on (`Opening`): it is sent files, once, and a function makes a state of them,
-which it keeps. A call is a function of that state, and of where it stands (`Context`), to a value that can be sent.
+An opening contains files, which are sent once, and a function that makes a state of them, which the worker keeps. A
+call is a function of this state and its context. Its value must be serialisable.
 """
 
 from __future__ import annotations
@@ -30,32 +30,32 @@ from reslrb_cli.records.manifest import versions
 
 
 class Context(Protocol):
-    """Where the state of all workers is to stand for a call; `digest` tells one from another."""
+    """The context that all workers set in their state before a call."""
 
     @property
     def digest(self) -> str:
-        """What tells it from others."""
+        """A digest of the context."""
 
     def take(self, state: Any) -> None:
-        """Bring a worker's state there."""
+        """Set this context in a worker's state."""
 
 
 @dataclass(frozen=True)
 class Anywhere:
-    """Where workers stand whose calls are functions of their arguments alone (`Context`)."""
+    """The `Context` of calls that depend only on their arguments."""
 
     digest: str = "anywhere"
 
     def take(self, state: Any) -> None:
-        """Leave the state as it is."""
+        """Leave the state unchanged."""
 
 
 @dataclass(frozen=True)
 class Opening:
-    """What workers work on: `function(folder, threads, *arguments)` makes the state of the files in a folder.
+    """The work of workers: `function(folder, threads, *arguments)` makes the state from the files in a folder.
 
-    It returns that, and the seconds that a call of each function takes whose kernels it has warmed, by name. `digest`
-    is of the files. `asks_for_code`: whether users' own code is to run, and the workers are not this run's own.
+    The function returns the state, and the seconds per call of each function whose kernels it has compiled, by name.
+    `digest` is that of the files. `asks_for_code`: users' own code must run, and the workers do not belong to this run.
     """
 
     digest: str
@@ -67,7 +67,7 @@ class Opening:
 
 @dataclass
 class _State:
-    """What a worker works on, and the digest of where it stands."""
+    """The state of a worker, and the digest of its context."""
 
     opening: str
     value: Any
@@ -82,14 +82,14 @@ ALLOW_CODE = "RESLRB_ALLOW_CODE"
 
 @dataclass(frozen=True)
 class Reply:
-    """What a worker says; `worker` is its address."""
+    """A worker's answer; `worker` is its address."""
 
     worker: str
 
 
 @dataclass(frozen=True)
 class Answer(Reply):
-    """The value of a call, and the seconds that it took to compute."""
+    """The value of a call, and the seconds of its computation."""
 
     value: Any
     seconds: float
@@ -97,15 +97,16 @@ class Answer(Reply):
 
 @dataclass(frozen=True)
 class Lacks(Reply):
-    """What a worker needs first: the opening's `files`, the `opening` itself, or the `context`."""
+    """The data that a worker lacks: the opening's `files`, the `opening` itself, or the `context`."""
 
     what: str
 
 
 @dataclass(frozen=True)
 class Fault(Reply):
-    """What is wrong with a worker's machine, and not with what was asked; `memory`: that is out; `stays`: also where
-    the worker is started anew."""
+    """A failure of a worker's machine instead of the call. `memory`: it has no memory left. `stays`: a restart does not
+    help.
+    """
 
     text: str
     memory: bool = False
@@ -113,7 +114,7 @@ class Fault(Reply):
 
 
 def open_state(opening: Opening, files: Mapping[str, bytes] | None, threads: int) -> Reply:
-    """Have this worker come to what it works on."""
+    """Load an opening in this worker."""
     global _state
     begin, me = time.perf_counter(), get_worker().address
     here = versions()
@@ -138,7 +139,7 @@ def open_state(opening: Opening, files: Mapping[str, bytes] | None, threads: int
 
 
 def _take_device(name: object) -> None:
-    """Of the GPUs that this machine shows have a worker that is known by its number see one alone, in turn."""
+    """Let a worker that is known by its number see only one of its machine's GPUs, in turn."""
     listed = os.environ.get("CUDA_VISIBLE_DEVICES")
     found = listed.split(",") if listed else [str(k) for k, _ in enumerate(Path("/proc/driver/nvidia/gpus").glob("*"))]
     if isinstance(name, int) and len(found) > 1:
@@ -146,7 +147,7 @@ def _take_device(name: object) -> None:
 
 
 def stand(opening: str, context: Context) -> Reply:
-    """Bring the state to `context`."""
+    """Set the context of the state."""
     begin, me = time.perf_counter(), get_worker().address
     if _state is None or _state.opening != opening:
         return Lacks(me, "opening")
@@ -161,7 +162,7 @@ def stand(opening: str, context: Context) -> Reply:
 
 
 def perform(opening: str, context: str, function: Callable[..., Any], arguments: Sequence[Any]) -> Reply:
-    """What `function` says of the state, which stands at `context`, and of `arguments`."""
+    """Return the value of `function` for the state with `context`, and `arguments`."""
     begin, me = time.perf_counter(), get_worker().address
     if _state is None or _state.opening != opening:
         return Lacks(me, "opening")
@@ -174,7 +175,7 @@ def perform(opening: str, context: str, function: Callable[..., Any], arguments:
 
 
 def _fault(error: Exception) -> Fault:
-    """What a worker's machine failed in. Raises what is the call's own fault, as an error that can be sent."""
+    """Return the failure of a worker's machine. Raises the errors of calls in a form that can be sent."""
     me = get_worker().address
     if is_out_of_memory(error):
         return Fault(me, one_line(str(error)), memory=True)
@@ -186,6 +187,6 @@ def _fault(error: Exception) -> Fault:
 
 
 def whereabouts() -> tuple[str, tuple[int, ...]]:
-    """This process's machine, and the cores that it may use."""
+    """Return this process's machine, and the cores that it may use."""
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
     return os.uname().nodename, tuple(sorted(cores))

@@ -1,1 +1,1 @@
-"""The configuration: one YAML file is one experiment. Knows no Mitsuba."""
+"""The configuration: one YAML file describes one experiment. Does not import Mitsuba."""

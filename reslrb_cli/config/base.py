@@ -1,4 +1,4 @@
-"""The basis of all sections of the configuration: strictness, paths, unions told apart by their `type`, numbers."""
+"""Base classes and validators of the configuration's sections: strict types, paths, unions by `type`, numbers."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ SEED_END = 2**32
 
 
 class Section(BaseModel):
-    """A mapping of the file: unknown keys are errors, values are not converted, NaN and infinity are refused.
+    """A mapping of the file. Unknown keys are errors, values are not converted, and NaN and infinity are refused.
 
-    What a setting means is its `description`, or the docstring below it.
+    The meaning of a setting is in its `description`, or in the docstring below it.
     """
 
     model_config = ConfigDict(
@@ -38,17 +38,17 @@ class Section(BaseModel):
 
 
 def located(key: str, message: str) -> PydanticCustomError:
-    """An error to raise in a validator of a whole section, located at `key` below that section."""
+    """Return an error for a validator of a section, located at `key` below this section."""
     return PydanticCustomError("located", "{message}", {"key": key, "message": message})
 
 
 def wrong(message: str) -> PydanticCustomError:
-    """An error to raise in a validator of one value: `message` says what the value must be."""
+    """Return an error for a validator of one value. `message` says what the value must be."""
     return PydanticCustomError("wrong", "{message}", {"message": message})
 
 
 def must(hold: Callable[[Any], bool], message: Callable[[Any], str]) -> AfterValidator:
-    """The check of a value that has its type already; `message` says of one that does not hold what it must be."""
+    """Return a validator for a value of the right type. `message` says what the value must be."""
 
     def check(value: Any) -> Any:
         if not hold(value):
@@ -66,10 +66,10 @@ NEEDS_TYPE: dict[str, Any] = {"required": ["type"]}
 
 
 class Choice(Section):
-    """A section whose `type` says which options it has."""
+    """A section whose `type` determines its options."""
 
     def options(self) -> dict[str, Any]:
-        """The options of this type by name, without `type` and without those that are None."""
+        """Return the options of this type by name, without `type` and without options that are None."""
         return self.model_dump(exclude={"type"}, exclude_none=True)
 
 
@@ -77,12 +77,12 @@ class Choice(Section):
 
 
 def _folder(info: ValidationInfo) -> Path:
-    """The folder of the config file, where one is known."""
+    """Return the folder of the configuration file, or the working directory."""
     return Path((info.context or {}).get("folder", "")).absolute()
 
 
 def _path(folder: Path, value: Any) -> Path:
-    """The path `value`, relative to `folder`. Joined, not resolved: `..` after a symbolic link is the system's."""
+    """Return the path `value` relative to `folder`. `..` is not resolved, because it may follow a symbolic link."""
     if not isinstance(value, (str, Path)) or not str(value).strip() or "\0" in str(value):
         raise wrong("must be a path")
     try:
@@ -103,12 +103,12 @@ ConfigPath = Annotated[Path, BeforeValidator(lambda value, info: config_path(val
 
 
 def config_path(value: Any, info: ValidationInfo) -> Path:
-    """A path relative to the folder of the config file, absolute. Raises an error to be raised in a validator."""
+    """Return an absolute path from a path relative to the configuration file's folder. Raises a validator's error."""
     return _path(_folder(info), value)
 
 
 def code_place(value: Any, info: ValidationInfo) -> str:
-    """FILE.py:NAME with the path joined to the folder of the configuration; raises as `config_path`."""
+    """Return FILE.py:NAME with an absolute path. Raises as `config_path` does."""
     path, colon, name = str(value).rpartition(":") if isinstance(value, str) else ("", "", "")
     if not (colon and path.endswith(".py") and name.isidentifier()):
         raise wrong("must be FILE.py:NAME, a file of Python code and the name of what is meant in it")
@@ -120,7 +120,7 @@ CodePlace = Annotated[str, BeforeValidator(code_place)]
 
 
 def code_file(place: str) -> Path:
-    """The file of a `CodePlace`."""
+    """Return the file of a `CodePlace`."""
     return Path(place.rpartition(":")[0])
 
 
@@ -136,12 +136,12 @@ MARK = "\0"
 
 
 def mark(name: str) -> Tag:
-    """The tag of a union's member."""
+    """Return the tag of a union's member."""
     return Tag(MARK + name)
 
 
 class ByType(Discriminator):
-    """Tells the members of a union apart by their key `type`, `default` where it is left out."""
+    """Discriminates the members of a union by their key `type`; `default` applies without it."""
 
     def __init__(self, default: str) -> None:
         def tag(value: Any) -> str | None:
@@ -157,9 +157,9 @@ class ByType(Discriminator):
 
 
 def by_kind(expected: str, word: str | None = None) -> Discriminator:
-    """Tells the members of a union apart by the kind of the value; `expected` says in an error what is right.
+    """Discriminate the members of a union by the kind of the value. `expected` describes valid values in errors.
 
-    Tags: `mapping`, `list`, `number`, and `text` for `word`, the only text that the union knows.
+    The tags are `mapping`, `list`, `number`, and `text` for `word`, the only text in the union.
     """
     return Discriminator(
         lambda value: kind_tag(value, word), custom_error_type="wrong", custom_error_message=f"must be {expected}"
@@ -167,7 +167,7 @@ def by_kind(expected: str, word: str | None = None) -> Discriminator:
 
 
 def kind_tag(value: Any, word: str | None = None) -> str | None:
-    """The tag of `by_kind` for a value."""
+    """Return the tag of `by_kind` for a value."""
     if isinstance(value, (dict, Section)):
         return MARK + "mapping"
     if isinstance(value, (list, tuple)):
@@ -181,12 +181,12 @@ def kind_tag(value: Any, word: str | None = None) -> str | None:
 
 
 def list_of_one(value: Any) -> Any:
-    """A name or a path as a list of it; what is none stays."""
+    """Return a name or a path as a list with one entry; other values are unchanged."""
     return [value] if isinstance(value, (str, Path)) else value
 
 
 def each_once(value: list[Any]) -> bool:
-    """Whether nothing stands twice in a list."""
+    """Whether no value occurs twice in a list."""
     return len(set(value)) == len(value)
 
 
@@ -201,7 +201,7 @@ Size = Annotated[tuple[Count, Count], Field(strict=False)]
 
 
 def few(what: str, reason: str = "") -> AfterValidator:
-    """The check of a size that has a bounded number of pixels, or `what` they are called there."""
+    """Return a validator for sizes whose product is limited; `what` names their unit in errors."""
     return must(
         lambda size: size[0] * size[1] <= PIXELS,
         lambda size: f"must have at most {PIXELS} {what}, not {size[0] * size[1]}{reason}",

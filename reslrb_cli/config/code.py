@@ -1,8 +1,8 @@
-"""A user's own Python code, named as FILE.py:NAME: a loss, or an integrator (`type: custom`).
+"""A user's own Python code, given as FILE.py:NAME: a loss, or an integrator (`type: custom`).
 
-A file is run with the user's rights, and nothing looks at what it does: so it is run only where the command line, or
-the caller in Python, allows it (`Config.with_code`), which no YAML can, and not before it is called for. Commands that
-read, show or export a run call for nothing.
+The code runs with the user's rights and without inspection. It therefore runs only if the command line or a Python
+caller allows it (`Config.with_code`), which YAML cannot do, and only when it is needed. Commands that read, show or
+export a run do not need it.
 """
 
 from __future__ import annotations
@@ -20,10 +20,9 @@ from reslrb_cli.errors import ConfigError, describe, is_machine_fault, is_out_of
 
 
 def load_named(file: Path, name: str, source: object, key: str) -> Callable[..., Any]:
-    """What the file calls `name`, once it is run. Files beside it can be imported by it, behind all other modules.
+    """Run a file and return the object `name`. The file can import modules from its folder, after all others.
 
-    Raises ConfigError, located at `key` of `source`, where it cannot be read or run, or has nothing callable of that
-    name.
+    Raises ConfigError, located at `key` of `source`, if the file cannot be read or run, or has no callable `name`.
     """
     try:
         text = read_file(file)
@@ -45,7 +44,7 @@ def load_named(file: Path, name: str, source: object, key: str) -> Callable[...,
 
 
 class Guard:
-    """While this is entered, what a user's code raises becomes one located line; what the machine raises stays."""
+    """Converts errors of a user's code to one located line. Errors of the machine pass unchanged."""
 
     def __init__(self, source: object, key: str, file: Path | None, what: str) -> None:
         self.source, self.key, self.file, self.what = source, key, file, what

@@ -1,4 +1,4 @@
-"""From pydantic's list of errors to one located line that says what would be right."""
+"""Conversion of pydantic's errors to one located line that also says what would be right."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ REMOVED = {
 
 
 def _removed(location: Location, value: Any = None) -> str | None:
-    """Return what to do in place of a removed key, or of a removed `value` of a key; None of others."""
+    """Return a replacement for a removed key, or for a removed `value` of a key; None if nothing was removed."""
     names = ".".join([part for part in location if isinstance(part, str)][-2:])
     advice = REMOVED.get(names if value is None else f"{names}: {value}")
     return None if advice is None else f"was removed; {advice}"
@@ -69,9 +69,9 @@ def _removed(location: Location, value: Any = None) -> str | None:
 
 @dataclass(frozen=True)
 class Problem:
-    """One error: where it is, in the notation of `--set`, and what is wrong; `explain` says what would be right.
+    """One error: its location in the notation of `--set`, and its description. `explain` says what would be right.
 
-    `unknown` is pydantic's location of a key that is not known, whose nearest known key takes time to find.
+    `unknown` is pydantic's location of an unknown key. The search for its nearest known key takes time.
     """
 
     key: str
@@ -79,12 +79,14 @@ class Problem:
     unknown: tuple[int | str, ...] | None = None
 
     def explain(self) -> str:
-        """What is wrong, and what would be right."""
+        """Describe the error and what would be right."""
         return self.message if self.unknown is None else _unknown_key(self.unknown)
 
 
 def problems(error: ValidationError, data: Any) -> list[Problem]:
-    """The problems that `error` reports of `data`, each once; unknown keys first, as they explain missing ones."""
+    """Return the errors that `error` reports for `data`, each once. Unknown keys come first, since they explain missing
+    ones.
+    """
     found = dict.fromkeys(_problem(detail, data) for detail in error.errors(include_url=False))
     return sorted(found, key=lambda problem: problem.unknown is None)
 
@@ -126,7 +128,9 @@ def _problem(detail: ErrorDetails, data: Any) -> Problem:
 
 
 def _location(loc: tuple[int | str, ...], data: Any) -> Location:
-    """pydantic's location without what is not in the file: tags of unions, the index into a list that we made."""
+    """Return pydantic's location without parts that are not in the file: tags of unions, and indices of lists made
+    here.
+    """
     location: list[str | int] = []
     for part in loc:
         if _is_tag(part) or (isinstance(part, int) and isinstance(data, str)):
@@ -151,14 +155,14 @@ def _join(key: str, below: str) -> str:
 
 
 def _sections(annotation: Any) -> list[type[Section]]:
-    """The section classes that an annotation names, at any depth."""
+    """Return the section classes in an annotation, at any depth."""
     if isinstance(annotation, type) and issubclass(annotation, Section):
         return [annotation]
     return [section for argument in get_args(annotation) for section in _sections(argument)]
 
 
 def _candidates(loc: tuple[int | str, ...]) -> tuple[list[type[Section]], type[Section]]:
-    """All sections that could stand at `loc`, and the one that was chosen there."""
+    """Return all sections that are possible at `loc`, and the one that was chosen there."""
     union: list[type[Section]] = [Config]
     chosen: type[Section] = Config
     for part in loc:
@@ -175,7 +179,7 @@ def _type_name(section: type[Section]) -> str | None:
 
 
 def _tag(section: type[Section]) -> str | None:
-    """What marks a section as a member of a union."""
+    """Return the tag of a section as member of a union."""
     return getattr(section, "TAG", None) or _type_name(section)
 
 
@@ -195,12 +199,12 @@ def _unknown_key(loc: tuple[int | str, ...]) -> str:
 
 
 def _nearest(word: str, known: Iterable[str]) -> list[str]:
-    """The known word that is most like `word`, if any is."""
+    """Return the most similar known word, if there is one."""
     return difflib.get_close_matches(word.lower(), list(known), n=1)
 
 
 def _below(section: type[Section], name: str, key: str) -> list[str]:
-    """Where `key` is known one level below `section`, which stands at `name`."""
+    """Return where `key` is known one level below `section`, which is at `name`."""
     return [
         _join(name, f"{child}.{key}")
         for child, field in section.model_fields.items()
@@ -219,7 +223,7 @@ def _one_of(known: list[str], value: Any) -> str:
 
 
 def _but_is(message: str, value: Any) -> str:
-    """`message` and, where it fits into a line, what stands there instead."""
+    """Add the actual value to `message` if it fits in a line."""
     if isinstance(value, bool):
         shown = str(value).lower()
     elif value is None:

@@ -1,4 +1,4 @@
-"""Bounds of settings, each with its reason, and the reading of files that a user names."""
+"""Limits of settings, each with its reason, and functions that read the user's files."""
 
 from __future__ import annotations
 
@@ -38,8 +38,9 @@ PIXELS = 2**27
 
 
 def as_path(given: object, name: str, what: str) -> Path:
-    """Return the path that the argument `name` of a call is. Raises ConfigError for another object, and names `what`
-    the call takes."""
+    """Return the path in the argument `name` of a call. Raises ConfigError for other objects; `what` names valid
+    arguments.
+    """
     if isinstance(given, (str, os.PathLike)):
         return Path(given)
     raise ConfigError(name, "", f"is {one_line(repr(given), 60)}, not {what}")

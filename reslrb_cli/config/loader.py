@@ -1,6 +1,6 @@
-"""The reader of configurations, from a file and from `--set`, or from a script; it also writes them as resolved.
+"""Reader of configurations from files, `--set` and scripts. It also writes resolved configurations.
 
-`--set a.b=value` is a value, typed as YAML, at a place in the configuration.
+`--set a.b=value` sets a value, typed as in YAML, at a location of the configuration.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _PART = re.compile(r"\[(\d+)\]|(?:^|\.)([^.\[\]]+)")
 
 @dataclass(frozen=True)
 class Override:
-    """One `--set`: `label` as it is named in errors, the place, and the value."""
+    """One `--set`: its `label` in errors, its location, and its value."""
 
     label: str
     location: Location
@@ -39,7 +39,7 @@ class Override:
 
 
 def parse_override(text: str, option: str = "--set", example: str = "KEY=VALUE, such as run.spp=32") -> Override:
-    """An override from `a.b=value`, which `option` was given. Raises ConfigError where `text` is none."""
+    """Parse `a.b=value`, an argument of `option`. Raises ConfigError for other text."""
     label = f"{option} {one_line(text, 100)}"
     path, equals, value = text.partition("=")
     path = path.strip()
@@ -71,17 +71,17 @@ def _parse_location(path: str, label: str) -> Location:
 
 
 def apply(data: dict[str, Any], override: Override) -> dict[str, Any]:
-    """A copy of `data` with the override's value in its place; sections on the way are made.
+    """Return a copy of `data` with the override's value. Missing sections on the way are created.
 
-    What is not on the way is shared with `data`. Raises ConfigError where the place cannot be: an index out of range, a
-    key below a value that has none.
+    Other parts are shared with `data`. Raises ConfigError if the location is impossible: an index out of range, or a
+    key below a plain value.
     """
     result: dict[str, Any] = _put(data, override, 0)
     return result
 
 
 def _put(at: Any, override: Override, depth: int) -> Any:
-    """The same for what stands at the first `depth` parts of the place."""
+    """Apply an override to the value at the first `depth` parts of its location."""
     if depth == len(override.location):
         return override.value
     part, name = override.location[depth], format_location(override.location[:depth])
@@ -104,28 +104,32 @@ def _put(at: Any, override: Override, depth: int) -> Any:
 
 
 def load(path: Path | str, overrides: Sequence[str | Override] = ()) -> Config:
-    """The configuration in the YAML file `path`, with `overrides` such as "run.spp=32" put in, in their order.
+    """Return the configuration in the YAML file `path`, with `overrides` such as "run.spp=32" applied in their order.
 
-    Raises ConfigError, located by the file (or the override that is at fault) and the key.
+    Raises ConfigError with the key and the file, or the wrong override.
     """
     return loads(read_text(Path(path), str(path)), path, overrides)
 
 
 def loads(text: str, path: Path | str, overrides: Sequence[str | Override] = ()) -> Config:
-    """The same from the text of a file; `path` names it, and paths in it are relative to where that is."""
+    """Return the configuration in a text. `path` names it, and relative paths start at its folder."""
     parsed = [parse_override(each) if isinstance(each, str) else each for each in overrides]
     return resolve(parse(text, str(path)), path, parsed)
 
 
 def replaces(location: Location, earlier: Mapping[str, Location]) -> str | None:
-    """What is wrong with a setting at `location` that leaves nothing of one of the `earlier` ones; None without one."""
+    """Return what is wrong with an override at `location` that replaces one of the `earlier` ones; None if it
+    does not.
+    """
     name = next((name for name, other in earlier.items() if other[: len(location)] == location), None)
     return None if name is None else f"replaces what {name} sets; give it first, or remove one of them"
 
 
 def overrides_of(given: Mapping[str, object] | None) -> list[Override]:
-    """The overrides of a script: keys as `--set` has them, values as YAML would have made them. Raises ConfigError,
-    also for one that leaves nothing of another before it."""
+    """Return the overrides of a script: keys as for `--set`, and Python values.
+
+    Raises ConfigError, also if one override replaces another before it.
+    """
     if given is not None and not isinstance(given, Mapping):
         reason = f'is {one_line(repr(given), 60)}, not a mapping such as {{"run.iterations": 5}}'
         raise ConfigError(OVERRIDDEN, "", reason)
@@ -141,8 +145,10 @@ def overrides_of(given: Mapping[str, object] | None) -> list[Override]:
 
 
 def plain(value: Any, source: object, key: str = "") -> Any:
-    """What YAML would have made of a value from a script: paths are text, tuples lists, NumPy's numbers and arrays
-    Python's. Raises ConfigError, located by `source` and `key`, for what YAML does not have."""
+    """Convert a Python value to plain data as from YAML: paths to text, tuples to lists, NumPy values to Python's.
+
+    Raises ConfigError, located by `source` and `key`, for other objects.
+    """
     if isinstance(value, Mapping):
         for name in value:
             if not isinstance(name, str):
@@ -161,7 +167,7 @@ def plain(value: Any, source: object, key: str = "") -> Any:
 
 
 def changed(config: Config, overrides: Sequence[str | Override]) -> Config:
-    """The same experiment with overrides put in; it keeps its own loss and the permission to run code.
+    """Return the experiment with overrides applied. It keeps its own loss function and the permission to run code.
 
     Raises ConfigError.
     """
@@ -172,9 +178,9 @@ def changed(config: Config, overrides: Sequence[str | Override]) -> Config:
 
 
 def resolve(data: Any, path: Path | str, parsed: Sequence[Override] = ()) -> Config:
-    """The configuration of settings as they were read, with overrides put in; `path` names where they come from.
+    """Validate settings with overrides applied. `path` names their origin.
 
-    Raises ConfigError, located by the file (or the override that is at fault) and the key.
+    Raises ConfigError with the key and the file, or the wrong override.
     """
     source = str(path)
     if data is None and not parsed:
@@ -195,13 +201,15 @@ def resolve(data: Any, path: Path | str, parsed: Sequence[Override] = ()) -> Con
 
 
 def told(first: Mapping[str, Any]) -> Config:
-    """The configuration that a process is told of first (`Measurement.first`), by one that had checked it."""
+    """Return the configuration in a process's first message (`Measurement.first`). The sender has validated it."""
     return loads(first["config"], first["source"]).with_code(first.get("allow_code") is True)
 
 
 def check_code(config: Config, codes: Mapping[str, Custom | Own] | None = None) -> None:
-    """Raise ConfigError, located by the key, where code that users have written is not to be run; None for all of the
-    experiment's. Nothing is loaded."""
+    """Raise ConfigError, located by the key, if users' code must not run. Loads nothing.
+
+    `codes` are the places of code; None: all of the experiment's.
+    """
     for key, one in (config.codes if codes is None else codes).items():
         if one.file is None and config.own_loss is None:
             reason = "missing; give FILE.py:NAME, or in Python the same function as at the start of the run"
@@ -212,9 +220,9 @@ def check_code(config: Config, codes: Mapping[str, Custom | Own] | None = None) 
 
 
 def _blame(stages: list[dict[str, Any]], overrides: Sequence[Override], problem: Problem, path: Path) -> str:
-    """Who made `problem`: an override without which it is not there yet, and with which it is; else the file.
+    """Return the origin of `problem`: the override that causes it, or the file.
 
-    `stages` hold the file's settings, and those after each override. Found by halving: a check takes time.
+    `stages` hold the file's settings, and those after each override. Uses bisection, since a check takes time.
     """
     without, having = 0, len(stages) - 1
     if having == 0 or problem in _validate(stages[0], path)[1]:
@@ -229,10 +237,9 @@ def _blame(stages: list[dict[str, Any]], overrides: Sequence[Override], problem:
 
 
 def with_integrator(config: Config, values: dict[str, Any], blame: str, adjoint: dict[str, Any]) -> Config:
-    """The same experiment with the integrator that `values` describe, and other settings of `run.adjoint`.
+    """Return the experiment with the integrator of `values`, and other settings of `run.adjoint`.
 
-    `adjoint` holds `adjoint` and what goes with it, or nothing, and all stays as it is. Raises ConfigError that names
-    `blame`.
+    `adjoint` has `adjoint` and its related settings, or is empty for no change. Raises ConfigError that names `blame`.
     """
     data = config.model_dump(mode="json", exclude_none=True) | {"integrator": values}
     if "adjoint" in adjoint:
@@ -245,12 +252,12 @@ def with_integrator(config: Config, values: dict[str, Any], blame: str, adjoint:
 
 
 def dump(config: Config) -> str:
-    """The configuration as YAML, with every default and absolute paths; `load` reads it back as an equal one."""
+    """Return the configuration as YAML, with all defaults and absolute paths. `load` reads it back as an equal one."""
     return write(config.model_dump(mode="json", exclude_none=True))
 
 
 def read_text(path: Path, source: str) -> str:
-    """The text of a configuration file, which `source` names in errors. Raises ConfigError where it is none."""
+    """Return the text of a configuration file, named `source` in errors. Raises ConfigError if it is not text."""
     try:
         return read_file(path).decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -258,7 +265,7 @@ def read_text(path: Path, source: str) -> str:
 
 
 def _validate(raw: dict[str, Any], path: Path) -> tuple[Config | None, list[Problem]]:
-    """The configuration, or the problems that `raw` has."""
+    """Return the configuration, or the errors in `raw`."""
     # a section whose lines are all commented out reads as null
     data = {key: value for key, value in raw.items() if value is not None or key not in Config.model_fields}
     run = data.setdefault("run", {})

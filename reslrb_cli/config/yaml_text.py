@@ -1,7 +1,7 @@
-"""YAML 1.2 to plain data and back.
+"""Conversion between YAML 1.2 and plain data.
 
-PyYAML alone reads YAML 1.1, where `1e-3` is text, `no` is false, `010` is 8 and `1:30` is 90. `Loader` has it read by
-the rules of YAML 1.2, and build plain data alone; `parse` and `write` are the two ways.
+PyYAML by itself reads YAML 1.1, in which `1e-3` is text, `no` is false, `010` is 8 and `1:30` is 90. `Loader` applies
+the rules of YAML 1.2, and creates only plain data. `parse` and `write` are the interface.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ INTEGER_END = 2**64
 
 
 class Loader(yaml.SafeLoader):
-    """One text being read; `at` names a line of it in errors."""
+    """Reads one text; `at` names a line of it in errors."""
 
     yaml_implicit_resolvers: dict[str, list[Any]] = {}  # noqa: RUF012 (PyYAML's own convention)
     yaml_constructors = {  # noqa: RUF012
@@ -42,7 +42,7 @@ class Loader(yaml.SafeLoader):
         self._at = at
 
     def fail(self, mark: yaml.Mark | None, message: str) -> ConfigError:
-        """The error for what stands at `mark`."""
+        """Return the error at `mark`."""
         return ConfigError(self._at(0 if mark is None else mark.line + 1), "", message)
 
 
@@ -99,7 +99,7 @@ _ALIAS = re.compile(r"\*[^\s,\]}]*")
 
 
 def format_location(location: Location) -> str:
-    """A place in the file as it is written in messages and in `--set`: `parameters[0].bounds`."""
+    """Return a location as in messages and `--set`: `parameters[0].bounds`."""
     text = ""
     for part in location:
         if isinstance(part, int):
@@ -110,11 +110,11 @@ def format_location(location: Location) -> str:
 
 
 def parse(text: str, source: str, name_line: bool = True, example: Callable[[str], str] | None = None) -> Any:
-    """Plain data from YAML `text`; `source` names it in errors, with the line where `name_line` says so.
+    """Return the plain data in YAML `text`. `source` names it in errors, with the line if `name_line`.
 
-    The keys of all mappings are text without control characters. `example` shows how a mended text is to be written
-    where it came from. Raises ConfigError where the text is not YAML, holds a tag that is not plain data, a key twice,
-    or one that is no text, or nests its values too deeply.
+    The keys of all mappings are text without control characters. `example` shows how a corrected text is written at its
+    origin. Raises ConfigError if the text is not YAML, has tags other than plain data, duplicate keys, or keys that are
+    not text, or is nested too deeply.
     """
 
     def at(line: int) -> str:
@@ -145,7 +145,7 @@ def parse(text: str, source: str, name_line: bool = True, example: Callable[[str
 
 
 def _problem(error: yaml.MarkedYAMLError, text: str, example: Callable[[str], str] | None) -> str:
-    """What is wrong, in a line; where it is text that wants quotes, with the quotes."""
+    """Describe the error in one line. If text must be quoted, show it with quotes."""
     problem = ", ".join(part for part in (error.context, error.problem) if part)
     mark = error.context_mark or error.problem_mark
     word = None if mark is None else _ALIAS.match(text, mark.index)
@@ -160,7 +160,7 @@ def _problem(error: yaml.MarkedYAMLError, text: str, example: Callable[[str], st
 
 
 def _check_keys(node: yaml.Node, at: Callable[[int], str], location: Location, seen: set[int]) -> None:
-    """Raise where a key is no text, or stands twice in its mapping."""
+    """Raise an error if a key is not text, or occurs twice in its mapping."""
     if id(node) in seen:  # an alias
         return
     seen.add(id(node))
@@ -185,7 +185,7 @@ def _check_keys(node: yaml.Node, at: Callable[[int], str], location: Location, s
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes what any reader of YAML 1.1 or 1.2 would take for something else than text."""
+    """Quotes text that a reader of YAML 1.1 or 1.2 would take for another type."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -202,5 +202,5 @@ _Dumper.add_representer(list, _represent_list)
 
 
 def write(data: Any) -> str:
-    """YAML of plain `data`, mappings in block style in their own order, lists of scalars on one line."""
+    """Return YAML for plain `data`: mappings in block style in their own order, lists of scalars on one line."""
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=False)

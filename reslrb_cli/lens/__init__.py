@@ -1,1 +1,3 @@
-"""From a picture to a surface that throws it: transport of light (`transport.py`), rays and heights (`surface.py`)."""
+"""From a picture to the surface whose caustic shows it: optimal transport (`transport.py`), rays and heights
+(`surface.py`).
+"""

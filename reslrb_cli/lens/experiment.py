@@ -1,9 +1,9 @@
-"""What `reslrb lens` writes about a face: the scene, its mesh and the configuration that shapes it further.
+"""The files that `reslrb lens` writes for a face: the scene, its mesh, and the configuration that refines the face.
 
-Text and arrays alone, in millimetres and by the axes of `surface.py`. The lamp of parallel light is as large as the
-face looks from it: its beam meets the face and nothing beside. A light of the sun's angle is `SUNS` such lamps, a point
-light a spot whose cone ends at the face's corners. The mount is black about the face. The camera stands on the
-receiver's normal: a point, which throws no shadow.
+Contains only text and arrays, in millimetres, with the axes of `surface.py`. The lamp of parallel light is as large as
+the face in its direction, so its beam meets exactly the face. A light with the sun's angular diameter consists of
+`SUNS` such lamps. A point light is a spot whose cone ends at the face's corners. The mount around the face is black.
+The camera is a point on the receiver's normal, and throws no shadow.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ _LEAST = 0.02
 
 
 def leaving(surface: Surface) -> float:
-    """Light (mm^2) that leaves the face, of parallel light of irradiance 1, or of a point light of intensity 1."""
+    """Return the light (mm^2) that leaves the face, for parallel light of irradiance 1 or a point light of
+    intensity 1.
+    """
     setting = surface.setting
     h, (ny, nx) = surface.heights, surface.heights.shape
     gy, gx = (np.gradient(h, step, axis=i) for i, step in enumerate((setting.size[1] / ny, setting.size[0] / nx)))
@@ -49,14 +51,18 @@ def leaving(surface: Surface) -> float:
 
 
 def vertices(setting: Setting, nx: int, ny: int) -> tuple[Array, Array]:
-    """x and y (mm; ny, nx) of the vertices of a face, from edge to edge; each lies at a texel's centre of the map."""
+    """Return x and y (mm; ny, nx) of a face's vertices, from edge to edge. Each is at the centre of a texel of
+    the map.
+    """
     x, y = (np.linspace(-side / 2, side / 2, n) for side, n in zip(setting.size, (nx, ny), strict=True))
     xs, ys = np.meshgrid(x, y)
     return xs, ys
 
 
 def at_vertices(surface: Surface, nx: int, ny: int) -> Array:
-    """Heights (ny, nx) at `vertices`: cubic between the cells of a surface, and parabolas on to its edges."""
+    """Return heights (ny, nx) at `vertices`: by cubic interpolation between cells, and parabolic extrapolation to the
+    edges.
+    """
     h = surface.heights
     for axis in (0, 1):
         h = np.moveaxis(h, axis, 0)
@@ -70,9 +76,9 @@ def at_vertices(surface: Surface, nx: int, ny: int) -> Array:
 
 
 def face_ply(setting: Setting, nx: int, ny: int, back: bool = False) -> bytes:
-    """The flat face as a binary PLY: a grid with normals along +z and texture coordinates, v along y.
+    """Return the flat face as a binary PLY: a grid with normals along +z and texture coordinates, v along y.
 
-    The `back` lies at z = -thickness with normals along -z.
+    The `back` is at z = -thickness with normals along -z.
     """
     x, y = vertices(setting, nx, ny)
     u, v = np.meshgrid((np.arange(nx) + 0.5) / nx, (np.arange(ny) + 0.5) / ny)
@@ -89,15 +95,18 @@ def face_ply(setting: Setting, nx: int, ny: int, back: bool = False) -> bytes:
 
 
 def film_size(shape: tuple[int, int], margin: float) -> tuple[int, int]:
-    """(width, height) of a film that sees a picture of (rows, columns) and `margin` of its longer side about it."""
+    """Return (width, height) of a film that sees a picture of (rows, columns) with a margin, a fraction of its longer
+    side.
+    """
     beside = round(margin * max(shape))
     return shape[1] + 2 * beside, shape[0] + 2 * beside
 
 
 def target_image(picture: Array, surface: Surface, margin: float) -> tuple[Array, float]:
-    """What the film is to see, and the light's irradiance or intensity with which its mean inside of the picture is 1.
+    """Return the wanted image (H, W), and the light's irradiance or intensity for a mean of 1 inside the picture.
 
-    (H, W), of the picture (luminance, row 0 at the top) with its dark parts lifted to the floor. No light is lost.
+    The image shows the luminance of the picture, row 0 at the top. Pixels darker than the floor are lifted to the
+    floor. No light is lost.
     """
     setting = surface.setting
     target = on_film(np.maximum(picture, surface.floor * picture.max()), surface, margin)
@@ -105,7 +114,7 @@ def target_image(picture: Array, surface: Surface, margin: float) -> tuple[Array
 
 
 def on_film(picture: Array, surface: Surface, margin: float) -> Array:
-    """A picture (rows, columns) as the film (H, W) sees it, its mean 1, with black about it."""
+    """Return a picture (rows, columns) on the film (H, W), with mean 1 and black around it."""
     width, height = film_size((picture.shape[0], picture.shape[1]), margin)
     film = np.zeros((height, width))
     top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
@@ -115,7 +124,10 @@ def on_film(picture: Array, surface: Surface, margin: float) -> Array:
 
 
 def lamps(surface: Surface, power: float, sun: float) -> str:
-    """The light: parallel, of a sun's diameter (degrees), or a point's; `power` is its irradiance, or intensity."""
+    """Return the XML of the light: parallel, with the sun's diameter (degrees), or a point light.
+
+    `power` is its irradiance or intensity.
+    """
     setting, rays = surface.setting, Rays(surface.setting)
     beam = rays.toward
     if np.isfinite(setting.light_distance):
@@ -153,7 +165,9 @@ def lamps(surface: Surface, power: float, sun: float) -> str:
 
 
 def _half_cone(surface: Surface) -> float:
-    """The angle (radians) between a point light's axis and its rays to a face's corners, or on average to its edge."""
+    """Return the angle (radians) between a point light's axis and its rays to a face's corners, or to a round edge on
+    average.
+    """
     setting, rays = surface.setting, Rays(surface.setting)
     is_round = setting.outline == "round"
     turn = np.radians(np.arange(0, 360, 5) if is_round else np.array([45, 135, 225, 315]))
@@ -170,9 +184,9 @@ def _half_cone(surface: Surface) -> float:
 def scene_xml(
     surface: Surface, film: tuple[int, int], pixels: int, power: float, sun: float = 0.0, both: bool = False
 ) -> str:
-    """The scene of a face; `pixels` of the `film`'s width are the picture's. `power` and `sun` are those of `lamps`.
+    """Return the XML of a face's scene. `pixels` is the width of the picture in pixels, on a `film` with a margin.
 
-    With `both` the back is a mesh, `back.ply`, too.
+    `power` and `sun` are those of `lamps`. With `both`, the back is a mesh as well, `back.ply`.
     """
     setting, rays = surface.setting, Rays(surface.setting)
     is_lens = setting.kind == "lens"
@@ -262,8 +276,9 @@ def scene_xml(
 def lens_yaml(
     surface: Surface, heights: NDArray[Any], name: str, iterations: int, sun: float = 0.0, both: bool = False
 ) -> str:
-    """The configuration, which begins at these `heights` (ny, nx), those in `start.exr`; the back, where it is free,
-    begins flat."""
+    """Return the configuration. It starts at these `heights` (ny, nx), which `start.exr` holds; a free back starts
+    flat.
+    """
     s, (ny, nx) = surface.setting, heights.shape
     least = min(_LEAST * max(s.size), float(heights.min()) + s.thickness)
     plate = f"type: thickness, thickness: {s.thickness:.9g}, least: {least:.4g}, weight: {1e6 / max(s.size) ** 4:.4g}"
@@ -322,7 +337,9 @@ def _rectangle(id: str, size: tuple[float, float], middle: Array, normal: Array,
 
 
 def _plane(type: str, id: str, size: tuple[float, float], middle: Array, normal: Array, up: Array, content: str) -> str:
-    """A rectangle, or a disk, that faces along `normal`, its height along what of `up` is across that."""
+    """Return the XML of a rectangle or disk that faces along `normal`, with its height along `up`, projected to its
+    plane.
+    """
     across = np.cross(up, normal) / np.linalg.norm(np.cross(up, normal))
     up = np.cross(normal, across)
     matrix = np.eye(4)

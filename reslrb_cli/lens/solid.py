@@ -1,11 +1,11 @@
-"""The solid behind a face of heights: a closed mesh in millimetres, its files, and what a maker wants to know of it.
+"""The solid behind a face of heights: a closed mesh in millimetres, its files, and measurements for its maker.
 
-It stands as in the scene: the face about z = 0 with its outside towards +z, the back at z = -thickness, y up. Front and
-back are the triangles with which light was traced, unchanged but where a round outline cuts them. About the face there
-may be a flat rim, a little below the face's lowest edge, so that nothing of it stands in the face's light.
+The solid has the scene's axes: the face is near z = 0 with its outside towards +z, the back is at z = -thickness, and y
+points up. Front and back consist of the triangles with which light was traced, except where a round outline cuts them.
+A flat rim may surround the face, a little below the face's lowest edge, so that it casts no shadow on the face.
 
-Faces are height fields over grids: no two points of one lie above each other, so that front and back cross where the
-solid's thickness along z is not above 0, and nowhere else.
+Faces are height fields over grids: no two points of a face lie above each other. Front and back therefore cross exactly
+where the thickness along z is not above 0.
 """
 
 from __future__ import annotations
@@ -38,9 +38,14 @@ _SAME, _SIZE = 1e-5, 1e-3
 
 @dataclass(frozen=True)
 class Sheet:
-    """A face over a grid: `points` (ny nx, 3; mm, rows of one y, the least first), `triangles` (n, 3), counterclockwise
-    as seen from +z; `x` (nx,) and `y` (ny,). `name` is its mesh's id. `smooth`: its mesh has interpolated normals, by
-    which light went elsewhere than its triangles send it."""
+    """A face over a grid.
+
+    - `points`: (ny nx, 3), mm, in rows of equal y, the least y first; `x` (nx,) and `y` (ny,).
+    - `triangles`: (n, 3), counterclockwise as seen from +z.
+    - `name`: the id of its mesh.
+    - `smooth`: the mesh has interpolated normals, with which light goes elsewhere than its flat triangles would send
+      it.
+    """
 
     name: str
     points: Array
@@ -56,7 +61,7 @@ class Sheet:
 
     @property
     def half(self) -> tuple[float, float]:
-        """Half its width and height."""
+        """Half of its width and height."""
         return float(np.ptp(self.x)) / 2, float(np.ptp(self.y)) / 2
 
 
@@ -69,13 +74,13 @@ class Solid:
 
     @property
     def volume(self) -> float:
-        """In mm^3, by the divergence theorem."""
+        """The volume in mm^3, by the divergence theorem."""
         a, b, c = (self.points[self.triangles[:, k]] for k in range(3))
         return float(np.sum(np.cross(a, b) * c)) / 6
 
     @property
     def extent(self) -> list[float]:
-        """Width, height and depth, in mm."""
+        """Width, height and depth in mm."""
         return [float(side) for side in np.ptp(self.points, axis=0)]
 
 
@@ -83,9 +88,9 @@ class Solid:
 
 
 def as_sheet(name: str, points: Array, triangles: Indices, smooth: bool = False) -> Sheet:
-    """The grid that a mesh is: vertices (n, 3), triangles (m, 3) of either winding.
+    """Convert a mesh to a grid. The mesh has vertices (n, 3), and triangles (m, 3) with either orientation.
 
-    Raises ConfigError, its key `fabrication.faces`, where it is none, or no height field.
+    Raises ConfigError, with the key `fabrication.faces`, if the mesh is no grid or no height field.
     """
     points = np.asarray(points, np.float64)
 
@@ -119,16 +124,16 @@ def as_sheet(name: str, points: Array, triangles: Indices, smooth: bool = False)
 
 
 def _areas(points: Array, triangles: Indices) -> Array:
-    """Areas (m,) of triangles as seen from +z, below 0 where they are clockwise."""
+    """Return the areas (m,) of triangles as seen from +z, negative for clockwise triangles."""
     a, b, c = (points[triangles[:, k], :2] for k in range(3))
     u, v = b - a, c - a
     return np.asarray((u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / 2)
 
 
 def make_solid(sheets: Sequence[Sheet], plan: Fabrication) -> Solid:
-    """The solid whose front is the first of `sheets`, and its back the second, or flat.
+    """Make the solid with the first of `sheets` as front, and with the second one, or a plane, as back.
 
-    Raises ConfigError, its key below `fabrication`: faces that cross, or that are not of the size that is asked for.
+    Raises ConfigError, with a key below `fabrication`, if the faces cross or have not the requested size.
     """
     half = sheets[0].half if plan.size is None else (plan.size[0] / 2, plan.size[1] / 2)
     for sheet in sheets:
@@ -161,7 +166,7 @@ def make_solid(sheets: Sequence[Sheet], plan: Fabrication) -> Solid:
 
 
 class _Building:
-    """Vertices and triangles of a solid, as they come; loops of vertices are counterclockwise as seen from +z."""
+    """Vertices and triangles of a solid in progress. Loops of vertices are counterclockwise as seen from +z."""
 
     def __init__(self, half: tuple[float, float]) -> None:
         self.half = np.array(half)
@@ -170,18 +175,18 @@ class _Building:
         self._count = 0
 
     def add(self, points: Array) -> Indices:
-        """Their indices."""
+        """Add vertices and return their indices."""
         self.points.append(points)
         self._count += len(points)
         return np.arange(self._count - len(points), self._count)
 
     def copy(self, loop: Indices, z: float, scale: Array | float = 1.0) -> Indices:
-        """New vertices at `loop`'s x and y, times `scale`, and at `z`."""
+        """Add vertices at the x and y of `loop`, multiplied by `scale`, and at `z`."""
         at = np.concatenate(self.points)[loop]
         return self.add(np.column_stack([at[:, :2] * scale, np.full(len(at), z)]))
 
     def add_face(self, sheet: Sheet, plan: Fabrication, side: int) -> Indices:
-        """Add a face, whose outside is towards +z or -z by `side`, and its rim; the loop about them."""
+        """Add a face with its rim. Its outside is towards +z or -z by `side`. Return the loop around both."""
         points, triangles = sheet.points, sheet.triangles
         if plan.outline == "round":
             points, triangles = cut_round(sheet, (self.half[0], self.half[1]))
@@ -198,7 +203,7 @@ class _Building:
         return outer
 
     def zip(self, lower: Indices, upper: Indices) -> None:
-        """Add the wall between two loops, its outside outwards, however many vertices each of them has."""
+        """Add the wall between two loops, which may have different numbers of vertices. Its outside points outwards."""
         points = np.concatenate(self.points)
         loops, angles = [], []
         for loop in (lower, upper):
@@ -221,7 +226,10 @@ class _Building:
 
 
 def edge_loop(triangles: Indices) -> Indices:
-    """The vertices about a sheet, counterclockwise: the edges that only one triangle has. Of several loops one."""
+    """Return the vertices around a sheet, counterclockwise: its edges are those that belong to only one triangle.
+
+    If there are several loops, one of them is returned.
+    """
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     n = int(edges.max()) + 1
     open_ones = edges[~np.isin(edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0])]
@@ -234,7 +242,7 @@ def edge_loop(triangles: Indices) -> Indices:
 
 
 def is_closed(triangles: Indices) -> bool:
-    """Whether each edge is met by two triangles, in opposite directions."""
+    """Whether each edge belongs to two triangles, in opposite directions."""
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     n = int(edges.max()) + 1
     there, back = edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0]
@@ -242,7 +250,9 @@ def is_closed(triangles: Indices) -> bool:
 
 
 def cut_round(sheet: Sheet, half: tuple[float, float]) -> tuple[Array, Indices]:
-    """Vertices and triangles of what of a face is within the ellipse of these half axes, cut where it crosses edges."""
+    """Return vertices and triangles of a face within the ellipse of these half axes. Triangles on the ellipse
+    are cut.
+    """
     points, triangles = sheet.points.copy(), sheet.triangles
     axes = np.array(half)
     far = np.linalg.norm(points[:, :2] / axes, axis=1)
@@ -259,7 +269,7 @@ def cut_round(sheet: Sheet, half: tuple[float, float]) -> tuple[Array, Indices]:
     known: dict[tuple[int, int], int] = {}
 
     def crossing(p: int, q: int) -> int:
-        """The vertex where the edge from `p`, within, to `q`, outside, meets the ellipse."""
+        """Return the vertex where the edge from `p`, inside, to `q`, outside, meets the ellipse."""
         if (p, q) not in known:
             a, d = points[p, :2] / axes, (points[q, :2] - points[p, :2]) / axes
             half_b, c = a @ d, a @ a - 1
@@ -287,7 +297,7 @@ def cut_round(sheet: Sheet, half: tuple[float, float]) -> tuple[Array, Indices]:
 
 
 def within(sheet: Sheet, plan: Fabrication) -> NDArray[np.bool_]:
-    """Which vertices (ny, nx) lie within the outline."""
+    """Return which vertices (ny, nx) are inside the outline."""
     if plan.outline == "rectangle":
         return np.ones(sheet.z.shape, bool)
     a, b = sheet.half
@@ -295,7 +305,9 @@ def within(sheet: Sheet, plan: Fabrication) -> NDArray[np.bool_]:
 
 
 def least_thickness(sheets: Sequence[Sheet], plan: Fabrication) -> float:
-    """The least thickness along z within the outline, rim included (mm; below 0 where front and back cross)."""
+    """Return the least thickness along z inside the outline, including the rim (mm; negative if front and back
+    cross).
+    """
     from scipy.interpolate import RegularGridInterpolator
 
     front = sheets[0]
@@ -317,7 +329,7 @@ def least_thickness(sheets: Sequence[Sheet], plan: Fabrication) -> float:
 
 
 def _edge_heights(sheet: Sheet, plan: Fabrication) -> Array:
-    """z of the vertices about a face."""
+    """Return z of the vertices on a face's edge."""
     points, triangles = sheet.points, sheet.triangles
     if plan.outline == "round":
         points, triangles = cut_round(sheet, sheet.half)
@@ -325,9 +337,9 @@ def _edge_heights(sheet: Sheet, plan: Fabrication) -> Array:
 
 
 def hollows(sheet: Sheet, plan: Fabrication, side: int) -> Array:
-    """The larger principal curvature (1/mm) of each inner vertex within the outline, above 0 where it is hollow.
+    """Return the larger principal curvature (1/mm) of each inner vertex inside the outline, positive in hollows.
 
-    By central differences of the heights, as seen from outside, which is towards +z or -z by `side`.
+    Uses central differences of the heights as seen from outside, which is towards +z or -z by `side`.
     """
     h, dx, dy = side * sheet.z, float(np.diff(sheet.x).mean()), float(np.diff(sheet.y).mean())
     c = h[1:-1, 1:-1]
@@ -342,7 +354,7 @@ def hollows(sheet: Sheet, plan: Fabrication, side: int) -> Array:
 
 
 def steepest(sheet: Sheet, plan: Fabrication) -> float:
-    """The largest angle (degrees) between a triangle of the face, within the outline, and the plane z = 0."""
+    """Return the largest angle (degrees) between a triangle of the face, inside the outline, and the plane z = 0."""
     points, triangles = sheet.points, sheet.triangles
     if plan.outline == "round":
         points, triangles = cut_round(sheet, sheet.half)
@@ -352,12 +364,16 @@ def steepest(sheet: Sheet, plan: Fabrication) -> float:
 
 
 def outwards(sheet: Sheet, plan: Fabrication, side: int) -> Array:
-    """Heights (ny, nx; mm) above the flat face, outwards: row 0 at the greatest y, columns along x."""
+    """Return heights (ny, nx; mm) above the flat face, positive outwards. Row 0 has the greatest y; columns go
+    along x.
+    """
     return (sheet.z if side > 0 else -plan.thickness - sheet.z)[::-1]
 
 
 def scaled(heights: Array, inside: NDArray[np.bool_]) -> tuple[NDArray[np.uint16], float, float]:
-    """Heights as 16-bit numbers n (what is not `inside` clipped), with `offset` and `step`: h = offset + step n."""
+    """Return heights as 16-bit numbers n with `offset` and `step`: h = offset + step n. Heights not `inside` are
+    clipped.
+    """
     low, high = float(heights[inside].min()), float(heights[inside].max())
     step = (high - low) / 65535
     numbers = np.rint((np.clip(heights, low, high) - low) / step) if step > 0 else np.zeros_like(heights)
@@ -365,7 +381,7 @@ def scaled(heights: Array, inside: NDArray[np.bool_]) -> tuple[NDArray[np.uint16
 
 
 def measured(solid: Solid, sheets: Sequence[Sheet], plan: Fabrication) -> dict[str, Any]:
-    """What fabrication.json says, in mm, mm^3 and degrees; `warnings` are sentences."""
+    """Return the content of fabrication.json, in mm, mm^3 and degrees; `warnings` are sentences."""
     thin, warnings, faces = least_thickness(sheets, plan), [], {}
     for sheet, side in zip(sheets, (1, -1), strict=False):
         inside, curvature = within(sheet, plan), hollows(sheet, plan, side)
@@ -409,7 +425,7 @@ def measured(solid: Solid, sheets: Sequence[Sheet], plan: Fabrication) -> dict[s
 
 
 def summary(numbers: dict[str, Any]) -> list[str]:
-    """What `measured` found, in lines: the solid, its faces, the warnings."""
+    """Return the results of `measured` as lines: the solid, its faces, the warnings."""
     wide, high, deep = numbers["extent"]
     lines = [f"{wide:.4g} x {high:.4g} x {deep:.4g} mm, {numbers['volume_mm3'] / 1000:.4g} cm^3, at its thinnest "
              f"{numbers['least_thickness']:.3g} mm; {numbers['triangles']} triangles"]  # fmt: skip
@@ -424,7 +440,9 @@ def summary(numbers: dict[str, Any]) -> list[str]:
 
 
 def stl(solid: Solid) -> bytes:
-    """Binary STL: normals by the right-hand rule, 32-bit floats; it has no unit, and is read as mm."""
+    """Return binary STL with normals by the right-hand rule and 32-bit floats. STL has no unit; programs read it
+    as mm.
+    """
     corners = solid.points[solid.triangles].astype("<f4")
     a, b, c = (corners[:, k].astype(np.float64) for k in range(3))
     normal = np.cross(b - a, c - a)
@@ -436,7 +454,7 @@ def stl(solid: Solid) -> bytes:
 
 
 def ply(solid: Solid) -> bytes:
-    """Binary PLY, 32-bit floats, in mm."""
+    """Return binary PLY with 32-bit floats, in mm."""
     return ply_file(solid.points, solid.triangles, "comment millimetres\n")
 
 
@@ -457,7 +475,7 @@ def ply_file(vertices: NDArray[Any], triangles: NDArray[Any], comment: str = "")
 
 
 def obj(solid: Solid) -> bytes:
-    """OBJ, in mm."""
+    """Return OBJ, in mm."""
     lines = ["# millimetres"]
     lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in solid.points.tolist()]
     lines += [f"f {a} {b} {c}" for a, b, c in (solid.triangles + 1).tolist()]
@@ -465,7 +483,7 @@ def obj(solid: Solid) -> bytes:
 
 
 def three_mf(solid: Solid) -> bytes:
-    """3MF in mm, by lib3mf. Raises ImportError where that is not installed."""
+    """Return 3MF in mm, written by lib3mf. Raises ImportError if lib3mf is not installed."""
     import lib3mf
 
     wrapper = lib3mf.get_wrapper()

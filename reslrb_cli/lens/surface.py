@@ -1,13 +1,13 @@
-"""The face of a lens or a mirror that throws a picture: light by Snell's law, heights by `transport.py`.
+"""The face of a lens or mirror whose caustic shows a picture: rays by Snell's law, heights by `transport.py`.
 
-Lengths in millimetres. The face is z = h(x, y) about the plane z = 0, its normal towards the receiver; light comes to a
-lens from z < 0, through a plane face at z = -thickness, and to a mirror from z > 0. Its central ray meets the middle of
-the face, and the receiver's middle lies on that ray as a flat face sends it on, `distance` away; the receiver stands
-across it, but for its tilt. Up is y on both.
+Lengths are in millimetres. The face is z = h(x, y) near the plane z = 0, with its normal towards the receiver. Light
+comes to a lens from z < 0 through a plane face at z = -thickness, and to a mirror from z > 0. The central ray meets the
+centre of the face. A flat face would send this ray to the receiver's centre, at `distance`. The receiver is
+perpendicular to the ray, except for its tilt. Up is y on both.
 
-The unknown of the transport is h itself: T(x, y) is where a ray that meets the face at (x, y, h) with the normal
-(-dh/dx, -dh/dy, 1) hits the receiver. So every light, tilt and depth of relief is treated alike and exactly, and no
-normals have to be integrated to heights, of which a part might not be integrable.
+The unknown of the transport problem is h itself. T(x, y) is the point at which a ray meets the receiver if it meets the
+face at (x, y, h) with the normal (-dh/dx, -dh/dy, 1). All lights, tilts and depths of relief are therefore treated in
+the same way and exactly. No normals need to be integrated to heights, which may be impossible in part.
 """
 
 from __future__ import annotations
@@ -27,13 +27,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Setting:
-    """What throws the picture, and where to.
+    """The arrangement of light, face and receiver.
 
-    `size`: width and height of the face; `outline`: round is the ellipse in it. `picture_size`: of the picture on the
-    receiver. `light_distance`: of a point light, or the middle of an area light, from the face that it meets first;
-    infinite for parallel light. `incidence` (degrees, about y): between the light's central ray and z. `tilt`
-    (degrees): of the receiver about its horizontal and its vertical axis. `through`: the picture is looked at from
-    behind the receiver.
+    - `size`: width and height of the face. `outline`: round is the ellipse within this size.
+    - `picture_size`: the size of the picture on the receiver.
+    - `light_distance`: the distance of a point light, or of an area light's centre, from the first face on its way;
+      infinite for parallel light.
+    - `incidence`: the angle (degrees, about y) between the central ray and z.
+    - `tilt`: the angles (degrees) of the receiver about its horizontal and its vertical axis.
+    - `through`: the picture is seen from behind the receiver.
     """
 
     kind: Literal["lens", "mirror"] = "lens"
@@ -51,11 +53,13 @@ class Setting:
 
 @dataclass
 class Surface:
-    """A face, and what it costs.
+    """A face with its relief and floor.
 
-    `heights` (ny, nx): h at the centres of a grid's cells, row 0 at the least y; of a round face also outside of its
-    outline. `inside` (ny, nx): cells within the outline. `floor`: the fraction of the maximum to which darker parts of
-    the picture were lifted. `relief`: between the highest and the lowest place, and `relief_at_twice` the distance.
+    - `heights` (ny, nx): h at the centres of a grid's cells, row 0 at the least y. A round face has heights outside of
+      its outline too.
+    - `inside` (ny, nx): the cells inside the outline.
+    - `floor`: the fraction of the maximum to which darker parts of the picture were lifted.
+    - `relief`: the height between the lowest and the highest point; `relief_at_twice`: the same at twice the distance.
     """
 
     setting: Setting
@@ -67,7 +71,7 @@ class Surface:
     transport: transport.Transport
 
     def summary(self) -> str:
-        """Depth, floor and errors, in one line."""
+        """Return depth, floor and errors in one line."""
         return (
             f"{self.relief:.3g} mm deep (at {2 * self.setting.distance:g} mm {self.relief_at_twice:.3g} mm); "
             f"nothing darker than {100 * self.floor:g} % of the brightest; "
@@ -76,7 +80,7 @@ class Surface:
 
 
 class Rays:
-    """Rays of a `Setting`: the `transport.Optics` that its face has."""
+    """Rays of a `Setting`: the `transport.Optics` of its face."""
 
     def __init__(self, setting: Setting) -> None:
         self.setting = s = setting
@@ -98,7 +102,10 @@ class Rays:
         self.middle, self.across, self.up, self.normal = forward * s.distance, across, up, normal
 
     def incoming(self, x: Array, y: Array, h: Array) -> tuple[Array, Array]:
-        """Direction (3, ...) of light that comes to (x, y, h), of a lens in its glass; light on a plane z = h."""
+        """Return the direction (3, ...) of light that arrives at (x, y, h), and the irradiance on a plane z = h.
+
+        For a lens, the direction is inside of the glass.
+        """
         s = self.setting
         if s.kind == "mirror":
             if not np.isfinite(s.light_distance):
@@ -125,7 +132,7 @@ class Rays:
         return np.stack([sine * dx / radius, sine * dy / radius, cosine]), light
 
     def outgoing(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
-        """Direction (3, ...) of the light that leaves; NaN where it is totally reflected."""
+        """Return the direction (3, ...) of the light that leaves; NaN for total reflection."""
         d, _ = self.incoming(x, y, h)
         normal = np.stack([-gx, -gy, np.ones_like(gx)]) / np.sqrt(1 + gx * gx + gy * gy)
         cosine = np.sum(d * normal, axis=0)
@@ -160,7 +167,7 @@ class Rays:
 
 
 def transmitted(cosine: Array, eta: float) -> Array:
-    """The part of unpolarised light that passes into a medium `eta` times as dense (Fresnel)."""
+    """Return the transmittance for unpolarised light into a medium with relative index `eta` (Fresnel)."""
     beyond = np.sqrt(np.maximum(1 - (1 - cosine**2) / eta**2, 0))
     s = (cosine - eta * beyond) / (cosine + eta * beyond)
     p = (eta * cosine - beyond) / (eta * cosine + beyond)
@@ -168,16 +175,18 @@ def transmitted(cosine: Array, eta: float) -> Array:
 
 
 def within(setting: Setting, x: Array, y: Array) -> NDArray[np.bool_]:
-    """Whether (x, y) is inside of the outline."""
+    """Whether (x, y) is inside the outline."""
     if setting.outline == "rectangle":
         return (np.abs(x) <= setting.size[0] / 2) & (np.abs(y) <= setting.size[1] / 2)
     return (2 * x / setting.size[0]) ** 2 + (2 * y / setting.size[1]) ** 2 <= 1
 
 
 def on_receiver(picture: Array, through: bool) -> Array:
-    """`picture` (row 0 at the top) by the receiver's axes: row 0 at its least y, columns along x; and back again.
+    """Convert `picture` (row 0 at the top) to the receiver's axes: row 0 at the least y, columns along x. Also converts
+    back.
 
-    Who looks at the receiver as the light does, with y up, has x to the left; who looks through it, to the right.
+    An observer who looks at the receiver from the light's side, with y up, has x to the left. An observer behind the
+    receiver has x to the right.
     """
     return picture[::-1] if through else picture[::-1, ::-1]
 
@@ -185,9 +194,10 @@ def on_receiver(picture: Array, through: bool) -> Array:
 def shape_surface(
     picture: Array, setting: Setting, cells: int = 256, floor: float | Literal["auto"] = "auto"
 ) -> Surface:
-    """The face that throws `picture` (rows, columns; luminance, row 0 at the top), on `cells` along its longer side.
+    """Return the face whose caustic shows `picture` (rows, columns; luminance, row 0 at the top).
 
-    Raises ConfigError, its key that of the setting: where there is no such face, and what would do.
+    The grid has `cells` along its longer side. Raises ConfigError, with the setting as key and a remedy, if there is no
+    such face.
     """
     _check(picture, setting)
     rays = Rays(setting)
@@ -240,7 +250,7 @@ def _depth(h: Array, inside: NDArray[np.bool_]) -> float:
 
 
 def _twice(setting: Setting, target: Array, shape: tuple[int, int]) -> float:
-    """The relief (mm) at twice the distance, on a grid of at most 64 cells."""
+    """Return the relief (mm) at twice the distance, from a grid of at most 64 cells."""
     far = replace(setting, distance=2 * setting.distance)
     coarse = min(1.0, transport.TRIAL / max(shape))
     small = (max(8, round(shape[0] * coarse)), max(8, round(shape[1] * coarse)))
@@ -250,7 +260,7 @@ def _twice(setting: Setting, target: Array, shape: tuple[int, int]) -> float:
 
 
 def _start(rays: Rays) -> Array:
-    """The polynomial of degree 2 (`transport.solve`) that sends the face about evenly to the picture."""
+    """Return the polynomial of degree 2 (`transport.solve`) that sends the face about evenly to the picture."""
     s = rays.setting
     x, y = transport.grid((9, 9), s.size)
     wanted = np.stack([x * (s.picture_size[0] / s.size[0]), y * (s.picture_size[1] / s.size[1])])
@@ -268,7 +278,9 @@ def _start(rays: Rays) -> Array:
 
 
 def is_even(picture: Array) -> bool:
-    """Whether a picture is of one colour: a level of 8 bits, or dithering between two levels, counts as none."""
+    """Whether a picture has only one colour: one level of 8 bits, or dithering between two levels, counts as one
+    colour.
+    """
     return bool(picture.max() - picture.min() <= 0.02 * picture.max())
 
 
@@ -308,10 +320,11 @@ def _check(picture: Array, setting: Setting) -> None:
 
 
 def _reaches(setting: Setting) -> bool:
-    """Whether a face can send light from its corners and middle to the picture's, and the receiver stands before it.
+    """Whether the face can send light from its corners and centre to those of the picture, on the front of the
+    receiver.
 
-    N proportional to n_i d_i - n_t d_t lies towards the light's side of the face only if n_i d_i . d_t > n_t: light is
-    bent by less than arccos(1 / n).
+    N proportional to n_i d_i - n_t d_t points to the light's side of the face only if n_i d_i . d_t > n_t: refraction
+    turns light by less than arccos(1 / n).
     """
     rays = Rays(setting)
     x, y = (a.ravel() for a in transport.grid((3, 3), (1.5 * setting.size[0], 1.5 * setting.size[1])))

@@ -1,14 +1,16 @@
-"""Transport of light from an aperture to a picture: the equation of Monge and Ampere, solved on a grid by Newton steps.
+"""Optimal transport of light from an aperture to a picture: the Monge-Ampere equation, solved on a grid by Newton's
+method.
 
-Unknown is a potential h at the centres of a grid of cells. An `Optics` says where light goes from a point of the
-aperture, given h and its gradient g there: T(x, h, g). Light is conserved where
+The unknown is a potential h at the centres of a grid's cells. An `Optics` maps a point of the aperture, with h and its
+gradient g there, to the picture: T(x, h, g). Light is conserved if
 
     nu(T(x)) det DT(x) = mu(x),                                                                                     (1)
 
-mu the light that arrives on the aperture, nu the picture, both of one mass, and where the aperture's edges go to the
-picture's edges. With T = g that is optimal transport for the squared distance (Brenier); with T by Snell's law h is the
-surface itself, so that nothing has to be integrated afterwards (`surface.py`). (1) is solved in its logarithm, on grids
-from coarse to fine; each Newton step by GMRES, preconditioned by the Laplacian, which SciPy's cosine transform inverts.
+with mu the light that arrives on the aperture, nu the picture, both of equal total, and the aperture's edges mapped to
+the picture's edges. For T = g this is optimal transport with squared distance (Brenier). With T from Snell's law, h is
+the surface itself, so nothing needs to be integrated afterwards (`surface.py`). The logarithm of (1) is solved on grids
+from coarse to fine. Each Newton step uses GMRES, preconditioned by the Laplacian, which SciPy's cosine transform
+inverts.
 """
 
 from __future__ import annotations
@@ -40,25 +42,30 @@ FADE = 0.7
 
 
 class Optics(Protocol):
-    """Where light goes. Lengths are those of the aperture and of the picture, each about its own centre."""
+    """The map of light. Lengths are those of the aperture and of the picture, each about its own centre."""
 
     def hit(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
-        """T (2, ...) of places (x, y) with potential h and gradient (gx, gy); NaN where no light goes."""
+        """Return T (2, ...) of points (x, y) with potential h and gradient (gx, gy); NaN if light does not reach the
+        picture.
+        """
 
     def arriving(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
-        """mu (...): light that arrives, by area of the aperture, in any unit; 0 outside of the aperture."""
+        """Return mu (...): the light that arrives per area of the aperture, in any unit; 0 outside of the aperture."""
 
 
 @dataclass
 class Transport:
     """A solution of (1).
 
-    `h` (ny, nx): the potential; `slopes`: its derivative along the axis at the edges, (left, right, bottom, top);
-    `T` (2, ny, nx): where the centres' light goes; `light` (ny, nx): mu, of mean 1; `residual`: of (1)'s logarithm,
-    root of the mean square over the light; `converged`: whether it became small, if need be of a picture blurred by a
-    few pixels. `error`: sum |pushed - nu| / sum nu, by the picture's pixels, or cells where these are larger; `pushed`:
-    the picture that T makes, mean 1. `folded`: the share of cells that T turns over; `stretch`: the largest factor by
-    which T lengthens anything, over that of the even map. `steps`: Newton steps on all grids.
+    - `h` (ny, nx): the potential. `slopes`: its derivatives along the axis at the edges, (left, right, bottom, top).
+    - `T` (2, ny, nx): the images of the cells' centres. `light` (ny, nx): mu, with mean 1.
+    - `residual`: the root mean square residual of (1)'s logarithm, weighted by the light.
+    - `converged`: whether it became small, possibly for a picture blurred by a few pixels.
+    - `error`: sum |pushed - nu| / sum nu, over the picture's pixels or larger cells. `pushed`: the picture that T
+      makes, with mean 1.
+    - `folded`: the share of cells that T turns over. `stretch`: the largest factor by which T lengthens a segment,
+      relative to the even map.
+    - `steps`: the number of Newton steps on all grids.
     """
 
     h: Array
@@ -76,7 +83,7 @@ class Transport:
 
 
 def sample(values: Array, size: tuple[float, float], x: Array, y: Array) -> Array:
-    """`values` (ny, nx) of a rectangle of `size` about 0, between centres of cells linearly, at places (x, y)."""
+    """Return `values` (ny, nx) of a rectangle of `size` about 0 at points (x, y), linear between centres of cells."""
     ny, nx = values.shape
     places = np.stack([(y / size[1] + 0.5) * ny - 0.5, (x / size[0] + 0.5) * nx - 0.5])
     return scipy.ndimage.map_coordinates(values, places, order=1, mode="nearest")
@@ -109,13 +116,13 @@ def _shares(old: int, new: int, between: bool) -> Array:
 
 
 def _shrunk(picture: Array, part: float) -> Array:
-    """`picture` with `part` of its rows and columns, or as it is where that would be more."""
+    """Return `picture` with `part` of its rows and columns, or unchanged if that would be more."""
     ny, nx = picture.shape
     return picture if part >= 1 else resized(picture, (max(2, round(ny * part)), max(2, round(nx * part))))
 
 
 def grid(shape: tuple[int, int], size: tuple[float, float]) -> tuple[Array, Array]:
-    """x and y (ny, nx) of the centres of a rectangle's cells; row 0 has the least y."""
+    """Return x and y (ny, nx) of the centres of a rectangle's cells. Row 0 has the least y."""
     ny, nx = shape
     x = ((np.arange(nx) + 0.5) / nx - 0.5) * size[0]
     y = ((np.arange(ny) + 0.5) / ny - 0.5) * size[1]
@@ -131,12 +138,14 @@ def solve(
     shape: tuple[int, int],
     start: Array,
 ) -> Transport:
-    """(1), from the coarsest grid up to `shape`.
+    """Solve (1) from the coarsest grid up to `shape`.
 
-    `picture` (my, mx), positive, row 0 at the least y: nu on a rectangle of `target` (width, height) about 0; `size`:
-    the aperture's. `start` (6,): polynomial c0 + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2 that sends the aperture evenly,
-    or about so, to the picture. Where a sharp picture leads to no solution, it is begun with a
-    blurred one.
+    - `picture` (my, mx): nu, positive, row 0 at the least y, on a rectangle of `target` (width, height) about 0.
+    - `size`: the size of the aperture.
+    - `start` (6,): the polynomial c0 + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2 that sends the aperture about evenly to
+      the picture.
+
+    If a sharp picture leads to no solution, the solver starts with a blurred picture.
     """
     levels = [shape]
     while min(levels[-1]) >= 2 * COARSEST:
@@ -169,7 +178,7 @@ def solve(
 
 @dataclass
 class _State:
-    """h on a grid, its slopes at the edges, and what steps know of them."""
+    """h on a grid, its slopes at the edges, and data for Newton steps."""
 
     h: Array
     slopes: list[Array]
@@ -184,7 +193,7 @@ class _State:
 
 
 def _padded(h: Array, slopes: list[Array], cell: tuple[float, float]) -> Array:
-    """h (ny + 2, nx + 2) with a ring of cells by which the derivative at each edge is what `slopes` say."""
+    """Return h (ny + 2, nx + 2) with a ring of cells such that the derivatives at the edges equal `slopes`."""
     left, right, bottom, top = slopes
     wide = np.concatenate([(h[:, 0] - left * cell[0])[:, None], h, (h[:, -1] + right * cell[0])[:, None]], axis=1)
     bottom, top = np.pad(bottom, 1, mode="edge"), np.pad(top, 1, mode="edge")
@@ -192,7 +201,7 @@ def _padded(h: Array, slopes: list[Array], cell: tuple[float, float]) -> Array:
 
 
 def _faces(p: Array, cell: tuple[float, float]) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
-    """(h, gx, gy) at the faces across x (ny, nx + 1), and at those across y (ny + 1, nx), of a padded h."""
+    """Return (h, gx, gy) at the faces across x (ny, nx + 1), and at those across y (ny + 1, nx), of a padded h."""
     dx, dy = cell
     row, column = p[1:-1], p[:, 1:-1]
     along_y, along_x = (p[2:] - p[:-2]) / (2 * dy), (p[:, 2:] - p[:, :-2]) / (2 * dx)
@@ -210,14 +219,14 @@ def _face_places(shape: tuple[int, int], size: tuple[float, float]) -> tuple[tup
 
 
 def _derivative(optics: Optics, place: tuple[Array, Array], at: tuple[Array, Array, Array], T: Array) -> Array:
-    """B (2, 2, ...): dT / dg, by differences; B[a, b] is that of T's component a by g's component b."""
+    """Return B (2, 2, ...): dT / dg by differences. B[a, b] is the derivative of T's component a by g's component b."""
     h, gx, gy = at
     e = 1e-6
     return np.stack([optics.hit(*place, h, gx + e, gy) - T, optics.hit(*place, h, gx, gy + e) - T], axis=1) / e
 
 
 class _Equation:
-    """(1) about one h: its residual, and its derivative along a change of h."""
+    """Equation (1) at one h: its residual, and its directional derivatives."""
 
     def __init__(
         self,
@@ -261,7 +270,7 @@ class _Equation:
         return (T[0][:, :, 1:] + T[0][:, :, :-1] + T[1][:, 1:] + T[1][:, :-1]) / 4
 
     def _over_cells(self, nu: Array, by: tuple[float, float] = (0.0, 0.0)) -> Array:
-        """The mean of nu over what T makes of each cell, moved `by`: of four points."""
+        """Return the mean of nu over the image of each cell under T, shifted `by`, from four points."""
         total = np.zeros(self.det.shape)
         for a in (-0.25, 0.25):
             for b in (-0.25, 0.25):
@@ -270,7 +279,7 @@ class _Equation:
         return total / 4
 
     def linearize(self) -> None:
-        """Makes ready for `along` and `step`."""
+        """Prepare `along` and `step`."""
         self.B = [_derivative(self.optics, *of) for of in zip(self.places, self.at, self.T, strict=True)]
         inverse = (
             np.stack([np.stack([self.D[1, 1], -self.D[0, 1]]), np.stack([-self.D[1, 0], self.D[0, 0]])]) / self.det
@@ -288,7 +297,7 @@ class _Equation:
         ])  # fmt: skip
 
     def along(self, v: Array) -> Array:
-        """The derivative of (1)'s logarithm along v (ny, nx), whose slopes at the edges are 0, times `scale`."""
+        """Return the derivative of (1)'s logarithm along v (ny, nx), which has slopes 0 at the edges, times `scale`."""
         p = np.pad(v, 1, mode="edge")
         dT = [
             np.einsum("ab...,b...->a...", B, np.stack(at[1:]))
@@ -299,7 +308,7 @@ class _Equation:
         return trace + np.einsum("a...,a...->...", self.slope, self._center(dT))
 
     def step(self, accuracy: float) -> Array:
-        """v (ny, nx) by which (1) holds to first order."""
+        """Return the Newton step v (ny, nx)."""
         shape = self.F.shape
         ky, kx = (2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in shape)
         symbol = self.weights[0] * kx[None] / self.cell[0] ** 2 + self.weights[1] * ky[:, None] / self.cell[1] ** 2
@@ -320,7 +329,9 @@ class _Equation:
 
 
 def _dim(mu: Array, fade: float, dim: float) -> Array:
-    """mu (ny, nx) with a little light outside of the aperture, less with each cell, so that T is known there too."""
+    """Return mu (ny, nx) with a little light outside of the aperture, decreasing per cell, so that T is determined
+    there.
+    """
     lit = mu > 0
     if lit.all():
         return mu
@@ -329,7 +340,7 @@ def _dim(mu: Array, fade: float, dim: float) -> Array:
 
 
 def _at_edges(state: _State, optics: Optics, target: tuple[float, float]) -> None:
-    """Sets the slopes at the edges so that light there goes to the picture's edges."""
+    """Set the slopes at the edges so that light there goes to the picture's edges."""
     for _ in range(3):
         at = _faces(_padded(state.h, state.slopes, state.cell), state.cell)
         for axis, (place, of) in enumerate(zip(_face_places(state.h.shape, state.size), at, strict=True)):
@@ -351,7 +362,7 @@ def _newton(
     contrast: float = 1.0,
     blur: float = 0.0,
 ) -> None:
-    """Newton steps on one grid, each as long as makes (1) hold better."""
+    """Take Newton steps on one grid. The length of each step is chosen so that the residual falls."""
     equation = _started(state, optics, nu, target, contrast, blur)
     for _ in range(steps):
         if not equation.fits or equation.merit < TOLERANCE:
@@ -376,9 +387,9 @@ def _newton(
 def _started(
     state: _State, optics: Optics, nu: Array, target: tuple[float, float], contrast: float, blur: float
 ) -> _Equation:
-    """The equation about a state, which is smoothed and mixed with the even map until T folds nowhere.
+    """Return the equation at a state, which is smoothed and mixed with the even map until T folds nowhere.
 
-    Convex functions stay so under both, and the even map brings what is close to an edge away from it.
+    Convex functions stay convex under both, and the even map moves points away from the edges.
     """
     h, slopes = state.h, list(state.slopes)
     even, even_slopes = _even(state.start, state.h.shape, state.size)
@@ -397,7 +408,7 @@ def _started(
 
 
 def _even(start: Array, shape: tuple[int, int], size: tuple[float, float]) -> tuple[Array, list[Array]]:
-    """h and slopes of the polynomial that `solve` starts from."""
+    """Return h and slopes of the polynomial from which `solve` starts."""
     x, y = grid(shape, size)
     h = start[0] + start[1] * x + start[2] * y + start[3] * x * x + start[4] * x * y + start[5] * y * y
     hx, hy = start[1] + 2 * start[3] * x + start[4] * y, start[2] + start[4] * x + 2 * start[5] * y
@@ -410,7 +421,7 @@ def _copied(state: _State) -> _State:
 
 
 def _finer(state: _State, shape: tuple[int, int]) -> _State:
-    """The state on a finer grid, by cubic splines; slopes at the edges go along."""
+    """Return the state on a finer grid, by cubic splines, including the slopes at the edges."""
     ring = 8  # for splines, whose reach is that of a few cells
     p = np.pad(_padded(state.h, state.slopes, state.cell), ring, mode="reflect", reflect_type="odd")
     ny, nx = state.h.shape
@@ -447,9 +458,9 @@ def _told(state: _State, optics: Optics, picture: Array, target: tuple[float, fl
 
 
 def pushed(T: Array, light: Array, shape: tuple[int, int], target: tuple[float, float], fine: int = 4) -> Array:
-    """The picture (shape), of mean 1, that `light` (ny, nx) makes where T (2, ny, nx) brings it, seen through a tent.
+    """Return the picture (shape), of mean 1, that `light` (ny, nx) makes at T (2, ny, nx), filtered by a tent.
 
-    Each cell sends `fine`^2 equal shares, T between centres linearly; each falls on the four nearest pixels.
+    Each cell sends `fine`^2 equal shares, with T linear between centres. Each share falls on the four nearest pixels.
     """
     ny, nx = light.shape
     at = np.meshgrid(
@@ -462,9 +473,10 @@ def pushed(T: Array, light: Array, shape: tuple[int, int], target: tuple[float, 
 
 
 def splat(column: Array, row: Array, share: Array, shape: tuple[int, int]) -> Array:
-    """Shares of light at places in pixels, each on the four pixels next to it (what falls outside of all is lost).
+    """Add shares of light at positions in pixels, each to the four nearest pixels. Shares outside of the picture are
+    lost.
 
-    At an edge a tent is folded back, as `through_tent` has it. Mean 1 where nothing is lost.
+    At an edge a tent is folded back, as in `through_tent`. The mean is 1 if nothing is lost.
     """
     result = np.zeros(shape)
     inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
@@ -480,7 +492,7 @@ def splat(column: Array, row: Array, share: Array, shape: tuple[int, int]) -> Ar
 
 
 def through_tent(picture: Array) -> Array:
-    """What `splat` makes of light that is even over each pixel of `picture`."""
+    """Return the result of `splat` for light that is constant over each pixel of `picture`."""
     for axis in (0, 1):
         picture = scipy.ndimage.convolve1d(picture, [1 / 8, 3 / 4, 1 / 8], axis=axis, mode="nearest")
     return picture
@@ -498,7 +510,7 @@ UNSOLVED, FOR_LINES = 0.03, 0.1
 
 
 def lifted(picture: Array, floor: float) -> Array:
-    """`picture` with nothing darker than `floor` times its maximum."""
+    """Return `picture` with values below `floor` times its maximum raised to that value."""
     return np.maximum(picture, max(floor, 1e-3) * picture.max())
 
 
@@ -506,7 +518,7 @@ def least_floor(
     optics: Optics, picture: Array, size: tuple[float, float], target: tuple[float, float], start: Array,
     floors: Sequence[float] = FLOORS,
 ) -> float | None:  # fmt: skip
-    """The least of `floors` with which the transport neither folds nor tears; None where the largest does."""
+    """Return the least of `floors` with which the transport neither folds nor tears; None if the largest does."""
     ratio = size[0] / size[1]
     shape = (round(TRIAL / max(ratio, 1)), round(TRIAL * min(ratio, 1)))
     small = _shrunk(picture, TRIAL / max(picture.shape))

@@ -425,7 +425,8 @@ def find_offenders(problem: Problem, iteration: int) -> list[Offender]:
 def _of_view(problem: Problem, view: View, step_seed: int, word: str) -> Offender | None:
     """Return the same for one view, from its samples or those of the shard that `word` names.
 
-    For independent dL/dI, the check uses dL/dI at one of the sample sets instead of the mean image of the others.
+    With `adjoint: others`, dL/dI is computed at an image of the shard's own samples, not at the mean image of the
+    others.
     """
     guiding = guiding_of(problem)
     witness = None if guiding is None else Witness(guiding)
