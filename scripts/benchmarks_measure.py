@@ -151,7 +151,10 @@ def _changed(commit: str, place: str) -> int:
 
 
 def _syntax(commit: str, file: str) -> str | None:
-    """Return the syntax tree of a Python file at a commit without docstrings; None if there is no such file."""
+    """Return the syntax tree of a Python file at a commit without docstrings and messages; None without the file.
+
+    Messages are texts on one line of at least four words. No figure depends on them.
+    """
     text = _git("show", f"{commit}:{file}")
     if text is None:
         return None
@@ -159,7 +162,24 @@ def _syntax(commit: str, file: str) -> str | None:
     for node in ast.walk(tree):
         if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(node) is not None:
             del node.body[0]
-    return ast.dump(tree)
+    return ast.dump(_WithoutMessages().visit(tree))
+
+
+class _WithoutMessages(ast.NodeTransformer):
+    """Replaces all messages of a syntax tree by one and the same text."""
+
+    def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.expr:
+        return self._without(
+            "".join(part.value if isinstance(part, ast.Constant) else "{}" for part in node.values), node
+        )
+
+    def visit_Constant(self, node: ast.Constant) -> ast.expr:
+        return self._without(node.value, node)
+
+    @staticmethod
+    def _without(text: object, node: ast.expr) -> ast.expr:
+        is_message = isinstance(text, str) and "\n" not in text and len(text.split()) >= 4
+        return ast.Constant("message") if is_message else node
 
 
 def record_file(name: str) -> Path:

@@ -85,7 +85,8 @@ def test_a_record_is_stale_once_the_code_that_it_measures_has_changed(
 ) -> None:
     for name, content in {
         "configs/room.yaml": "scene: {file: ../scenes/room/scene.xml}", "scenes/room/scene.xml": "", "docs/a.md": "",
-        "reslrb_cli/transport/walk.py": "", "reslrb_cli/measure/bench.py": "", "reslrb_cli/cli/bench.py": "",
+        "reslrb_cli/transport/walk.py": 'a = f"must be less than {1}"', "reslrb_cli/measure/bench.py": "",
+        "reslrb_cli/cli/bench.py": "",
     }.items():  # fmt: skip
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(content)
@@ -102,7 +103,7 @@ def test_a_record_is_stale_once_the_code_that_it_measures_has_changed(
         origin = {"kind": "origin", "command": command} | state
         (tmp_path / "docs" / "benchmarks" / f"{name}.jsonl").write_text(json.dumps(origin) + "\n")
     (tmp_path / "reslrb_cli/cli/bench.py").write_text("1")  # changes no figure, nor do words
-    (tmp_path / "reslrb_cli/transport/walk.py").write_text('"""Walk."""  # along a path\n')
+    (tmp_path / "reslrb_cli/transport/walk.py").write_text('"""Walk."""  # along a path\na = "this is another message"')
     assert benchmarks_measure.code_state()["clean"] is False
     commit_all(tmp_path)
     assert main(["stale"]) == 0
@@ -111,7 +112,7 @@ def test_a_record_is_stale_once_the_code_that_it_measures_has_changed(
         "reslrb_cli/transport/walk.py": ["depth", "room"],
     }.items():  # fmt: skip
         capsys.readouterr()
-        (tmp_path / place).write_text('"""Walk."""\n1')
+        (tmp_path / place).write_text('a = "no message"')
         commit_all(tmp_path)
         assert main(["stale"]) == 1
         lines = capsys.readouterr().out.splitlines()

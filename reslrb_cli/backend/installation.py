@@ -133,7 +133,7 @@ def python_command(code: str) -> list[str]:
     return [sys.executable, "-c", f"import sys\nsys.path[:] = {path!r}\n{code}"]
 
 
-MISSING_LIBRARY = "run scripts/setup, or install the package that holds it"
+MISSING_LIBRARY = "run scripts/setup, or install the package that contains it"
 
 #: Of each package the versions that pyproject.toml has, the first of them and the first that is too new, and functions
 #: by which it is told from another package of its name.
@@ -164,11 +164,11 @@ def _load(name: str) -> ModuleType:
     version = getattr(package, "__version__", None)
     if not all(callable(getattr(package, function, None)) for function in functions):
         raise BackendError(
-            f"the package {name} at {_place(name)} is not the one that is wanted (it has no {functions[0]}); "
-            f"take it off the path (PYTHONPATH, or the folder that Python was started in), or {mend}"
+            f"the package {name} at {_place(name)} is another one of that name (it has no {functions[0]}); remove it "
+            f"from the path (PYTHONPATH, or the folder in which Python was started), or {mend}"
         )
     if not isinstance(version, str) or not first <= _numbers(version) < end:
-        raise BackendError(f"{name} {version} was found at {_place(name)}; {_dotted(first)} is needed: {mend}")
+        raise BackendError(f"found {name} {version} at {_place(name)}, but {_dotted(first)} is needed: {mend}")
     return package
 
 

@@ -119,7 +119,7 @@ def _examine(path: Path) -> Library:
         command = [sys.executable, "-I", "-S", shared_library.__file__, str(path)]
         probe = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
-        return Library(path, fault=f"could not be tried ({error})")
+        return Library(path, fault=f"could not be tested ({error})")
     if probe.returncode != 0:
         message = " ".join(probe.stderr.split()) or f"loading it ended a process with code {probe.returncode}"
         missing = shared_library.missing_library(message)
@@ -133,7 +133,7 @@ def _examine(path: Path) -> Library:
 
 
 def _too_old(version: str) -> str:
-    return f"version {version} is too old; with some before {MIN_VERSION} Dr.Jit ends the process"
+    return f"version {version} is too old; some versions before {MIN_VERSION} make Dr.Jit end the process"
 
 
 def _major(version: str) -> int:

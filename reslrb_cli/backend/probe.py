@@ -72,9 +72,9 @@ def probe(variant: str) -> Probe:
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=300, check=False)
     except subprocess.TimeoutExpired:
-        return Probe("gave no result within 300 s")
+        return Probe("no result within 300 s")
     except OSError as error:
-        return Probe(f"could not be tried ({error})")
+        return Probe(f"could not be tested ({error})")
     if done.returncode == 0:
         try:
             return Probe(**json.loads(done.stdout.splitlines()[-1]))

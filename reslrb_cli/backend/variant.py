@@ -27,7 +27,7 @@ def set_variant(name: str = "auto") -> str:
     if chosen.startswith("cuda") and name != "auto":
         missing = missing_cuda(chosen)
         if missing:
-            advice = "install NVIDIA's driver (535 or newer, with OptiX), or take `variant: llvm_ad_rgb`"
+            advice = "install NVIDIA's driver (535 or newer, with OptiX), or use `variant: llvm_ad_rgb`"
             raise BackendError(f"variant {chosen}: {missing}; {advice}")
     library = llvm.require() if chosen.startswith("llvm") else None
     dr, mi = load_packages()
@@ -55,7 +55,7 @@ def keep_variant(name: str, source: object) -> str:
     if now is None:
         return set_variant(name)
     if name not in ("auto", now):
-        advice = "leave `variant` out, or take another process"
+        advice = "remove `variant`, or use another process"
         raise ConfigError(source, "variant", f"is {name}, but {now} is set in this process; {advice}")
     check_variant(now)
     return set_variant(now)
@@ -80,9 +80,7 @@ def check_variant(variant: str | None) -> None:
     import mitsuba as mi
 
     if variant is None or not works_under(variant):
-        is_set = (
-            "no variant is set" if variant is None else f"variant {variant} is set, under which reslrb does not work"
-        )
+        is_set = "no variant is set" if variant is None else f"variant {variant} is set, which reslrb does not support"
         works = ", ".join(sorted(filter(works_under, mi.variants()), key=lambda name: not name.endswith("_rgb")))
         raise BackendError(f"{is_set}; call mitsuba.set_variant(...) with one of {works}")
 
@@ -124,7 +122,7 @@ def _check_loaded_llvm(dr: ModuleType) -> None:
     if not dr.has_backend(dr.JitBackend.LLVM):
         fault = "found no usable libLLVM"
     elif (major := dr.detail.llvm_version()[0]) < llvm.MIN_VERSION:
-        fault = f"took libLLVM {major}, which would end the process"
+        fault = f"loaded libLLVM {major}, which would end the process"
     if fault:
         advice = f"import reslrb_cli first, or set {llvm.VARIABLE}"
         raise BackendError(f"Dr.Jit was imported before reslrb_cli and {fault}; {advice}")

@@ -132,7 +132,7 @@ def unpack(files: Mapping[str, bytes], folder: Path) -> None:
                 path.write_bytes(data)
             unfinished.rename(folder)
     except OSError as error:
-        raise MachineError(f"{folder}: the experiment cannot be written there: {error.strerror}") from None
+        raise MachineError(f"{folder}: cannot write the experiment: {error.strerror}") from None
 
 
 def read_bundle(folder: Path) -> tuple[Config, Values]:

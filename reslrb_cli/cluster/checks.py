@@ -92,11 +92,11 @@ def _with_file(case: Listed, put: Callable[[str], str]) -> Listed:
 def check_shareable(settings: CheckSettings) -> None:
     """Raise ConfigError if samples depend on the process that takes them, or on time."""
     if settings.seeds is None:
-        reason = "a budget of seconds says nothing of other machines; say how many seeds there are with --seeds"
+        reason = "a budget of seconds has no meaning on other machines; give the number of seeds with --seeds"
         raise ConfigError("--cluster", "", reason)
     for label, config in settings.configs().items():
         if config.integrator.options().get("guiding", "off") != "off":
-            reason = f"{label} learns from the samples before; --set integrator.guiding=off, or leave --cluster out"
+            reason = f"{label} learns from earlier samples; use --set integrator.guiding=off, or remove --cluster"
             raise ConfigError(config.source, "integrator.guiding", reason)
 
 

@@ -78,12 +78,10 @@ class Place:
         elif kind == "local" and count.isdecimal() and 1 <= int(count[:9]) <= MOST_WORKERS:
             place = cls(int(count))
         else:
-            what = "local:N, N processes on this machine, such as local:2, or tls://HOST:PORT, a scheduler of dask's"
+            what = "local:N, N processes on this machine, such as local:2, or tls://HOST:PORT, a dask scheduler"
             raise ConfigError("--cluster", "", f"must be {what}, not {one_line(text, 60)}")
         if any(importlib.util.find_spec(name) is None for name in ("distributed", "cryptography")):
-            raise ConfigError(
-                "--cluster", "", "dask.distributed is not installed; `pip install reslrb[cluster]` has it"
-            )
+            raise ConfigError("--cluster", "", "dask.distributed is not installed; run `pip install reslrb[cluster]`")
         return place
 
     def __str__(self) -> str:
@@ -188,7 +186,7 @@ def _certificates() -> object:
     for name, file in files.items():
         variable = f"DASK_DISTRIBUTED__COMM__TLS__{name.upper().replace('-', '_').replace('.', '__')}"
         if not file:
-            reason = f"is not set; say where the file is, for example by {variable}=FILE (docs/cluster.md)"
+            reason = f"is not set; give the file, for example by {variable}=FILE (docs/cluster.md)"
             raise ConfigError("--cluster", f"distributed.comm.tls.{name}", reason)
         if "\n" not in file and not os.access(file, os.R_OK):
             raise ConfigError("--cluster", f"distributed.comm.tls.{name}", f"{file} cannot be read")

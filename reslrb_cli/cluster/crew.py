@@ -173,7 +173,7 @@ class Crew:
             self._open(new, here)
         for worker, (_, began) in [*self._opening.items()]:
             if now - began > OPENING_S:
-                self._leave_out(worker, f"did not come to the experiment within {OPENING_S:.0f} s")
+                self._leave_out(worker, f"did not load the experiment within {OPENING_S:.0f} s")
         self._nobody_since = None if self._heard or self._opening else self._nobody_since or now
         wait_s = 0 if self._left_out and not self._restarts else NOBODY_S
         if self._nobody_since is not None and now - self._nobody_since > wait_s:
@@ -186,7 +186,7 @@ class Crew:
                 return call()
         except (OSError, CancelledError, TimeoutError):
             pass
-        raise MachineError("--cluster: the scheduler has gone; --resume goes on where the run was")
+        raise MachineError("--cluster: the scheduler has ended; --resume continues the run")
 
     def _forget(self, worker: str) -> None:
         self._heard.pop(worker, None)
@@ -217,9 +217,9 @@ class Crew:
 
     def _nobody(self) -> str:
         if not self._left_out:
-            return f"--cluster: no worker was there for {NOBODY_S:.0f} s"
+            return f"--cluster: no worker within {NOBODY_S:.0f} s"
         worker, reason = next(iter(self._left_out.items()))
-        more = f" (so it is with {len(self._left_out)} of them)" if len(self._left_out) > 1 else ""
+        more = f" (the same for {len(self._left_out)} workers)" if len(self._left_out) > 1 else ""
         return f"--cluster: no worker can be used: {self._name(worker)} {reason}{more}"
 
     def _name(self, worker: str) -> str:
@@ -247,16 +247,16 @@ class Crew:
     def _leave_out(self, worker: str, reason: str) -> None:
         self._forget(worker)
         self._left_out[worker] = reason
-        logger.warning(f"--cluster: {self._name(worker)} {reason}; it takes no part")
+        logger.warning(f"--cluster: {self._name(worker)} {reason}; it is not used")
 
     def _start_anew(self, worker: str, reason: str) -> None:
         """Let dask restart a worker, which takes some time."""
         name = self._name(worker)
         self._restarts[name] += 1
         if self._restarts[name] > RESTARTS:
-            self._leave_out(worker, f"{reason}, again and again")
+            self._leave_out(worker, f"{reason}, repeatedly")
             return
-        logger.warning(f"--cluster: {name} {reason}; it is started anew")
+        logger.warning(f"--cluster: {name} {reason}; it is restarted")
         self._forget(worker)
         self._anew.add(worker)
 
@@ -265,8 +265,8 @@ class Crew:
                 self.client.restart_workers([worker], timeout=RESTART_S, raise_for_error=False)
             except (ValueError, OSError, TimeoutError):
                 if self.client.status == "running":  # else the run has ended
-                    self._left_out[worker] = f"{reason}, and has nobody to start it anew"
-                    logger.warning(f"--cluster: {name} has nobody to start it anew; it takes no part")
+                    self._left_out[worker] = f"{reason}, and nothing can restart it"
+                    logger.warning(f"--cluster: nothing can restart {name}; it is not used")
             self._anew.discard(worker)
 
         threading.Thread(target=start_anew, daemon=True).start()
@@ -366,7 +366,7 @@ class Crew:
         todo.losses += 1
         if todo.losses > LOSSES + todo.size:
             left = len(todo.left)
-            raise MachineError(f"--cluster: asked again {todo.losses} times; calls without an answer: {left}")
+            raise MachineError(f"--cluster: repeated {todo.losses} calls; calls without an answer: {left}")
 
     def _take_fault(self, todo: _Round, fault: Fault, place: int | None) -> None:
         """Ask other workers and restart this one. Raises MachineError or OutOfMemory if that has failed before."""
@@ -412,7 +412,7 @@ class Crew:
         compiling = {worker for worker in silent if todo.cold is not None and worker not in todo.computing}
         limits = {worker: OPENING_S if worker in compiling else hung_s for worker in silent if worker in self._late}
         for worker in [worker for worker, limit in limits.items() if now - self._heard[worker] > limit]:
-            self._start_anew(worker, f"said nothing for {now - self._heard[worker]:.0f} s")
+            self._start_anew(worker, f"did not answer for {now - self._heard[worker]:.0f} s")
 
 
 def _reply(future: Future) -> Reply | None:
@@ -432,7 +432,7 @@ def _reply(future: Future) -> Reply | None:
             return found
         return None
     except KilledWorker as error:
-        return Fault("", f"worker after worker ended over one shard, the last one of them {error.last_worker.address}")
+        return Fault("", f"several workers ended during one shard, the last one at {error.last_worker.address}")
     except (CancelledError, CommClosedError):
         return None
     finally:

@@ -70,7 +70,7 @@ class Standing:
             problem.optimizer.set_value(key, like(dr.detach(problem.optimizer[key]), value))
         wrong = restore_tables(problem, self.calls, self.learned)
         if wrong is not None:
-            raise MachineError(f"a worker has other tables of guided emission than the run: {wrong}")
+            raise MachineError(f"a worker has other guiding tables than the run: {wrong}")
         problem.apply()
 
 
@@ -133,7 +133,7 @@ def opening_of(course: RunProgress, folder: Path, own: bool) -> tuple[Opening, B
     bundle, here = bundle_of(config, {key: selection.array(key) for key in selection.keys}), digests(config)
     for key, digest in course.files.items():
         if here.get(key) != digest:
-            raise ConfigError(config.source, key, "has changed since the run began; put it back, or begin anew")
+            raise ConfigError(config.source, key, "has changed since the run began; restore it, or start a new run")
     course.save(folder)
     write_archive(folder / TARGETS_FILE, target_arrays(course.problem.views))
     for name in (STATE_FILE, TARGETS_FILE):

@@ -120,9 +120,11 @@ def open_state(opening: Opening, files: Mapping[str, bytes] | None, threads: int
     here = versions()
     for name, version in opening.versions.items():
         if here.get(name) != version:
-            return Fault(me, f"has {name} {here.get(name)}, and the run {version}: install the same", stays=True)
+            return Fault(
+                me, f"has {name} {here.get(name)}, but the run has {version}: install the same version", stays=True
+            )
     if opening.asks_for_code and os.environ.get(ALLOW_CODE) != "1":
-        return Fault(me, f"runs no code of users' own: start it with {ALLOW_CODE}=1 in its environment", stays=True)
+        return Fault(me, f"does not run users' own code: start it with {ALLOW_CODE}=1 in its environment", stays=True)
     folder = Path(get_worker().local_directory) / f"reslrb-{opening.digest}"  # dask removes it with the worker
     if files is None and not folder.is_dir():
         return Lacks(me, "files")

@@ -106,13 +106,16 @@ class Projective(Replayed):
 
     def obstacle(self, scene: mi.Scene, sensors: Iterable[mi.Sensor], moved: Iterable[mi.Object]) -> str | None:
         """Return why Mitsuba 3.9 computes silhouettes or shadow edges of the `moved` shapes wrongly, or None."""
-        advice = "or set integrator.sppp to 0, which leaves out outlines that the sensor sees"
+        advice = "or set integrator.sppp to 0, which leaves out outlines seen by the sensor"
         for sensor in sensors if self.plugin.sppp != 0 else ():
             if sensor.class_name() != "PerspectiveCamera":
-                return f"has outlines for perspective sensors alone, and {sensor.id()} is none; take such, {advice}"
+                return (
+                    f"has outlines only for perspective sensors, and {sensor.id()} is none; use a perspective "
+                    f"sensor, {advice}"
+                )
             rectangle = next((shape for shape in moved if shape.class_name() == "Rectangle"), None)
             if rectangle is not None:
-                return f"has wrong outlines of rectangles, as {rectangle.id()} is; make it a mesh, {advice}"
+                return f"has wrong outlines of rectangles such as {rectangle.id()}; use a mesh instead, {advice}"
         return None
 
 
@@ -192,15 +195,15 @@ class Trajectory(LightTracer, Reversed):
     def __init__(self, max_depth: int = -1, **common: Any) -> None:
         super().__init__(max_depth, motion=Motion(attached=False), **common)
         if max_depth == -1:
-            raise ValueError('"max_depth" must be given: it is the size of the record')
+            raise ValueError('"max_depth" is missing: it is the size of the record')
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
         with dr.suspend_grad():
             parts = self.passes(job)
             if parts[0].plan.differentiate_null:
                 raise UnsupportedScene(
-                    "trajectory: Dr.Jit cannot reverse the loop through masks within that of the path; give "
-                    "parameters to other surfaces than masks alone"
+                    "trajectory: Dr.Jit cannot reverse the loop through masks inside the loop of the path; recover "
+                    "parameters of other surfaces, too"
                 )
             adjoint = parts[0].film.adjoint(gradient)
 

@@ -85,7 +85,7 @@ class Differentiated:
                 emitting[node] = None
                 least[key] = 0
             else:
-                obstacle = "light tracing has derivatives of what light meets and leaves from, not of the sensor"
+                obstacle = "light tracing has derivatives of surfaces and emitters, not of the sensor"
             if obstacle is not None:
                 raise UnsupportedScene(f"{key}: {obstacle}")
         return Differentiated(tuple(nodes), tuple(emitting), tuple(shapes), tuple(emitters), least, entries)
@@ -128,18 +128,18 @@ def attach(plan: Plan, which: Differentiated, motion: Motion, scene: mi.Scene, s
     moves = bool(which.shapes or which.emitters)
     if motion.attached is False and moves:
         raise UnsupportedScene(
-            "attached: false leaves out the derivatives of parameters that move light; leave it at auto", "attached"
+            "attached: false leaves out the derivatives of parameters that move light; use auto", "attached"
         )
     if not (moves or (motion.attached is True and (which.bsdf_nodes or which.emission_nodes))):
         return plan
     if motion.obstacle is not None:
         raise UnsupportedScene(motion.obstacle, "estimator")
     if plan.needs.has_null:
-        raise UnsupportedScene("attached derivatives do not go through masks and other surfaces with null lobes")
+        raise UnsupportedScene("attached derivatives do not support masks and other surfaces with null lobes")
     if sensor.film().rfilter().is_box_filter():
         raise UnsupportedScene(
-            f"sensor {sensor.id()} has a box filter, whose splats do not change while they move inside of a pixel; "
-            "take a smooth one, such as gaussian, for derivatives of what moves light"
+            f"sensor {sensor.id()} has a box filter, whose splats do not change while they move within a pixel; use a "
+            "smooth filter, such as gaussian, for derivatives of moving light"
         )
     if any(interpolates_normals(shape) for shape in which.shapes):
         plan = with_shading_normals(plan)  # a flat mesh is about to bend

@@ -70,7 +70,7 @@ class Recordings:
             self._functions[key] = _record(kind, plain, common, inputs)
         recorded = self._functions.get(key)
         if recorded is not None and recorded.n_recordings >= MOST_RECORDINGS:
-            logger.debug("no longer recorded (%s): it was %d times", kind, recorded.n_recordings)
+            logger.debug("no longer recorded (%s): recorded %d times", kind, recorded.n_recordings)
             recorded = self._functions[key] = None
         if recorded is None:
             return plain(*common, *inputs)
@@ -82,8 +82,8 @@ class Recordings:
                 raise
             reason = str(error.__cause__ or error).splitlines()[0]
             raise UnsupportedScene(
-                f"freeze: a recorded step no longer fits, as when another scene was loaded since ({reason}); "
-                "switch recordings off by drjit.set_flag(drjit.JitFlag.KernelFreezing, False)"
+                f"freeze: a recorded step no longer fits, possibly because another scene was loaded since ({reason}); "
+                "switch off recordings with drjit.set_flag(drjit.JitFlag.KernelFreezing, False)"
             ) from error
 
     def counts(self) -> dict[str, int]:

@@ -52,7 +52,7 @@ class OwnIntegrator(Reversed):
     @cached_property
     def _work(self) -> Replayed:
         if not self.allowed:
-            raise ConfigError(self.file, self.name, "would be run, with all your rights; --allow-code has it run")
+            raise ConfigError(self.file, self.name, "would run with all your rights; --allow-code permits it")
         found = load_named(self.file, self.name, self.file, self.name)
         options = mi.Properties("custom")
         for key, value in {**self._options, **self._arguments}.items():
@@ -60,7 +60,9 @@ class OwnIntegrator(Reversed):
         with Guard(self.file, self.name, self.file, "making it"):
             plugin = found(options)
         if not isinstance(plugin, mi.Integrator):
-            raise ConfigError(self.file, self.name, f"is no Mitsuba integrator, but makes a {type(plugin).__name__}")
+            raise ConfigError(
+                self.file, self.name, f"is not a Mitsuba integrator, but creates a {type(plugin).__name__}"
+            )
         unknown = [key for key in options.unqueried() if key in self._arguments]
         if unknown:
             raise ConfigError(self.file, self.name, f"has no option {', '.join(unknown)}")

@@ -53,7 +53,7 @@ def _on_variant(old: str | None, new: str) -> None:
 def _refuse(type: str, props: mi.Properties) -> NoReturn:
     """Raise an error under a variant without the plugin, because "no such plugin" would be no help."""
     check_variant(mi.variant())
-    raise AssertionError("called under such variants only")
+    raise AssertionError("requires such a variant")
 
 
 def _plugin_class() -> type[mi.CppADIntegrator]:

@@ -233,7 +233,7 @@ class LightTracer:
         with dr.suspend_grad():
             parts = self.passes(job)
             if parts[0].plan.moving_emission:
-                raise UnsupportedScene("forward mode has no derivatives of emitters that move; take reverse mode")
+                raise UnsupportedScene("forward mode has no derivatives of moving emitters; use reverse mode")
             film = parts[0].film
             block = film.block()
             in_passes(parts, splat_tangents, block)
@@ -285,7 +285,7 @@ class Reslrb(LightTracer):
         estimator = estimator or ("stack" if paths == "camera" else cls.OPTIONS["estimator"])
         if estimator == "auto":
             raise ValueError(
-                '"estimator" auto needs an experiment to measure on (`reslrb optimize`); as a plugin, name one of '
+                '"estimator" auto needs an experiment to measure on (`reslrb optimize`); for the plugin, name one of '
                 + ", ".join(ESTIMATORS)
             )
         if estimator not in ESTIMATORS:
@@ -293,8 +293,8 @@ class Reslrb(LightTracer):
         own = {name: options.pop(name) for name in options_of(estimator) if name in options}
         if paths == "camera" and estimator != "stack":
             raise ValueError(
-                f'"estimator" {estimator} chooses among the connections of light paths, of which paths: camera has '
-                "none; leave it out, or take stack"
+                f'"estimator" {estimator} needs the connections of light paths, and paths: camera has none; remove it, '
+                "or use stack"
             )
         obstacle = None if estimator in ATTACHED else _no_attached(estimator)
         motion = Motion(attached, filter_normalization, obstacle, attached_sampling)
@@ -305,7 +305,7 @@ class Reslrb(LightTracer):
         ):
             if value == "auto":
                 raise ValueError(
-                    f'"{name}" auto needs an experiment to measure on (`reslrb optimize`); say {" or ".join(values)}'
+                    f'"{name}" auto needs an experiment to measure on (`reslrb optimize`); use {" or ".join(values)}'
                 )
             one_of(name, value, values)
         options |= {"guided": guiding == "on", "low_discrepancy": sequence == "low_discrepancy"}
@@ -365,8 +365,8 @@ class Reslrb(LightTracer):
 
 def _no_attached(estimator: str) -> str:
     return (
-        f"estimator {estimator} has no derivatives of what moves light: it would need the Jacobians that reservoir "
-        f"takes at every vertex, and gain nothing by them; take {', '.join(ATTACHED)}"
+        f"estimator {estimator} has no derivatives of moving light: it would need the Jacobians that reservoir "
+        f"computes at every vertex, without a benefit; use {', '.join(ATTACHED)}"
     )
 
 

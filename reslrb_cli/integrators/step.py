@@ -170,7 +170,7 @@ class Halves:
 def half_jobs(job: Job) -> tuple[Job, Job]:
     """Return the two halves of a job. Raises ValueError for an odd number of samples per pixel."""
     if job.spp < 2 or job.spp % 2:
-        raise ValueError(f"the samples per pixel of a set ({job.spp}) must be even, where they are halved")
+        raise ValueError(f"the samples per pixel of a set ({job.spp}) must be even, because they are halved")
     first, second = (replace(job, seed=seed, spp=job.spp // 2) for seed in half_seeds(job.seed))
     return first, second
 
@@ -296,7 +296,7 @@ def given_step(
 def _check_number(name: str, value: object, least: int, most: int) -> None:
     """Raise ValueError for an argument that is no whole number from `least` to `most`."""
     if not isinstance(value, Integral) or not least <= int(value) <= most:
-        raise ValueError(f'"{name}" must be a whole number from {least} to {most}, not {value!r}')
+        raise ValueError(f'"{name}" must be an integer from {least} to {most}, not {value!r}')
 
 
 def _differentiate(work: StepIntegrator, job: Job, gradient: mi.TensorXf, on_samples: OnSamples | None) -> None:

@@ -95,8 +95,8 @@ def as_sheet(name: str, points: Array, triangles: Indices, smooth: bool = False)
     points = np.asarray(points, np.float64)
 
     def fail(why: str) -> ConfigError:
-        return ConfigError("", "fabrication.faces", f"`{name}` {why}; a solid is made of a rectangular grid of heights "
-                           "along z, as `reslrb lens` writes it")  # fmt: skip
+        return ConfigError("", "fabrication.faces", f"`{name}` {why}; a solid needs a rectangular grid of heights "
+                                                    "along z, as written by `reslrb lens`")  # fmt: skip
 
     if not np.all(np.isfinite(points)):
         raise fail("has vertices that are not finite")
@@ -109,9 +109,9 @@ def as_sheet(name: str, points: Array, triangles: Indices, smooth: bool = False)
     (x, y), (column, row) = lines, at
     place = row * len(x) + column
     if min(len(x), len(y)) < 3 or len(points) != len(x) * len(y) or len(np.unique(place)) < len(points):
-        raise fail(f"has {len(points)} vertices that lie on no grid")
+        raise fail(f"has {len(points)} vertices that are not on a grid")
     if any(np.ptp(np.diff(line)) > 1e-2 * np.diff(line).mean() for line in (x, y)):
-        raise fail("has vertices at uneven distances")
+        raise fail("has vertices at unequal distances")
     ordered = np.empty_like(points)
     ordered[place] = points
     corners = place[np.asarray(triangles, np.int64)]
@@ -138,16 +138,16 @@ def make_solid(sheets: Sequence[Sheet], plan: Fabrication) -> Solid:
     half = sheets[0].half if plan.size is None else (plan.size[0] / 2, plan.size[1] / 2)
     for sheet in sheets:
         if any(abs(a - b) > _SIZE * b for a, b in zip(sheet.half, half, strict=True)):
-            raise ConfigError("", "fabrication.size", f"is {2 * half[0]:g} x {2 * half[1]:g} mm, and `{sheet.name}` "
-                              f"{2 * sheet.half[0]:g} x {2 * sheet.half[1]:g}")  # fmt: skip
+            raise ConfigError("", "fabrication.size", f"is {2 * half[0]:g} x {2 * half[1]:g} mm, but `{sheet.name}` "
+                                                      f"{2 * sheet.half[0]:g} x {2 * sheet.half[1]:g}")  # fmt: skip
         middle = sheet.x.mean(), sheet.y.mean()
         if max(map(abs, middle)) > _SIZE * max(half):
-            raise ConfigError("", "fabrication.faces", f"the middle of `{sheet.name}` is at x = {middle[0]:.3g}, "
-                              f"y = {middle[1]:.3g}; it must be at 0")  # fmt: skip
+            raise ConfigError("", "fabrication.faces", f"the centre of `{sheet.name}` is at x = {middle[0]:.3g}, y = "
+                                                       f"{middle[1]:.3g}; it must be at 0")  # fmt: skip
     thin = least_thickness(sheets, plan)
     if thin <= 0:
-        raise ConfigError("", "fabrication.thickness", f"{plan.thickness:g} mm: front and back cross, by {-thin:.3g} "
-                          f"mm; it must be above {plan.thickness - thin:.4g}")  # fmt: skip
+        raise ConfigError("", "fabrication.thickness", f"{plan.thickness:g} mm: front and back overlap by {-thin:.3g} "
+                                                       f"mm; it must be above {plan.thickness - thin:.4g}")  # fmt: skip
     build = _Building(sheets[0].half)
     outer = build.add_face(sheets[0], plan, 1)
     if len(sheets) == 2:
@@ -161,7 +161,9 @@ def make_solid(sheets: Sequence[Sheet], plan: Fabrication) -> Solid:
         build.triangles.append(np.stack([np.full_like(below, middle_point), turned, below], 1))
     solid = Solid(np.concatenate(build.points), np.concatenate(build.triangles))
     if not is_closed(solid.triangles):
-        raise ConfigError("", "fabrication.faces", "the faces make no closed solid: their edges are not one outline")
+        raise ConfigError(
+            "", "fabrication.faces", "the faces do not form a closed solid: their edges differ from one outline"
+        )
     return solid
 
 
@@ -397,15 +399,17 @@ def measured(solid: Solid, sheets: Sequence[Sheet], plan: Fabrication) -> dict[s
             narrow = float(np.mean(curvature > 1 / plan.tool_radius)) if curvature.size else 0.0
             face["share_narrower_than_tool"] = narrow
             if narrow > 0:
-                warnings.append(f"the tool does not get into {100 * narrow:.2g} % of `{sheet.name}`: its radius is "
-                                f"{plan.tool_radius:g} mm, that of hollows {1 / sharpest:.3g} mm and more")  # fmt: skip
+                warnings.append(
+                    f"the tool does not reach {100 * narrow:.2g} % of `{sheet.name}`: its radius is "
+                    f"{plan.tool_radius:g} mm, and hollows have radii from {1 / sharpest:.3g} mm"
+                )
         faces[sheet.name] = face
         if sheet.smooth:
-            warnings.append(f"`{sheet.name}` was shaped with interpolated normals, which a solid does not have: it "
-                            'throws another picture; give the mesh <boolean name="face_normals" value="true"/> in the '
-                            "scene's file, and shape it again")  # fmt: skip
+            warnings.append(f"`{sheet.name}` was shaped with interpolated normals, which a solid does not have, so its "
+                            'picture will differ; add <boolean name="face_normals" value="true"/> to the mesh in the '
+                            "scene's file, and run `reslrb optimize` again")  # fmt: skip
     if plan.min_thickness is not None and thin < plan.min_thickness:
-        warnings.append(f"at its thinnest it is {thin:.3g} mm thick, less than {plan.min_thickness:g} mm; add "
+        warnings.append(f"its least thickness is {thin:.3g} mm, below {plan.min_thickness:g} mm; add "
                         f"{plan.min_thickness - thin:.3g} mm to fabrication.thickness")  # fmt: skip
     return {
         "unit": "mm",
@@ -427,11 +431,11 @@ def measured(solid: Solid, sheets: Sequence[Sheet], plan: Fabrication) -> dict[s
 def summary(numbers: dict[str, Any]) -> list[str]:
     """Return the results of `measured` as lines: the solid, its faces, the warnings."""
     wide, high, deep = numbers["extent"]
-    lines = [f"{wide:.4g} x {high:.4g} x {deep:.4g} mm, {numbers['volume_mm3'] / 1000:.4g} cm^3, at its thinnest "
+    lines = [f"{wide:.4g} x {high:.4g} x {deep:.4g} mm, {numbers['volume_mm3'] / 1000:.4g} cm^3, least thickness "
              f"{numbers['least_thickness']:.3g} mm; {numbers['triangles']} triangles"]  # fmt: skip
     for name, face in numbers["faces"].items():
         radius, slope = face["smallest_concave_radius"], face["steepest_slope_degrees"]
-        hollow = "nowhere hollow" if radius is None else f"hollows of {radius:.3g} mm in radius and more"
+        hollow = "nowhere hollow" if radius is None else f"hollows with radii from {radius:.3g} mm"
         lines.append(f"{name}: {face['relief']:.3g} mm deep, slopes up to {slope:.3g} degrees, {hollow}")
     return lines + numbers["warnings"]
 

@@ -211,13 +211,13 @@ def shape_surface(
             ) is not None  # fmt: skip
         if not is_lit:
             near = np.isfinite(setting.light_distance)
-            key, what = ("light_distance", "a light farther away") if near else ("distance", "a larger distance")
-            raise ConfigError("", key, f"is {getattr(setting, key):g} mm, from where no {setting.kind} was found that "
-                              f"lights the receiver evenly; {what}, or a smaller size, may do")  # fmt: skip
+            key, what = ("light_distance", "a more distant light") if near else ("distance", "a larger distance")
+            raise ConfigError("", key, f"is {getattr(setting, key):g} mm, at which no {setting.kind} was found that "
+                                       f"lights the receiver evenly; try {what}, or a smaller size")  # fmt: skip
         if found is None:
             raise ConfigError("", "picture", f"has too much contrast for this {setting.kind}: even with a floor of "
-                              f"{transport.FLOORS[-1]:g} of its maximum light would have to be torn apart; "
-                              "a larger distance, lifted dark parts or a crop may do")  # fmt: skip
+                                             f"{transport.FLOORS[-1]:g} of its maximum, light would be torn apart; try "
+                                             "a larger distance, brighter dark parts, or a crop")  # fmt: skip
         floor = found
     longer = max(setting.size)
     shape = (max(8, round(cells * setting.size[1] / longer)), max(8, round(cells * setting.size[0] / longer)))
@@ -232,16 +232,18 @@ def shape_surface(
         made = solved(floor)
     target = transport.lifted(target, floor)
     if not made.converged:
-        raise ConfigError("", "distance", f"no face was found that throws this picture {setting.distance:g} mm far; "
-                          "a larger distance or a higher floor may do")  # fmt: skip
+        raise ConfigError("", "distance", f"no face was found for this picture at {setting.distance:g} mm; try a "
+                                          "larger distance or a higher floor")  # fmt: skip
     inside = within(setting, *transport.grid(shape, setting.size))
     relief = _depth(made.h, inside)
     twice = _twice(setting, target, inside.shape)
     low = float(made.h[inside].min())
     if setting.kind == "lens" and setting.thickness + low <= 0:
-        raise ConfigError("", "thickness", f"the relief, {relief:.3g} mm deep, goes {-low:.3g} mm into the glass; "
-                          f"thickness must be above {-low:.3g} mm, or distance larger (at {2 * setting.distance:g} mm "
-                          f"the relief is {twice:.3g} mm deep)")  # fmt: skip
+        reason = (
+            f"the relief is {relief:.3g} mm deep and goes {-low:.3g} mm into the glass; thickness must be above "
+            f"{-low:.3g} mm, or distance larger (at {2 * setting.distance:g} mm the relief is {twice:.3g} mm deep)"
+        )
+        raise ConfigError("", "thickness", reason)
     return Surface(setting, made.h, inside, floor, relief, twice, made)
 
 
@@ -287,11 +289,13 @@ def is_even(picture: Array) -> bool:
 def _check(picture: Array, setting: Setting) -> None:
     s = setting
     if picture.ndim != 2 or min(picture.shape) < 2:
-        raise ConfigError("", "picture", f"is {' x '.join(map(str, picture.shape))}; it must have 2 x 2 pixels or more")
+        raise ConfigError(
+            "", "picture", f"is {' x '.join(map(str, picture.shape))}; it must have at least 2 x 2 pixels"
+        )
     if not np.all(np.isfinite(picture)) or picture.min() < 0:
         raise ConfigError("", "picture", "has values that are negative or not finite")
     if is_even(picture):
-        raise ConfigError("", "picture", "is of one colour; there is nothing to throw")
+        raise ConfigError("", "picture", "has only one colour; there is no picture to show")
     for key in ("size", "picture_size"):
         if min(getattr(s, key)) <= 0:
             raise ConfigError("", key, "must be above 0 mm")
@@ -303,20 +307,23 @@ def _check(picture: Array, setting: Setting) -> None:
     if max(map(abs, s.tilt)) > 80:
         raise ConfigError("", "tilt", f"is {s.tilt[0]:g} and {s.tilt[1]:g} degrees; both must be between -80 and 80")
     if s.kind == "lens" and not 1 < s.ior <= 5:
-        raise ConfigError("", "ior", f"is {s.ior:g}; glass and plastics that bend light have 1.3 to 2.0, at most 5")
+        raise ConfigError("", "ior", f"is {s.ior:g}; glass and plastics have 1.3 to 2.0, and the limit is 5")
     if s.kind == "mirror":
         angle = np.radians(abs(s.incidence))
         beside = s.distance * np.sin(2 * angle)
         needed = s.size[0] / 2 * np.cos(angle) + s.picture_size[0] / 2 * abs(np.cos(2 * angle))
         if beside < needed:
-            raise ConfigError("", "incidence", f"at {s.incidence:g} degrees the receiver stands in the mirror's light; "
-                              "30 degrees do for pictures of the mirror's size at its distance or more")  # fmt: skip
+            reason = (
+                f"at {s.incidence:g} degrees the receiver blocks the mirror's light; 30 degrees suffice if the "
+                "distance is at least the mirror's size"
+            )
+            raise ConfigError("", "incidence", reason)
     if not _reaches(s):
         enough = next((f for f in np.geomspace(1, 100, 100) if _reaches(replace(s, distance=s.distance * f))), None)
         advice = "a smaller picture or tilt" if enough is None else f"a distance of {s.distance * enough:.3g} mm"
         raise ConfigError("", "distance", f"at {s.distance:g} mm light cannot reach the whole picture: " + (
-            f"an index of {s.ior:g} bends light by at most {np.degrees(np.arccos(1 / s.ior)):.0f} degrees "
-            "before it is totally reflected; " if s.kind == "lens" else "") + f"{advice} would do")  # fmt: skip
+            f"an index of {s.ior:g} bends light by at most {np.degrees(np.arccos(1 / s.ior)):.0f} degrees before total "
+            "reflection; " if s.kind == "lens" else "") + f"{advice} would do")  # fmt: skip
 
 
 def _reaches(setting: Setting) -> bool:

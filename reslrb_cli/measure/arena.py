@@ -180,7 +180,7 @@ class Arena(Generic[Measured, Worker]):
         if not self.plan.default:
             return None
         if self.facts.get("paths") == "light" and case.options.get("paths", "light") != "light":
-            return "this scene has light paths alone"
+            return "this scene has only light paths"
         reason: str | None = self.facts["without"].get(case.type)
         return reason
 

@@ -236,7 +236,9 @@ class Bench(Arena[Sweep, BenchRun]):
             if run.alive and run.cold is not None and run.cold["step_ms"] > 1e3 * SLOW:
                 self._say(f"{name}, {run.case.label}: the first step took {run.cold['step_ms'] / 1e3:.0f} s")
         if self._tight():
-            self._say(f"{name}: together the cases need more than the memory; each releases its own after a step")
+            self._say(
+                f"{name}: together the cases need more than the available memory; each releases its memory after a step"
+            )
         # Rounds go on from those of an earlier session, whose numbers made the seeds, until all have enough of them.
         first = 1 + max((round for run in self.members for round in run.steps), default=-1)
         return self._take_rounds(self._alive, first, min((len(run.steps) for run in self._alive()), default=0))
@@ -248,4 +250,4 @@ class Bench(Arena[Sweep, BenchRun]):
             return "; nothing had compiled by then, so allow several times as much"
         # What has not compiled is taken to take as long as what has; deeper paths take longer.
         further = late / warm + sum(GROWTH**k for k in range(1, left))
-        return f"; all of it takes about {self._pace.spent_s + self._pace.depth_s * further:.0f} s"
+        return f"; everything takes about {self._pace.spent_s + self._pace.depth_s * further:.0f} s"

@@ -249,11 +249,17 @@ def compare_expectations(
     cosine, variances = _alikeness(ours, reference)
     verdict, message = Verdict.HOLDS, ""
     if heavy:
-        verdict, message = Verdict.HEAVY_TAILED, "single seeds carry the variance: more samples per pixel, or seeds"
+        verdict, message = (
+            Verdict.HEAVY_TAILED,
+            ("single seeds dominate the variance: use more samples per pixel, or more seeds"),
+        )
     elif z_max >= family.z_max_limit or z_rms >= rms_limit:
         verdict = Verdict.FAILS
     elif detectable > RESOLUTION:
-        verdict, message = Verdict.UNRESOLVED, f"a deviation by {detectable:.0%} could hide in the noise: more seeds"
+        verdict, message = (
+            Verdict.UNRESOLVED,
+            (f"a deviation of {detectable:.0%} could hide in the noise: use more seeds"),
+        )
     return Comparison(
         verdict, relative_l2=far, z_rms=z_rms, z_rms_limit=rms_limit, z_max=z_max, z_max_limit=family.z_max_limit,
         cosine=cosine, variance_ratio=variances, detectable=detectable, message=message,
@@ -330,7 +336,7 @@ def _problem(ours: np.ndarray, reference: np.ndarray) -> Comparison | None:
         if bad:
             return Comparison(Verdict.FAILS, message=f"the {name} has {bad} entries that are not finite")
     if not ours.any() and not reference.any():
-        return Comparison(Verdict.UNREACHED, message="gradient and reference are zero: no light path sees it")
+        return Comparison(Verdict.UNREACHED, message="gradient and reference are zero: no light path reaches it")
     return None
 
 

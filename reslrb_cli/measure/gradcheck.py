@@ -163,7 +163,7 @@ class Gradcheck:
         if late and not stop():
             needed_s = self._sampling.needed_s()
             enough = "several times as much" if needed_s is None else f"about {needed_s:.0f} s"
-            say(f"the fewest seeds of everything take {enough}; allow that with --budget")
+            say(f"the minimum number of seeds takes {enough}; allow this with --budget")
 
     def _needs(self, row: Row) -> list[Name]:
         """Return the names of the samples that a comparison needs: the estimator's, and the reference's unless it is

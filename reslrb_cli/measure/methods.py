@@ -85,7 +85,7 @@ class Case:
         blame = f"{self.source} {self.label}"
         adjoint = {name: value for name, value in self.options.items() if name in ADJOINT}
         if known and adjoint:
-            raise ConfigError(blame, next(iter(adjoint)), "has no effect where dL/dI is known; change --objective")
+            raise ConfigError(blame, next(iter(adjoint)), "has no effect if dL/dI is known; change --objective")
         if known:
             adjoint = {"adjoint": "independent"}  # valid with any loss
         shared, own = config.integrator.options(), _TYPES[self.type].model_fields if self.type in _TYPES else {}
@@ -101,7 +101,7 @@ class Case:
             given["arguments"] = {name: given.pop(name) for name in [*given] if name not in own}
         values |= given
         if self.type == "reslrb" and values.setdefault("estimator", PLUGIN_ESTIMATOR) == "auto" and not auto:
-            raise ConfigError(blame, "estimator", "`auto` is for whole runs; take `stack`")
+            raise ConfigError(blame, "estimator", "`auto` is for whole runs; use `stack`")
         ways = {"guiding": "`on` with `off`", "sequence": "`independent` with `low_discrepancy`",
                 "pixels": "`even` with `measured`"}  # fmt: skip
         for option, compared in (ways | {"paths": "`light`, `camera` and `both`"}).items():
@@ -109,7 +109,7 @@ class Case:
                 raise ConfigError(blame, option, f"`auto` measures whether it pays; compare {compared}")
         made = with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
         if self.type == "custom" and not config.allows_code:
-            raise ConfigError(blame, "", "would be run, with all your rights; --allow-code has it run")
+            raise ConfigError(blame, "", "would run with all your rights; --allow-code permits it")
         return made
 
     @property
@@ -146,7 +146,7 @@ def parse_own(text: str) -> list[Case]:
     """Parse a list of a user's own integrators, FILE.py:CLASS[(OPTION=VALUE,...)]. Raises like `parse_cases`."""
     cases = _parse(text, _OPTION, "", "integrator of your own; write FILE.py:CLASS[(OPTION=VALUE,...)]", False)
     if others := [case.label for case in cases if case.type != "custom"]:
-        reason = f"`{others[0]}` is none of your own (FILE.py:CLASS); estimators of reslrb go with --estimators"
+        reason = f"`{others[0]}` is not your own (FILE.py:CLASS); use --estimators for estimators of reslrb"
         raise ConfigError(_OPTION, "", reason)
     return cases
 
@@ -181,20 +181,20 @@ def _parse(text: str, source: str, prefix: str, wanted: str, deep: bool) -> list
             match, kind, options = own, "custom", {"file": place}
         options = {name: value for name, value in options.items() if value is not None}
         if match is None or (prefix and "estimator" not in options):
-            raise ConfigError(source, "", f"`{item}` is no {wanted}")
+            raise ConfigError(source, "", f"`{item}` is not a {wanted}")
         for pair in _split(match["options"]) if match["options"] else []:
             name, equals, value = (part.strip() for part in pair.partition("="))
             if not equals or not name:
                 raise ConfigError(source, item, f"`{pair}` must be OPTION=VALUE")
             if name == "max_depth" and deep:
-                raise ConfigError(source, item, "max_depth is what is varied; --max-depth says how far")
+                raise ConfigError(source, item, "max_depth is varied; --max-depth sets its end")
             if name == "max_depth" or (name in ADJOINT and prefix):
                 section = "run" if name in ADJOINT else "integrator"
-                raise ConfigError(source, item, f"all share one {name}; take --set {section}.{pair}")
+                raise ConfigError(source, item, f"all share one {name}; use --set {section}.{pair}")
             options[name] = parse(value, f"{source} {item}", name_line=False)
         case = Case(prefix + item, kind, options, source)
         if case.label in [other.label for other in cases]:
-            raise ConfigError(source, "", f"`{item}` is named twice")
+            raise ConfigError(source, "", f"`{item}` is given twice")
         cases.append(case)
     return cases
 
@@ -420,7 +420,7 @@ class Plan(Measurement):
     def check(self) -> None:
         """Raise ConfigError if an integrator of the list, or the reference, is invalid."""
         if self.reference.options.get("estimator") == "auto":
-            raise ConfigError("--reference", "", "`auto` measures which estimator to take; name one")
+            raise ConfigError("--reference", "", "`auto` measures which estimator to use; name one")
         for case, spp in self.entries:
             self.config_of(case, spp)
         _ = self.reference_config
@@ -441,7 +441,7 @@ def compared(integrators: str | None, reference: str | None, usual: str) -> dict
     cases = parse_cases(integrators or usual, deep=False)
     stands = parse_cases(reference or REFERENCE, "--reference", deep=False)
     if len(stands) != 1:
-        raise ConfigError("--reference", "", "errors are taken from one method; name one")
+        raise ConfigError("--reference", "", "errors are relative to one method; name one")
     return {"cases": cases, "reference": stands[0], "default": integrators is None}
 
 
@@ -450,6 +450,6 @@ def machine_of(config: Config, memory_limit: int | None) -> dict[str, Any]:
     variant, _ = choose(config.variant)
     on_gpu, memory = variant.startswith("cuda"), memory_bytes(variant)
     if on_gpu and memory_limit is not None:
-        raise ConfigError("--memory-limit", "", f"bounds address space, which says nothing of {variant}'s memory")
+        raise ConfigError("--memory-limit", "", f"limits the address space, which does not include {variant}'s memory")
     limit = memory_limit or (None if on_gpu else memory)
     return {"variant": variant, "memory": memory, "memory_limit": limit, "device": device_name(variant)}

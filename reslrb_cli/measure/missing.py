@@ -248,7 +248,7 @@ class MissingCheck:
         weights = gradient.astype(np.float64)[:, :, : self.case.weights.shape[2]]
         if not np.any(weights):
             raise ConfigError(
-                self.source, "loss", "has no derivative at the initial values, which are the target's own"
+                self.source, "loss", "has no derivative at the initial values, which equal those of the target"
             )
         # Its size has no part in a share, and tiny numbers would vanish beside the rounding of a sum.
         self.case.weigh(weights / np.abs(weights).mean())
@@ -277,10 +277,10 @@ def check_missing(problem: Problem, warn: Callable[[str], None]) -> list[Missing
     line, way = "; ".join(record.line() for record in told), "integrator.type=prb_projective"
     camera = camera_finds_all(problem.scene, config.integrator.max_depth)
     if any(record.is_for_the_most_part for record in told) and not config.run.accept_incomplete:
-        first = f"--set {way} has all of it, and" if camera else "the steps would go astray;"
+        first = f"--set {way} includes all of it, and" if camera else "the steps would have wrong directions;"
         raise ConfigError(config.source, "integrator.type", f"{line}; {first} --set run.accept_incomplete=true runs it "
-                          "all the same")  # fmt: skip
-    warn(f"{line}; --set {way} has all of it" if camera else line)
+                                                            "anyway")  # fmt: skip
+    warn(f"{line}; --set {way} includes all of it" if camera else line)
     return found
 
 

@@ -131,7 +131,7 @@ QUANTITIES = (
     "connection factor c",
     "derivative of the connection factor, dc",
     "contribution C = E s_1 ... s_{i-1} c_i",
-    "radiance that is met, or that a sampled emitter sends",
+    "incident radiance, or radiance of a sampled emitter",
     "derivative of that radiance",
 )
 
@@ -545,7 +545,7 @@ def _of_step(step: TracedStep, view: View, largest: Offender | None) -> Offender
     if largest is not None:
         what = "sum of contributions, each of which is finite; the largest"
         return replace(largest, sensor=view.sensor, quantity=what)
-    unseen = "(of this integrator no paths are looked at)"
+    unseen = "(the paths of this integrator are not checked)"
     if bad and np.isfinite(image).all():
         return Offender(view.sensor, None, f"gradient {unseen} of {bad[0]}", [], None)
     y, x, _ = (int(index) for index in np.argwhere(~np.isfinite(image))[0])

@@ -248,7 +248,7 @@ class Looking:
         if not np.isfinite(before.value):
             return ""
         scene, sensor = self.parts.case.scene, self.parts.case.sensor
-        for what, keys, meant in (("lamps", self._lamps(), "of light, as against fireflies"),
+        for what, keys, meant in (("lamps", self._lamps(), "of light, as opposed to fireflies"),
                                   ("surfaces", self._surfaces(), "of the throughput")):  # fmt: skip
             if not keys:
                 continue
@@ -260,8 +260,8 @@ class Looking:
                 case.set(case.initial)
             if not darker.same(before) and abs(darker.value - 1) < abs(before.value - 1) / 2:
                 return (
-                    f"with all {what} {DARKER:g} times darker the light of these paths is {darker} what it should be, "
-                    f"and {before} as they are: look for a limit from above {meant} (dr.minimum, a clamp)"
+                    f"with all {what} {DARKER:g} times darker, the light of these paths is {darker} its correct value, "
+                    f"and {before} without this change: look for an upper limit {meant} (dr.minimum, a clamp)"
                 )
         return ""
 
@@ -269,7 +269,7 @@ class Looking:
         """Report the current measurement."""
         where = ", ".join(f"{name} {value}" for name, value in options.items() if value != NEVER)
         without = "without roulette" if NEVER in options.values() else ""
-        self._say(f"looking into {self.label}: {', '.join(filter(None, [what, where, without]))}")
+        self._say(f"examining {self.label}: {', '.join(filter(None, [what, where, without]))}")
 
     def _each(self, count: int, block: int) -> Iterator[int]:
         """Yield seeds until the user stops."""
@@ -283,8 +283,8 @@ class Looking:
         """Return the sentence that says where to look."""
         if self.parts.attached:
             return (
-                "wrong where light moves: look at derivatives of silhouettes, of edges of shadows, and of where light "
-                "goes; --missing, without --integrators, says how much the first two make up"
+                "wrong if light moves: check derivatives of silhouettes, of shadow edges, and of the direction of "
+                "light; --missing, without --integrators, measures the first two"
             )
         if any(record.parameter is None for record in failing) and (image := self.images()).wrong:
             return self._of_image(image)
@@ -299,17 +299,17 @@ class Looking:
             self._seeds = MORE * SEEDS
             return self.sentence(failing)
         return (
-            f"its gradient is right along the reference's own direction ({_list(found)}), and wrong entry by entry: "
-            "look at where derivatives land (texture coordinates, the pixel that dL/dI is taken from)"
+            f"its gradient is right along the reference's own direction ({_list(found)}), but wrong in single entries: "
+            "check where derivatives land (texture coordinates, the pixel of dL/dI)"
         )
 
     def _of_image(self, ratio: Ratio) -> str:
         where, _ = self._from_depth(lambda depth: self.images(max_depth=depth))
-        parts = [f"its image is {ratio} the reference's, so look at what it renders first: the gradient follows it"]
+        parts = [f"its image is {ratio} the reference's; check the image first, because the gradient follows it"]
         if where is not None:
             parts.append(_segments(where, self._options["hide_emitters"]))
         if self._roulette() and not self.images(rr_depth=NEVER).wrong:
-            parts.append("without roulette it is right: the weight 1/p of a path that goes on")
+            parts.append("without roulette it is right: check the weight 1/p of surviving paths")
         elif where is not None:
             parts.append(self._limited(where, self._sums, self._of_length(where, self._sums)))
         return "; ".join(filter(None, parts))
@@ -318,8 +318,8 @@ class Looking:
         zero = [key for key, ratio in wrong.items() if ratio.value == 0 and ratio.error == 0]
         if zero:
             return (
-                f"its image holds; the gradient of {_names(zero)} is exactly 0: no derivative arrives there (a BSDF "
-                "or an emitter that is evaluated outside of dr.resume_grad, or detached)"
+                f"its image holds; the gradient of {_names(zero)} is exactly 0: no derivative arrives there (a BSDF or "
+                "an emitter is evaluated outside of dr.resume_grad, or detached)"
             )
         first, *others = wrong.values()
         if len(wrong) == len(found) and all(first.same(other) for other in others):
@@ -332,7 +332,7 @@ class Looking:
             return f"its image holds; its gradient is {first} the reference's{named}"
         right = [key for key in found if key not in wrong]
         beside = f", while {_names(right)} {'holds' if len(right) == 1 else 'hold'}" if right else ""
-        return f"its image holds; of the reference's gradient it has {_list(wrong)}{beside}"
+        return f"its image holds; it has {_list(wrong)} of the reference's gradient{beside}"
 
     def _narrowed(self, wrong: dict[str, Ratio]) -> list[str]:
         """Return the remaining faults: passes that differ, roulette, derivatives from some depth on, or lobes."""
@@ -343,21 +343,21 @@ class Looking:
         if self._roulette():
             without = self.gradients(rr_depth=NEVER).get(worst)
             if without is not None and not without.wrong:
-                return ["without roulette (rr_depth) it is right: the probability to go on is differentiated, or its "
-                        "weight stands in one of the two passes alone"]  # fmt: skip
+                return ["without roulette (rr_depth) it is right: the survival probability is differentiated, or its "
+                        "weight is missing in one of the two passes"]  # fmt: skip
         said = []
         at, before = self._from_depth(lambda depth: self.gradients(max_depth=depth).get(worst))
         if at is not None and (alone := self._of_length(at, self._sums)).wrong:
             said.append(
-                f"{_segments(at, self._options['hide_emitters'], before)}; the light of these alone is {alone} what it "
-                "should be in its image, which has little of it"
+                f"{_segments(at, self._options['hide_emitters'], before)}; in its image, the light of these paths "
+                f"alone is {alone} its correct value, but there is little of it"
             )
             said.append(self._limited(at, self._sums, alone))
         elif at is not None:
             said.append(
-                f"{_from(at, before)}, though its derivative by emission is right, and so are its paths and what "
-                "their vertices add: look at what is differentiated there (the BSDF's value over its detached self), "
-                "and at the light from behind it: L less all that was added up to this vertex, its own light included"
+                f"{_from(at, before)}, though its derivative by emission, its paths and the terms of their vertices "
+                "are right: check the terms that are differentiated there (the BSDF's value over its detached self), "
+                "and the light from behind: L minus all that was added up to this vertex, including its own light"
             )
         if lobes := self._lobes(worst):
             said.append(lobes)
@@ -375,21 +375,19 @@ class Looking:
             if scatter > SAME_PATHS and self._right_if_even():
                 return _MIXED
             return None if scatter <= SAME_PATHS else (
-                f"at equal seeds its derivative by all emission scatters by {100 * scatter:.2g} % about its image, "
-                "which it has to equal: the pass that differentiates traces other paths than the first (random numbers "
-                "out of step)"
+                f"at equal seeds its derivative by all emission varies by {100 * scatter:.2g} % about its image, which "
+                "it must equal: the differentiated pass traces other paths than the first one (random numbers out of "
+                "step)"
             )  # fmt: skip
-        begin = f"its derivative by all emission is {ratio} its image, which it has to equal: "
+        begin = f"its derivative by all emission is {ratio} its image, which it must equal: "
         if self._right_if_even():
             return _MIXED
         if scatter <= 0.01 * abs(ratio.value - 1) and all(ratio.same(other) for other in wrong.values()):
-            return (
-                f"{begin}one factor at every seed, so that it is dL/dI that is passed on wrongly (its sign, its scale)"
-            )
+            return f"{begin}the factor is the same at every seed, so dL/dI is passed on wrongly (its sign, its scale)"
         if self._too_short():
-            return f"{begin}the pass that differentiates ends paths a segment too soon"
+            return f"{begin}the differentiated pass ends paths a segment too soon"
         at, before = self._from_depth(lambda depth: (self.emission(depth) or (None,))[0])
-        said = [f"{begin}what a vertex adds in the pass that differentiates is not what it adds in the first"]
+        said = [f"{begin}the terms of a vertex differ between the differentiated pass and the first one"]
         if at is not None:
             sums = functools.partial(self._by_emission, self._lamps())
             said.append(_segments(at, self._options["hide_emitters"], before))
@@ -424,16 +422,16 @@ class Looking:
         for bsdf in self.parts.bsdfs_of(key):
             if bsdf.component_count() > 1 and bsdf.class_name() != "TwoSidedBRDF":
                 return (
-                    f"it belongs to a {bsdf.class_name()} of {bsdf.component_count()} lobes: the weight of "
-                    "`bsdf.sample` has the probability of the lobe in it, whose derivative does not belong there; take "
-                    "that of `bsdf.eval`, over a detached density"
+                    f"it belongs to a {bsdf.class_name()} with {bsdf.component_count()} lobes: the weight of "
+                    "`bsdf.sample` contains the probability of the lobe, whose derivative must not be included; use "
+                    "the value of `bsdf.eval` over a detached density"
                 )
         return ""
 
 
 _MIXED = (
-    "its derivative by all emission is the image, which it has to equal, where dL/dI is 1 everywhere, and is not where "
-    "that differs between pixels and channels: look at where dL/dI is taken from (another pixel, another channel)"
+    "its derivative by all emission equals the image, as it must, if dL/dI is 1 everywhere, but not if dL/dI differs "
+    "between pixels and channels: check where dL/dI is read (another pixel, another channel)"
 )
 
 
@@ -447,11 +445,11 @@ def _segments(depth: int, hides: bool, before: bool = True) -> str:
     what = "throughput, and the BSDF's value over its density"
     if depth == 1:
         hidden = " (hide_emitters is on here)" if hides else ""
-        what = f"emission that the sensor sees itself{hidden}, the film, or how samples are counted"
+        what = f"emission seen directly by the sensor{hidden}, the film, or the sample count"
     if depth == 2:
         what = (
-            "light that comes straight from a lamp, which is the BSDF's value with its cosine, over the density of the "
-            "emitter's sample with the choice of the emitter, times a weight of multiple importance sampling"
+            "direct light of a lamp: the BSDF's value with its cosine, over the density of the emitter's sample "
+            "including the choice of the emitter, times a weight of multiple importance sampling"
         )
     return f"{_from(depth, before)}: {what}"
 

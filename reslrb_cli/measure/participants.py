@@ -248,7 +248,7 @@ class Participants:
             return listed
         if settings.named or not able:
             without, able_ones = others[0].options["estimator"], ", ".join(ATTACHED)
-            raise ConfigError("--estimators", "", f"{without} has no derivatives of what moves light; take {able_ones}")
+            raise ConfigError("--estimators", "", f"{without} has no derivatives of moving light; use {able_ones}")
         return able
 
     def _with_paths(self, settings: CheckSettings, configs: dict[str, Config], problem: Problem) -> list[Listed]:
@@ -259,9 +259,7 @@ class Participants:
             ours = [case for case in settings.integrators if case.type == "reslrb"]
             told = [case for case in ours if case.options.get("paths", "light") != "light"]
             if told and settings.named:
-                raise ConfigError(
-                    "--estimators", told[0].label, "what moves light has derivatives on light paths alone"
-                )
+                raise ConfigError("--estimators", told[0].label, "only light paths have derivatives of moving light")
             return [case for case in settings.integrators if case not in told]
         refused: dict[Way, ConfigError] = {}
         for way, config in {Way.of(config): config for config in configs.values()}.items():

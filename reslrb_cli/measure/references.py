@@ -148,26 +148,28 @@ def _alike_first(at: Situation, reasons: dict[Reference, str | None]) -> dict[Re
 def ptracer_image(at: Situation) -> str | None:
     """Check stock light tracing without roulette as reference of the image."""
     if any(_is_turned(emitter) for emitter in at.scene.emitters()):
-        return "it emits wrongly from a turned environment map"
+        return "it has wrong emission from a rotated environment map"
     if at.needs.has_null:
         return "it does not connect through masks"
     if any(_is_mirrored(shape) for shape in at.scene.shapes()):
-        return "it sees black where a mesh is mirrored"
+        return "it renders mirrored meshes black"
     if at.needs.has_perturbed_normals:
-        return "it does not treat bump and normal maps as this code does"
+        return "it treats bump and normal maps differently"
     clipping = stock_clip(at.needs)
     if clipping is not None:
         return f"it {clipping}"
     if not ends(at.max_depth):
-        return f"without roulette its paths are to end at depth {DEEPEST} or before"
+        return f"without roulette its paths must end at depth {DEEPEST} or before"
     if at.paths == "light":
         return None
     if at.view.specular > 0:
         return "it does not connect to glass or mirrors, which the sensor sees"
     if at.hide_emitters and at.view.emission > 0:
-        return "hidden emitters stop its paths, and not those from the sensor"
+        return "hidden emitters stop its paths, but not paths from the sensor"
     if at.paths == "camera" and at.has_pointlike and at.needs.has_delta_lobes:
-        return "it finds what paths from the sensor cannot: point or parallel lights through glass or by mirrors"
+        return (
+            "it finds light that paths from the sensor cannot find: point or parallel lights through glass or mirrors"
+        )
     return None
 
 
@@ -179,7 +181,7 @@ def ends(max_depth: int) -> bool:
 def path_image(at: Situation) -> str | None:
     """Check `path` as reference of the image."""
     if at.needs.has_null and (at.needs.environment is None or at.hide_emitters):
-        return "it drops what masks reflect where nothing stands behind them"
+        return "it loses light reflected by masks if nothing is behind them"
     return prb_image(at)
 
 
@@ -191,13 +193,13 @@ def prb_image(at: Situation) -> str | None:
         return "it cannot find point or parallel lights through masks"
     # What it does not find by glass and mirrors, other paths from the sensor do not, either.
     if at.has_pointlike and at.needs.has_delta_lobes and at.paths != "camera":
-        return "camera paths cannot find point or parallel lights through glass or by mirrors"
+        return "camera paths cannot find point or parallel lights through glass or mirrors"
     if at.paths != "light":
         return None
     if at.view.specular > 0:
-        return "the sensor sees glass or mirrors, where light paths cannot connect"
+        return "the sensor sees glass or mirrors, to which light paths cannot connect"
     if at.hide_emitters and at.view.emission > 0:
-        return "it looks through hidden emitters, which stop light paths"
+        return "it sees through hidden emitters, which stop light paths"
     return None
 
 
@@ -209,15 +211,15 @@ def ptracer_gradient(at: Situation, key: str) -> str | None:
     if moves_light(at.params, key):
         return _ptracer_motion(at, (key,) if key in at.params.properties else at.moved)
     if _all_zero_somewhere(at.params[key]):
-        return "it stops paths whose throughput is 0"
+        return "it stops paths with throughput 0"
     if parameter_kind(at.params, key) == "emitter":
-        return None if key.endswith(".value") else "it differentiates how a textured emitter is sampled"
+        return None if key.endswith(".value") else "it differentiates the sampling of a textured emitter"
     if at.attached and not at.needs.unfollowed:
         return None
     if key.split(".")[-2 if key.endswith((".value", ".data")) else -1] in _ROUGHNESS:
-        return "it differentiates how roughness is sampled"
+        return "it differentiates the sampling of roughness"
     others = {bsdf.class_name() for bsdf in bsdfs_of(at, key)} - set(_FIXED_SAMPLING)
-    return f"it differentiates how a {sorted(others)[0]} is sampled" if others else None
+    return f"it differentiates the sampling of a {sorted(others)[0]}" if others else None
 
 
 def _ptracer_motion(at: Situation, keys: tuple[str, ...]) -> str | None:
@@ -225,21 +227,23 @@ def _ptracer_motion(at: Situation, keys: tuple[str, ...]) -> str | None:
     for key in keys:
         node = at.params.properties[key][2]
         if not isinstance(node, mi.Shape) or node.is_emitter():
-            return "it does not differentiate how an emitter that moves is sampled"
+            return "it does not differentiate the sampling of a moving emitter"
     if at.needs.unfollowed:
-        return f"it differentiates how a {at.needs.unfollowed[0].class_name()} is sampled, but not its choice of a lobe"
+        return (
+            f"it differentiates the sampling of a {at.needs.unfollowed[0].class_name()}, but not its choice of a lobe"
+        )
     return None
 
 
 def prb_gradient(at: Situation, key: str) -> str | None:
     """Check path replay backpropagation from the sensor as reference of the gradient by `key`."""
     if moves_light(at.params, key):
-        return "it has no derivatives of what moves light"
+        return "it has no derivatives of moving light"
     reason = prb_image(at)
     if reason is not None:
         return reason
     if np.any(np.array(at.params[key]) == 0):
-        return "it loses derivatives where a channel is exactly 0"
+        return "it loses derivatives if a channel is exactly 0"
     if parameter_kind(at.params, key) != "emitter" and any(
         int(bsdf.flags()) & int(mi.BSDFFlags.Delta) for bsdf in bsdfs_of(at, key)
     ):

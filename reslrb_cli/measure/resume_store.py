@@ -74,7 +74,7 @@ class Earlier:
         if head.get("version") != VERSION:
             raise self.other("it was written by another version")
         if head.get("kind") != kind:
-            raise self.other(f"it is of `{head.get('kind')}`, this is `{kind}`")
+            raise self.other(f"it belongs to `{head.get('kind')}`, this is `{kind}`")
 
     def check(self, now: Mapping[str, Any]) -> None:
         """Raise ConfigError, with the first difference, unless the `settings` are those of this session."""
@@ -102,8 +102,8 @@ class Earlier:
 
     def other(self, reason: str) -> ConfigError:
         """Return the error for samples of another measurement, which must not be overwritten."""
-        advice = "remove the file, or name another one"
-        return ConfigError("--json", "", f"{self.source} is of another measurement: {reason}; {advice}")
+        advice = "remove the file, or use another one"
+        return ConfigError("--json", "", f"{self.source} belongs to another measurement: {reason}; {advice}")
 
 
 def head(kind: str, settings: Mapping[str, Any], **content: Any) -> dict[str, Any]:

@@ -78,7 +78,7 @@ def with_textures(problem: Problem, width: int) -> Config:
         else:
             parameters.append(spec)
     if not found:
-        raise ConfigError("--sweep", "", "texture: none of the parameters is a texture that can be resampled")
+        raise ConfigError("--sweep", "", "texture: no parameter is a texture that can be resampled")
     return problem.config.model_copy(update={"parameters": parameters})
 
 

@@ -109,9 +109,9 @@ def load_for_rendering(
 def check_passes(source: str, spp: int, multiple: int | None) -> None:
     """Raise ConfigError, located by `source`, if passes of `multiple` samples do not divide `spp`."""
     if spp < 1:
-        raise ConfigError(source, "", f"is {spp}; at least 1 is needed")
+        raise ConfigError(source, "", f"is {spp}; it must be at least 1")
     if multiple is not None and spp % min(multiple, spp):
-        raise ConfigError(source, "", f"{spp} is not a multiple of integrator.samples_per_pass, which is {multiple}")
+        raise ConfigError(source, "", f"{spp} is not a multiple of integrator.samples_per_pass, {multiple}")
 
 
 def set_values(problem: Problem, values: Mapping[str, Any]) -> Problem:
@@ -123,15 +123,17 @@ def set_values(problem: Problem, values: Mapping[str, Any]) -> Problem:
     for key, value in values.items():
         if key not in problem.selection.keys:
             near = difflib.get_close_matches(key, problem.selection.keys, n=1, cutoff=0)
-            raise ConfigError("values", key, f"is no parameter of this experiment; did you mean {near[0]}?")
+            raise ConfigError("values", key, f"is not a parameter of this experiment; did you mean {near[0]}?")
         shape = problem.selection.array(key).shape
         try:
             array = np.broadcast_to(np.asarray(value, np.float32), shape).copy()
         except (TypeError, ValueError):
             has = f"of shape {np.shape(value)}" if isinstance(value, np.ndarray) else "no array"
-            raise ConfigError("values", key, f"is {has}; the parameter's shape is {shape}, of numbers") from None
+            raise ConfigError(
+                "values", key, f"is {has}; it must have the parameter's shape {shape} and contain numbers"
+            ) from None
         if not np.isfinite(array).all():
-            raise ConfigError("values", key, "holds a value that is not finite")
+            raise ConfigError("values", key, "has a value that is not finite")
         found[key] = array
     return problem.afresh({**problem.values(), **found})
 
@@ -190,10 +192,11 @@ def _check_plates(problem: Problem) -> None:
                      .min())  # fmt: skip
         if thin < plate.settings.thinnest:
             index = next(i for i, spec in enumerate(problem.config.parameters) if key in spec.names)
-            raise ConfigError(problem.config.source, f"parameters[{index}].regularizers", f"`{key}` and "
-                              f"`{plate.other}` begin {thin:.3g} apart at their nearest, and are held "
-                              f"{plate.settings.thinnest:.3g} apart, a tenth of `least`; lower that, or thicken the "
-                              "plate")  # fmt: skip
+            reason = (
+                f"`{key}` and `{plate.other}` start {thin:.3g} apart at their nearest point, but must stay "
+                f"{plate.settings.thinnest:.3g} apart, a tenth of `least`; lower `least`, or thicken the plate"
+            )
+            raise ConfigError(problem.config.source, f"parameters[{index}].regularizers", reason)
 
 
 def _check_values(selection: Selection, values: Mapping[str, Array]) -> None:
@@ -205,7 +208,7 @@ def _check_values(selection: Selection, values: Mapping[str, Array]) -> None:
         if value.shape != shape or value.dtype.kind != "f":
             raise ValueError(f"`{key}` is {value.dtype} of shape {value.shape}, not numbers of shape {shape}")
         if not np.isfinite(value).all():
-            raise ValueError(f"`{key}` holds a value that is not finite")
+            raise ValueError(f"`{key}` has a value that is not finite")
 
 
 # --- stages -----------------------------------------------------------------------------------------------------------
@@ -252,15 +255,17 @@ def _film_at(problem: Problem, number: int) -> tuple[int, int] | None:
     films = [problem.scene.sensors()[sensor].film() for sensor in problem.sensors]
     sizes = {tuple(int(n) for n in film.crop_size()) for film in films}
     if len(sizes) > 1 or sizes != {tuple(int(n) for n in film.size()) for film in films}:
-        raise ConfigError(config.source, key, "goes with films of one size without a crop window; leave it out")
+        raise ConfigError(config.source, key, "requires films of one size without a crop window; remove it")
     (size,) = sizes
     width, height = (round(n * share) for n in size)
     if min(width, height) < 1 or (size[0] % width, size[1] % height) != (0, 0) or size[0] * height != size[1] * width \
             or abs(size[0] / width * share - 1) > 1e-3:  # fmt: skip
         least = math.gcd(*size)
         would = [f"1/{n}" for n in range(2, least + 1) if least % n == 0][:4]
-        advice = f"{', '.join(would)} would do" if would else "no smaller one has whole pixels"
-        raise ConfigError(config.source, key, f"{share:g} of {size[0]}x{size[1]} pixels has no whole ones; {advice}")
+        advice = f"{', '.join(would)} would do" if would else "no smaller film has an integer size"
+        raise ConfigError(
+            config.source, key, f"{share:g} of {size[0]}x{size[1]} pixels is not an integer size; {advice}"
+        )
     return width, height
 
 
@@ -293,7 +298,7 @@ def _specs_at(problem: Problem, number: int) -> list[ParameterSpec]:
             specs.append(spec.model_copy(update=changes))
     if not coarser:
         place = f"run.stages[{number}].resolution"
-        raise ConfigError(config.source, place, "makes nothing coarser: no parameter is a texture or a heightmap alone")
+        raise ConfigError(config.source, place, "makes nothing coarser: no parameter is only a texture or a heightmap")
     return specs
 
 

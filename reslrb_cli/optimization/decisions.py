@@ -47,7 +47,7 @@ class MemoryPlan(Jsonable):
         if not self.exceeded or before:
             return None
         allowed = f"{self.budget_bytes / MIB:.1f} MiB"
-        return f"run.memory_budget: {used / MIB:.1f} MiB were used, more than the {allowed} that it allows"
+        return f"run.memory_budget: {used / MIB:.1f} MiB were used, more than the budget of {allowed}"
 
 
 #: Time as a multiple of what a run has: kernels to compile, in those of one step, and iterations' worth of work.
@@ -102,7 +102,7 @@ class Allowance:
     def line(self) -> str:
         """Return a line about the time that was spent."""
         part = 100 * self.spent_s / max(self.run_s, 1e-9)
-        return f"measuring took {self.spent_s:.1f} s, {part:.2g} % of what this run is expected to take"
+        return f"measuring took {self.spent_s:.1f} s, {part:.2g} % of this run's expected time"
 
 
 @dataclass(frozen=True)

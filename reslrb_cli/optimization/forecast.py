@@ -220,7 +220,7 @@ def make_forecast(
         iterations = min(iterations, max(int(left_s / max(steps.iteration_s, 1e-6)), 1))
     parts = _parts(problem)
     rest = max(steps.peak - sum(parts.values()), 0)
-    parts["images of a step, gradients, what is kept of paths (reservoir)"] = rest
+    parts["images of a step, gradients, stored paths (reservoir)"] = rest
     between = run.iterations // run.images_every if run.images_every else 0
     images = 2 * saved_spp(problem, between=False) + between * saved_spp(problem, between=True)
     has_verdicts = run.certainty and config.by_pixel and run.iterations >= LEAST_ITERATIONS

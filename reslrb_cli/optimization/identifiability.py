@@ -58,7 +58,7 @@ def find_reached(problem: Problem) -> Problem:
     """
     if not problem.truth:
         return problem
-    logger.debug(f"finding what light and sensor reach: {REACH_SPP} spp")
+    logger.debug(f"finding surfaces that light and sensor reach: {REACH_SPP} spp")
     sensitive, masks = sensitivity(problem), dict[str, Array]()
     for key in problem.truth:
         mask: Array = sensitive[key] | (key in problem.selection.factors)  # every image shows its exposure
@@ -123,12 +123,15 @@ def check_exposures(problem: Problem) -> None:
         return
     (exposure, *_), parameters = found
     what = " and ".join(f"`{key}`" for key in found[0]) + " from " + ", ".join(f"`{key}`" for key in parameters)
-    reason = f"the images cannot tell {what}: changed together, they look the same; give one of them a number, such as "
+    reason = (
+        f"the images cannot distinguish {what}: changed together, they give the same image; give one of them a "
+        "number, such as "
+    )
     place = "target.exposure"
     for number, spec in enumerate(problem.config.views or ()):
         if spec.exposure is not None and exposure == f"{SHARED}.{spec.sensor}":
             place = f"views[{number}].exposure"
-    raise ConfigError(problem.config.source, place, f"{reason}exposure: 1, or remove a parameter whose value is known")
+    raise ConfigError(problem.config.source, place, f"{reason}exposure: 1, or remove a parameter with a known value")
 
 
 def find_ambiguous(problem: Problem) -> tuple[list[str], list[str]] | None:

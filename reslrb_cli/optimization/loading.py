@@ -80,7 +80,7 @@ def render_in_passes(
         with dr.suspend_grad():
             image = np.array(render_image(integrator, scene, sensor, pass_seed, part), dtype=np.float64) * (part / spp)
         total = image if total is None else total + image
-    assert total is not None, "spp is at least 1"
+    assert total is not None, "spp must be at least 1"
     return total.astype(np.float32)
 
 
@@ -186,7 +186,7 @@ def check_integrator(
 def _warn_of_clipping(config: Config, sensor: mi.Sensor, scene: mi.Scene) -> None:
     wrong = stock_clip(scene_needs(scene, sensor))
     if wrong is not None:
-        warn_once(f"{config.scene.file}: sensor {sensor.id()}: ptracer {wrong}; reslrb is right there")
+        warn_once(f"{config.scene.file}: sensor {sensor.id()}: ptracer {wrong}; reslrb is correct there")
 
 
 def make_configured(config: Config, integrator: Integrator, paths: str) -> StepIntegrator:

@@ -63,7 +63,7 @@ RECORD_BYTES = 60
 #: Light paths of a run beyond which a word is said of them, and how many a second that word reckons with.
 MANY_PATHS, RATE = 1e11, 1e7
 
-COARSER = "take a smaller film or coarser textures"
+COARSER = "use a smaller film or coarser textures"
 
 
 # --- what a step takes ------------------------------------------------------------------------------------------------
@@ -144,7 +144,7 @@ def fit_memory(problem: Problem) -> Problem:
     if size == 0:
         mib = -(-expected.total // MIB)
         reason = f"one sample per pixel takes about {mib:.0f} MiB (scene, targets, images of a step, parameters, paths)"
-        reason += f"; allow at least {mib:.0f} MiB, beside which Python, libraries and kernels are not counted"
+        reason += f"; allow at least {mib:.0f} MiB, not counting Python, libraries and kernels"
         raise ConfigError(config.source, "run.memory_budget", reason)
     return in_passes(problem, MemoryPlan(budget, size, samples // size, expected))
 
@@ -210,10 +210,10 @@ def check_described(config: Config, description: Description) -> None:
     if needed > free:
         largest = max(texels, key=lambda name: texels[name], default=key)
         key = largest if texels.get(largest, 0) > pixels else key
-        reason = f"{what}, with which a step takes at least {in_words(needed)}, and {in_words(free)} are free"
+        reason = f"{what}: a step takes at least {in_words(needed)}, and {in_words(free)} are free"
         raise ConfigError(config.source, key, f"{reason}; {COARSER}")
     if needed > MUCH:
-        least = f"a step takes at least {in_words(needed)}, of {in_words(free)} that are free"
+        least = f"a step takes at least {in_words(needed)}, and {in_words(free)} are free"
         logger.info(f"{what}: {least}; loading takes a while")
 
 
@@ -251,7 +251,7 @@ def _check_size(config: Config, key: str, what: str, size: tuple[int, int], each
     free = free_for(needed)
     if needed > free:
         fits = "x".join(str(max(int(n * (free / needed) ** 0.5), 1)) for n in size)
-        reason = f"{what} takes at least {in_words(needed)}, and {in_words(free)} are free; take at most {fits}"
+        reason = f"{what} takes at least {in_words(needed)}, and {in_words(free)} are free; use at most {fits}"
         raise ConfigError(config.source, key, reason)
 
 
@@ -278,14 +278,14 @@ def check_memory(problem: Problem, integrator: Reslrb) -> None:
     free = free_for(expected.total)
     if expected.total * SURE[config.adjoint] <= free:
         return
-    parts = {"images and parameters": expected.images, "targets": expected.fixed, "what is kept of paths":
+    parts = {"images and parameters": expected.images, "targets": expected.fixed, "stored paths":
              expected.paths, "thread-local memory": expected.scratch}  # fmt: skip
     largest = max(parts, key=lambda name: parts[name])
     key, advice = "scene.file", COARSER
     if expected.paths > expected.total // 2:
         key, advice = (
             "run.spp",
-            "set run.memory_budget, or leave run.adjoint at auto, with which nothing is kept of paths",
+            "set run.memory_budget, or leave run.adjoint at auto, which stores no paths",
         )
     reason = f"a step takes about {in_words(expected.total)} ({largest} {in_words(parts[largest])}), and "
     raise ConfigError(config.source, key, f"{reason}{in_words(free)} are free; {advice}")
@@ -297,9 +297,9 @@ def check_baseline(problem: Problem) -> None:
     kind, depth = config.integrator.type, config.integrator.max_depth
     most = local_bytes() // RECORD_BYTES
     if kind == "trajectory" and depth > most and not mi.variant().startswith("cuda"):
-        reason = f"the record of {depth} segments does not fit on a thread's stack; take at most {most}, raise "
+        reason = f"the record of {depth} segments does not fit on a thread's stack; use at most {most}, raise "
         raise ConfigError(
-            config.source, "integrator.max_depth", f"{reason}`ulimit -s`, or take reslrb, which needs no record"
+            config.source, "integrator.max_depth", f"{reason}`ulimit -s`, or use reslrb, which needs no record"
         )
     if kind not in NAIVE:
         return
@@ -307,8 +307,8 @@ def check_baseline(problem: Problem) -> None:
     needed = paths * PATH_BYTES
     free = free_for(needed)
     if needed > free:
-        reason = f"{kind} keeps the state of all {paths} light paths of a pass, at least {in_words(needed)}, and "
-        reason += f"{in_words(free)} are free; lower run.spp, set integrator.samples_per_pass, or take reslrb, which "
+        reason = f"{kind} stores the state of all {paths} light paths of a pass, at least {in_words(needed)}, and "
+        reason += f"{in_words(free)} are free; lower run.spp, set integrator.samples_per_pass, or use reslrb, which "
         raise ConfigError(config.source, "run.spp", f"{reason}keeps none")
 
 
@@ -320,4 +320,4 @@ def outlook(config: Config, scene: mi.Scene, sensors: Sequence[int]) -> str | No
     if paths < MANY_PATHS:
         return None
     takes = f"{duration(paths / RATE)} at {RATE / 1e6:.0f} million paths a second; --dry-run measures it"
-    return f"{each:.3g} light paths an iteration, {paths:.3g} in all: the run takes {takes}"
+    return f"{each:.3g} light paths per iteration, {paths:.3g} in total: the run takes {takes}"

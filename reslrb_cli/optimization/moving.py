@@ -115,10 +115,8 @@ def warn_of_border(problem: Problem, warn: Callable[[str], None]) -> None:
         number = dr.opaque(mi.UInt32, seed(problem.config.run.seed, 0, index, "border"))
         share = border_share(tracer, Job(problem.scene, sensor, number, SPP, problem.selection.params))
         if share > NOTICED:
-            line = (
-                f"view {index}: {share:.0%} of the light that moves lands at the film's border, where its derivative "
-            )
-            warn(f"{line}is cut off; a view in which all of it stays inside has none of that")
+            line = f"view {index}: {share:.0%} of the moving light lands at the film's border, where its derivative "
+            warn(f"{line}is cut off; use a view with all of this light inside")
 
 
 def is_attached(problem: Problem) -> bool:
@@ -139,7 +137,7 @@ def check_moving(problem: Problem) -> None:
     config, moved = problem.config, where_moved(problem.selection.params, problem.selection.scene_keys)
     kind, tracer = config.integrator.type, problem.integrator
     if moved and kind in ("prb", "trajectory"):
-        reason = f"{kind} has no derivatives of what moves light, as `{moved[0].key}` does; take reslrb, ptracer or "
+        reason = f"{kind} has no derivatives of moving light, which `{moved[0].key}` needs; use reslrb, ptracer or "
         reason += "prb_projective"
         raise ConfigError(config.source, "integrator.type", reason)
     if isinstance(tracer, Projective):
@@ -158,6 +156,6 @@ def check_moving(problem: Problem) -> None:
     for index in problem.sensors:  # the splats of Mitsuba's own light tracer have no derivative through a box filter
         sensor = problem.scene.sensors()[index]
         if sensor.film().rfilter().is_box_filter():
-            reason = f"sensor {sensor.id()} has a box filter, whose splats do not change while they move inside of a "
-            reason += "pixel; take a smooth one, such as gaussian, for derivatives of what moves light"
+            reason = f"sensor {sensor.id()} has a box filter, whose splats do not change while they move within a "
+            reason += "pixel; use a smooth filter, such as gaussian, for derivatives of moving light"
             raise ConfigError(config.source, "scene.file", reason)

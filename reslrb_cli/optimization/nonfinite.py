@@ -96,8 +96,8 @@ def why_end(kind: OnNonFinite, found: Findings, standstill: int) -> str:
         return ""
     where = found.whose_loss if found.loss else "dL/dI" if found.refused else ", ".join(found.by_parameter)
     return (
-        f"{where} was not finite in {standstill} iterations in a row (up to iteration {found.iteration}); "
-        "no parameter was given such a value; check the scene for extreme values, or lower the learning rate"
+        f"{where} was not finite in {standstill} iterations in a row (up to iteration {found.iteration}); no parameter "
+        "received such a value; check the scene for extreme values, or lower the learning rate"
     )
 
 

@@ -65,13 +65,13 @@ class OwnLoss:
         if isinstance(value, mi.TensorXf):
             value = value.array
         if not isinstance(value, mi.Float):
-            raise self._wrong(f"returns {type(value).__name__}, not mi.Float (for one dr.mean(..., axis=None))")
+            raise self._wrong(f"returns {type(value).__name__}, not mi.Float (such as dr.mean(..., axis=None))")
         if dr.width(value) != 1:
-            raise self._wrong(f"returns {dr.width(value)} numbers, not one: a mean over pixels and channels is wanted")
-        if dr.grad_enabled(image) and not dr.grad_enabled(value):
             raise self._wrong(
-                "returns what has no derivative by the image: it has to be computed from `image` by Dr.Jit"
+                f"returns {dr.width(value)} numbers instead of one: return a mean over pixels and channels"
             )
+        if dr.grad_enabled(image) and not dr.grad_enabled(value):
+            raise self._wrong("returns a value without a derivative by the image: compute it from `image` with Dr.Jit")
         return value
 
     def attempt(self, target: mi.TensorXf, weights: mi.TensorXf | None) -> None:
@@ -90,16 +90,16 @@ class OwnLoss:
                 dr.backward(value)
         loss, gradient = float(dr.detach(value)[0]), np.array(dr.grad(image))
         if not np.isfinite(loss):
-            raise self._wrong(f"returns {loss} of a target and a darker image, not a finite number")
+            raise self._wrong(f"returns {loss} for a target and a darker image, not a finite number")
         if not np.isfinite(gradient).all():
-            raise self._wrong("has a derivative that is not finite, of a target and a darker image")
+            raise self._wrong("has a derivative that is not finite for a target and a darker image")
 
     def _check_even(self, weights: mi.TensorXf | None) -> None:
         if weights is None or weights is self._even:
             return
         kept = np.unique(np.array(weights))
         if len(kept[kept > 0]) > 1:
-            raise self._wrong("takes no weights, which this view's mask has: give it a third argument, `weights`")
+            raise self._wrong("has no argument for the weights of this view's mask: add a third argument, `weights`")
         self._even = weights
 
     def _wrong(self, reason: str) -> ConfigError:

@@ -82,7 +82,7 @@ def make_cost(regularizer: Regularizer, spans: Spans) -> Cost:
     elif isinstance(regularizer, Thickness):
         function = _thin(regularizer.least - regularizer.thickness, spans)
     else:
-        raise TypeError(f"{regularizer.type} is no cost of a map")
+        raise TypeError(f"{regularizer.type} is not a cost of a map")
     return _weighed(function, regularizer.weight)
 
 

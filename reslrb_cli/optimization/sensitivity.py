@@ -361,7 +361,7 @@ def step_line(row: Scaled, transform: str, learning_rate: float) -> str:
     """
     if row.own_length is None:
         lacks = "no effect on the image" if row.length is None else "no gradient"
-        return f"{row.key} has {lacks} where it starts; it is not scaled"
+        return f"{row.key} has {lacks} at its start; it is not scaled"
     first = f"about {row.first_step or 0.0:.3g}"
     if transform == "log":
         first = f"a factor of {math.exp(min(row.own_length * learning_rate, 700.0)):.3g}, up or down"
@@ -372,5 +372,5 @@ def step_line(row: Scaled, transform: str, learning_rate: float) -> str:
 def curvature_line(row: Scaled, learning_rate: float) -> str:
     """Return a line for the user about one parameter in units of its curvature."""
     if row.own_length is None:
-        return f"{row.key} has no effect on the image where it starts; it is not scaled"
-    return f"{row.key} moves by {row.first_step or 0.0:.3g} at first, at {learning_rate:g} of what its steepness bears"
+        return f"{row.key} has no effect on the image at its start; it is not scaled"
+    return f"{row.key} moves by {row.first_step or 0.0:.3g} at first, {learning_rate:g} of the largest stable step"

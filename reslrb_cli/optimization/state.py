@@ -124,7 +124,7 @@ def load(problem: Problem, stored: Stored, whole: Problem) -> State:
     state = replace(stored.fill(asked), values=values)
     wrong = put(problem, state)
     if wrong is not None:
-        raise stored.wrong(wrong, "is not what was learned of this scene")
+        raise stored.wrong(wrong, "does not match the learned tables of this scene")
     return state
 
 

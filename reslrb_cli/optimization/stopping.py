@@ -102,4 +102,4 @@ class Watch:
         fall, error = (float(each) / max(abs(float(np.median(last))), 1e-300) for each in line(last))
         kind = "loss of held-out views" if self.held_out else "loss"
         share = f"{-100 * fall:.2g} +- {100 * error:.1g} %"
-        return f"the {kind} stands: over the last {count * span} iterations it fell by {share} in {span}"
+        return f"the {kind} has stopped falling: over the last {count * span} iterations it fell by {share} in {span}"

@@ -38,11 +38,11 @@ TARGET_SEED = 0
 FEW_REMARKS = 2
 #: What pixels of each kind are said to do.
 WORDS = {
-    "specular": "see smooth glass or mirrors",
-    "mixed": "see coats, blends or thin panes",
-    "border": "lie at the film's border",
+    "specular": "show smooth glass or mirrors",
+    "mixed": "show coats, blends or thin panes",
+    "border": "are at the film's border",
     "clipped": "are clipped",
-    "beside": "are reached by the film's filter from clipped ones",
+    "beside": "are within the film's filter of clipped ones",
     "alpha": "have alpha 0",
     "nonfinite": "are not finite",
     "file": "have weight 0 in the mask's file",
@@ -86,7 +86,7 @@ def mask_of(config: Config, wanted: Wanted, scene: mi.Scene, photo: Photo | None
 def mask_line(name: str, masked: Masked, weights: Array) -> str | None:
     """Return a line for the user about a view's mask; None if nothing is excluded, weighted or counted."""
     counts = masked.counts()
-    stay = [f"{count} {WORDS[kind]} and stay" for kind, count in masked.stay.items()]
+    stay = [f"{count} {WORDS[kind]} and are kept" for kind, count in masked.stay.items()]
     if not counts and not stay and masked.weights is None:
         return None
     left, total = int((weights == 0).sum()), weights.size
@@ -146,8 +146,8 @@ def _check_light(problem: Problem, say: Callable[[str], None]) -> None:
     which = f"sensor{'s' * (len(black) > 1)} {', '.join(map(str, black))}"
     if len(black) == len(problem.views):
         render = problem.config.target.render
-        said = "; `reslrb inspect` says what is seen"
-        why = "" if render is None else f": no light comes there in {render.spp} spp{said}"
+        said = "; `reslrb inspect` lists the visible objects"
+        why = "" if render is None else f": no light arrives there in {render.spp} spp{said}"
         raise ConfigError(problem.config.source, "target", f"the image of {which} is black everywhere{why}")
     say(f"the target of {which} is black everywhere")
 
@@ -168,13 +168,13 @@ def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: C
     weights = view.masked.total(target.shape[:2])
     line = mask_line(f"view {view.sensor}", view.masked, weights)
     if not weights.any():
-        advice = "switch kinds off, such as {specular: false}, or set it to none"
-        raise ConfigError(config.source, wanted.mask_key, f"leaves nothing to compare ({line}); {advice}")
+        advice = "switch off kinds, such as {specular: false}, or set it to none"
+        raise ConfigError(config.source, wanted.mask_key, f"leaves no pixel to compare ({line}); {advice}")
     masked = "specular" in view.masked.left_out
     if masked and problem.moves and scene_needs(problem.scene, problem.scene.sensors()[view.sensor]).has_delta_lobes:
         others = {kind: pixels for kind, pixels in view.masked.left_out.items() if kind != "specular"}
         view.fixed = replace(view.masked, left_out=others).total(target.shape[:2])
-        line = f"{line or f'view {view.sensor}'}; each iteration leaves out glass and mirrors where they are then"
+        line = f"{line or f'view {view.sensor}'}; each iteration leaves out the current pixels of glass and mirrors"
     if line is not None:
         say(line)
     view.see(target, weights)
@@ -183,7 +183,7 @@ def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: C
 def _render_targets(problem: Problem, say: Callable[[str], None]) -> dict[str, Array]:
     """Render the targets of views without a file; return the parameters' true values."""
     config, render = problem.config, problem.config.target.render
-    assert render is not None, "called for rendered targets only"
+    assert render is not None, "requires rendered targets"
     true_scene = load_configured(config, warn=False)
     truth = _truth(problem, set_true_values(config, true_scene), say)
     chosen = render.integrator or config.integrator
@@ -213,7 +213,7 @@ def _truth(problem: Problem, true_values: Selection, say: Callable[[str], None])
         truth[key] = true_values.array(key)
         grid = comparison_grid(problem.selection.array(key).shape, truth[key].shape)
         if grid is not None:
-            say(f"{key} has another resolution than its true value: compared, resampled, at {grid[1]}x{grid[0]}")
+            say(f"{key} and its true value have different resolutions: compared at {grid[1]}x{grid[0]}")
     return truth
 
 
@@ -223,5 +223,5 @@ def set_true_values(config: Config, scene: mi.Scene) -> Selection:
     They are checked like initial values; errors are located in the target.
     """
     render = config.target.render
-    assert render is not None, "called for rendered targets only"
+    assert render is not None, "requires rendered targets"
     return set_values(scene, config.parameters, render.parameters, config.source, "target.render.parameters")

@@ -110,7 +110,7 @@ def wanted_views(config: Config, scene: mi.Scene) -> list[Wanted]:
         images = {sensor: camera.image for sensor, camera in enumerate(read_cameras(config.scene.cameras))}
     specs, held_out, wanted = _view_specs(config, sensors), _held_out(config, scene, sensors), []
     if held_out == set(sensors):
-        raise ConfigError(config.source, "run.held_out", "leaves no view to train on")
+        raise ConfigError(config.source, "run.held_out", "leaves no view for training")
     for number, spec in enumerate(specs):
         place = f"views[{number}]"
         file_key = f"{place}.target"
@@ -134,16 +134,17 @@ def wanted_views(config: Config, scene: mi.Scene) -> list[Wanted]:
         )
         if spec.sensor in held_out and isinstance(exposure, str) and spec.exposure is not None:
             reason = (
-                f"has sensor {spec.sensor}, whose own exposure nothing else tells; give it a number, or all views one"
+                f"has sensor {spec.sensor}, whose own exposure no image determines; give it a number, or one "
+                "exposure to all views"
             )
             raise ConfigError(config.source, "run.held_out", reason)
     trained, asked = len(wanted) - len(held_out), config.run.views_per_iteration or 1
     if asked > trained:
-        reason = f"is {asked}; views that are trained on: {trained}"
+        reason = f"is {asked}; training views: {trained}"
         raise ConfigError(config.source, "run.views_per_iteration", reason)
     if config.drawn_views is None and config.run.shards != "auto" and config.shards > trained:
-        reason = f"is {config.shards}, with scene.cameras at most the {trained} views that are trained on; list "
-        raise ConfigError(config.source, "run.shards", f"{reason}`views`, for shards of a view's samples")
+        reason = f"is {config.shards}, above the {trained} training views of scene.cameras; list "
+        raise ConfigError(config.source, "run.shards", f"{reason}`views` for shards of a view's samples")
     return wanted
 
 
@@ -153,7 +154,7 @@ def _held_out(config: Config, scene: mi.Scene, sensors: list[int]) -> set[int]:
     for place, given in enumerate(config.run.held_out):
         sensor = names.get(given, -1) if isinstance(given, str) else given
         if sensor not in sensors:
-            raise ConfigError(config.source, f"run.held_out[{place}]", f"is {given}, which is the sensor of no view")
+            raise ConfigError(config.source, f"run.held_out[{place}]", f"is {given}, which is not the sensor of a view")
         found.add(sensor)
     return found
 
@@ -338,7 +339,7 @@ def make_views(config: Config, scene: mi.Scene) -> list[View]:
         codes: list[OwnLoss] = []
         for key, kind in loss_keys("type", config.loss):
             if kind.type == "ssim" and min(width, height) < SSIM_SIDE:
-                reason = f"ssim needs {SSIM_SIDE}x{SSIM_SIDE} pixels, and there are {width}x{height}"
+                reason = f"ssim needs {SSIM_SIDE}x{SSIM_SIDE} pixels, but the image has {width}x{height}"
                 raise ConfigError(config.source, key, reason)
             if isinstance(kind, Custom):
                 codes.append(OwnLoss(config, f"{key.removesuffix('type')}file", kind))

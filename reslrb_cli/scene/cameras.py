@@ -137,7 +137,7 @@ def _frame(file: Path, key: str, frame: Mapping[str, Any]) -> Camera:
     width, height = (int(w), int(h)) if w and h else image_size(image)
     focal = fx or (width / (2 * math.tan(angle / 2)) if angle else None)
     if focal is None:
-        raise ConfigError(file, f"{key}.fl_x", "missing, and no `camera_angle_x` either")
+        raise ConfigError(file, f"{key}.fl_x", "missing, and so is `camera_angle_x`")
     _check_square(file, key, focal, fy or focal)
     return Camera(image.stem, image, (width, height), focal, (cx or width / 2, cy or height / 2), to_world)
 
@@ -168,7 +168,7 @@ def _check_distortion(source: object, key: str, parameters: Mapping[str, Any]) -
 def _check_square(source: object, key: str, fx: float, fy: float) -> None:
     if abs(fx - fy) > SQUARE * fx:
         what = f"has focal lengths {fx:g} and {fy:g}, but Mitsuba's pixels are squares"
-        raise ConfigError(source, key, f"{what}; undistort to one of them")
+        raise ConfigError(source, key, f"{what}; undistort to equal focal lengths")
 
 
 # --- COLMAP -----------------------------------------------------------------------------------------------------------
@@ -189,9 +189,11 @@ def _colmap(file: Path) -> list[Camera]:
             camera, name = int(words[8]), " ".join(words[9:])
             rotation = Rotation.from_quat([*pose[:3], w]).as_matrix()
         except (ValueError, IndexError):
-            raise ConfigError(place, "", "is no image: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME") from None
+            raise ConfigError(
+                place, "", "is not an image: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"
+            ) from None
         if camera not in models or not name or not np.isfinite([w, *pose]).all():
-            raise ConfigError(place, "", f"has camera {camera}, which cameras.txt does not have, or no name")
+            raise ConfigError(place, "", f"has camera {camera}, which cameras.txt lacks, or no name")
         to_world = np.eye(4)
         to_world[:3, :3], to_world[:3, 3] = rotation.T, -rotation.T @ pose[3:]
         cameras.append(Camera(Path(name).stem, file.parent / name, *models[camera], to_world @ _COLMAP))
@@ -211,7 +213,7 @@ def _models(file: Path) -> Iterator[tuple[int, tuple[tuple[int, int], float, tup
             number, width, height = int(words[0]), int(words[2]), int(words[3])
             found = dict(zip(MODELS[model], map(float, words[4:]), strict=True))
         except (ValueError, IndexError):
-            raise ConfigError(place, "", f"is no camera: CAMERA_ID, {model}, WIDTH, HEIGHT, parameters") from None
+            raise ConfigError(place, "", f"is not a camera: CAMERA_ID, {model}, WIDTH, HEIGHT, parameters") from None
         _check_distortion(place, "", found)
         focal = found.get("f", found.get("fx", 0.0))
         _check_square(place, "", focal, found.get("fy", focal))

@@ -183,7 +183,7 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
     id, _, name = key.rpartition(".")
     if kind == "shape" or (kind == "emitter" and name in PLACES):
         if kind == "shape" and name not in ("to_world", "vertex_positions"):
-            return "belongs to a shape, of which vertices and motions are recovered"
+            return "belongs to a shape, which has vertices and motions to recover"
         if (reason := moving_obstacle(node, name)) is not None:
             return f"cannot be moved ({reason})"
         return f"is recovered as a motion (`motion: {{of: {id}}}`)" if name == "to_world" else None
@@ -192,19 +192,19 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
     if node.class_name() in _SPECTRA:
         return "is a constant of a spectrum; give the colour as <rgb>"
     if value is None:
-        return "is not given in the scene file"
+        return "is not in the scene file"
     if kind not in ("bsdf", "emitter", "attribute"):
-        return f"is no property of a material or a light; {only}"
+        return f"is not a property of a material or a light; {only}"
     if kind == "emitter" and name in BEAMS:
-        return f"{BEAMS[name]}; of an emitter, only what it emits has derivatives"
+        return f"{BEAMS[name]}; only the emission of an emitter has derivatives"
     if coarse is not None:  # not differentiable for that reason alone
         return None
     bits = _storage_bits(value)
     if bits is not None and bits < 32:
-        return f"is stored with {bits} bits a channel, too few to follow a gradient"
+        return f"is stored with {bits} bits per channel, too few to follow a gradient"
     if not differentiable:
         return f"is not differentiable ({node.class_name()})"
-    return f"is no number with derivatives ({type(value).__name__})" if bits is None else None
+    return f"is not a number with derivatives ({type(value).__name__})" if bits is None else None
 
 
 def _storage_bits(value: Any) -> int | None:

@@ -63,17 +63,17 @@ def moving_obstacle(node: mi.Shape | mi.Emitter, key: str) -> str | None:
         if name == MOVING_EMITTERS.get(kind):
             return None
         if name in BEAMS:
-            return f"{name} changes where the light of a {kind} goes, which has no derivative here"
+            return f"{name} changes the direction of the light of a {kind}, which has no derivative here"
         if kind in ("EnvironmentMapEmitter", "SunskyEmitter"):
-            return f"a {kind} that turns has no derivative here: its directions are drawn from what it shows in each"
-        return f"a {kind} that moves has no derivative here"
+            return f"a rotating {kind} has no derivative here: its directions are sampled by its radiance in each"
+        return f"a moving {kind} has no derivative here"
     if node.is_mesh() and kind not in MOVING_SHAPES:  # Mitsuba takes a rectangle for a mesh, too
         moving = " and ".join(MOVING_MESH)
         return None if name in MOVING_MESH else f"of a mesh, {moving} have derivatives, not {name}"
     if kind in MOVING_SHAPES and name == "to_world":
         return None
     kinds = ", ".join(shape.lower() for shape in MOVING_SHAPES)
-    return f"meshes (by their vertices) and {kinds} (by `to_world`) have derivatives, not a {kind}"
+    return f"meshes (by their vertices) and {kinds} (by `to_world`) have derivatives, but a {kind} has not"
 
 
 @dataclass(frozen=True)
@@ -107,10 +107,12 @@ class Movable:
         if not self.by_vertices:
             why = f"`{self.id}` is a {self.node.class_name()}; a heightmap displaces the vertices of a mesh"
             return (
-                f"{why}; `grid: 257` in `heightmap` makes one of it" if self.node.class_name() == "Rectangle" else why
+                f"{why}; `grid: 257` in `heightmap` converts it to a mesh"
+                if self.node.class_name() == "Rectangle"
+                else why
             )
         if not self.node.has_vertex_texcoords():
-            return f"`{self.id}` has no texture coordinates, over which a heightmap is laid; give the mesh some"
+            return f"`{self.id}` has no texture coordinates, which a heightmap needs; give the mesh some"
         return None
 
     def casts_edges(self, scene: mi.Scene) -> bool:
@@ -131,7 +133,7 @@ def find_movable(params: mi.SceneParameters, id: str) -> Movable | str:
         reason = moving_obstacle(node, key)
         return Movable(id, key, node) if reason is None else f"`{id}` cannot be moved: {reason}"
     if any(key.startswith(f"{id}.") for key in params.properties):
-        return f"`{id}` has neither vertices nor a place in the scene that can be moved"
+        return f"`{id}` has neither vertices nor a position that can be moved"
     known = [item.id for item in list_movable(params)]
     near = difflib.get_close_matches(id, known, n=3, cutoff=0.4) or known[:3]
     hint = f"; did you mean {' or '.join(f'`{name}`' for name in near)}?" if near else "; nothing here can be moved"

@@ -98,7 +98,7 @@ class Replacing:
         """Write the value of the scene parameter `key`. Raises ConfigError if the description cannot express it."""
         node = self.params.properties[key][2]
         if (place := self._owners.place(self.params, key)) is None:
-            raise self._fail(key, "what it belongs to does not stand in the scene's files")
+            raise self._fail(key, "the object that it belongs to is not in the scene's files")
         owner, (*below, name) = place
         if below:
             self._put_nested(owner, below, name, key)
@@ -130,11 +130,11 @@ class Replacing:
             reflectance = colour(owner, below[1], self._array(key), bounded=True)
             owner.children.append(owner.new("bsdf", reflectance, type="diffuse"))
         else:
-            raise self._fail(key, "what it belongs to does not stand in the scene's files")
+            raise self._fail(key, "the object that it belongs to is not in the scene's files")
 
     def _put_number(self, owner: Element, name: str, value: Array, key: str) -> None:
         if value.size != 1:
-            raise self._fail(key, f"{owner.type} has no way to be given {value.size} numbers as its {name}")
+            raise self._fail(key, f"{owner.type} cannot have {value.size} numbers as its {name}")
         if name == "eta" and owner.type in _RELATIVE_INDEX:
             replace(owner, number(owner, "ext_ior", 1.0))
             name = "int_ior"
@@ -143,7 +143,7 @@ class Replacing:
 
     def _put_spectrum(self, owner: Element, name: str, key: str) -> None:
         if owner.type == "spot" and name == "texture":
-            raise self._fail(key, "a spot's texture is an image for Mitsuba; recover its intensity in place of it")
+            raise self._fail(key, "Mitsuba requires an image as a spot's texture; recover the spot's intensity instead")
         if owner.type in _CONDUCTORS and name in ("eta", "k"):
             # A material's name gives both, and either stands in its place with the other alone.
             stem = key.rpartition(f".{name}.value")[0]
@@ -153,7 +153,7 @@ class Replacing:
         if owner.type in ("principled", "principledthin") and name in LOBES and self._array(key).any():
             given = owner.find(name)
             if given is None or (given.tag == "float" and float(given.value) == 0):
-                why = f"a {owner.type} has no such lobe where its file has no {name}, or 0, and so it had no effect"
+                why = f"a {owner.type} has no such lobe if its file has no {name}, or 0, so the value had no effect"
                 raise self._fail(key, why)
         replace(owner, colour(owner, name, self._array(key), bounded=parameter_kind(self.params, key) == "bsdf"))
 
@@ -287,6 +287,6 @@ def _check(folder: Path, params: mi.SceneParameters, source: object) -> None:
         if not is_given or key.rpartition(".")[2] in _ASIDE or key.startswith("integrator."):
             continue
         if key not in found.properties and not _ADDRESS.match(key):
-            raise ConfigError(source, key, "cannot be exported: Mitsuba does not find it in what was written")
+            raise ConfigError(source, key, "cannot be exported: Mitsuba does not find it in the written scene")
         if key in found.properties and not same_values(params[key], found[key]):
-            raise ConfigError(source, key, "cannot be exported: Mitsuba reads another value from what was written")
+            raise ConfigError(source, key, "cannot be exported: Mitsuba reads another value from the written scene")

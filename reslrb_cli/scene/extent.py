@@ -54,10 +54,10 @@ def _lost_light(scene: Any) -> str | None:
         return None
     centre = float(np.linalg.norm((low + high) / 2))
     if centre > size:
-        place, advice = f"stands {centre:.3g} from the origin and measures {size:.3g} across", "move it to the origin"
+        place, advice = f"is {centre:.3g} from the origin and {size:.3g} wide", "move it to the origin"
     else:
         place, advice = f"measures {size:.3g} across", "scale it to about 1"
-    return f"the scene {place}: Mitsuba starts rays {offset:.2g} off surfaces there, and light is lost; {advice}"
+    return f"the scene {place}: Mitsuba starts rays {offset:.2g} away from surfaces there, and light is lost; {advice}"
 
 
 def clipped(scene: Any, sensor: Any) -> tuple[bool, bool]:
@@ -121,11 +121,11 @@ def _coincident(scene: Any) -> str | None:
     if not pairs:  # as between two boxes that stand side by side
         return None
     named = [" and ".join(quoted(shapes[index].id()) for index in dict.fromkeys(pair)) for pair in sorted(pairs)]
-    more = f" (and of {len(named) - _NAMED} more pairs)" if len(named) > _NAMED else ""
+    more = f" (and {len(named) - _NAMED} more pairs)" if len(named) > _NAMED else ""
     return (
-        f"faces of {', of '.join(named[:_NAMED])}{more} are at the same place and differ: rounding decides which of "
-        "them a ray meets, differently for light paths and camera paths; remove one of each, or move them apart "
-        "(`twosided` shows a face from both sides)"
+        f"faces of {', of '.join(named[:_NAMED])}{more} coincide and differ: rounding decides which of them a ray "
+        "meets, differently for light paths and camera paths; remove one of each pair, or move them apart (`twosided` "
+        "shows a face from both sides)"
     )
 
 
@@ -291,6 +291,6 @@ def _thin_glass(scene: mi.Scene) -> str | None:
         return None
     return (
         f"light passes through surfaces that are {np.median(near):.2g} ray offsets apart (a ray starts "
-        f"{mi.math.RayEpsilon:.2g} (1 + max |p|) off the surface at p): it may jump over what is thinner than "
+        f"{mi.math.RayEpsilon:.2g} (1 + max |p|) away from the surface at p): it may jump over glass thinner than "
         f"{LEAST_OFFSETS}; make the glass thicker, or the scene larger"
     )

@@ -28,8 +28,8 @@ def make_grid(description: Description, id: str, size: tuple[int, int], place: P
     if element.type != "rectangle":
         corners = _corners_of(element, description)
         if corners is None:
-            raise place.fail("heightmap.grid", f"`{id}` is no rectangle, nor a mesh of four vertices that is one; "
-                             "remove `grid`, or give it a mesh as fine as the map")  # fmt: skip
+            raise place.fail("heightmap.grid", f"`{id}` is neither a rectangle nor a rectangular mesh of four "
+                                               "vertices; remove `grid`, or use a mesh as fine as the map")  # fmt: skip
         p, q, d, inside_out = corners
         normal = np.cross(q - p, d - p)
         matrix = np.eye(4)

@@ -27,8 +27,8 @@ from reslrb_cli.errors import ConfigError, is_out_of_memory
 
 logger = logging.getLogger(__name__)
 FORMATS = "EXR, PNG, JPG, HDR, PFM, PPM or BMP"
-_NO_IMAGE = f"is not an image that can be read ({FORMATS})"
-_CUT_OFF = "is cut off: the file ends before its image; copy or save it again"
+_NO_IMAGE = f"is not a readable image ({FORMATS})"
+_CUT_OFF = "is truncated: the file ends before its image; copy or save it again"
 #: Bytes in which a file says how large its image is; a preview may stand before it.
 _HEAD = 2**20
 #: Parts that a PNG or a JPEG has at most, so that one of nothing but empty parts takes no time.
@@ -78,7 +78,7 @@ def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> 
         turned = f", {TURNS[orientation]} as its EXIF orientation says" if orientation > 1 else ""
         raise ConfigError(path, "", f"is {width}x{height} pixels{turned}; it must be {size[0]}x{size[1]}")
     if width * height > PIXELS:
-        raise ConfigError(path, "", f"is {width}x{height} pixels; more than {PIXELS} are not read")
+        raise ConfigError(path, "", f"is {width}x{height} pixels; the limit is {PIXELS} pixels")
     complaints: list[str] = []
     try:
         with _heard(complaints) if header.is_jpeg else nullcontext():
@@ -87,14 +87,16 @@ def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> 
         if is_out_of_memory(error):
             raise
         raise ConfigError(
-            path, "", "is damaged or cut off, or of a kind that Mitsuba does not decode, as CMYK; save it as RGB"
+            path,
+            "",
+            ("is damaged or truncated, or has a format that Mitsuba does not decode, such as CMYK; save it as RGB"),
         ) from None
     for line in complaints:
         if line.startswith(("Corrupt JPEG data", "Premature end")):
-            raise ConfigError(path, "", f"is damaged or cut off ({line}); copy or save it again")
+            raise ConfigError(path, "", f"is damaged or truncated ({line}); copy or save it again")
         logger.warning("%s: %s", path, line)
     if (int(bitmap.width()), int(bitmap.height())) != header.size:
-        raise ConfigError(path, "", f"says that it is {header.size[0]}x{header.size[1]} pixels, and is not")
+        raise ConfigError(path, "", f"claims {header.size[0]}x{header.size[1]} pixels, but has another size")
     if orientation == 1:
         return bitmap
     turned_bitmap = mi.Bitmap(np.ascontiguousarray(turn(np.array(bitmap), orientation)), bitmap.pixel_format())
@@ -123,7 +125,7 @@ def image_size(path: Path) -> Size:
     """Return the stored (width, height) of an image. Raises ConfigError, located in it, if it is none."""
     width, height = _examine(path).size
     if min(width, height) < 1:
-        raise DamagedImage(path, "", f"says that it is {width}x{height} pixels; save it again")
+        raise DamagedImage(path, "", f"claims {width}x{height} pixels; save it again")
     return width, height
 
 
@@ -239,7 +241,7 @@ def _hdr(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
     if width * height <= PIXELS:  # else it is refused for that
         file.seek(found.end())
         if not _are_whole(file.read(), width, height):
-            raise DamagedImage(path, "", "is damaged or cut off; copy or save it again")
+            raise DamagedImage(path, "", "is damaged or truncated; copy or save it again")
     return _Header((width, height))
 
 
@@ -341,7 +343,7 @@ def turned_line(path: Path, upright: bool = True) -> str | None:
     turned = TURNS.get(orientation_of(path))
     if turned is None or upright:
         return None if turned is None else f"{path}: {turned}, as its EXIF orientation says"
-    return f"{path}: not {turned} as its EXIF orientation says: cameras of files see pixels as they lie"
+    return f"{path}: not {turned} as its EXIF orientation says: cameras of files use the stored orientation"
 
 
 def read_image(path: Path, color_space: str = "auto", size: Size | None = None, signed: bool = False) -> Image:
@@ -356,7 +358,7 @@ def read_image(path: Path, color_space: str = "auto", size: Size | None = None, 
     image = read_photo(path, color_space, size, upright=False, signed=signed).image
     orientation = orientation_of(path)
     if orientation > 1:
-        logger.warning("%s: is read as it lies in the file, not %s as its EXIF says", path, TURNS[orientation])
+        logger.warning("%s: the stored orientation is used, not %s as its EXIF says", path, TURNS[orientation])
     return image
 
 
@@ -375,7 +377,7 @@ def read_photo(
     """
     bitmap = read_bitmap(path, size, upright)
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
-        raise ConfigError(path, "", f"has {bitmap.channel_count()} channels; give one with R, G, B or Y only")
+        raise ConfigError(path, "", f"has {bitmap.channel_count()} channels; use an image with only R, G, B or Y")
     width, height = (int(n) for n in bitmap.size())
     raw = np.array(bitmap).reshape(height, width, -1)
     alpha = raw[:, :, -1] if bitmap.has_alpha() else None

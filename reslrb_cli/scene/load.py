@@ -69,7 +69,7 @@ def load_scene(
         look(description)
     scene, unused = build(description)
     if not isinstance(scene, mi.Scene):
-        raise ConfigError(file, "", "its root is a single object, not a <scene>")
+        raise ConfigError(file, "", "its root is a single object instead of a <scene>")
     for objects, wrong in (
         (scene.shapes(), "the scene is empty: it has no shapes"),
         (scene.emitters(), "the scene has no emitters: no light path can start"),
@@ -146,7 +146,7 @@ def _check_meshes(file: Path, scene: mi.Scene) -> None:
         if shape.is_mesh() and shape.face_count() and shape.vertex_count():
             last = int(np.array(shape.faces_buffer()).max())
             if last >= shape.vertex_count():
-                has = f"has a face with vertex {last}, and {shape.vertex_count()} vertices"
+                has = f"has a face with vertex {last}, but only {shape.vertex_count()} vertices"
                 raise ConfigError(file, "", f"the mesh {quoted(shape.id())} {has}; write it again")
 
 

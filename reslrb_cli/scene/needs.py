@@ -49,8 +49,8 @@ _NO_POINTS = {"SDFGrid": "sdfgrid", "Ellipsoids": "ellipsoids", "EllipsoidsMesh"
 #: Shapes that Mitsuba cannot have emit at all.
 _NO_LAMPS = {"BSplineCurve": "bsplinecurve", "LinearCurve": "linearcurve"}
 _MEDIUM = (
-    " a participating medium; no integrator here knows media (nor do Mitsuba's prb, path and ptracer): remove it from "
-    "the scene file"
+    " a participating medium; no integrator here supports media (nor do Mitsuba's prb, path and ptracer): remove it "
+    "from the scene file"
 )
 #: Surfaces along a primary ray that `surfaces_met` yields.
 CROSSINGS = 32
@@ -161,11 +161,11 @@ def check_paths(scene: Any, sensor: Any, paths: str, hide_emitters: bool = False
     kind = next((kind for kind, reason in reasons.items() if reason is None), None)
     if kind is not None:
         is_set = paths in ("camera", "both")  # the integrator has the option
-        way = f"take integrator.paths: {kind}" if is_set else f"take integrator: {{type: reslrb, paths: {kind}}}"
+        way = f"take integrator.paths: {kind}" if is_set else f"use integrator: {{type: reslrb, paths: {kind}}}"
         has_its_own = any(f"; {word} " in obstacle for word in ("give", "let", "take", "remove"))
         raise UnsupportedScene(f"{obstacle}{', or' if has_its_own else ';'} {way}")
     other = next((reason for reason in reasons.values() if reason != obstacle), None)
-    raise UnsupportedScene(obstacle + (f"; nor can other paths render it: {other}" if other else ""))
+    raise UnsupportedScene(obstacle + (f"; other paths cannot render it either: {other}" if other else ""))
 
 
 def paths_obstacle(scene: Any, sensor: Any, paths: str, hide_emitters: bool = False) -> str | None:
@@ -195,7 +195,7 @@ def scaled_emitter(scene: Any) -> str | None:
             continue
         columns = np.array(emitter.world_transform().matrix, dtype=float).reshape(4, 4, -1)[:3, :3]
         if np.any(np.abs(np.linalg.norm(columns, axis=0) - 1) > 1e-4):
-            why = "with which light and camera paths of Mitsuba's disagree on its light"
+            why = "for which light and camera paths of Mitsuba disagree"
             return f"emitter {emitter.id()} is a `{plugin}` with a scale in `to_world`, {why}; remove the scale"
     return None
 
@@ -245,8 +245,8 @@ def _light_obstacle(scene: Any, sensor: Any, hide_emitters: bool) -> str | None:
     view, name = look(scene, sensor), sensor.id()
     if view.specular > 0 and view.smooth == 0 and (hide_emitters or view.emission == 0):
         return (
-            f"only smooth specular surfaces (glass, mirrors) face sensor {name}: light paths cannot connect to it from "
-            "them; let it see a rough surface"
+            f"sensor {name} sees only smooth specular surfaces (glass, mirrors), to which light paths cannot connect; "
+            "let it see a rough surface"
         )
     return None
 
@@ -269,9 +269,9 @@ def _film_obstacle(sensor: Any) -> str | None:
 def stock_clip(needs: SceneNeeds) -> str | None:
     """Return the error of Mitsuba's own light tracing with a sensor's clip planes, in words; None if there is none."""
     if needs.lens_clip:
-        return "does not clip what a `thinlens` sees, and loses light where it focuses on a clip plane or beyond"
+        return "does not clip the view of a `thinlens`, and loses light if it focuses on a clip plane or beyond"
     if needs.near_clip:
-        return "has what stands before the sensor's near clip plane hide what is behind it"
+        return "lets objects before the sensor's near clip plane hide objects behind it"
     return None
 
 
@@ -306,10 +306,10 @@ def unsupported_part(scene: Any, sensor: Any) -> str | None:
         return obstacle
     for bsdf in graph.of_type(mi.BSDF):
         if (plugin := _ONE_WAY.get(bsdf.class_name())) is not None:
-            why = "which is not the same with light and view exchanged: light paths would render another material"
+            why = "which changes if light and view are exchanged: light paths would render another material"
             return f"bsdf {bsdf.id()} is `{plugin}`, {why}"
     if (lamp := _lamp_on(graph, _NO_POINTS)) is not None:
-        return f"{lamp}, where Mitsuba draws no points for light to start from; give the lamp as a mesh"
+        return f"{lamp}, on which Mitsuba samples no points for light to start from; use a mesh as lamp"
     return None
 
 
@@ -320,15 +320,15 @@ def _unknown_part(scene: Any, sensor: Any, graph: SceneGraph) -> str | None:
             return f"shape {shape.id() or 'of a group'} bounds{_MEDIUM}"
     for held in (sensor, *(child for child in graph.of_type(mi.Sensor) if sensor in graph.parents[child])):
         if held.get_medium() is not None:
-            return f"sensor {held.id()} stands in{_MEDIUM}"
+            return f"sensor {held.id()} is inside{_MEDIUM}"
     for emitter in scene.emitters():
         if emitter.get_medium() is not None:
-            return f"emitter {emitter.id()} stands in{_MEDIUM}"
+            return f"emitter {emitter.id()} is inside{_MEDIUM}"
         if emitter.class_name() == "TimedSunskyEmitter":
-            why = "which evaluates arrays while it is traced: Mitsuba 3.9 cannot render it in a kernel; take a `sunsky`"
+            why = "which evaluates arrays during tracing: Mitsuba 3.9 cannot render it in a kernel; use a `sunsky`"
             return f"emitter {emitter.id()} is a `timed_sunsky`, {why}"
     if (lamp := _lamp_on(graph, _NO_LAMPS)) is not None:
-        return f"{lamp}, which Mitsuba cannot have emit; give the lamp as a `cylinder` or a mesh"
+        return f"{lamp}, which Mitsuba does not allow to emit; use a `cylinder` or a mesh as lamp"
     # Such as one whose texture has too many channels.
     si, half, context = _somewhere(), mi.Point2f(0.5), mi.BSDFContext()
     calls = []

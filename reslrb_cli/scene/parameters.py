@@ -76,9 +76,9 @@ class Selection:
                 raise place.fail(at, f"`{key}` has no surface; heightmaps, bitmaps and vertex_positions have one")
             if each.type not in REGULARIZERS[kind]:
                 would = ", ".join(REGULARIZERS[kind])
-                raise place.fail(at, f"{each.type} has no meaning for `{key}`, a {kind}; {would} would do")
+                raise place.fail(at, f"{each.type} is not defined for `{key}`, a {kind}; use {would}")
             if each.type in seen:
-                raise place.fail(at, f"{each.type} stands twice; give it once, with the sum of the weights")
+                raise place.fail(at, f"{each.type} is given twice; give it once, with the sum of the weights")
             seen.add(each.type)
             if isinstance(each, Thickness) and each.opposite is not None:
                 self._check_opposite(key, each.opposite, place, f"regularizers[{number}].opposite")
@@ -89,12 +89,12 @@ class Selection:
         maps = [each for each in self.deformation.values if each.endswith(f".{HEIGHTMAP}") and each != key]
         if name not in maps:
             meshes = [f"`{each.rpartition('.')[0]}`" for each in maps]
-            hint = f"; {' or '.join(meshes)} would do" if meshes else ""
-            raise place.fail(at, f"`{mesh}` has no heightmap in `parameters` that lies opposite{hint}")
+            hint = f"; use {' or '.join(meshes)}" if meshes else ""
+            raise place.fail(at, f"`{mesh}` has no opposite heightmap in `parameters`{hint}")
         own, there = (self.deformation.displaced(each)[3].mean(axis=0) for each in (key, name))
         if own @ there > -0.99 * np.linalg.norm(own) * np.linalg.norm(there):
-            raise place.fail(at, f"the outside of `{mesh}` does not look away from that of `{key.rpartition('.')[0]}`; "
-                             "thickness is that of a plate, whose faces are opposite")  # fmt: skip
+            raise place.fail(at, f"the outsides of `{mesh}` and of `{key.rpartition('.')[0]}` do not face away from "
+                                 "each other; thickness is defined for a plate with opposite faces")  # fmt: skip
 
     def value(self, key: str) -> Any:
         """Return the current value of `key`, in Dr.Jit's form."""
@@ -204,7 +204,7 @@ def select_parameters(
             check_bounds(slot, value, settings.bounds, held)
         check_transform(slot, value, settings, place)
         if settings.smoothing is not None and not (selection.is_map(key) or selection.faces(key) is not None):
-            raise place.fail("precondition", f"smooths textures, heightmaps and vertices; `{key}` is none of them")
+            raise place.fail("precondition", f"smooths textures, heightmaps and vertices, but not `{key}`")
         selection.check_regularizers(key, place)
         if values is not None or settings.initial != "scene" or settings.resolution is not None:
             slot.set(value)
@@ -227,9 +227,9 @@ def set_values(
         place = Place(source, f"{option}.{pattern}", lambda _: "")  # a value has no options
         for key in [pattern] if pattern in names else _matching(selection.params, pattern, place, [*names]):
             if key in given:
-                raise place.fail("", f"`{key}` is matched by `{given[key]}` already")
+                raise place.fail("", f"`{key}` is already matched by `{given[key]}`")
             if key in selection.deformation.keys:
-                raise place.fail("", f"`{key}` follows from {' and '.join(f'`{name}`' for name in names)} here")
+                raise place.fail("", f"`{key}` depends on {' and '.join(f'`{name}`' for name in names)} here")
             given[key] = pattern
             slot = selection.slot(key)
             slot.set(initial_array(slot, value, None, place, any_size=key in names))
@@ -264,9 +264,9 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
         for number, key in enumerate(keys):
             at = f"key[{number}]" if len(spec.keys) > 1 else "key"
             if key in origin:
-                raise place.fail(at, f"`{key}` is matched by parameters[{origin[key]}] already")
+                raise place.fail(at, f"`{key}` is already matched by parameters[{origin[key]}]")
             if key in deformation.keys:
-                raise place.fail(at, f"`{key}` follows from a motion or a heightmap; remove one of the two")
+                raise place.fail(at, f"`{key}` depends on a motion or a heightmap; remove one of the two")
             origin[key] = index
         if len(spec.keys) > 1:
             tied[keys[0]], keys = keys[1:], keys[:1]
@@ -278,10 +278,10 @@ def _warn_of_finer(items: tuple[Movable, ...], resolution: tuple[int, int]) -> N
     """Warn, once, of a map with more texels than its meshes have vertices: texels between vertices have no effect."""
     vertices, (width, height) = sum(item.node.vertex_count() for item in items), resolution
     if width * height > vertices:
-        hint = f"; `grid: [{width}, {height}]` makes one as fine of a rectangle" if vertices == 4 * len(items) else ""
+        hint = f"; `grid: [{width}, {height}]` makes such a mesh from a rectangle" if vertices == 4 * len(items) else ""
         ids = " and ".join(f"`{item.id}`" for item in items)
-        warn_once(f"the heightmap of {ids}, {width}x{height}, is finer than the mesh, of {vertices} vertices: "
-                  f"what lies between these has no effect{hint}")  # fmt: skip
+        warn_once(f"the heightmap of {ids}, {width}x{height}, is finer than the mesh with {vertices} vertices: texels "
+                  f"between vertices have no effect{hint}")  # fmt: skip
 
 
 def _movables(params: mi.SceneParameters, spec: ParameterSpec, place: Place, origin: dict[str, int]
@@ -296,7 +296,7 @@ def _movables(params: mi.SceneParameters, spec: ParameterSpec, place: Place, ori
         if isinstance(item, str):
             raise place.fail(at, item)
         if item.key in origin:
-            raise place.fail(at, f"`{item.key}` is what parameters[{origin[item.key]}] recovers")
+            raise place.fail(at, f"`{item.key}` is already recovered by parameters[{origin[item.key]}]")
         found.append(item)
     if spec.motion is not None:
         for word in spec.motion.free:
@@ -347,7 +347,9 @@ def _matching(params: mi.SceneParameters, pattern: str, place: Place, names: Seq
         id, _, word = pattern.rpartition(".")
         if word in (*WORDS, HEIGHTMAP) and isinstance(find_movable(params, id), Movable):
             kind = "heightmap" if word == HEIGHTMAP else "motion"
-            raise place.fail("key", f"`{pattern}` belongs to a {kind} of `{id}`, and `parameters` have none that is so")
+            raise place.fail(
+                "key", f"`{pattern}` belongs to a {kind} of `{id}`, and `parameters` has none of this kind"
+            )
         raise place.fail("key", f"`{pattern}` matches no parameter of the scene; did you mean {hint}?")
     infos = [describe(params, key) for key in matches]
     usable = [info.key for info in infos if _obstacle(info) is None]
@@ -365,6 +367,6 @@ def _obstacle(info: ParameterInfo) -> str | None:
     if info.bits is None:
         return info.obstacle
     return (
-        f"is stored with {info.bits} bits a channel, too few to follow a gradient; give the texture in the scene file "
-        '<string name="format" value="variant"/>'
+        f'is stored with {info.bits} bits per channel, too few to follow a gradient; add <string name="format" '
+        'value="variant"/> to the texture in the scene file'
     )

@@ -89,7 +89,7 @@ def initial_array(
     current, resizable = slot.get(), any_size or resolution is not None
     if resolution is not None:
         if not slot.is_texture:
-            raise place.fail("resolution", f"`{slot.key}` is no texture and cannot be resampled")
+            raise place.fail("resolution", f"`{slot.key}` is not a texture and cannot be resampled")
         least = [2, 3] if slot.halo else [2, 2]
         if resolution[0] < least[0] or resolution[1] < least[1]:
             raise place.fail("resolution", f"must be at least {least}; Mitsuba has no smaller textures")
@@ -106,7 +106,7 @@ def initial_array(
     if resolution is not None and array.shape[:2] != resolution[::-1]:
         array = resample(array, resolution)
     if (bad := _first(array, ~np.isfinite(array))) is not None:
-        raise place.fail("initial", f"`{slot.key}` holds {bad}; all values must be finite")
+        raise place.fail("initial", f"`{slot.key}` has {bad}; all values must be finite")
     return array
 
 
@@ -130,7 +130,7 @@ def check_transform(slot: ParameterValue, array: Array, spec: Settings, place: P
         outside = (array < np.float32(low)) | (array > np.float32(high))
     if (value := _first(array, outside)) is not None:
         yields = f"values between its bounds, {low:g} and {high:g}" if bounded else "positive values"
-        problem = f"`{slot.key}` begins at {value}; transform: {spec.transform} yields {yields} alone"
+        problem = f"`{slot.key}` starts at {value}; transform: {spec.transform} yields only {yields}"
         raise place.fail("initial", problem)
 
 
@@ -159,7 +159,7 @@ def _fill(slot: ParameterValue, current: Array, numbers: list[float], place: Pla
 
 def _from_file(slot: ParameterValue, current: Array, image_file: Any, any_size: bool, place: Place) -> Array:
     if not slot.is_texture:
-        raise place.fail("initial", f"`{slot.key}` is no texture; give a number or a list of numbers")
+        raise place.fail("initial", f"`{slot.key}` is not a texture; give a number or a list of numbers")
     path: Path = image_file.file
     try:
         image = read_image(path, image_file.color_space, signed=slot.is_signed)
@@ -170,7 +170,7 @@ def _from_file(slot: ParameterValue, current: Array, image_file: Any, any_size: 
         raise place.fail("initial.file", message)
     if slot.channels == 1:
         if (image != image[..., :1]).any():
-            raise place.fail("initial.file", f"{path} is coloured, but `{slot.key}` has one channel; give a grey image")
+            raise place.fail("initial.file", f"{path} is coloured, but `{slot.key}` has one channel; use a grey image")
         return image[..., :1]
     if slot.channels != 3:
         raise place.fail("initial.file", f"{path} has 3 channels, but `{slot.key}` has {slot.channels}")
@@ -189,7 +189,7 @@ def _from_run(slot: ParameterValue, current: Array, run: Path, any_size: bool, p
         has = f"with {_size(array)} texels, the texture has {_size(current)}; {_RESAMPLE}"
     else:
         shapes = ["x".join(map(str, value.shape)) or "one number" for value in (array, current)]
-        has = f"of shape {shapes[0]}, the scene of shape {shapes[1]}"
+        has = f"of shape {shapes[0]}, but in the scene of shape {shapes[1]}"
     raise place.fail("initial.run", f"{run} has `{slot.key}` {has}")
 
 

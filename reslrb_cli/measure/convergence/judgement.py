@@ -26,7 +26,7 @@ from reslrb_cli.records.measurements import (
 STOCK_ROUNDING = 1e-3
 
 #: What is said of noise with heavy tails.
-HEAVY = "single steps carry the variance: intervals are too narrow, and more steps may show more"
+HEAVY = "single steps dominate the variance: the intervals are too narrow; take more steps"
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ class Judgement:
         return ReferenceRecord(member.method, key, len(member.rows), floor, **known)
 
 
-_UNSEEN = "nothing of it stands out of the reference's noise"
+_UNSEEN = "nothing exceeds the reference's noise"
 
 
 def _kin(member: Member) -> str:

@@ -85,11 +85,11 @@ class Session(Arena[Plan, Member]):
         """Give the members their earlier steps. Raises ConfigError if they differ."""
         entries = earlier.head["members"]
         if [member.name for member in self.members] != [entry["name"] for entry in entries]:
-            raise earlier.other("its methods are others: " + ", ".join(entry["name"] for entry in entries))
+            raise earlier.other("its methods differ: " + ", ".join(entry["name"] for entry in entries))
         samples = earlier.samples
         for member, entry in zip(self.members, entries, strict=True):
             if entry["config"] != dump(member.config):
-                raise earlier.other(f"its settings are not those of {member.label} here")
+                raise earlier.other(f"its settings differ from those of {member.label} here")
             member.restore(entry, samples.get(("rows", member.name), np.empty(0)))
 
     @property
@@ -227,8 +227,8 @@ class Session(Arena[Plan, Member]):
             return
         # What has not compiled is taken to take as long as what has.
         needed = self._budget_of(self._fewest, share=1 + len(late) / len(warm))
-        advice = f"allow about {needed:.0f} s with --budget, or name fewer --integrators, or take a smaller film"
-        fact = f"figures need {FEWEST} rounds" if self._before < FEWEST else "no round was added"
+        advice = f"allow about {needed:.0f} s with --budget, name fewer --integrators, or use a smaller film"
+        fact = f"results need {FEWEST} rounds" if self._before < FEWEST else "no round was added"
         self._say(f"{fact}; {advice}")
 
     def _say_what_slopes_take(self) -> None:
@@ -237,8 +237,8 @@ class Session(Arena[Plan, Member]):
             return
         rounds = max(-(-FEWEST_FOR_SLOPE // m.count) for m in few) - self._before
         names, needed = ", ".join(member.label for member in few), self._budget_of(rounds)
-        advice = f"allow about {needed:.0f} s with --budget, or take fewer samples per step with --spp"
-        self._say(f"no slope of {names}: it takes {FEWEST_FOR_SLOPE} steps of each; {advice}")
+        advice = f"allow about {needed:.0f} s with --budget, or use fewer samples per step with --spp"
+        self._say(f"no slope for {names}: it needs {FEWEST_FOR_SLOPE} steps of each; {advice}")
 
     def _budget_of(self, rounds: int, share: float = 1.0) -> float:
         """Return the seconds for `rounds` rounds of this session, with `share` times the measured work."""

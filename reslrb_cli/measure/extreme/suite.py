@@ -331,7 +331,7 @@ def _hidden_from(case: ExtremeCase, setup: Case) -> str | None:
     at = Situation.of(setup.scene, setup.scene.sensors()[0], setup.params, depth, hidden, paths="both")
     reason = prb_image(at)
     if reason is None and case.image == "ptracer" and not _loses_border(case, setup):
-        reason = "paths from the sensor hardly find this light"
+        reason = "paths from the sensor hardly ever find this light"
     return reason
 
 
@@ -444,7 +444,7 @@ def _parameters(setup: Case) -> Iterator[tuple[str, slice, tuple[int, ...]]]:
 def _settled(case: ExtremeCase, parameter: str | None, found: Comparison, ours: np.ndarray) -> Comparison:
     """Return the comparison after the case's other conditions. A suite leaves no comparison open without a reason."""
     if found.verdict is Verdict.UNREACHED and (isinstance(case.source, Zero) or parameter in case.open_ended):
-        message = "exactly zero" if isinstance(case.source, Zero) else "exactly zero, as the reference"
+        message = "exactly zero" if isinstance(case.source, Zero) else "exactly zero, like the reference"
         return replace(found, verdict=Verdict.HOLDS, message=message)
     if found.verdict in (Verdict.UNREACHED, Verdict.HEAVY_TAILED, Verdict.UNRESOLVED):
         reason = case.open_ended.get(parameter or "")

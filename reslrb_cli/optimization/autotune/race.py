@@ -140,7 +140,7 @@ class Tuner:
         if not allowance.affords(*needs):
             return unmeasured(allowance.note())
         if not allowance.spent_s:
-            self.say("measuring which sampling is most efficient here")
+            self.say("measuring which sampling is most efficient")
         with allowance.spending(later if allowance.affords(*needs, *later) else ()):
             record = measure(allowance)
         logger.debug(allowance.line())
@@ -383,7 +383,7 @@ class Turns(Generic[Record]):
         kernels = (1 + self._sizes.longer) * (plain.kernel_ms + plain.image_ms)
         if not self._learned(kernels + 2 * plain.beside_ms):
             most = f"{self._most * ITERATIONS:.2g}"
-            return self._record(f"to measure it would cost more than {most} iteration{'s' * (most != '1')}")
+            return self._record(f"measuring it would take more than {most} iteration{'s' * (most != '1')}")
         self._spend(take(True, 0, spp), first=True)
         for round in range(1, 1 + self.LOOKS * self._sizes.rounds):
             for other in (False, True):
@@ -478,7 +478,7 @@ class Turns(Generic[Record]):
 
     def _decided(self) -> Record:
         if len(self._steps[False]) < self.LEAST:
-            return self._record(f"{len(self._steps[False])} steps of both are too few to tell")
+            return self._record(f"{len(self._steps[False])} steps of both are too few to decide")
         picture = self._image_gain()
         images = self._images(picture)
         gain = self._gain(images or not self._apart)

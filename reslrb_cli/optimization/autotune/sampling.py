@@ -122,13 +122,13 @@ def _whether_pixels(problem: Problem) -> PixelsRecord:
     (docs/notes/method.md).
     """
     if any(loss.type != "l2" for loss in problem.config.losses):
-        return PixelsRecord(measured=False, note="left alone where the loss is not l2 alone")
+        return PixelsRecord(measured=False, note="unchanged, because not every loss is l2")
     run, films = problem.config.run, pixels_of(problem.scene, [view.sensor for view in problem.trained])
     each = run.iterations * run.spp * len(problem.drawn(0)) / len(films)
     part = noted_part(each * sum(films), each)
     if part is None:
-        return PixelsRecord(measured=False, note="a run as short as this has no time for it")
-    return PixelsRecord(measured=True, note=f"where noise weighs most, by {100 * part:.2g} % of this run's samples")
+        return PixelsRecord(measured=False, note="the run is too short for it")
+    return PixelsRecord(measured=True, note=f"by noise, measured with {100 * part:.2g} % of this run's samples")
 
 
 def with_sides(integrator: Any, sides: PathsRecord | None) -> Any:
@@ -152,7 +152,7 @@ def settle_sampling(tuner: race.Tuner) -> None:
     if race.is_auto(config, "sequence"):
         sequence, found = _sequence(tuner, trials), tuner.problem.guided
         if found is not None and sequence.alone and sequence.low_discrepancy:
-            note = f"low-discrepancy numbers without it have {sequence.gain:.2g} times that"
+            note = f"low-discrepancy numbers without it have {sequence.gain:.2g} times the efficiency"
             found = replace(found, guided=False, images=False, note=note)
             integrator = tuner.problem.integrator.afresh(guided=False)
             tuner.take(guided=found, integrator=integrator, memory=memory)
@@ -199,11 +199,11 @@ def suits_even_numbers(problem: Problem) -> str | None:
     (docs/sequences.md).
     """
     if is_attached(problem):
-        return "of what moves light, evenly spread numbers say most"
+        return "for moving light, low-discrepancy numbers help most"
     for emitter in problem.scene.emitters():
         if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta) and emitter.class_name() != "DirectionalArea":
             return None
-    return "of light from points and beams, evenly spread numbers say most"
+    return "for light from points and beams, low-discrepancy numbers help most"
 
 
 def sizes(problem: Problem, longer: float, planned: float = race.PLANNED) -> race.Sizes:
@@ -323,7 +323,7 @@ def _paths(tuner: race.Tuner) -> PathsRecord:
         needs=[needs] if alone else [needs, *later],
         integrator=problem.integrator,
         measure=measure,
-        unmeasured=lambda note: PathsRecord(paths="both", note=f"{note}; half of them cost little anywhere"),
+        unmeasured=lambda note: PathsRecord(paths="both", note=f"{note}; half of them costs little in any scene"),
         later=later,
     )
 
@@ -405,7 +405,7 @@ def _sequence(tuner: race.Tuner, trials: list[StepTrial]) -> SequenceRecord:
         return replace(record, **{name: getattr(record, name) + getattr(alone, name) for name in costs})
 
     def unmeasured(note: str) -> SequenceRecord:
-        why = "guided paths gain little by others" if is_guided else suits_even_numbers(problem)
+        why = "guided paths gain little from others" if is_guided else suits_even_numbers(problem)
         note = f"{note}; {why or 'evenly spread ones have been no loss in any scene'}"
         return SequenceRecord(low_discrepancy=not is_guided, note=note)
 

@@ -154,7 +154,7 @@ def _unused(props: mi.Properties, element: Element) -> list[Note]:
         number = re.match(r"_arg_(\d+)", name)
         if number and int(number[1]) < len(unnamed):
             child = unnamed[int(number[1])]
-            wrong = f"{element.type} has no use for a <{child.tag}> in Mitsuba 3"
+            wrong = f"{element.type} does not use a <{child.tag}> in Mitsuba 3"
         else:
             likely = likely_parameters(element.type) if len(notes) < _HINTS else []
             near = difflib.get_close_matches(name, likely, n=1, cutoff=0.75)

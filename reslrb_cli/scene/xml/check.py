@@ -20,31 +20,29 @@ from reslrb_cli.scene.xml.read import Description, Element, quoted
 
 #: Plugins of Mitsuba 0.6 that Mitsuba 3 does not have, with substitutes.
 LOST_PLUGINS = {
-    **dict.fromkeys((("bsdf", "coating"), ("bsdf", "roughcoating")), "`principled` with a clearcoat comes near"),
-    ("bsdf", "mixturebsdf"): "nested `blendbsdf` say the same",
-    ("bsdf", "phong"): "`roughplastic` comes near",
-    ("bsdf", "ward"): "`roughconductor` or `roughplastic` comes near",
-    ("bsdf", "roughdiffuse"): "`diffuse` comes near",
-    ("bsdf", "difftrans"): "`principledthin` comes near",
-    ("bsdf", "hk"): "a medium comes near",
-    ("bsdf", "irawan"): "a texture comes near",
-    **dict.fromkeys(
-        (("emitter", "sky"), ("emitter", "sun")), "`sunsky` comes near, with z for its up axis in place of y"
-    ),
-    ("emitter", "collimated"): "`directionalarea` comes near",
+    **dict.fromkeys((("bsdf", "coating"), ("bsdf", "roughcoating")), "use `principled` with a clearcoat"),
+    ("bsdf", "mixturebsdf"): "use nested `blendbsdf`",
+    ("bsdf", "phong"): "use `roughplastic`",
+    ("bsdf", "ward"): "use `roughconductor` or `roughplastic`",
+    ("bsdf", "roughdiffuse"): "use `diffuse`",
+    ("bsdf", "difftrans"): "use `principledthin`",
+    ("bsdf", "hk"): "use a medium",
+    ("bsdf", "irawan"): "use a texture",
+    **dict.fromkeys((("emitter", "sky"), ("emitter", "sun")), "use `sunsky`, with z instead of y as its up axis"),
+    ("emitter", "collimated"): "use `directionalarea`",
     ("shape", "heightfield"): "write it as a mesh",
     ("texture", "scale"): "multiply the texture itself",
-    ("texture", "gridtexture"): "`bitmap` or `checkerboard` comes near",
-    ("texture", "wireframe"): "`bitmap` comes near",
-    ("texture", "curvature"): "`mesh_attribute` comes near",
-    ("texture", "vertexcolors"): "`mesh_attribute` says the same",
+    ("texture", "gridtexture"): "use `bitmap` or `checkerboard`",
+    ("texture", "wireframe"): "use `bitmap`",
+    ("texture", "curvature"): "use `mesh_attribute`",
+    ("texture", "vertexcolors"): "use `mesh_attribute`",
 }
 
 #: Plugins that Mitsuba 3 has, or whose name it has, but that scene files cannot use here.
 REFUSED_PLUGINS = {
     ("shape", "hair"): "is a plugin of Mitsuba 0.6 that Mitsuba 3 does not have; `bsplinecurve` draws strands",
     ("shape", "blender"): "reads the memory of a running Blender; export the mesh as `ply` or `obj`",
-    ("sensor", "flat_sensor"): "belongs to Mitsuba's own RayDataLoader; take a `perspective` one",
+    ("sensor", "flat_sensor"): "belongs to Mitsuba's own RayDataLoader; use a `perspective` one",
 }
 
 #: Parameters without which a plugin reads memory out of bounds.
@@ -65,7 +63,7 @@ def check(description: Description) -> None:
         elif element.tag in _NUMBERS:
             _check_numbers(element)
         if element.tag == "film" and (size := _size_of(element)).width * size.height > PIXELS:
-            why = f"it must have at most {PIXELS}, since each image of a step takes 12 bytes or more of every one"
+            why = f"it must have at most {PIXELS}, since each image of a step takes at least 12 bytes per pixel"
             raise element.fail("", f"a film of {size.width}x{size.height} pixels; {why}")
     check_files(description)
 
@@ -78,7 +76,7 @@ def _check_plugin(root: Element, element: Element) -> None:
     if not is_known(type):
         raise _unknown_plugin(root, element)
     if plugin_type(type) not in (mi.ObjectType.Unknown, _object_type(tag)):
-        raise element.fail("", f"{quoted(type)} is no {tag}")
+        raise element.fail("", f"{quoted(type)} is not a {tag}")
     needed = _NEEDED.get(type)
     if needed is not None and element.find(needed) is None:
         raise element.fail("", f"{type} needs a parameter `{needed}`")
@@ -163,10 +161,10 @@ def _wrong_file(name: str, description: Description) -> str | None:
     """
     path = description.find_file(name)
     if path is None:
-        looked = "" if os.path.isabs(name) else f"; looked for in {', '.join(map(str, description.folders))}"
+        looked = "" if os.path.isabs(name) else f"; searched in {', '.join(map(str, description.folders))}"
         return f"{quoted(name)}: no such file{looked}"
     if not stat.S_ISREG(path.stat().st_mode):
-        return f"{path} is no regular file"
+        return f"{path} is not a regular file"
     try:
         width, height = image_size(path)
     except DamagedImage as error:
@@ -174,7 +172,7 @@ def _wrong_file(name: str, description: Description) -> str | None:
     except ConfigError:
         return None  # not an image, or of an unknown format
     if width * height > PIXELS:
-        return f"{path} is {width}x{height} pixels; more than {PIXELS} are not read"
+        return f"{path} is {width}x{height} pixels; the limit is {PIXELS} pixels"
     return None
 
 

@@ -61,20 +61,20 @@ def warnings(notes: Sequence[Note], root: Element) -> list[str]:
         more = ", ".join(others[:_LINES]) + f" and {len(others) - _LINES} more" * (len(others) > _LINES)
         lines.append(f"{elements[0].place}: {wrong}: {done}" + f" (also in line {more})" * bool(others))
     if len(lines) > _WARNINGS:
-        rest = f"{len(lines) - _WARNINGS} more kinds of things were mended or left out"
+        rest = f"{len(lines) - _WARNINGS} more kinds of elements were mended or left out"
         lines[_WARNINGS:] = [f"{root.source.file}: {rest}"]
     return lines
 
 
 #: Elements with another name in Mitsuba 3.
 ELEMENTS = {"lookAt": "lookat", "srgb": "rgb"}
-_BEFORE_04 = "an element of Mitsuba before 0.4, whose axes pointed elsewhere; save the scene with Mitsuba 0.6"
+_BEFORE_04 = "an element of Mitsuba before 0.4, which had other axes; save the scene with Mitsuba 0.6"
 #: Elements of Mitsuba 0.x that Mitsuba 3 cannot express, with the reason and a remedy.
 LOST_ELEMENTS = {
     **dict.fromkeys(("camera", "luminaire"), _BEFORE_04),
-    "subsurface": "an element of Mitsuba 0.6 that Mitsuba 3 does not have; remove it, or take a medium",
-    "blackbody": "an element of Mitsuba 0.6 that Mitsuba 3 does not have; write its colour as <rgb>",
-    "animation": "an element of Mitsuba 0.6; nothing moves in Mitsuba 3: write one of its transforms",
+    "subsurface": "an element of Mitsuba 0.6 that Mitsuba 3 does not have; remove it, or use a medium",
+    "blackbody": "an element of Mitsuba 0.6 that Mitsuba 3 does not have; give its colour as <rgb>",
+    "animation": "an element of Mitsuba 0.6; nothing moves in Mitsuba 3: give one of its transforms",
 }
 
 #: Attributes of elements that are not objects.
@@ -101,8 +101,8 @@ PLUGINS = {
 
 #: Objects that do not affect the light on the film, and what replaces them.
 REPLACEABLE = {
-    "sampler": "an `independent` one takes its place",
-    "rfilter": "the film's default takes its place",
+    "sampler": "replaced by an `independent` one",
+    "rfilter": "replaced by the film's default",
 }
 
 #: Renamed values of text parameters, by plugin and parameter.
@@ -169,7 +169,7 @@ def by_wavelength(spectrum: Element, owner: Element) -> dict[str, str]:
     inner = spectrum.find("value")
     if spectrum.type == "blackbody":
         if owner.tag != "emitter":
-            raise spectrum.fail("", f"a blackbody is what an emitter emits; a {owner.tag} can have <rgb>")
+            raise spectrum.fail("", f"only emitters can have a blackbody; a {owner.tag} can have <rgb>")
         wavelengths, values = _black_body(spectrum)
     elif inner is not None and inner.tag == "spectrum":
         return {key: value for key, value in inner.attributes.items() if key in ("value", "filename")}
@@ -190,7 +190,7 @@ def _black_body(spectrum: Element) -> tuple[np.ndarray, np.ndarray]:
     """Return wavelengths in nm, and the radiance of a black body in W/(m^2 sr nm)."""
     temperature = _numbers(spectrum, "temperature")
     if len(temperature) > 1 or temperature[0] <= 0:
-        raise spectrum.fail("temperature", "must be a number of kelvin above 0")
+        raise spectrum.fail("temperature", "must be a positive number of kelvin")
     first, last = _range(spectrum, _VISIBLE)
     nm = np.linspace(first, last, min(math.ceil((last - first) / _STEP), _MOST) + 1)
     exponent = _SECOND / (1e-9 * nm * temperature[0])
@@ -216,7 +216,7 @@ def _numbers(spectrum: Element, name: str) -> np.ndarray:
         raise spectrum.fail("", f"{spectrum.type} needs a parameter `{name}`")
     numbers = np.array(_floats(parameter.value))
     if not numbers.size or not (np.isfinite(numbers) & (numbers >= 0)).all():
-        raise spectrum.fail(name, f"must be numbers from 0 on, not {quoted(parameter.value)}")
+        raise spectrum.fail(name, f"must be numbers of at least 0, not {quoted(parameter.value)}")
     return numbers
 
 
@@ -280,11 +280,11 @@ def _name_objects(root: Element) -> list[Note]:
         taken.add(name)
         element.attributes["id"] = name
         if own in owners:
-            notes.append(Note(element, f"id {quoted(own)} is that of {owners[own].place}, too", f"named {name}"))
+            notes.append(Note(element, f"id {quoted(own)} is also that of {owners[own].place}", f"named {name}"))
         elif own.strip() and own not in renamed:
             renamed[own] = name
             if not own.startswith(_UNNAMED):
-                notes.append(Note(element, f"id {quoted(own)} cannot stand in a key", f"named {name}"))
+                notes.append(Note(element, f"id {quoted(own)} cannot be part of a key", f"named {name}"))
     for element in root.walk("ref", "alias"):
         own = element.id
         if own in differing:
@@ -431,7 +431,7 @@ class _Mender:
             return
         element.attributes["name"], element.written = name, old
         if not element.source.is_old:
-            self.note(element, f"{quoted(old)} is spelled as before Mitsuba 2", f"read as {quoted(name)}")
+            self.note(element, f"{quoted(old)} has the spelling before Mitsuba 2", f"read as {quoted(name)}")
 
     def _text(self, element: Element, owner: Element, value: str) -> bool:
         wrong = f"{owner.type} has no {element.name} {quoted(value)} in Mitsuba 3"
@@ -474,7 +474,7 @@ class _Mender:
                 elif owner is not root:
                     name = child.name or meant.name
                     if not name:
-                        raise child.fail("", f"<{meant.tag}> `{meant.type}` needs a name: that of what it is for")
+                        raise child.fail("", f"<{meant.tag}> `{meant.type}` needs a name, that of a parameter")
                     kept.append(child.new("spectrum", name=name, **by_wavelength(meant, owner)))
-                    self.note(meant, f"RGB variants have no spectrum `{meant.type}`", "read as the colour of it")
+                    self.note(meant, f"RGB variants have no spectrum `{meant.type}`", "read as its colour")
             owner.children[:] = kept

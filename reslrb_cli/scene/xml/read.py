@@ -296,7 +296,7 @@ class _Reader:
                 self.values.setdefault(_required(child, "name"), _required(child, "value"))
             elif child.tag == "path":
                 if element is not root:
-                    raise child.fail("", "<path> can only stand directly below the root")
+                    raise child.fail("", "<path> must be directly below the root")
                 folders.insert(0, _folder(child, folders))
             elif child.tag == "include":
                 children += self._include(child, folders)
@@ -326,7 +326,7 @@ class _Reader:
     def _fail(self, behind: str, element: Element) -> ConfigError:
         name = quoted(re.match(r"\w*", behind, re.ASCII)[0], "")  # type: ignore[index]  # an empty text matches
         how = f"set scene.options.{name} (--set scene.options.{name}=VALUE)"
-        message = f"has no value and no default; {how}" if name else "is no variable; write \\$"
+        message = f"has no value and no default; {how}" if name else "is not a variable; write \\$"
         return element.fail(f"${name}", message)
 
     def _include(self, include: Element, folders: list[Path]) -> list[Element]:
