@@ -153,7 +153,7 @@ def _changed(commit: str, place: str) -> int:
 def _syntax(commit: str, file: str) -> str | None:
     """Return the syntax tree of a Python file at a commit without docstrings and messages; None without the file.
 
-    Messages are texts on one line of at least four words. No figure depends on them.
+    Messages are texts on one line of at least two words. No figure depends on them.
     """
     text = _git("show", f"{commit}:{file}")
     if text is None:
@@ -163,6 +163,10 @@ def _syntax(commit: str, file: str) -> str | None:
         if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(node) is not None:
             del node.body[0]
     return ast.dump(_WithoutMessages().visit(tree))
+
+
+#: A word of a message.
+_WORD = re.compile(r"[a-z]{2,}", re.IGNORECASE)
 
 
 class _WithoutMessages(ast.NodeTransformer):
@@ -178,7 +182,7 @@ class _WithoutMessages(ast.NodeTransformer):
 
     @staticmethod
     def _without(text: object, node: ast.expr) -> ast.expr:
-        is_message = isinstance(text, str) and "\n" not in text and len(text.split()) >= 4
+        is_message = isinstance(text, str) and "\n" not in text and " " in text and len(_WORD.findall(text)) > 1
         return ast.Constant("message") if is_message else node
 
 

@@ -269,7 +269,7 @@ class Looking:
         """Report the current measurement."""
         where = ", ".join(f"{name} {value}" for name, value in options.items() if value != NEVER)
         without = "without roulette" if NEVER in options.values() else ""
-        self._say(f"examining {self.label}: {', '.join(filter(None, [what, where, without]))}")
+        self._say(f"now examining {self.label}: {', '.join(filter(None, [what, where, without]))}")
 
     def _each(self, count: int, block: int) -> Iterator[int]:
         """Yield seeds until the user stops."""

@@ -89,7 +89,7 @@ class Selection:
         maps = [each for each in self.deformation.values if each.endswith(f".{HEIGHTMAP}") and each != key]
         if name not in maps:
             meshes = [f"`{each.rpartition('.')[0]}`" for each in maps]
-            hint = f"; use {' or '.join(meshes)}" if meshes else ""
+            hint = f"; use for example {' or '.join(meshes)}" if meshes else ""
             raise place.fail(at, f"`{mesh}` has no opposite heightmap in `parameters`{hint}")
         own, there = (self.deformation.displaced(each)[3].mean(axis=0) for each in (key, name))
         if own @ there > -0.99 * np.linalg.norm(own) * np.linalg.norm(there):
