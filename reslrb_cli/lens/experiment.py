@@ -118,8 +118,7 @@ def on_film(picture: Array, surface: Surface, margin: float) -> Array:
     width, height = film_size((picture.shape[0], picture.shape[1]), margin)
     film = np.zeros((height, width))
     top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
-    seen = picture[:, ::-1] if surface.setting.through else picture
-    film[top : top + picture.shape[0], left : left + picture.shape[1]] = seen / seen.mean()
+    film[top : top + picture.shape[0], left : left + picture.shape[1]] = picture / picture.mean()
     return film
 
 
@@ -226,6 +225,8 @@ def scene_xml(
         rays.up, f'<bsdf type="diffuse">\n            <rgb name="reflectance" value="{ALBEDO:g}"/>\n        </bsdf>',
     )  # fmt: skip
     camera = rays.middle - away * rays.normal
+    # Behind an opaque receiver a camera sees nothing. A mirrored one before it sees the same as one behind it.
+    mirrored = '\n            <scale x="-1"/>' if setting.through else ""
     return f"""<?xml version="1.0" encoding="utf-8"?>
 <!-- A {setting.kind} that throws a picture; written by reslrb lens. Millimetres, y up: docs/lens.md, "Axes". -->
 <scene version="3.0.0">
@@ -241,7 +242,7 @@ def scene_xml(
         <string name="fov_axis" value="x"/>
         <float name="near_clip" value="{away / 100:.6g}"/>
         <float name="far_clip" value="{away * 100:.6g}"/>
-        <transform name="to_world">
+        <transform name="to_world">{mirrored}
             <lookat origin="{_triple(camera)}" target="{_triple(rays.middle)}" up="{_triple(rays.up)}"/>
         </transform>
         <film type="hdrfilm" id="film">

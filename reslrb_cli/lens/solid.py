@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from reslrb_cli.config.schema import Fabrication
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.lens.workshop import cutter
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -394,6 +395,7 @@ def measured(solid: Solid, sheets: Sequence[Sheet], plan: Fabrication) -> dict[s
             "relief": float(np.ptp(z)),
             "smallest_concave_radius": 1 / sharpest if sharpest > 1e-9 else None,
             "steepest_slope_degrees": steepest(sheet, plan),
+            "cutter": cutter(curvature, plan.tool_radius),
         }
         if plan.tool_radius is not None:
             narrow = float(np.mean(curvature > 1 / plan.tool_radius)) if curvature.size else 0.0
@@ -417,6 +419,7 @@ def measured(solid: Solid, sheets: Sequence[Sheet], plan: Fabrication) -> dict[s
         "outline": plan.outline,
         "extent": solid.extent,
         "thickness": plan.thickness,
+        "ior": plan.ior if plan.kind == "lens" else None,
         "least_thickness": thin,
         "rim": plan.rim,
         "volume_mm3": solid.volume,

@@ -247,20 +247,27 @@ def tolerances(
     target: Array,
     spp: int,
     say: Callable[[str], None] = lambda _: None,
+    original: Array | None = None,
+    keep: Callable[[str, Array], None] = lambda name, image: None,
 ) -> dict[str, dict[str, Any]]:
     """Return `figures` against the luminance `target` (H, W) for the `planned` scene and for each error, by name.
 
-    `shift` (columns, rows; pixels) is the shift of the whole picture due to a rotation, and is removed first.
+    `shift` (columns, rows; pixels) is the shift of the whole picture due to a rotation, and is removed first. With an
+    `original` (H, W), the picture before its dark parts were lifted, `ssim_of_picture` is the SSIM with it. `keep`
+    receives the name and the luminance (H, W) of each image.
     """
     plan, both = bench.plan, bench.solid_parts()
     found: dict[str, dict[str, Any]] = {}
 
     def tell(name: str, image: Array, turned: bool = False) -> None:
         entry: dict[str, Any] = {}
+        keep(name, image)
         if turned:
             rows, columns = (float(value) for value in shift_between(image, planned))
             image = scipy.ndimage.shift(image, (-rows, -columns), order=1)
             entry["shift"] = [columns + 0.0, rows + 0.0]  # no -0
+        if original is not None:
+            entry["ssim_of_picture"] = figures(image, original)["ssim"]
         found[name] = figures(image, target) | {"spp": spp} | entry
         moved = f", shifted by {np.hypot(*entry['shift']):.2g} pixels" if turned else ""
         say(f"{name}: SSIM {found[name]['ssim']:.3f}, {100 * found[name]['inside']:.3g} % of the light inside{moved}")

@@ -13,6 +13,7 @@ import difflib
 import errno
 import itertools
 import os
+import re
 import shutil
 import tempfile
 import time
@@ -39,8 +40,13 @@ Array = np.ndarray[Any, Any]
 #: Maximum number of keys that an error names.
 _SHOWN = 3
 
-#: Fabrication data of the solid of a run, and the name of its picture in `images`.
-FABRICATION_FILE, SOLID_PICTURE = "fabrication.json", "solid"
+#: Fabrication data of the solid of a run.
+FABRICATION_FILE = "fabrication.json"
+
+
+def workshop_file(name: str) -> str:
+    """Return the name in `images`, without suffix, of a picture of the sheet for the workshop."""
+    return "sheet-" + re.sub(r"[^a-z0-9.+-]+", "-", name.lower())
 
 
 def read_value(run: Path, key: str) -> Array:

@@ -29,24 +29,29 @@ from reslrb_cli.lens.solid import (
     within,
 )
 from reslrb_cli.measure.references import DEEPEST, Situation, ptracer_image
-from reslrb_cli.measure.tolerance import OpticalBench, figures, where_light_goes
-from reslrb_cli.measure.tolerance import tolerances as measure
+from reslrb_cli.measure.tolerance import OpticalBench
 from reslrb_cli.optimization.loading import check_integrator, choose_sensors, load_configured, paths_of
 from reslrb_cli.optimization.moving import moves_anything
 from reslrb_cli.records.atomic import write_atomically, writing
 from reslrb_cli.records.images import luminance, write_bitmap, write_file, write_image
 from reslrb_cli.records.metrics import finite
-from reslrb_cli.records.run_folder import FABRICATION_FILE, SOLID_PICTURE, exposures, opened
+from reslrb_cli.records.run_folder import FABRICATION_FILE, exposures, opened, workshop_file
+from reslrb_cli.runs.workshop import add_sheet, add_tolerances
 from reslrb_cli.scene.export import export_scene
 from reslrb_cli.scene.graph import interpolates_normals
-from reslrb_cli.scene.images import read_image, read_photo
+from reslrb_cli.scene.images import read_photo
 from reslrb_cli.scene.parameters import select_parameters
 from reslrb_cli.scene.xml.read import Description
 
 Array = np.ndarray[Any, Any]
 
-#: Samples per pixel of the picture of the solid.
+#: Samples per pixel of pictures of the solid, and the direction and the upper side of each view.
 PICTURE_SPP = 128
+DIRECTIONS = {
+    "solid": ((-0.5, -1.1, 1.5), [0, 0, 1]),
+    "solid-front": ((0, 0, 1), [0, 1, 0]),
+    "solid-side": ((-1, 0.02, 0.12), [0, 1, 0]),
+}
 
 #: Unsupported formats of solids, which must not be taken for the name of a folder.
 _OTHER_SOLIDS = (".step", ".stp", ".iges", ".igs", ".dxf", ".f3d", ".sldprt", ".glb", ".gltf", ".fbx", ".amf")
@@ -75,7 +80,7 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
     A variant must be set. `say` is called with a line about each thing written. Raises ConfigError and
     UnsupportedScene.
     """
-    plan, writer, off = config.fabrication, WRITERS.get(output.suffix.lower()), dict[str, dict[str, Any]]()
+    plan, writer = config.fabrication, WRITERS.get(output.suffix.lower())
     described: list[Description] = []
     scene = load_configured(config, described.append)
     selection, sensors = select_parameters(scene, config.parameters, config.source), choose_sensors(config, scene)
@@ -87,23 +92,27 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
                 output.parent.mkdir(parents=True, exist_ok=True)
                 content = writer(solid)
                 write_atomically(output, lambda file: file.write(content))
-            tell_solid(output, plan, sheets, solid, say)
+            tell_solid(output, measured(solid, sheets, plan), say)
             return
     moves = moves_anything(config, selection)
     check_integrator(config, config.integrator, scene, sensors, moves)
     paths = paths_of(config.integrator, scene, sensors, moves)
     integrator, why = choose_integrator(config, scene, selection.params, paths)
+    numbers: dict[str, Any] = {}
+    pictures: dict[str, Array] = {}
     if plan is not None:
+        numbers = measured(solid, sheets, plan)
         target = read_target(config, scene.sensors()[sensors[0]], needed=tolerances)
-        light, loss = dict[str, float](), dict[str, Any]()
         if target is not None:
-            image, loss = measure_loss(config, scene, sensors[0], integrator, target)
+            image, numbers["loss"] = measure_loss(config, scene, sensors[0], integrator, target)
+            pictures = add_sheet(numbers, plan, scene, sensors[0], sheets, luminance(image), luminance(target))
             if tolerances:
                 bench = bench_of(config, scene, selection.params, integrator, sensors[0])
-                off = measure(bench, sheets, luminance(image), luminance(target), config.run.final_spp, say)
-            if is_there(scene, plan):
-                light = where_light_goes(scene, scene.sensors()[sensors[0]], plan, luminance(target))
-        beside = solid_files(plan, sheets, solid, light, loss, off)
+                pictures |= add_tolerances(
+                    numbers, bench, sheets, luminance(image), luminance(target), config.run.final_spp, say
+                )
+        pictures |= pictures_of(solid)
+        beside = solid_files(plan, sheets, solid, numbers, pictures)
     exposure = exposure_line(run)
     with writing("--output", output):
         export_scene(described[0], selection.params, selection.scene_keys, integrator, output, run, beside, exposure)
@@ -117,18 +126,18 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
         )
         say(f"no solid was made of `{faces[0]}`: --set {how} makes one of that thickness if the scene is in mm")
     if plan is not None:
-        tell_solid(output / f"{plan.kind}.stl", plan, sheets, solid, say)
-        if light:
+        tell_solid(output / f"{plan.kind}.stl", numbers, say)
+        if light := numbers.get("light"):
             inside, aside, beyond = (100 * light[name] for name in ("inside", "beside", "beyond"))
             say(f"of the light that leaves it, {inside:.4g} % falls in the picture, {aside:.2g} % beside it on the "
                 f"film, {beyond:.2g} % outside")  # fmt: skip
-        if loss:
+        if loss := numbers.get("loss"):
             how = f"{loss['integrator']} ({loss['spp']} samples per pixel, seed {loss['seed']})"
             say(f"mean squared difference from the target is {loss['l2']:.4g}, also for the solid, by {how}")
         if f"{plan.kind}.3mf" not in beside:
             say(f"{plan.kind}.3mf is not written: lib3mf is missing; pip install 'reslrb[fabrication]'")
-    if off:
-        keep_tolerances(config, run, off, say)
+    if off := numbers.get("tolerances"):
+        keep_tolerances(config, run, {"tolerances": off, "allowed_errors": numbers["allowed_errors"]}, pictures, say)
 
 
 def exposure_line(run: Path) -> str:
@@ -154,27 +163,19 @@ def keep_solid(
     """
     assert config.fabrication is not None
     sheets, solid = read_solid(config, config.fabrication, params)
-    numbers, wanted = measured(solid, sheets, config.fabrication), luminance(target)
-    thrown = luminance(image)
-    numbers["thrown"] = figures(thrown, wanted)
-    if is_there(scene, config.fabrication):
-        numbers["light"] = where_light_goes(scene, scene.sensors()[sensor], config.fabrication, wanted)
-    if config.fabrication.picture is not None:
-        picture = luminance(read_image(config.fabrication.picture))
-        if picture.shape == wanted.shape:
-            kept = np.where(wanted > 0, np.maximum(picture, 1e-9), 0)  # the same rectangle as in the target
-            numbers["thrown"]["ssim_of_picture"] = figures(thrown, kept)["ssim"]
-    write_image(run / "images" / SOLID_PICTURE, picture_of(solid))
+    numbers = measured(solid, sheets, config.fabrication)
+    pictures = add_sheet(
+        numbers, config.fabrication, scene, sensor, sheets, luminance(image), luminance(target)
+    ) | pictures_of(solid)
+    _write_pictures(run, pictures)
     _write_numbers(run, numbers)
 
 
-def is_there(scene: mi.Scene, plan: Fabrication) -> bool:
-    """Whether the scene contains the face that the light leaves and the receiver that it falls on."""
-    return {plan.faces[0], plan.receiver} <= {shape.id() for shape in scene.shapes()}
+def keep_tolerances(config: Config, run: Path, off: dict[str, Any], pictures: dict[str, Array], say: Say) -> None:
+    """Add measured tolerances and their pictures to the run folder and update its report.
 
-
-def keep_tolerances(config: Config, run: Path, off: dict[str, dict[str, Any]], say: Say) -> None:
-    """Add the measured tolerances to the run folder and update its report, unless another process uses the folder."""
+    If another process uses the folder, or the run has another solid, prints why and changes nothing.
+    """
     from reslrb_cli.report.page import write_report
 
     try:
@@ -182,7 +183,8 @@ def keep_tolerances(config: Config, run: Path, off: dict[str, dict[str, Any]], s
             if load(run / "config.yaml").fabrication != config.fabrication:
                 raise ValueError("`fabrication` differs from that of the run")
             numbers = json.loads((run / FABRICATION_FILE).read_text())
-            _write_numbers(run, numbers | {"tolerances": off})
+            _write_numbers(run, numbers | off)
+            _write_pictures(run, {name: image for name, image in pictures.items() if name in off["tolerances"]})
             write_report(run)
     except (ConfigError, OSError, ValueError) as error:
         say(f"{run}: the page does not show the tolerances: {error}")
@@ -195,30 +197,36 @@ def _write_numbers(run: Path, numbers: dict[str, Any]) -> None:
     write_atomically(run / FABRICATION_FILE, lambda file: file.write(content))
 
 
-def picture_of(solid: Solid) -> Array:
-    """Render the solid like plaster in grazing light, with the first face seen from a corner; returns (H, W, 3)."""
+def _write_pictures(run: Path, pictures: dict[str, Array]) -> None:
+    for name, image in pictures.items():
+        write_image(run / "images" / workshop_file(name), image)
+
+
+def pictures_of(solid: Solid) -> dict[str, Array]:
+    """Render views of the solid like plaster in grazing light, (H, W, 3), by the names of the workshop's sheet."""
+    low, high = solid.points.min(axis=0), solid.points.max(axis=0)
+    middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    found = {}
     with tempfile.TemporaryDirectory(prefix="reslrb-") as folder:
         file = Path(folder) / "solid.ply"
         file.write_bytes(WRITERS[".ply"](solid))
-        low, high = solid.points.min(axis=0), solid.points.max(axis=0)
-        middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
-        away = np.array([-0.5, -1.1, 1.5])
-        origin = middle + 4.2 * radius * away / np.linalg.norm(away)
-        scene = mi.load_dict({
-            "type": "scene",
-            "solid": {"type": "ply", "filename": str(file), "face_normals": True,
-                      "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.7}}},
-            "lamp": {"type": "directional", "direction": [0.92, -0.3, -0.2], "irradiance": 6},
-            "sky": {"type": "constant", "radiance": 0.15},
-            "camera": {"type": "perspective", "fov": 28, "fov_axis": "smaller",
-                       "to_world": mi.ScalarTransform4f().look_at(origin.tolist(), middle.tolist(), [0, 0, 1]),
-                       "film": {"type": "hdrfilm", "width": 480, "height": 360, "pixel_format": "rgba",
-                                "rfilter": {"type": "box"}}},
-        })  # fmt: skip
-        image = np.array(
-            mi.render(scene, integrator=mi.load_dict({"type": "direct", "hide_emitters": True}), spp=PICTURE_SPP)
-        )
-    return np.asarray(image[:, :, :3] + (1 - image[:, :, 3:4]) * 0.9, dtype=np.float32)
+        for name, (away, up) in DIRECTIONS.items():
+            origin = middle + 4.2 * radius * np.array(away) / np.linalg.norm(away)
+            scene = mi.load_dict({
+                "type": "scene",
+                "solid": {"type": "ply", "filename": str(file), "face_normals": True,
+                          "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.7}}},
+                "lamp": {"type": "directional", "direction": [0.92, -0.3, -0.2], "irradiance": 6},
+                "sky": {"type": "constant", "radiance": 0.15},
+                "camera": {"type": "perspective", "fov": 28, "fov_axis": "smaller",
+                           "to_world": mi.ScalarTransform4f().look_at(origin.tolist(), middle.tolist(), up),
+                           "film": {"type": "hdrfilm", "width": 480, "height": 360, "pixel_format": "rgba",
+                                    "rfilter": {"type": "box"}}},
+            })  # fmt: skip
+            integrator = mi.load_dict({"type": "direct", "hide_emitters": True})
+            image = np.array(mi.render(scene, integrator=integrator, spp=PICTURE_SPP))
+            found[name] = np.asarray(image[:, :, :3] + (1 - image[:, :, 3:4]) * 0.9, dtype=np.float32)
+    return found
 
 
 def check_folder(path: Path) -> None:
@@ -313,20 +321,19 @@ def solid_files(
     plan: Fabrication,
     sheets: Sequence[Sheet],
     solid: Solid,
-    light: dict[str, float],
-    loss: dict[str, Any],
-    off: dict[str, dict[str, Any]],
+    numbers: dict[str, Any],
+    pictures: dict[str, Array],
 ) -> dict[str, Callable[[Path], object]]:
     """Return a writer for each file of a solid in an exported folder, by file name; no 3MF if lib3mf is missing.
 
-    `light` says where the light goes, `loss` is the result of `measure_loss`, and `off` holds the measured tolerances.
+    `numbers` and `pictures` are the content of the sheet for the workshop.
     """
+    from reslrb_cli.report.workshop import sheet as sheet_page
 
     files: dict[str, Callable[[Path], object]] = {}
     for suffix, made in WRITERS.items():
         if suffix != ".3mf" or _writes_3mf():
             files[plan.kind + suffix] = lambda path, made=made: path.write_bytes(made(solid))  # type: ignore[misc]
-    numbers = measured(solid, sheets, plan)
     for i, sheet in enumerate(sheets):
         stem = "heights" if i == 0 else "heights-back"
         heights = outwards(sheet, plan, 1 - 2 * i)
@@ -343,20 +350,15 @@ def solid_files(
             "rows": "from the greatest y to the least; columns from the least x",
             "pitch": [float(np.diff(line).mean()) for line in (sheet.x, sheet.y)],
         }
-    if light:
-        numbers["light"] = light
-    if loss:
-        numbers["loss"] = loss
-    if off:
-        numbers["tolerances"] = off
-    files["fabrication.json"] = lambda path: path.write_text(json.dumps(numbers, indent=2) + "\n")
+    files["fabrication.json"] = lambda path: path.write_text(json.dumps(finite(numbers), indent=2) + "\n")
+    page = sheet_page(numbers, pictures, f"{plan.kind.capitalize()} for the workshop")
+    files["sheet.html"] = lambda path: path.write_text(page, encoding="utf-8")
     return files
 
 
-def tell_solid(path: Path, plan: Fabrication, sheets: Sequence[Sheet], solid: Solid, say: Say) -> None:
+def tell_solid(path: Path, numbers: dict[str, Any], say: Say) -> None:
     """Report the fabrication data of the solid in the file `path`."""
-
-    first, *others = summary(measured(solid, sheets, plan))
+    first, *others = summary(numbers)
     say(f"{path}: {first}")
     for line in others:
         say(line)

@@ -29,7 +29,7 @@ from reslrb_cli.measure.tolerance import (
 )
 from reslrb_cli.records.images import luminance, write_file
 from reslrb_cli.records.lock import FolderLock
-from reslrb_cli.report.page import write_report
+from reslrb_cli.report.format import number
 from reslrb_cli.runs import export
 
 PTRACER = {"type": "ptracer", "max_depth": 4}
@@ -80,17 +80,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
 
 
 def test_tolerances_leave_the_folder_of_a_run_at_work_alone(tmp_path: Path) -> None:
-    run, said, off = make_run(tmp_path / "run"), list[str](), {"as planned": {"ssim": 1.0}}
+    run, said = make_run(tmp_path / "run"), list[str]()
+    off = {"tolerances": {"as planned": {"ssim": 1.0}}, "allowed_errors": {}}
     (run / "fabrication.json").write_text('{"kind": "lens"}')
     sections = "scene: {file: a}", "target: {file: a}", "parameters: [{key: a}]", "fabrication: {thickness: 25}"
     (run / "config.yaml").write_text("\n".join(sections))
     config = load(run / "config.yaml")
     with FolderLock(run):
-        export.keep_tolerances(config, run, off, said.append)
+        export.keep_tolerances(config, run, off, {}, said.append)
     assert json.loads((run / "fabrication.json").read_text()) == {"kind": "lens"}
     assert not (run / "report.html").exists()
-    export.keep_tolerances(config, run, off, said.append)
-    assert json.loads((run / "fabrication.json").read_text()) == {"kind": "lens", "tolerances": off}
+    export.keep_tolerances(config, run, off, {}, said.append)
+    assert json.loads((run / "fabrication.json").read_text()) == {"kind": "lens", **off}
     assert ["is in use by a run" in line for line in said] == [True, False]
 
 
@@ -300,8 +301,16 @@ def test_the_page_of_a_run_has_what_a_maker_wants_to_know(
     page = (run / "report.html").read_text()
     assert "<h2>Fabrication</h2>" in page
     assert f"{100 * numbers['light']['inside']:.4g} % of the light that leaves the face" in page
-    assert "the solid of the lens" in page
-    assert "with the picture before its dark parts were brightened" in page
+    assert [page.count(words) for words in ("the lens, seen from", "the original picture", "the caustic, as")] == [
+        4, 2, 2,
+    ]  # fmt: skip
+    assert f"<td>{number(thrown['ssim_of_picture'], 3)} with the original picture" in page
+    setup = numbers["setup"]
+    assert (setup["lit_side"], setup["light_distance"], setup["through"]) == ("back", "parallel", False)
+    assert setup["receiver_distance"] == pytest.approx(200, rel=1e-4)
+    assert setup["picture_size"] == pytest.approx([100, 100], rel=1e-3)
+    assert "the flat back" in page
+    assert "200 mm from the middle of the relief, perpendicular" in page
     assert "mean |image − target|" not in page
     read, render, called = export.read_photo, mi.render, []
     monkeypatch.setattr(export, "read_photo", lambda file: (called.append(file), read(file))[1])
@@ -309,16 +318,17 @@ def test_the_page_of_a_run_has_what_a_maker_wants_to_know(
     result = done("export", run, "-o", tmp_path / "made", "--tolerances", *settings("run.final_spp=8"))
     assert ": shows the tolerances" in result.output
     found = json.loads((run / "fabrication.json").read_text())
-    off = found.pop("tolerances")
+    off, allowed = found.pop("tolerances"), found.pop("allowed_errors")
+    assert allowed.keys() == {"distance", "light turned", "solid turned", "index"}
     assert off.keys() >= {"as planned", "distance +2 %", "index -0.005"}
     images = len(off) - 1 + len(tolerance._DIRECTIONS)  # a wide light is the mean of so many
     assert called == [tmp_path / "l/target.exr", *["image"] * images]  # nothing is read or rendered twice
     assert found == numbers
-    assert "distance +2 %" in (run / "report.html").read_text()
-    found["thrown"]["ssim_of_picture"] = found["thrown"]["ssim"]  # as where nothing was lifted
-    (run / "fabrication.json").write_text(json.dumps(found))
-    write_report(run)
-    assert "dark parts were brightened" not in (run / "report.html").read_text()
+    for page in (run / "report.html", tmp_path / "made/sheet.html"):
+        text = page.read_text()
+        assert "distance +2 %: SSIM" in text
+        assert f"±{number(allowed['distance']['value'], 2)} mm" in text
+        assert text.count('class="sketch"') == 1
     shutil.rmtree(run / "images")
     (run / "fabrication.json").unlink()  # a run of before
     result = done("export", run, "-o", tmp_path / "again", "--tolerances", *settings("run.final_spp=8"))

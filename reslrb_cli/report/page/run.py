@@ -23,14 +23,15 @@ from reslrb_cli.records.decisions import (
 )
 from reslrb_cli.records.images import load_image
 from reslrb_cli.records.measurements import incomplete_records
-from reslrb_cli.records.run_folder import FABRICATION_FILE, SOLID_PICTURE
+from reslrb_cli.records.run_folder import FABRICATION_FILE, workshop_file
 from reslrb_cli.report.format import count, number
 from reslrb_cli.report.outcome import outcome_of
-from reslrb_cli.report.page.images import image_rows, seen_tables, show, view_table
+from reslrb_cli.report.page.images import image_rows, seen_tables, view_table
 from reslrb_cli.report.page.layout import lay_out, soft
 from reslrb_cli.report.page.values import convergence, parameter_table, texture_pictures
 from reslrb_cli.report.run_summary import error_line, measured_line, warnings
 from reslrb_cli.report.sources import Run
+from reslrb_cli.report.workshop import CAPTIONS, VIEWS, workshop
 
 #: Number of first steps left out of medians, because they compile kernels.
 WARM_UP = 5
@@ -80,20 +81,15 @@ DAMAGED = "This part cannot be shown: what was recorded of it is damaged."
 
 
 def fabrication(run: Run) -> Markup:
-    """Return picture, image quality, dimensions and tolerances of the run's solid; empty without one."""
+    """Return the sheet for the workshop of the run's solid; empty without one."""
     text = _read(run.path / FABRICATION_FILE)
     if not text:
         return Markup()
     numbers = json.loads(text)
-    image = load_image(run.path / "images" / f"{SOLID_PICTURE}.exr")
-    caption = lay_out("titled", f"the {numbers['kind']}", ", its first face in grazing light")
-    shown = [] if image is None else [show(image, f"the solid of the {numbers['kind']}", caption)]
-    return (
-        lay_out("gallery", shown)
-        + lay_out("run.fabrication", numbers)
-        + lay_out("run.tolerances", numbers.get("tolerances") or {})
-        + lay_out("note", numbers.get("warnings") or [])
-    )
+    names = [*CAPTIONS, *VIEWS, *(numbers.get("tolerances") or {})]
+    files = {name: run.path / "images" / f"{workshop_file(name)}.exr" for name in names}
+    pictures = {name: image for name, file in files.items() if (image := load_image(file)) is not None}
+    return workshop(numbers, pictures)
 
 
 def header(run: Run) -> Markup:

@@ -1,0 +1,105 @@
+"""The sheet for a workshop: its figures against closed forms, and set-ups against the scenes that `lens` writes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from cli.tiny import done
+from lens.test_experiment import picture
+
+from reslrb_cli.config.loader import load
+from reslrb_cli.lens.workshop import (
+    SCALLOP,
+    allowed_errors,
+    blacks,
+    cutter,
+    light_warnings,
+    stepover,
+    unlit_corners,
+)
+from reslrb_cli.optimization.loading import load_configured
+from reslrb_cli.records.images import luminance, write_file
+from reslrb_cli.report.sketch import sketch
+from reslrb_cli.report.workshop import material, setup_facts
+from reslrb_cli.runs.export import read_solid
+from reslrb_cli.runs.setup import setup_of
+
+
+def test_the_step_of_a_ball_leaves_scallops_of_the_given_height() -> None:
+    step = stepover(3.0)
+    assert 3.0 - np.sqrt(3.0**2 - (step / 2) ** 2) == pytest.approx(SCALLOP)
+
+
+def test_the_largest_ball_fits_into_all_hollows_but_the_sharpest_hundredth() -> None:
+    curvature = np.concatenate([np.full(990, 0.1), np.full(10, 5.0)])
+    found = cutter(curvature, None)
+    assert found["largest_radius"] == pytest.approx(10)
+    assert found["stepover"] == pytest.approx(stepover(10.0))
+    assert cutter(np.concatenate([curvature, np.full(5, 5.0)]), None)["largest_radius"] == pytest.approx(0.2)
+    assert cutter(np.full(9, -0.1), None)["largest_radius"] is None
+    assert cutter(curvature, 2.0)["stepover"] == pytest.approx(stepover(2.0))
+
+
+def test_an_error_is_allowed_until_ssim_has_fallen_by_a_twentieth() -> None:
+    found = {
+        "as planned": {"ssim": 0.7, "ssim_of_picture": 0.9}, "distance +2 %": {"ssim": 0.7, "ssim_of_picture": 0.88},
+        "distance -2 %": {"ssim": 0.7, "ssim_of_picture": 0.8}, "light turned by 1 degree about x": {"ssim": 0.89},
+        "lens turned by 1 degree about y": {"ssim": 0.5},
+    }  # fmt: skip
+    allowed = allowed_errors(found, "lens", {"turn": 1.0, "index": 0.005, "distance": 4.0})
+    assert allowed.keys() == {"distance", "light turned", "solid turned"}
+    assert (allowed["distance"]["value"], allowed["distance"]["passes"]) == (pytest.approx(2.0), True)
+    assert (allowed["light turned"]["value"], allowed["light turned"]["at_least"]) == (1.0, True)
+    assert (allowed["solid turned"]["value"], allowed["solid turned"]["passes"]) == (pytest.approx(0.125), False)
+
+
+def test_grey_blacks_and_dark_corners_are_warned_of() -> None:
+    wanted = np.ones((20, 20))
+    wanted[5:9, 5:9] = 0
+    assert light_warnings(blacks(wanted, wanted), unlit_corners(wanted, wanted)) == []
+    seen = np.maximum(wanted, 0.3)
+    seen[:2, -2:] = 0.1
+    grey, corner = light_warnings(blacks(seen, wanted), unlit_corners(seen, wanted))
+    assert grey.startswith("Black parts of the picture come out at 3")
+    assert corner.startswith("The top right corner of the picture gets less than half of its light")
+
+
+SETUPS = {
+    "lens": ((), "back", "parallel", False, "the flat back"),
+    "lamp": (("--light-distance", 400, "--thickness", 60), "back", 400, False, "a small lamp, 400 mm from the flat"),
+    "mirror": (("--mirror", "--incidence", 30), "front", "parallel", False, "30° from the perpendicular"),
+    "through": (("--through",), "back", "parallel", True, "behind the receiver"),
+    "tilted": (("--tilt", 20, 0), "back", "parallel", False, "tilted by 20°"),
+}
+
+
+@pytest.mark.parametrize("name", SETUPS)
+def test_a_set_up_is_that_of_the_command(name: str, tmp_path: Path, llvm: str) -> None:
+    options, side, light, through, words = SETUPS[name]
+    write_file(tmp_path / "p.exr", np.repeat(picture(24, 16)[:, :, None], 3, 2).astype(np.float32), linear=True)
+    done("lens", tmp_path / "p.exr", "--pixels", 24, "--distance", 300, "--size", 60, "-o", tmp_path / "l", *options)
+    config = load(tmp_path / "l/lens.yaml")
+    assert config.fabrication is not None
+    scene = load_configured(config)
+    sheets, _ = read_solid(config, config.fabrication, mi.traverse(scene))
+    target = luminance(np.array(mi.Bitmap(str(tmp_path / "l/target.exr")))[:, :, :3])
+    setup = setup_of(scene, scene.sensors()[0], config.fabrication, sheets[0], target)
+    assert setup is not None
+    far = setup["light_distance"]
+    assert (setup["lit_side"], far if light == "parallel" else round(far), setup["through"]) == (side, light, through)
+    assert setup["receiver_distance"] == pytest.approx(300, rel=1e-3)
+    assert setup["picture_size"] == pytest.approx([40, 60], rel=2e-3)
+    assert words in " ".join(setup_facts(setup).values())
+    assert setup["picture_up"][1] > 0.9
+    drawn = sketch(setup, config.fabrication.thickness)
+    assert "300 mm" in drawn
+    assert "NaN" not in drawn.replace("nan", "NaN")
+
+
+def test_a_material_is_named_by_its_index() -> None:
+    assert "acrylic" in material("lens", 1.49)["material"]
+    assert "such as" not in material("lens", 2.4)["material"]
+    assert "reflect" in material("mirror", None)["finish"]
