@@ -298,7 +298,7 @@ def test_an_old_libllvm_taken_by_dr_jit_itself_is_refused(llvm: str, monkeypatch
     import drjit as dr
 
     monkeypatch.setattr(dr.detail, "llvm_version", lambda: (15, 0, 6))
-    with pytest.raises(BackendError, match="took libLLVM 15"):
+    with pytest.raises(BackendError, match="loaded libLLVM 15"):
         variant.set_variant("llvm_ad_rgb")
 
 

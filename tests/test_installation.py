@@ -23,28 +23,28 @@ PACKAGES = {
     "another mitsuba": (
         "mitsuba.py",
         "",
-        "the package mitsuba at {place} is not the one that is wanted (it has no set_v",
+        "the package mitsuba at {place} is another one of that name (it has no set_v",
     ),
     "an older mitsuba": (
         "mitsuba/__init__.py",
         WORKING + "__version__ = '3.5.2'",
-        "mitsuba 3.5.2 was found at {place}; 3.9 is needed: " + MITSUBA,
+        "found mitsuba 3.5.2 at {place}, but 3.9 is needed: " + MITSUBA,
     ),
     "a newer mitsuba": (
         "mitsuba.py",
         WORKING + "__version__ = '3.10.0'",
-        "mitsuba 3.10.0 was found at {place}; 3.9 is",
+        "found mitsuba 3.10.0 at {place}, but 3.9 is",
     ),
-    "no version": ("mitsuba.py", WORKING, "mitsuba None was found at {place}; 3.9 is needed"),
+    "no version": ("mitsuba.py", WORKING, "found mitsuba None at {place}, but 3.9 is needed"),
     "a version of words": (
         "mitsuba.py",
         WORKING + "__version__ = 'new'",
-        "mitsuba new was found at {place}; 3.9 is needed",
+        "found mitsuba new at {place}, but 3.9 is needed",
     ),
     "a newer drjit": (
         "drjit.py",
         "__version__ = '2.0'\ndef has_backend(b): pass\ndef eval(): pass\n",
-        "drjit 2.0 was found at {place}; 1.5 is needed: " + DRJIT,
+        "found drjit 2.0 at {place}, but 1.5 is needed: " + DRJIT,
     ),
     "one that fails": (
         "drjit/__init__.py",
@@ -65,7 +65,7 @@ PACKAGES = {
     "a missing library": (
         "drjit.py",
         "raise ImportError('libatomic.so.1: cannot open shared object file: No such file')",
-        "run scripts/setup, or install the package that holds it",
+        "run scripts/setup, or install the package that contains it",
     ),
 }
 

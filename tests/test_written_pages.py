@@ -112,7 +112,7 @@ def test_a_record_is_stale_once_the_code_that_it_measures_has_changed(
         "reslrb_cli/transport/walk.py": ["depth", "room"],
     }.items():  # fmt: skip
         capsys.readouterr()
-        (tmp_path / place).write_text('a = "no message"')
+        (tmp_path / place).write_text("a = 1")
         commit_all(tmp_path)
         assert main(["stale"]) == 1
         lines = capsys.readouterr().out.splitlines()

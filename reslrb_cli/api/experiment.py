@@ -43,7 +43,7 @@ NAMELESS = "<dict>"
 #: Advice in error messages on the command line, and its replacement in a script.
 ARGUMENTS = {
     "add --set run.output=FOLDER": "give folder=FOLDER",
-    "--allow-code has it run": "allow_code=True has it run, or the experiment `load(...).with_code()`",
+    "--allow-code permits it": "allow_code=True permits it, or the experiment `load(...).with_code()`",
 }
 
 logger = logging.getLogger(__name__)

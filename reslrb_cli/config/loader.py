@@ -215,7 +215,7 @@ def check_code(config: Config, codes: Mapping[str, Custom | Own] | None = None) 
             reason = "missing; give FILE.py:NAME, or in Python the same function as at the start of the run"
             raise ConfigError(config.source, key, reason)
         if one.file is not None and not config.allows_code:
-            reason = f"would run the code of {one.path}, with all your rights; --allow-code has it run"
+            reason = f"would run the code of {one.path} with all your rights; --allow-code permits it"
             raise ConfigError(config.source, key, reason)
 
 

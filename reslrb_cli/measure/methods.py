@@ -181,7 +181,7 @@ def _parse(text: str, source: str, prefix: str, wanted: str, deep: bool) -> list
             match, kind, options = own, "custom", {"file": place}
         options = {name: value for name, value in options.items() if value is not None}
         if match is None or (prefix and "estimator" not in options):
-            raise ConfigError(source, "", f"`{item}` is not a {wanted}")
+            raise ConfigError(source, "", f"`{item}` is not an {wanted}")
         for pair in _split(match["options"]) if match["options"] else []:
             name, equals, value = (part.strip() for part in pair.partition("="))
             if not equals or not name:

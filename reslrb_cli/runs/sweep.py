@@ -296,7 +296,7 @@ def _check_files(folder: Path, kept: Sweep, allowed: bool) -> None:
     """Raise ConfigError if a file of the sweep has changed, or if it would run code that is not allowed."""
     for file, digest in (kept.codes | kept.files).items():
         if file in kept.codes and not allowed:
-            reason = f"would run the code of {file}, with all your rights; --allow-code has it run"
+            reason = f"would run the code of {file} with all your rights; --allow-code permits it"
             raise ConfigError(folder, "", reason)
         if digest_of(Path(file)) != digest:
             reason = f"has changed since the sweep in {folder} began; put it back, or start another with -o"

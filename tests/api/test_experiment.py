@@ -110,7 +110,7 @@ def test_paths_of_a_mapping_are_relative_to_base(folder: Path, monkeypatch: pyte
         (lambda: rl.optimize(resume=3), "resume: is 3, not the folder of a run"),  # type: ignore[arg-type]
         (
             lambda: rl.gradcheck("tiny.yaml", integrators="own.py:A"),
-            "integrators own.py:A: would be run, with all your rights; allow_code=True has it run",
+            "integrators own.py:A: would run with all your rights; allow_code=True permits it",
         ),
         (lambda: rl.load("none.yaml"), "none.yaml: no such file"),
         (lambda: rl.load("."), ".: is no run's folder"),
@@ -228,19 +228,20 @@ def test_the_gradient_is_that_of_the_loss(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("call", "line"),
     [
-        (lambda: rl.render("tiny.yaml", spp=0), "spp: is 0; at least 1 is needed"),
+        (lambda: rl.render("tiny.yaml", spp=0), "spp: is 0; it must be at least 1"),
         (lambda: rl.render("tiny.yaml", values={"poster": 1}),
-         f"values: poster: is no parameter of this experiment; did you mean {KEY}?"),
+         f"values: poster: is not a parameter of this experiment; did you mean {KEY}?"),
         (lambda: rl.render("tiny.yaml", values={KEY: np.zeros((3, 4, 3))}),
-         f"values: {KEY}: is of shape (3, 4, 3); the parameter's shape is (4, 4, 3), of numbers"),
-        (lambda: rl.render("tiny.yaml", values={KEY: "grey"}), f"values: {KEY}: is no array; the parameter's shape is"),
-        (lambda: rl.gradient("tiny.yaml", values={KEY: np.nan}), f"values: {KEY}: holds a value that is not finite"),
+         f"values: {KEY}: is of shape (3, 4, 3); it must have the parameter's shape (4, 4, 3) and contain numbers"),
+        (lambda: rl.render("tiny.yaml", values={KEY: "grey"}),
+         f"values: {KEY}: is no array; it must have the parameter's shape"),
+        (lambda: rl.gradient("tiny.yaml", values={KEY: np.nan}), f"values: {KEY}: has a value that is not finite"),
         (lambda: rl.render("tiny.yaml", values={KEY: 1}, initial=False), "values: are those of parameters; leave out"),
         (lambda: rl.gradient("tiny.yaml", spp=0), "overrides: run.spp: must be at least 1"),
         (lambda: rl.gradcheck("tiny.yaml", "stick"), "estimators reslrb:stick: integrator.estimator: must be one of"),
         (lambda: rl.gradcheck("tiny.yaml", seeds=2), "seeds: is 2; at least 3 are needed"),
         (lambda: rl.convergence("tiny.yaml", "prb,nothing"), "integrators nothing: integrator.type: must be one of"),
-        (lambda: rl.convergence("tiny.yaml", reference="prb,ptracer"), "reference: errors are taken from one method"),
+        (lambda: rl.convergence("tiny.yaml", reference="prb,ptracer"), "reference: errors are relative to one method"),
         (lambda: rl.convergence("tiny.yaml", objective="mean"), "objective: is 'mean'; there are fixed, loss, image"),
         (lambda: rl.convergence("tiny.yaml", rounds=0), "rounds: is 0; at least 1 is needed"),
         (lambda: rl.convergence("tiny.yaml", spps=[4, 0]), "spps: is 0; at least 1 is needed"),
@@ -323,7 +324,7 @@ class Interrupting(logging.Handler):
     [
         (lambda: rl.gradcheck("tiny.yaml", "stack", seeds=3, spp=4), "gradient reslrb:stack", "differences"),
         (lambda: rl.gradcheck("tiny.yaml", seeds=12, spp=4, integrators="own_replay.py:Replay(fault=kept)",
-                              allow_code=True), "looking into", "gradients, max_depth 1"),
+                              allow_code=True), "examining", "gradients, max_depth 1"),
     ],
 )  # fmt: skip
 def test_an_interrupt_ends_what_takes_long(

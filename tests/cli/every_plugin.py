@@ -118,9 +118,9 @@ def phase(inner: str) -> str:
     return fog(inner)
 
 
-MEDIUM = "a participating medium; no integrator here knows media"
-ONE_WAY = "not the same with light and view exchanged"
-NO_POINTS = "where Mitsuba draws no points for light to start from"
+MEDIUM = "a participating medium; no integrator here supports media"
+ONE_WAY = "which changes if light and view are exchanged"
+NO_POINTS = "on which Mitsuba samples no points for light to start from"
 NO_RAYS = "Mitsuba cannot sample the rays of emitter"
 PINHOLE = "light paths connect to `perspective` and `thinlens` sensors"
 OWN_INTEGRATOR = "replaced by the integrator of the configuration"
@@ -184,7 +184,7 @@ PHASES = {
 }  # fmt: skip
 INTEGRATORS = ("aov", "depth", "direct", "moment", "path", "ptracer", "stokes", "volpath", "volpathmis", "prb",
                "prb_basic", "prb_projective", "prbvolpath", "volprim_rf_basic", "direct_projective")  # fmt: skip
-MENDED = "RGB variants have no spectrum `{}`: read as the colour of it"
+MENDED = "RGB variants have no spectrum `{}`: read as its colour"
 
 ROWS: tuple[Row, ...] = (
     *(Row("bsdf", name, scene=thing(xml), note=SAID_OF.get(name, ""), without=SMOOTH.get(name, ""))
@@ -216,7 +216,7 @@ ROWS: tuple[Row, ...] = (
     *(Row("shape", name, "that emits", filed(name, SHAPES[name], '<emitter type="area"/>'),
           light=NO_POINTS) for name in ("sdfgrid", "ellipsoids", "ellipsoidsmesh")),
     *(Row("shape", name, "that emits", filed(name, SHAPES[name], '<emitter type="area"/>'),
-          light="which Mitsuba cannot have emit", camera="which Mitsuba cannot have emit")
+          light="which Mitsuba does not allow to emit", camera="which Mitsuba does not allow to emit")
       for name in ("bsplinecurve", "linearcurve")),
     Row("shape", "shapegroup", "with `instance`", f'<shape type="shapegroup" id="g">{SOME.format(WHITE)}</shape>'
         '<shape type="instance"><ref id="g"/></shape><shape type="instance"><ref id="g"/>'
@@ -239,8 +239,8 @@ ROWS: tuple[Row, ...] = (
     Row("emitter", "spot", "with an image", f'<emitter type="spot">{ABOVE}{bitmap("texture")}</emitter>'),
     Row("emitter", "projector", scene=f'<emitter type="projector">{ABOVE}{bitmap("irradiance")}</emitter>'),
     Row("emitter", "sunsky", scene='<emitter type="sunsky"/>'),
-    Row("emitter", "timed_sunsky", scene='<emitter type="timed_sunsky"/>', light="take a `sunsky`",
-        camera="take a `sunsky`"),
+    Row("emitter", "timed_sunsky", scene='<emitter type="timed_sunsky"/>', light="use a `sunsky`",
+        camera="use a `sunsky`"),
     Row("texture", "bitmap", scene=painted(bitmap("reflectance"))),
     Row("texture", "checkerboard", scene=painted(CHECKS)),
     Row("texture", "mesh_attribute", scene=filed("ply", "mesh.ply", f'<bsdf type="diffuse">'
@@ -257,7 +257,7 @@ ROWS: tuple[Row, ...] = (
     Row("texture", "blackbody", "on a lamp", lit(BLACK_BODY), mended=MENDED.format("blackbody"),
         note="in W/(m² sr), so its values are in the thousands"),
     Row("texture", "blackbody", "in a material", painted(BLACK_BODY),
-        loading="a blackbody is what an emitter emits; a bsdf can have <rgb>"),
+        loading="only emitters can have a blackbody; a bsdf can have <rgb>"),
     Row("texture", "d65", "on a lamp", lit('<spectrum type="d65" name="{}"/>')),
     Row("texture", "d65", "in a material",
         painted('<spectrum type="d65" name="{}"><float name="scale" value="0.5"/></spectrum>')),
@@ -400,15 +400,15 @@ REASONS = {
     NO_POINTS: "Mitsuba cannot sample points on it for light to start from",
     NO_RAYS: "Mitsuba cannot sample rays from this emitter",
     PINHOLE: "light paths need a `perspective` or `thinlens` sensor",
-    "which Mitsuba cannot have emit": "Mitsuba does not support it as an emitter",
+    "which Mitsuba does not allow to emit": "Mitsuba does not support it as an emitter",
     "camera paths cannot find": "camera paths cannot find its light",
-    "take a `sunsky`": "use `sunsky` instead",
+    "use a `sunsky`": "use `sunsky` instead",
     "eval_1() is not defined": "this parameter takes one number",
     "`none.bsdf`: no such file": "the file does not exist",
     "can only render a specific wavelength specified by the `wavelength` parameter": "it needs `wavelength`",
     "reads the memory of a running Blender": "it reads the memory of a running Blender",
     "irregular has 3 wavelengths and 2 values": "both lists must have the same length",
-    "a blackbody is what an emitter emits; a bsdf can have <rgb>": "only emitters can have it; use `rgb` instead",
+    "only emitters can have a blackbody; a bsdf can have <rgb>": "only emitters can have it; use `rgb` instead",
     "belongs to Mitsuba's own RayDataLoader": "it belongs to Mitsuba's own RayDataLoader",
     "can only be used in Mitsuba variants that perform a spectral simulation": "it needs a spectral variant of Mitsuba",
 }

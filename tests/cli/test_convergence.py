@@ -117,9 +117,9 @@ def test_a_budget_that_is_too_small_says_so(folder: Path, capsys: pytest.Capture
 @pytest.mark.parametrize(
     ("args", "line"),
     [
-        (("--integrators", "ptracer,ptracer"), "--integrators: `ptracer` is named twice"),
-        (("--integrators", "reslrb:stack(adjoint=batched)"), "adjoint: has no effect where dL/dI is known"),
-        (("--reference", "ptracer,prb"), "--reference: errors are taken from one method; name one"),
+        (("--integrators", "ptracer,ptracer"), "--integrators: `ptracer` is given twice"),
+        (("--integrators", "reslrb:stack(adjoint=batched)"), "adjoint: has no effect if dL/dI is known"),
+        (("--reference", "ptracer,prb"), "--reference: errors are relative to one method; name one"),
         (("--reference", "walk"), "--reference walk: integrator.type: must be one of"),
         (("--json", "no/such/folder.jsonl"), "--json: cannot write no/such/folder.jsonl"),
         (("--objective", "gradient"), "'gradient' is not one of 'fixed', 'loss', 'image'"),
@@ -134,7 +134,7 @@ def test_a_budget_that_is_too_small_says_so(folder: Path, capsys: pytest.Capture
             ("--rates=1,3",),
             "--rates was removed; compare rates with `reslrb sweep CONFIG --vary 'optimizer.learning",
         ),
-        (("--integrators", "reslrb:auto"), "`auto` is for whole runs; take `stack`"),
+        (("--integrators", "reslrb:auto"), "`auto` is for whole runs; use `stack`"),
     ],
 )
 def test_bad_input_is_one_located_line(
@@ -164,8 +164,8 @@ def test_going_on(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert {line["repeats"] for line in read(folder / "c.jsonl") if line["kind"] == "method"} == {16}
     capsys.readouterr()
     assert call("tiny.yaml", *args[:-1], "9", "--json", "c.jsonl", "--set", "run.spp=8") == 2
-    reason = "run.spp is 4 there, 8 here; remove the file, or name another one"
-    assert capsys.readouterr().err == f"--json: c.jsonl is of another measurement: {reason}\n"
+    reason = "run.spp is 4 there, 8 here; remove the file, or use another one"
+    assert capsys.readouterr().err == f"--json: c.jsonl belongs to another measurement: {reason}\n"
     assert len(read(folder / "c.jsonl")) > 2  # as it was
 
 

@@ -280,11 +280,11 @@ def little(monkeypatch: pytest.MonkeyPatch) -> int:
 @pytest.mark.usefixtures("llvm")
 def test_what_needs_more_than_is_free(experiment: Path, little: int) -> None:
     line = obstacle(experiment, "scene.size=[6000, 4000]")
-    said = "scene.size: a film of 6000x4000 pixels takes at least 1.3 GiB, and 1 GiB are free; take at most 5181x3454"
+    said = "scene.size: a film of 6000x4000 pixels takes at least 1.3 GiB, and 1 GiB are free; use at most 5181x3454"
     assert line.endswith(said)
     line = obstacle(experiment, "parameters[0].resolution=[10000, 10000]")
     assert line.endswith("parameters[0].resolution: 10000x10000 texels takes at least 1.5 GiB, and 1 GiB are free; "
-                         "take at most 8192x8192")  # fmt: skip
+                         "use at most 8192x8192")  # fmt: skip
     (experiment / "scene.xml").write_text(SCENE.replace('value="8"', 'value="5000"'))
     assert "scene.file: a film of 5000x5000 pixels takes at least 1.4 GiB" in obstacle(experiment)
 
@@ -301,11 +301,11 @@ def test_a_step_that_needs_more_than_is_free(experiment: Path, monkeypatch: pyte
     # Bytes that are free, in MiB. What the scene's file does not say of the texture, its channels, makes the difference
     # between the first two.
     for free, sets, said in (
-        (40, ["parameters[0].resolution=[512, 512]"], "scene.size: a film of 512x512 pixels and 512x512 texels, with "
-                                                      "which a step takes at least 48.8 MiB, and 40 MiB are free; "),
+        (40, ["parameters[0].resolution=[512, 512]"], "scene.size: a film of 512x512 pixels and 512x512 texels: "
+                                                      "a step takes at least 48.8 MiB, and 40 MiB are free; "),
         (64, ["parameters[0].resolution=[512, 512]"], "scene.file: a step takes about "),
         (32, ["run.adjoint=correlated"], "run.spp: a step takes about "),
-        (32, [naive], "run.spp: ptracer keeps the state of all 4194304 light paths of a pass, at least 192 MiB, and "),
+        (32, [naive], "run.spp: ptracer stores the state of all 4194304 light paths of a pass, at least 192 MiB, and "),
     ):  # fmt: skip
         monkeypatch.setattr(room, "free_bytes", lambda variant, free=free: free * 2**20)
         with pytest.raises(ConfigError) as error:
@@ -334,10 +334,8 @@ def test_what_the_scene_says_of_its_film_is_known_before_it_is_built(
     sides = SCENE.replace('value="8"', 'value="11500"', 1).replace('value="8"', 'value="11500"', 1)
     (experiment / "scene.xml").write_text(sides)
     line = obstacle(experiment, "parameters[0].resolution=[8000, 8000]")
-    said = (
-        "scene.file: a film of 11500x11500 pixels and 8000x8000 texels, with which a step takes at least 22.6 GiB, and "
-    )
-    assert line.endswith(f"{said}16 GiB are free; take a smaller film or coarser textures")
+    said = "scene.file: a film of 11500x11500 pixels and 8000x8000 texels: a step takes at least 22.6 GiB, and "
+    assert line.endswith(f"{said}16 GiB are free; use a smaller film or coarser textures")
     assert obstacle(experiment, "run.spp=1000000").endswith("set integrator.samples_per_pass to 25, or lower run.spp")
     window = '<integer name="crop_width" value="100"/> <integer name="crop_height" value="50"/> <rfilter'
     for scene, sets in (
@@ -360,7 +358,7 @@ def test_of_what_is_large_and_fits_a_line_is_said_before_it_is_built(
     caplog.set_level("INFO")
     for sets, lines in (
         (["scene.size=[11500, 11500]", "parameters[0].resolution=[8000, 8000]"],
-         ["a film of 11500x11500 pixels and 8000x8000 texels: a step takes at least 22.6 GiB, of 32 GiB that are free; "
+         ["a film of 11500x11500 pixels and 8000x8000 texels: a step takes at least 22.6 GiB, and 32 GiB are free; "
           "loading takes a while"]),
         (["scene.size=[1000, 1000]", "parameters[0].resolution=[1000, 1000]"], []),
     ):  # fmt: skip
@@ -384,7 +382,9 @@ def test_a_long_run_is_told_of(experiment: Path) -> None:
     problem = assemble_scene(config)
     line = room.outlook(config, problem.scene, problem.sensors)
     assert line is not None
-    assert line.startswith("4.19e+06 light paths an iteration, 4.19e+12 in all: the run takes 4.9 days at 10 million")
+    assert line.startswith(
+        "4.19e+06 light paths per iteration, 4.19e+12 in total: the run takes 4.9 days at 10 million"
+    )
     assert room.outlook(load(experiment / "tiny.yaml"), problem.scene, problem.sensors) is None
 
 
@@ -440,4 +440,4 @@ def test_a_texture_that_is_too_large(experiment: Path) -> None:
 
     attributes = b"dataWindow\0box2i\0" + struct.pack("<i4i", 16, 0, 0, 59999, 59999)
     (experiment / "poster.exr").write_bytes(b"\x76\x2f\x31\x01\x02\0\0\0" + attributes + b"\0" * 100)
-    assert "poster.exr is 60000x60000 pixels; more than 134217728 are not read" in obstacle(experiment)
+    assert "poster.exr is 60000x60000 pixels; the limit is 134217728 pixels" in obstacle(experiment)

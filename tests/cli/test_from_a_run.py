@@ -195,7 +195,7 @@ def test_a_run_that_lacks_a_value_or_has_a_bad_one_is_refused_in_a_line(folder: 
     assert "did not recover `wall.translation`; it has" in refusal()
     values |= {"wall.translation": np.zeros(3, np.float32), "wall.scale": np.array(1, np.float32)}
     save_checkpoint(run / "checkpoint", 1, values | {LAMP: np.ones(2, np.float32)}, {})
-    assert f"`{LAMP}` of shape 2, the scene of shape 3" in refusal()
+    assert f"`{LAMP}` of shape 2, but in the scene of shape 3" in refusal()
     save_checkpoint(run / "checkpoint", 1, values | {LAMP: np.full(3, np.nan, np.float32)}, {})
     assert "all values must be finite" in refusal()
     save_checkpoint(run / "checkpoint", 1, values | {tiny.KEY: np.full((4, 4, 3), 2, np.float32)}, {})
@@ -213,7 +213,7 @@ def test_an_exported_scene_is_rendered_by_path_where_ptracer_is_wrong(tmp_path: 
     scene = load_scene(config.scene.file)
     integrator, why = choose_integrator(config, scene, mi.traverse(scene), "light")
     assert integrator == {"type": "path", "max_depth": 3, "rr_depth": 5, "hide_emitters": False}
-    assert why == ", since ptracer emits wrongly from a turned environment map"
+    assert why == ", since ptracer has wrong emission from a rotated environment map"
     by_prb = load(tmp_path / "tiny.yaml", ["integrator={type: prb, max_depth: 4}"])
     integrator, why = choose_integrator(by_prb, scene, mi.traverse(scene), "camera")
     assert (integrator["type"], integrator["max_depth"], why) == ("path", 4, "")

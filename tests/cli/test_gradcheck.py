@@ -89,7 +89,7 @@ def test_what_fails_is_named(
     ("args", "line"),
     [
         (["--estimators", "stak"], "--estimators reslrb:stak: integrator.estimator: must be one of"),
-        (["--estimators", "stack("], "--estimators: `stack(` is no estimator"),
+        (["--estimators", "stack("], "--estimators: `stack(` is not an estimator"),
         (["--set", "run.sp=3"], "did you mean `spp`?"),
         (["--seeds", "2"], "--seeds"),
         (["--json", "/nowhere/a.jsonl"], "--json: cannot write /nowhere/a.jsonl"),

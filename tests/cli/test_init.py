@@ -164,7 +164,7 @@ def test_a_texture_of_8_bits_is_offered_recovered_and_exported(folder: Path) -> 
         (("room/scene.xml", "--target", "wide.png"), "is 16x8 pixels, the scene's film 8x8, with another aspect ratio"),
         (("room/scene.xml", "--target", "wide.png"), "such as 8x8"),
         (("room/scene.xml", "--target", "none.png"), "none.png: no such file"),
-        (("room/scene.xml", "--target", "room/scene.xml"), "is not an image that can be read"),
+        (("room/scene.xml", "--target", "room/scene.xml"), "is not a readable image"),
         (("room/none.xml",), "none.xml: no such file"),
         (("room/scene.xml", "-o", "config.txt"), "must end in .yaml"),
         (("room/scene.xml", "-o", "nowhere/config.yaml"), "cannot write"),

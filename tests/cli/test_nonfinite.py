@@ -345,7 +345,7 @@ def test_lamps_that_camera_paths_find_are_looked_at(spoilt_experiment, capsys):
     ours = "integrator={type: reslrb, max_depth: 4, estimator: stack, paths: camera}"
     _, err = optimize(capsys, STOP, "scene.options={power: 3.4028236e38}", ours)
     _, [offender], _ = inspect(capsys, err)
-    assert offender["quantity"] in ("radiance that is met, or that a sampled emitter sends", "connection factor c")
+    assert offender["quantity"] in ("incident radiance, or radiance of a sampled emitter", "connection factor c")
     assert offender["where"]["samples"].endswith(", camera paths")
 
 

@@ -245,7 +245,7 @@ FOG = '<shape type="sphere"><bsdf type="null"/><medium name="interior" type="hom
 #: By name: what is replaced in the scene, by what, with which integrator, and what the error line holds.
 BAD_SCENES = {
     "orthographic": (CAMERA, PARALLEL, "{type: reslrb, paths: light}", "OrthographicCamera"),
-    "orthographic from both sides": (CAMERA, PARALLEL, "{type: reslrb, paths: both}", "take integrator.paths: camera"),
+    "orthographic from both sides": (CAMERA, PARALLEL, "{type: reslrb, paths: both}", "use integrator.paths: camera"),
     "glass alone": (POSTER, PANE + POSTER, "{type: reslrb, paths: light}", "specular"),
     "light for prb": ('type="area" id="light"', 'type="directionalarea" id="light"', "{type: prb}", "directionalarea"),
     "no light": (LIGHT, "", "{type: reslrb}", "no emitters"),
@@ -417,8 +417,8 @@ def test_vertices_are_a_parameter_like_others(tmp_path, llvm):
 @pytest.mark.parametrize(
     ("override", "line"),
     [
-        (PARAMETERS, "parameters[2].heightmap.mesh: `slab.vertex_positions` is what parameters[1] recovers"),
-        ("integrator.estimator=event", "integrator.estimator: estimator event has no derivatives of what moves light"),
+        (PARAMETERS, "parameters[2].heightmap.mesh: `slab.vertex_positions` is already recovered by parameters[1]"),
+        ("integrator.estimator=event", "integrator.estimator: estimator event has no derivatives of moving light"),
         ("scene.options.filter=box", "scene.file: sensor camera has a box filter"),
         ("parameters[0].motion.of=nothing", "parameters[0].motion.of: there is no `nothing` in the scene"),
         (

@@ -141,8 +141,8 @@ def test_names_are_short_safe_and_different(folder):
         (["--vary", "scene.file=[scene.xml, gone.xml]"], "gone.xml: no such file"),
         (["--vary", "integrator=[prb, path]"], "--vary integrator path: integrator.type: must be one of"),
         (["--vary", "integrator=[prb, 'ptracer,prb']"], "names several integrators in one value"),
-        (["--vary", "integrator=[prb, 'reslrb:']"], "--vary integrator: `reslrb:` is no integrator; write TYPE"),
-        (["--vary", "integrator=[own.py:Own]"], "would be run, with all your rights; --allow-code has it run"),
+        (["--vary", "integrator=[prb, 'reslrb:']"], "--vary integrator: `reslrb:` is not an integrator; write TYPE"),
+        (["--vary", "integrator=[own.py:Own]"], "would run with all your rights; --allow-code permits it"),
         (["--resume", "gone"], "gone: no such folder"),
         (["--resume", "."], ".: is no sweep's folder: it has no sweep.json"),
         (["-o", "tiny.yaml"], "-o: tiny.yaml is a file, not the folder of a sweep"),
@@ -490,12 +490,12 @@ def test_code_of_the_users_own_is_asked_for_and_stays_the_same(folder):
     )
     result = reslrb(*words)
     assert (result.exit_code, Path("s").exists()) == (2, False)
-    assert result.output == (f"tiny.yaml: loss.file: would run the code of {folder / 'own.py'}, with all your rights; "
-                             "--allow-code has it run\n")  # fmt: skip
+    assert result.output == (f"tiny.yaml: loss.file: would run the code of {folder / 'own.py'} with all your rights; "
+                             "--allow-code permits it\n")  # fmt: skip
     assert "finished, 2 of 2 runs done" in tiny.done(*words, "--allow-code").output
     more = ("sweep", "--resume", "s", "--seeds", "2")
     asked = reslrb(*more)
-    assert (asked.exit_code, "--allow-code has it run" in asked.output) == (2, True)
+    assert (asked.exit_code, "--allow-code permits it" in asked.output) == (2, True)
     Path("own.py").write_text(OWN + "# another\n")
     for again in ((*more, "--allow-code"), (*words, "--allow-code", "--seeds", "2")):
         changed = reslrb(*again)

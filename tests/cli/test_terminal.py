@@ -53,7 +53,7 @@ def test_inspect(experiment, capsys):
     code, out, err = reslrb(capsys, "inspect", experiment / "c.yaml")
     assert code == 0
     assert not {"\x1b", TURNED} & set(out + err)
-    assert "id `pos\\u202eter` cannot stand in a key: named Diffuse_1" in err
+    assert "id `pos\\u202eter` cannot be part of a key: named Diffuse_1" in err
     assert "Diffuse_1.reflectance.value" in out
     code, out, _ = reslrb(capsys, "inspect", experiment / "c.yaml", "--json")
     assert not {"\x1b", TURNED} & set(out)

@@ -134,6 +134,6 @@ def difference_from_ptracer(
     options = {"max_depth": 6, "rr_depth": 3, "hide_emitters": True} | options
     ours = images(scene, "reslrb", range(2), spp, **options, **(reslrb or {}))
     theirs = images(scene, "ptracer", range(2), spp, **options)
-    assert theirs.mean() > 1e-3, "nothing to compare"
+    assert theirs.mean() > 1e-3, "no pixel to compare"
     colors = 3 if ours.shape[-1] >= 3 else 1
     return float(np.abs(ours - theirs)[..., :colors].mean() / theirs[..., :colors].mean())

@@ -69,7 +69,7 @@ def distances(case: AttachedCase) -> Iterator[tuple[str, float, float]]:
         return float(np.median([relative(gradients[left][name], gradients[right][name]) for gradients in found]))
 
     for name in found[0]["walk_ad"]:
-        assert all(gradients["walk_ad"][name].any() for gradients in found), f"nothing to compare: {name}"
+        assert all(gradients["walk_ad"][name].any() for gradients in found), f"no pixel to compare: {name}"
         # What the references differ by is theirs, and much where terms cancel. If NaN stood anywhere it would show.
         apart = distance(name, "walk_ad", "ptracer") if case.stock else 0.0
         limit = max(case.limit, 2 * apart)
@@ -286,7 +286,7 @@ def test_as_a_plugin_every_pixel_is_that_of_naive_ad(normalization: str):
 
 def test_a_lamp_that_moves_is_refused():
     case = SCENES["moved_point"].case()
-    with pytest.raises(UnsupportedScene, match="forward mode has no derivatives of emitters that move"):
+    with pytest.raises(UnsupportedScene, match="forward mode has no derivatives of moving emitters"):
         case.tangent(integrator("reslrb", 2, estimator="stack"), np.array([1.0, 0, 0]), 1, 4)
 
 

@@ -381,7 +381,7 @@ def test_a_share_that_leaves_one_side_has_nothing_of_the_other():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"paths": "camera", "estimator": "gather"}, "chooses among the connections of light paths"),
+        ({"paths": "camera", "estimator": "gather"}, "needs the connections of light paths"),
         ({"paths": "both", "light_share": 1.5}, "must lie in"),
         ({"paths": "sideways"}, "must be one of light, camera, both"),
     ],
@@ -399,7 +399,7 @@ def test_sensors_that_light_paths_cannot_connect_to():
     ours = images(scene, "reslrb", range(8), 64, max_depth=4, estimator="stack", paths="camera")
     theirs = images(scene, "path", range(50, 58), 64, max_depth=4)
     assert compare(ours[..., :3], theirs[..., :3])
-    with pytest.raises(UnsupportedScene, match=r"take integrator.paths: camera"):
+    with pytest.raises(UnsupportedScene, match=r"use integrator.paths: camera"):
         images(scene, "reslrb", range(1), 4, max_depth=4, estimator="stack", paths="both")
 
 

@@ -505,7 +505,7 @@ def test_batches_serve_the_baselines(case_of_two: Case, reference: tuple, name: 
 @pytest.mark.parametrize("batches", [1, 3])
 def test_batches_that_do_not_divide_are_refused(case_of_two: Case, reference: tuple, batches: int):
     with pytest.raises(
-        ValueError, match='"batches" must be a whole number from 2' if batches < 2 else "multiple of the batches"
+        ValueError, match='"batches" must be an integer from 2' if batches < 2 else "multiple of the batches"
     ):
         case_of_two.gradient(integrator("reslrb"), 1, SPP, l2(reference[0]), adjoint="batched", batches=batches)
 

@@ -391,4 +391,4 @@ def test_a_mesh_that_its_transform_mirrors():
     result = agreement(scene, "path", spp=256, max_depth=4, rr_depth=5)
     assert result, result
     at = Situation.of(scene, scene.sensors()[0], mi.traverse(scene), 4, False)
-    assert ptracer_image(at) == "it sees black where a mesh is mirrored"
+    assert ptracer_image(at) == "it renders mirrored meshes black"

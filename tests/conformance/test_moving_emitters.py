@@ -217,10 +217,10 @@ def test_one_kernel_has_it_all(kind: str, emitter: str):
 
 
 REFUSED = {
-    "envmap": ({"type": "envmap", "data": None}, "light.to_world", "drawn from what it shows"),
-    "sunsky": ({"type": "sunsky"}, "light.to_world", "drawn from what it shows"),
-    "sun": ({"type": "sunsky"}, "light.sun_direction", "where the light"),
-    "cutoff": ({"type": "spot"}, "light.cutoff_angle", "where the light"),
+    "envmap": ({"type": "envmap", "data": None}, "light.to_world", "sampled by its radiance"),
+    "sunsky": ({"type": "sunsky"}, "light.to_world", "sampled by its radiance"),
+    "sun": ({"type": "sunsky"}, "light.sun_direction", "direction of the light"),
+    "cutoff": ({"type": "spot"}, "light.cutoff_angle", "direction of the light"),
 }
 
 
@@ -354,7 +354,7 @@ def test_a_run_is_told_once_a_view(scale: float, lines: int):
         selection=types.SimpleNamespace(params=case.params))  # fmt: skip
     warn_of_border(problem, said.append)
     assert len(said) == lines
-    assert all(line.startswith("view 0: 2") and "% of the light that moves" in line for line in said)
+    assert all(line.startswith("view 0: 2") and "% of the moving light" in line for line in said)
 
 
 def test_other_integrators_are_not_asked():

@@ -173,15 +173,15 @@ def test_samples_that_passes_do_not_divide_raise(case: Case):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"spp": -1}, '"spp" must be a whole number from 0 to'),
-        ({"spp": 1.5}, '"spp" must be a whole number from 0 to .*, not 1.5'),
-        ({"spp": 10**13}, '"spp" must be a whole number'),
-        ({"seed": -1}, '"seed" must be a whole number from 0 to 4294967295, not -1'),
-        ({"seed": 2**32}, '"seed" must be a whole number'),
+        ({"spp": -1}, '"spp" must be an integer from 0 to'),
+        ({"spp": 1.5}, '"spp" must be an integer from 0 to .*, not 1.5'),
+        ({"spp": 10**13}, '"spp" must be an integer'),
+        ({"seed": -1}, '"seed" must be an integer from 0 to 4294967295, not -1'),
+        ({"seed": 2**32}, '"seed" must be an integer'),
         ({"sensor": 1}, '"sensor" is 1, but the scene has one sensor, index 0'),
         ({"sensor": -1}, '"sensor" is -1'),
         ({"adjoint": "batches"}, '"adjoint" must be one of correlated, independent, batched, not "batches"'),
-        ({"adjoint": "batched", "batches": 1}, '"batches" must be a whole number from 2 to'),
+        ({"adjoint": "batched", "batches": 1}, '"batches" must be an integer from 2 to'),
         ({"adjoint": "batched", "batches": 3}, r"the samples per pixel \(4\) must be a multiple of the batches \(3\)"),
         ({"adjoint": "batched", "spp": 0}, r"the samples per pixel \(0\) must be a multiple"),
     ],
@@ -307,7 +307,7 @@ def test_what_moves_is_refused_with_the_reason(name: str, options: dict[str, str
     case = Case(_textured(), (FLOOR,))  # its sensor has a box filter
     dr.enable_grad(case.params[key])
     case.params.update()
-    reasons = {"walk_ad": "leave it at auto", "stack": "box filter", "event": "estimator event has no"}
+    reasons = {"walk_ad": "use auto", "stack": "box filter", "event": "estimator event has no"}
     reason = "not of the sensor" if "camera" in key else reasons[options.get("estimator", name)]
     with pytest.raises(UnsupportedScene, match=reason):
         gradient_step(integrator(name, **options), case.scene, 0, case.objective, seed=1, spp=4)

@@ -160,11 +160,11 @@ def test_a_sphere_s_radius_slope_and_relief_are_told(sign: int, outline: str) ->
     if sign > 0:
         assert face["smallest_concave_radius"] == pytest.approx(radius, rel=2e-3)
         assert face["share_narrower_than_tool"] == 1
-        assert told["warnings"][0].startswith("the tool does not get into 1e+02 % of `face`")
+        assert told["warnings"][0].startswith("the tool does not reach 1e+02 % of `face`")
     else:
         assert face["smallest_concave_radius"] is None
         assert face["share_narrower_than_tool"] == 0
-    assert "less than 9.5 mm; add" in told["warnings"][-1]
+    assert "below 9.5 mm; add" in told["warnings"][-1]
     # Of a back, whose outside is below, the other sign is hollow.
     below = solids.hollows(faces[0], wanted, -1)
     assert below.max() == pytest.approx(-1 / radius if sign > 0 else 1 / radius, rel=2e-3)
@@ -201,15 +201,15 @@ def test_what_makes_no_solid_is_refused() -> None:
     one = sheet()
     cases: list[tuple[Callable[[], object], str]] = [
         (lambda: as_sheet("face", torn, triangles), "fabrication.faces: `face` has vertices that are not finite"),
-        (lambda: as_sheet("face", scattered, triangles), "vertices that lie on no grid"),
-        (lambda: as_sheet("face", points[:-1], triangles[:10]), "vertices that lie on no grid"),
+        (lambda: as_sheet("face", scattered, triangles), "vertices that are not on a grid"),
+        (lambda: as_sheet("face", points[:-1], triangles[:10]), "vertices that are not on a grid"),
         (lambda: as_sheet("face", points, holed), "folds, or has holes"),
         (lambda: as_sheet("face", points, np.concatenate([triangles, triangles[:1, ::-1]])), "folds, or has holes"),
         (lambda: make_solid([dome], plan(thickness=1.5)),
-         "fabrication.thickness: 1.5 mm: front and back cross, by 0.5 mm; it must be above 2"),
-        (lambda: make_solid([one, back], plan(faces=["face", "back"])), "front and back cross"),
-        (lambda: make_solid([dome], plan(thickness=2.05, rim=3.0)), "cross, by 0.05 mm"),
-        (lambda: make_solid([one], plan(size=[60.0, 41.0])), "fabrication.size: is 60 x 41 mm, and `face` 60 x 40"),
+         "fabrication.thickness: 1.5 mm: front and back overlap by 0.5 mm; it must be above 2"),
+        (lambda: make_solid([one, back], plan(faces=["face", "back"])), "front and back overlap"),
+        (lambda: make_solid([dome], plan(thickness=2.05, rim=3.0)), "overlap by 0.05 mm"),
+        (lambda: make_solid([one], plan(size=[60.0, 41.0])), "fabrication.size: is 60 x 41 mm, but `face` 60 x 40"),
         (lambda: make_solid([as_sheet("face", points + np.array([1.0, 0, 0]), triangles)], plan()), "must be at 0"),
     ]  # fmt: skip
     for make, line in cases:
@@ -249,7 +249,7 @@ def test_a_run_s_folder_holds_the_solid_that_its_scene_shows(run: Path, tmp_path
     corners = {tuple(point) for point in np.asarray(read.vertices, np.float32).tolist()}
     assert {tuple(point) for point in points.tolist()} <= corners
     assert "lens.stl: 75 x 100 x" in said
-    assert "less than 30 mm; add" in said
+    assert "below 30 mm; add" in said
     assert told["warnings"][0] in said
     # Heights: as seen from the receiver's side, y up.
     map = told["faces"]["face"]["heights"]
@@ -369,8 +369,8 @@ def test_files_that_cannot_be_are_refused_in_one_line(
         ("a.step", (), "a.step: .step is not supported; give a folder, or a file that ends in .stl"),
         ("a.stl", ("fabrication=null",), "a.stl: a solid needs a section `fabrication`"),
         ("a.3mf", (), "a.3mf: 3MF needs lib3mf, which is missing: pip install 'reslrb[fabrication]'"),
-        ("a.stl", ("fabrication.thickness=1",), "fabrication.thickness: 1 mm: front and back cross, by"),
-        ("out", ("fabrication.thickness=1",), "fabrication.thickness: 1 mm: front and back cross, by"),
+        ("a.stl", ("fabrication.thickness=1",), "fabrication.thickness: 1 mm: front and back overlap by"),
+        ("out", ("fabrication.thickness=1",), "fabrication.thickness: 1 mm: front and back overlap by"),
         ("a.stl", ("fabrication.faces=[plate]",), "fabrication.faces[0]: there is no mesh `plate` in the scene"),
         ("a.stl", ("fabrication.faces=[face, face]",), "fabrication.faces: must name each mesh once"),
         ("a.stl", ("fabrication.thickness=0",), "fabrication.thickness: must be"),

@@ -119,7 +119,7 @@ def test_far_away_heights_are_those_of_the_paraxial_formula(
         ({"thickness": 2.0}, "thickness", "thickness must be above .* or distance larger"),
         ({"incidence": 90.0}, "incidence", "between"),
         ({"tilt": (85.0, 0.0)}, "tilt", "between"),
-        ({"kind": "mirror"}, "incidence", "stands in the mirror's light; 30 degrees do"),
+        ({"kind": "mirror"}, "incidence", "blocks the mirror's light; 30 degrees suffice"),
         ({"size": (0.0, 1.0)}, "size", "above 0"),
     ],
 )  # fmt: skip

@@ -44,7 +44,7 @@ class Pretended:
         if stop():
             raise Stopped
         if self.type in self.refusing:
-            raise Refused("no derivatives of what moves light", 2)
+            raise Refused("no derivatives of moving light", 2)
         if self.ends.get((self.type, self.depth)) == self.asked:
             raise Ended(BenchStatus.OUT_OF_MEMORY, "ended by SIGSEGV")
         if self.question is None:

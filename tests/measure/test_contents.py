@@ -247,7 +247,7 @@ def test_no_measurement_of_another_experiment_is_gone_on_from(folder: Path, comm
             continue
         restore = change(folder / file)
         result = reslrb(*words, "first.jsonl")
-        advice = "remove the file, or name another one"
-        said = f"--json: first.jsonl is of another measurement: {place} has changed; {advice}"
+        advice = "remove the file, or use another one"
+        said = f"--json: first.jsonl belongs to another measurement: {place} has changed; {advice}"
         assert (result.exit_code, result.stderr.splitlines()[-1]) == (2, said), file
         restore()

@@ -73,7 +73,7 @@ def test_noise_whose_tails_are_too_heavy_for_intervals_is_reported(tmp_path: Pat
     session, results, _ = play(tmp_path, Stage(case_reslrb_stack=heavy, case_reslrb_event=Pretence(0.1, 0.1)), plan())
     for key in (*SHAPES, "all"):
         flagged, sound = of(results, "reslrb:stack", key), of(results, "reslrb:event", key)
-        assert "carry the variance" in flagged.message, key
+        assert "dominate the variance" in flagged.message, key
         assert flagged.biased is None  # its z scores prove nothing either
         assert (sound.message, sound.biased) == ("", False)
     [member] = [member for member in session.of(Role.CASE) if member.label == "reslrb:stack"]
@@ -85,7 +85,7 @@ def test_noise_whose_tails_are_too_heavy_for_intervals_is_reported(tmp_path: Pat
 
 
 def test_tails_that_are_no_worse_than_usual_are_not_reported(tmp_path: Path) -> None:
-    """Every fourth step ten times as noisy: many steps carry the variance, and intervals hold."""
+    """Every fourth step ten times as noisy: many steps dominate the variance, and intervals hold."""
     stage = Stage(case_reslrb_stack=Pretence(0.1, 0.05, outliers=tuple(range(0, 200, 4)), outlier=10.0))
     _, results, _ = play(tmp_path, stage, plan())
     record = of(results, "reslrb:stack")

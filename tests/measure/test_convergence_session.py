@@ -117,7 +117,7 @@ def test_an_independent_reference_that_ends_is_replaced(tmp_path: Path) -> None:
 def test_only_what_nobody_named_is_left_out(tmp_path: Path, default: bool) -> None:
     stage = Stage({"without": {"ptracer": "it emits wrongly"}})
     session, _, said = play(tmp_path, stage, plan(default=default, rounds=4))
-    assert ("left out: ptracer: it emits wrongly" in said) is default
+    assert ("left out: ptracer: it has wrong emission" in said) is default
     assert ("ptracer" in [m.label for m in session.of(Role.CASE)]) is not default
 
 
@@ -215,12 +215,12 @@ def test_only_the_same_is_gone_on_from(tmp_path: Path, change: dict[str, Any], l
     kept = session.kept()
     assert kept is not None
     earlier = Earlier("convergence", Path("c.jsonl"), *kept)
-    with pytest.raises(ConfigError, match=re.escape(f"--json: c.jsonl is of another measurement: {line}")):
+    with pytest.raises(ConfigError, match=re.escape(f"--json: c.jsonl belongs to another measurement: {line}")):
         begin(plan(**({"rounds": 8} | change)), earlier)
     begin(plan(rounds=8), earlier)
     with pytest.raises(ConfigError, match="by another version"):
         Earlier("convergence", Path("c.jsonl"), kept[0] | {"version": 0}, kept[1])
-    with pytest.raises(ConfigError, match="it is of `convergence`, this is `bench`"):
+    with pytest.raises(ConfigError, match="it belongs to `convergence`, this is `bench`"):
         Earlier("bench", Path("c.jsonl"), *kept)
 
 
@@ -262,7 +262,7 @@ def test_too_few_steps_for_a_slope_say_what_it_would_take(tmp_path: Path) -> Non
     _, results, said = play(tmp_path, slow(), plan(rounds=None, budget_s=45.0))
     lacking = {record.method.label for record in results.methods if record.slope is None}
     assert lacking == {"ptracer"}
-    assert said[-1].startswith("no slope of ptracer: it takes 16 steps of each; allow about ")
+    assert said[-1].startswith("no slope for ptracer: it needs 16 steps of each; allow about ")
     enough = float(said[-1].split("allow about ")[1].split(" s")[0])
     assert enough > 45
     _, results, said = play(tmp_path, slow(), plan(rounds=None, budget_s=1.05 * enough))
@@ -287,9 +287,9 @@ def test_the_budget_is_kept_and_used(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "line"),
     [
-        ("reslrb:stack(max_depth=3)", "all share one max_depth; take --set integrator.max_depth=3"),
-        ("reslrb:stack(adjoint=batched)", "has no effect where dL/dI is known; change --objective"),
-        ("reslrb:auto", "`auto` is for whole runs; take `stack`"),
+        ("reslrb:stack(max_depth=3)", "all share one max_depth; use --set integrator.max_depth=3"),
+        ("reslrb:stack(adjoint=batched)", "has no effect if dL/dI is known; change --objective"),
+        ("reslrb:auto", "`auto` is for whole runs; use `stack`"),
         ("path", "integrator.type: must be one of"),
     ],
 )

@@ -47,7 +47,11 @@ def test_case(name: str):
 
 @pytest.mark.parametrize(
     ("name", "reason"),
-    [("refraction", "point or parallel lights"), ("slab", "directionalarea"), ("nested_dielectrics", "hardly find")],
+    [
+        ("refraction", "point or parallel lights"),
+        ("slab", "directionalarea"),
+        ("nested_dielectrics", "hardly ever find"),
+    ],
 )
 def test_camera_paths_alone_are_left_out_of_what_they_cannot_find(name: str, reason: str):
     [record] = run_suite([name], ["stack(paths=camera)"])

@@ -230,8 +230,8 @@ def test_estimators_have_the_options_of_the_configuration():
     ]  # fmt: skip
     assert [case.options for case in parse_estimators("event(capacity=2)")] == [{"estimator": "event", "capacity": 2}]
     for text, message in (
-        ("", "is no estimator"),
-        ("stack,stack", "named twice"),
+        ("", "is not an estimator"),
+        ("stack,stack", "given twice"),
         ("stack(max_depth=3)", "--set integrator.max_depth=3"),
         ("stack(adjoint=independent)", "--set run.adjoint=independent"),
     ):
@@ -262,7 +262,7 @@ def test_references_refuse_what_they_cannot_do():
     def at(depth: int = 4, hidden: bool = False) -> Situation:
         return Situation.of(scene.scene, sensor, scene.params, depth, hidden)
 
-    assert "throughput is 0" in ptracer_gradient(at(), key)
+    assert "throughput 0" in ptracer_gradient(at(), key)
     assert "exactly 0" in prb_gradient(at(), key)
     assert ptracer_image(at()) is path_image(at()) is None
     assert "without roulette" in ptracer_image(at(-1))
@@ -294,7 +294,7 @@ def test_path_loses_what_masks_reflect_before_nothing():
     pane = {"type": "rectangle", "to_world": transform(rotate=([1, 0, 0], -45)), "bsdf": veil}
     scene = Case(room(floor_shape=None, wall_shape=None, side_shape=None, pane=pane), [])
     at = Situation.of(scene.scene, scene.scene.sensors()[0], scene.params, 4, False)
-    assert "masks reflect" in path_image(at)
+    assert "reflected by masks" in path_image(at)
     assert prb_image(at) is None
     ours, path, prb = (scene.image(integrator(name, 4), 1, 256).sum() for name in ("reslrb", "path", "prb"))
     assert abs(prb / ours - 1) < 0.02
@@ -410,7 +410,7 @@ def test_of_camera_paths_alone_there_is_one_estimator():
 @pytest.mark.usefixtures("llvm")
 def test_of_what_moves_light_there_are_light_paths():
     config = room_moving("lamp_over_floor.xml", "lamp.position")
-    with pytest.raises(ConfigError, match="what moves light has derivatives on light paths alone"):
+    with pytest.raises(ConfigError, match="only light paths have derivatives of moving light"):
         Gradcheck(CheckSettings(config, parse_estimators("stack(paths=both)"), 0, 3))
 
 
@@ -452,7 +452,7 @@ def test_a_lamp_that_moves():
     assert of[Reference.FINITE_DIFFERENCE].holds
     assert of[Reference.FINITE_DIFFERENCE].relative_l2 < 5e-3
     assert of[Reference.PTRACER].verdict is Verdict.NO_REFERENCE
-    assert "an emitter that moves" in of[Reference.PTRACER].message
+    assert "a moving emitter" in of[Reference.PTRACER].message
     assert Reference.FORWARD_MODE not in of
 
 
@@ -462,7 +462,7 @@ def test_who_takes_part():
     some = Gradcheck(CheckSettings(config, all_estimators(config), 0, 3, named=False))
     assert [case.label for case in some.participants.listed] == ["reslrb:reservoir", "reslrb:stack"]
     assert {row.label for row in some.rows if row.key is not None} == {"reslrb:reservoir", "reslrb:stack"}
-    with pytest.raises(ConfigError, match="gather has no derivatives of what moves light; take reservoir, stack"):
+    with pytest.raises(ConfigError, match="gather has no derivatives of moving light; use reservoir, stack"):
         Gradcheck(CheckSettings(config, parse_estimators("gather,stack"), 0, 3))
     still = room_moving("lamp_over_floor.xml", "floor.bsdf.reflectance.value")
     all_of_them = Gradcheck(CheckSettings(still, all_estimators(still), 0, 3, named=False))
@@ -518,7 +518,7 @@ def test_references_of_what_moves():
     assert ptracer_gradient(at("ball.to_world"), "ball.to_world") is None
     assert "emitter" in (ptracer_gradient(at("lamp.to_world"), "lamp.to_world") or "")
     assert "emitter" in (ptracer_gradient(at("ball.to_world", "lamp.to_world"), "ball.translation") or "")
-    assert "moves light" in (prb_gradient(at("ball.to_world"), "ball.to_world") or "")
+    assert "moving light" in (prb_gradient(at("ball.to_world"), "ball.to_world") or "")
 
 
 @pytest.mark.usefixtures("llvm")
@@ -589,7 +589,7 @@ def test_only_the_same_is_gone_on_from(change: dict[str, Any], line: str) -> Non
     head = {"version": VERSION, "kind": KIND, "settings": settings(what, "llvm_ad_rgb", "")}
     with pytest.raises(ConfigError) as caught:
         Earlier(KIND, Path("g.jsonl"), head, {}).check(settings(replace(what, **change), "llvm_ad_rgb", ""))
-    assert f"--json: g.jsonl is of another measurement: {line}" in str(caught.value)
+    assert f"--json: g.jsonl belongs to another measurement: {line}" in str(caught.value)
 
 
 def test_samples_of_other_code_are_not_gone_on_from(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -231,7 +231,7 @@ def test_the_command_and_more_seeds(
         assert call(str(config), *again, "--seeds", "6", "--json", str(part)) == 0
     assert json.loads(part.read_text().splitlines()[-1]) == other
     assert call(str(config), "--missing", "--seeds", "9", "--spp", "4", "--json", str(part)) == 2
-    assert "is of another measurement: directions is 2 there, None here" in capsys.readouterr().err
+    assert "belongs to another measurement: directions is 2 there, None here" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("_quiet")

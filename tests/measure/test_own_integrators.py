@@ -106,17 +106,17 @@ def test_one_that_is_right_holds_and_its_cost_is_told(capsys: pytest.CaptureFixt
 
 #: Faults, and what the sentence has to say of them.
 FOUND = {
-    "fault=cosine": ["its derivative by all emission is 1.", "light that comes straight from a lamp", "its cosine"],
-    "fault=replay": ["scatters by", "other paths than the first"],
+    "fault=cosine": ["its derivative by all emission is 1.", "direct light of a lamp", "its cosine"],
+    "fault=replay": ["varies by", "other paths than the first"],
     "fault=roulette": ["without roulette (rr_depth) it is right"],
     "fault=lobe": ["wall.bsdf.reflectance.value holds", "a BlendBSDF of", "the probability of the lobe"],
-    "fault=kept": ["its own light included"],
+    "fault=kept": ["including its own light"],
     "fault=emitters": ["wrong from paths of 2 segments on", "the choice of the emitter"],
-    "fault=twice": ["wrong from paths of 2 segments on", "light that comes straight from a lamp"],
-    "fault=first": ["segments on, though its derivative by emission is right", "what is differentiated there"],
-    "fault=sign": ["is -1", "one factor at every seed"],
+    "fault=twice": ["wrong from paths of 2 segments on", "direct light of a lamp"],
+    "fault=first": ["segments on, though its derivative by emission", "terms that are differentiated there"],
+    "fault=sign": ["is -1", "the factor is the same at every seed"],
     "fault=depth": ["a segment too soon"],
-    "primal_fault=emitters": ["its image is", "look at what it renders first", "from paths of 2 segments on"],
+    "primal_fault=emitters": ["its image is", "check the image first", "from paths of 2 segments on"],
 }
 #: The default suite looks for these in paths that are no longer than they need.
 QUICK = {"fault=cosine": 3, "fault=roulette": 4}
@@ -134,7 +134,7 @@ def test_a_fault_is_found_and_the_sentence_points_at_it(capsys: pytest.CaptureFi
     assert len(lines) == 2, lines
     for words in FOUND[fault]:
         assert words in lines[1], lines[1]
-    assert "limit from above" not in lines[1], lines[1]
+    assert "upper limit" not in lines[1], lines[1]
 
 
 #: A Cornell box, all of it diffuse.
@@ -152,8 +152,8 @@ def test_what_is_limited_from_above_is_told_by_darker_scenes(capsys: pytest.Capt
     assert call(words) == ExitCode.CHECK_FAILED
     said = capsys.readouterr().out.splitlines()[-1]
     darker, meant = ("surfaces", "the throughput") if options.endswith("clamp") else ("lamps", "light")
-    assert f"with all {darker} 16 times darker the light of these paths is" in said, said
-    assert f"look for a limit from above of {meant}" in said, said
+    assert f"with all {darker} 16 times darker, the light of these paths is" in said, said
+    assert f"look for an upper limit of {meant}" in said, said
     assert f"wrong from paths of {3 if options.endswith('clamp') else 2} segments on" in said, said
 
 
@@ -234,9 +234,7 @@ def test_silhouettes_are_judged_by_differences(
     holds = {each["integrator"]: each["holds"] for each in found if each.get("parameter") == "thing.translation"}
     assert holds == {names[0]: projective_holds, names[1]: False}
     said = capsys.readouterr().out.splitlines()
-    pointed = [
-        line.partition(":")[2] for line in said if ": wrong where light moves: look at derivatives of silh" in line
-    ]
+    pointed = [line.partition(":")[2] for line in said if ": wrong if light moves: check derivatives of silh" in line]
     assert [line.partition(":")[0] for line in pointed] == [each.partition(":")[2] for each in names if not holds[each]]
 
 
@@ -252,23 +250,23 @@ def test_where_there_is_nothing_in_either_image_they_agree() -> None:
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("own_replay.py:Replay", "would be run, with all your rights; --allow-code has it run"),
+        ("own_replay.py:Replay", "would run with all your rights; --allow-code permits it"),
         ("missing.py:Replay", "no such file"),
         ("own_replay.py:Other", "has nothing of the name `Other`"),
         ("own_replay.py:NONE", "has a int, not a function, of the name"),
-        ("own_replay.py:makes_none", "is no Mitsuba integrator, but makes a str"),
+        ("own_replay.py:makes_none", "is not a Mitsuba integrator, but creates a str"),
         ("own_replay.py:Replay(falt=cosine)", "has no option falt"),
         ("own_replay.py:Replay(fault=raises)", "making it raises in line 23 RuntimeError: of all things"),
         ("own_replay.py:Black(what=raises)", "its render raises in line"),
         ("own_replay.py:Black(what=list)", "its render returns list, not mi.TensorXf"),
         ("own_replay.py:Black(what=wide)", "its image is 16x17x3, not 16x16 (height, width) with channels"),
-        ("own_replay:Replay", "is none of your own (FILE.py:CLASS)"),
-        ("own_replay.py", "is no integrator of your own; write FILE.py:CLASS"),
-        ("reslrb:stack", "is none of your own (FILE.py:CLASS)"),
+        ("own_replay:Replay", "is not your own (FILE.py:CLASS)"),
+        ("own_replay.py", "is not an integrator of your own; write FILE.py:CLASS"),
+        ("reslrb:stack", "is not your own (FILE.py:CLASS)"),
     ],
 )
 def test_what_is_no_integrator_is_one_line(capsys: pytest.CaptureFixture[str], name: str, said: str) -> None:
-    allowed = [] if "would be run" in said else ["--allow-code"]
+    allowed = [] if "would run" in said else ["--allow-code"]
     code = call(["gradcheck", "room.yaml", "--integrators", name, *allowed, "--seeds", "3", "--spp", "4"])
     error = capsys.readouterr().err
     assert code == ExitCode.USAGE, error
@@ -290,11 +288,11 @@ def test_a_run_by_one_is_that_of_prb(capsys: pytest.CaptureFixture[str]) -> None
     words = ["optimize", "room.yaml", "--set", own, "--set", "run.name=own", "--set", "run.certainty=false"]
     words += ["--set", "target.render.integrator={type: prb, max_depth: 3}"]
     assert call(words) == ExitCode.USAGE
-    assert "--allow-code has it run" in capsys.readouterr().err
+    assert "--allow-code permits it" in capsys.readouterr().err
     assert call([*words, "--allow-code"]) == 0
     capsys.readouterr()
     assert call(["optimize", "--resume", "runs/own", "--set", "run.iterations=3"]) == ExitCode.USAGE
-    assert "--allow-code has it run" in capsys.readouterr().err
+    assert "--allow-code permits it" in capsys.readouterr().err
     assert call(["optimize", "--resume", "runs/own", "--set", "run.iterations=3", "--allow-code"]) == 0
     assert call(["report", "runs/own"]) == 0
     with Path("own_replay.py").open("a") as file:

@@ -90,7 +90,7 @@ def test_errors_are_taken_from_all_light_that_the_scene_allows_for(
     method = results.references[0].method
     assert (method.label, method.paths, method.light_share) == (label, paths, share)
     assert session.of(Role.REFERENCE)[0].config.integrator.options()["paths"] == paths
-    left_out = "left out: reslrb:stack(paths=both): this scene has light paths alone"
+    left_out = "left out: reslrb:stack(paths=both): this scene has only light paths"
     assert (left_out in said) == (paths == "light")
 
 

@@ -132,7 +132,7 @@ def test_cases_of_the_suite_are_calls(tmp_path: Path, capsys: pytest.CaptureFixt
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["--cluster", "local:2"], "--cluster: a budget of seconds says nothing of other machines"),
+        (["--cluster", "local:2"], "--cluster: a budget of seconds has no meaning on other machines"),
         (["--cluster", "2", "--seeds", "4"], "--cluster: must be local:N"),
         (["--cluster", "local:2", "--missing"], "--cluster: has no effect with --missing"),
         (["--cluster", "local:2", "--seeds", "4", "--set", "integrator.guiding=on"], "integrator.guiding: "),

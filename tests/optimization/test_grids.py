@@ -111,7 +111,7 @@ def test_what_is_no_rectangle_is_refused_and_what_lacks_a_grid_told(tmp_path, wi
     from reslrb_cli.optimization.assemble import assemble_scene
 
     (tmp_path / "quad.ply").write_text(QUAD.replace("-1 1 0 0 1", "-1 2 0 0 1"))
-    with pytest.raises(ConfigError, match=r"parameters\[0\].heightmap.grid: `back` is no rectangle"):
+    with pytest.raises(ConfigError, match=r"parameters\[0\].heightmap.grid: `back` is neither a rectangle"):
         assemble_scene(configured(tmp_path, "mesh: back, resolution: [4, 4], grid: 9", with_quad))
     with pytest.raises(ConfigError, match=r"`back` is a Rectangle.*`grid: 257`"):
         assemble_scene(configured(tmp_path, "mesh: back, resolution: [4, 4]"))

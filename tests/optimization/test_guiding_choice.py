@@ -306,7 +306,7 @@ def test_who_compares_or_writes_a_script_has_to_say(option: str) -> None:
     assert plain.at(config, 4, known=True).integrator.options()[option] == WORDS[option][False]
     with pytest.raises(ConfigError, match=f"compare `{named[0]}` with `{named[1]}`"):
         asked.at(config, 4, known=True)
-    with pytest.raises(ValueError, match=f"say {named[0]} or {named[1]}"):
+    with pytest.raises(ValueError, match=f"use {named[0]} or {named[1]}"):
         make_integrator("reslrb", **{option: "auto"})
 
 
@@ -413,8 +413,8 @@ def test_its_share_is_kept(spp: int, overhead: float, python: float, time: float
     taken = [call for call in world.calls if call[0] is not False]
     assert all(call[2] <= spp for call in world.calls)
     if record.gain is None:
-        dear = re.fullmatch(r"to measure it would cost more than [\d.e+-]+ iterations?", record.note)
-        assert dear or "too few to tell" in record.note
+        dear = re.fullmatch(r"measuring it would take more than [\d.e+-]+ iterations?", record.note)
+        assert dear or "too few to decide" in record.note
         assert not record.guided
     else:
         assert record.rounds >= LEAST_ROUNDS

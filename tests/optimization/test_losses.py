@@ -250,7 +250,7 @@ def test_lists_that_are_none(tmp_path, loss, key, words):
 def test_ssim_of_an_image_that_is_too_small(tmp_path):
     scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective", "film": {
         "type": "hdrfilm", "width": 21, "height": 10}}})  # fmt: skip
-    with pytest.raises(ConfigError, match=r"loss\[1\].type: ssim needs 11x11 pixels, and there are 21x10"):
+    with pytest.raises(ConfigError, match=r"loss\[1\].type: ssim needs 11x11 pixels, but the image has 21x10"):
         make_views(read(tmp_path, "[{type: l2}, {type: ssim}]"), scene)
 
 
@@ -305,7 +305,7 @@ def test_the_gradient_is_that_of_the_mean_image(folder, kind, adjoint):
 def test_what_the_images_cannot_tell_apart_is_refused(folder, exposure):
     """All light, or all that it falls on directly, scales the image as the exposure does."""
     wall = make(folder, exposure, "integrator.max_depth=2")
-    with pytest.raises(ConfigError, match=f"cannot tell `exposure.*` from `{KEY}`") as error:
+    with pytest.raises(ConfigError, match=f"cannot distinguish `exposure.*` from `{KEY}`") as error:
         check_exposures(wall)
     assert error.value.key == exposure.replace("=[{sensor: 0, exposure: auto}]", "[0].exposure").replace("=auto", "")
     lamp = make(folder, exposure, f"parameters=[{{key: {LAMP}, initial: 5}}]")
@@ -419,7 +419,7 @@ def test_what_the_filter_mixes_with_a_clipped_pixel_is_left_out_with_it(masked_f
     y, x = CLIPPED
     near = {(v, u) for v in range(max(y - 2, 0), min(y + 3, 8)) for u in range(max(x - 2, 0), min(x + 3, 8))}
     assert set(left_out(problem)) == near | {CLEAR}
-    assert f"1 are clipped, {len(near) - 1} are reached by the film's filter from clipped ones, 1 have" in lines[0]
+    assert f"1 are clipped, {len(near) - 1} are within the film's filter of clipped ones, 1 have" in lines[0]
     off = "target.mask={border: false, clipped: false}"
     assert left_out(make_masked(masked_folder, "target.file=photo.png", off)[0]) == [CLEAR]
 
@@ -508,12 +508,12 @@ def test_what_light_tracing_cannot_see(masked_folder, bsdf, kind):
         return
     assert masked.counts().keys() == {"clipped", "alpha"}
     assert masked.stay["mixed"] > 0
-    assert "see coats, blends or thin panes and stay" in lines[0]
+    assert "show coats, blends or thin panes and are kept" in lines[0]
 
 
 def test_an_empty_mask_is_refused(masked_folder):
     mi.Bitmap(np.zeros((8, 8, 3), np.float32)).write(str(masked_folder / "nothing.exr"))
-    with pytest.raises(ConfigError, match=r"leaves nothing to compare .*64 have weight 0 in the mask's file") as error:
+    with pytest.raises(ConfigError, match=r"leaves no pixel to compare .*64 have weight 0 in the mask's file") as error:
         make_masked(masked_folder, "target.file=photo.png", "target.mask=nothing.exr")
     assert error.value.key == "target.mask"
 

@@ -165,9 +165,9 @@ def test_roughness_alone_stays_detached_unless_asked(tmp_path):
 
 #: Settings, and where the error is and what it holds.
 REFUSED = {
-    "estimator": (["integrator.estimator=event"], "integrator.estimator", "take reservoir, stack"),
-    "detached": (["integrator.attached=false"], "integrator.attached", "leave it at auto"),
-    "prb": (["integrator={type: prb}"], "integrator.type", "prb has no derivatives of what moves light"),
+    "estimator": (["integrator.estimator=event"], "integrator.estimator", "use reservoir, stack"),
+    "detached": (["integrator.attached=false"], "integrator.attached", "use auto"),
+    "prb": (["integrator={type: prb}"], "integrator.type", "prb has no derivatives of moving light"),
     "trajectory": (["integrator={type: trajectory}"], "integrator.type", "trajectory has no derivatives"),
     "box filter": (["scene.options.filter=box"], "scene.file", "camera has a box filter"),
     "box filter, ptracer": (
@@ -175,7 +175,7 @@ REFUSED = {
     ),
     "alpha by gather": (
         [FLOOR, NO_TRUTH, "integrator={estimator: gather, attached: true}"],
-        "integrator.estimator", "take reservoir, stack",
+        "integrator.estimator", "use reservoir, stack",
     ),
 }  # fmt: skip
 

@@ -158,10 +158,10 @@ def test_yaml_cannot_allow_it(experiment: Path, capsys: pytest.CaptureFixture[st
     [
         ("nan", "returns nan"),
         ("nan_derivative", "derivative that is not finite"),
-        ("not_one", "returns 192 numbers, not one"),
+        ("not_one", "returns 192 numbers instead of one"),
         ("number", "returns float, not mi.Float"),
-        ("constant", "has no derivative by the image"),
-        ("detached", "has no derivative by the image"),
+        ("constant", "without a derivative by the image"),
+        ("detached", "without a derivative by the image"),
         ("raises", "raises in line 41 ValueError: no such thing"),
         ("ends", "raises in line 45 SystemExit: 0"),
         ("needs_two", "raises"),
@@ -285,8 +285,8 @@ def test_what_is_wrong_with_a_function_is_located_by_its_name_and_line(experimen
 
     line = raises.__code__.co_firstlineno + 1
     cases = [
-        (nan, "loss: nan: returns nan of"), (wide, "loss: wide: returns 192 numbers, not one"),
-        (detached, "loss: detached: returns what has no derivative by the image"),
+        (nan, "loss: nan: returns nan for"), (wide, "loss: wide: returns 192 numbers instead of one"),
+        (detached, "loss: detached: returns a value without a derivative by the image"),
         (raises, f"loss: raises: it raises in line {line} ValueError: no such thing"),
         ("own.py:own", "loss: is no function; a file's is named by the setting"),
     ]  # fmt: skip
@@ -329,7 +329,7 @@ def test_weights_are_handed_to_a_function_that_takes_them(experiment: Path) -> N
     assert float(view("with_weights", even).judge(mi.TensorXf(image))[0]) == pytest.approx(expected, rel=1e-5)
     assert float(view("own", even).judge(mi.TensorXf(image))[0]) == pytest.approx(expected * 5 / 8, rel=1e-5)
     view("with_weights", uneven).judge(mi.TensorXf(image))
-    with pytest.raises(ConfigError, match=r"loss\.file: takes no weights"):
+    with pytest.raises(ConfigError, match=r"loss\.file: has no argument for the weights"):
         view("own", uneven).judge(mi.TensorXf(image))
 
 

@@ -105,10 +105,10 @@ def test_parts_have_their_own_samples_and_steps_no_memory(tmp_path: Path) -> Non
 #: Settings, whether there is a spot lamp, and where the error is and what it holds.
 REFUSED = {
     "prb": (["integrator.type=prb"], False, "integrator.type", "prb_projective"),
-    "lens": (["scene.options.sensor=orthographic"], False, "integrator.type", "perspective sensors alone, and camera"),
+    "lens": (["scene.options.sensor=orthographic"], False, "integrator.type", "only for perspective sensors, and"),
     "rectangle": (
         ["parameters=[{motion: {of: lamp}}]", "target.render.parameters={}"], False, "integrator.type",
-        "wrong outlines of rectangles, as lamp",
+        "wrong outlines of rectangles such as lamp",
     ),
 }  # fmt: skip
 

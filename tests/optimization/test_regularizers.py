@@ -199,7 +199,7 @@ def test_a_bitmap_is_measured_in_its_texture_coordinates(tmp_path):
     assert costs[0] == pytest.approx(slope, rel=2e-3)
     assert costs[1] == pytest.approx(slope, rel=0.15)  # resampling makes the rim flat
     bad = ParameterSpec(key="*.reflectance.data", regularizers=[{"type": "curvature", "radius": 1.0}])
-    with pytest.raises(ConfigError, match="a bitmap; total_variation, laplacian would do"):
+    with pytest.raises(ConfigError, match="a bitmap; use total_variation, laplacian"):
         select_parameters(load_scene(tmp_path / "s.xml"), [bad], "c.yaml")
 
 
@@ -225,8 +225,8 @@ def test_a_run_records_it(tmp_path, spp):
 REFUSED = {
     "a colour": ("key: '*.reflectance.value'", "[{type: laplacian}]", "has no surface; heightmaps"),
     "a motion": ("motion: {of: face}", "[{type: laplacian}]", "has no surface"),
-    "a mesh": ("key: face.vertex_positions", "[{type: slope, degrees: 3}]", "a mesh; laplacian would do"),
-    "twice": (HEAD, "[{type: laplacian}, {type: laplacian}]", "regularizers[1].type: laplacian stands twice"),
+    "a mesh": ("key: face.vertex_positions", "[{type: slope, degrees: 3}]", "a mesh; use laplacian"),
+    "twice": (HEAD, "[{type: laplacian}, {type: laplacian}]", "regularizers[1].type: laplacian is given twice"),
     "unknown": (HEAD, "[{type: smooth}]", "regularizers[0].type"),
     "no radius": (HEAD, "[{type: curvature}]", "regularizers[0].radius: missing"),
     "through": (
@@ -356,10 +356,10 @@ def test_a_step_that_would_have_both_faces_of_a_lens_cross_is_held_back(llvm, tm
 
 def test_faces_that_begin_crossed_or_have_no_opposite_are_refused(llvm, tmp_path):
     for number, (setting, line) in enumerate((
-        ("parameters[1].initial=-24.9", "parameters[0].regularizers: `face.heightmap` and `back.heightmap` begin"),
+        ("parameters[1].initial=-24.9", "parameters[0].regularizers: `face.heightmap` and `back.heightmap` start"),
         ("parameters[0].regularizers[0].opposite=lid",
-         "regularizers[0].opposite: `lid` has no heightmap in `parameters` that lies opposite; `back` would do"),
-        ("parameters[0].regularizers[0].opposite=face", "`face` has no heightmap in `parameters` that lies opposite"),
+         "regularizers[0].opposite: `lid` has no opposite heightmap in `parameters`; use for example `back`"),
+        ("parameters[0].regularizers[0].opposite=face", "`face` has no opposite heightmap in `parameters`"),
     )):  # fmt: skip
         with pytest.raises(ConfigError) as error:
             lens_with_two_faces(tmp_path / str(number), [setting])

@@ -308,4 +308,4 @@ def test_a_run_with_ptracer_says_where_a_lens_is_not_clipped(tmp_path, caplog):
 
     assert lines("reslrb") == []
     [line] = lines("ptracer")
-    assert "sensor eye: ptracer does not clip what a `thinlens` sees" in line
+    assert "sensor eye: ptracer does not clip the view of a `thinlens`" in line

@@ -193,8 +193,7 @@ def test_the_first_step_is_what_the_line_says(transform):
 def test_the_line_of_what_is_not_scaled_says_why():
     row = Scaled("lamp.intensity.value", 3, 1.0, 0.0, 0.0)
     assert (
-        step_line(row, "log", 0.1)
-        == "lamp.intensity.value has no effect on the image where it starts; it is not scaled"
+        step_line(row, "log", 0.1) == "lamp.intensity.value has no effect on the image at its start; it is not scaled"
     )
     row = Scaled("lamp.intensity.value", 3, 1.0, 0.0, 0.0, change=1.0, curvature=1.0, length=1.0)
     assert "no gradient" in step_line(row, "log", 0.1)

@@ -255,8 +255,8 @@ def test_its_share_is_kept(share: float, step: int, overhead: float, time: float
     used = sizes(share, step)
     record = one.run(used, share)
     if record.gain is None:
-        dear = re.fullmatch(r"to measure it would cost more than [\d.e+-]+ iterations?", record.note)
-        assert dear or "too few to tell" in record.note
+        dear = re.fullmatch(r"measuring it would take more than [\d.e+-]+ iterations?", record.note)
+        assert dear or "too few to decide" in record.note
         assert not record.low_discrepancy
         # A step is what it takes to know what one takes.
         assert record.share * ITERATIONS * (step + overhead) <= max(

@@ -133,8 +133,8 @@ def test_a_run_that_is_to_have_more_iterations_does_not_go_back(experiment: Path
 @pytest.mark.parametrize(
     ("stages", "message"),
     [
-        ("[{until: 0.5, film: 0.3}]", r"run.stages\[0\].film: 0.3 of 8x8 pixels has no whole ones; 1/2, 1/4, 1/8"),
-        ("[{until: 0.5, film: 0.75}]", r"run.stages\[0\].film: 0.75 of 8x8 pixels has no whole ones"),
+        ("[{until: 0.5, film: 0.3}]", r"run.stages\[0\].film: 0.3 of 8x8 pixels is not an integer size; 1/2, 1/4, 1/8"),
+        ("[{until: 0.5, film: 0.75}]", r"run.stages\[0\].film: 0.75 of 8x8 pixels is not an integer size"),
         ("[{until: 1}]", r"run.stages\[0\].until: must be below 1"),
         ("[{until: 0.5}, {until: 0.5}]", r"run.stages\[1\].until: must be above 0.5"),
         (

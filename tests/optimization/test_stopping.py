@@ -64,7 +64,7 @@ def test_a_small_fall_is_none_even_without_noise(tmp_path: Path) -> None:
     losses = 1 - 1e-4 * np.arange(400)
     [*_, last] = follow(config(tmp_path, STOP), losses)
     assert last.iteration == 60
-    assert last.stopped.startswith("the loss stands: over the last 60 iterations it fell by 0.2 +- ")
+    assert last.stopped.startswith("the loss has stopped falling: over the last 60 iterations it fell by 0.2 +- ")
     assert len(follow(config(tmp_path, "run.stop={relative: 0}"), losses)) == 400
 
 
@@ -148,7 +148,7 @@ def test_a_run_that_stops_does_so_after_a_kill_as_well(
     whole, left = run_and_kill(monkeypatch, at, *SETS, *every, *stop)
     assert len(read_metrics(whole)) == 20
     assert (manifest(whole)["status"], manifest(whole)["results"]["iterations"]) == ("finished", 20)
-    assert manifest(whole)["results"]["stopped"].startswith("the loss stands: ")
+    assert manifest(whole)["results"]["stopped"].startswith("the loss has stopped falling: ")
     assert optimize("--resume", str(left), "--quiet") == 0
     assert differences(whole, left) == []
 

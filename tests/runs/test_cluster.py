@@ -204,7 +204,7 @@ def test_a_worker_says_what_it_lacks(as_worker: None, monkeypatch: pytest.Monkey
     said = worker.open_state(other, None, 1)
     assert said.stays
     assert said.text.startswith("has mitsuba ")
-    assert said.text.endswith("and the run 0.1: install the same")
+    assert said.text.endswith("but the run has 0.1: install the same version")
     asking = worker.Opening("1", reads, asks_for_code=True)
     assert worker.open_state(asking, None, 1).stays
     monkeypatch.setenv(worker.ALLOW_CODE, "1")
@@ -461,7 +461,7 @@ def test_five_kills_of_who_is_alone_are_gone_on_with(net, tmp_path: Path, whom: 
         if whom == "scheduler":
             scheduler.wait()
             assert run.wait(60) == 6, said(net, run)
-            assert "--cluster: the scheduler has gone" in said(net, run).splitlines()[-1]
+            assert "--cluster: the scheduler has ended" in said(net, run).splitlines()[-1]
         else:
             run.wait()
     assert values(folder) == values(tmp_path / "runs" / "local")

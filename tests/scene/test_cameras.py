@@ -153,7 +153,7 @@ def test_what_is_wrong_in_a_transforms_json(folder, changes, message):
     [
         ("SIMPLE_RADIAL 40 24 50 20 12 0.02", r"cameras.txt:2: has distortion \(k1 = 0.02\)"),
         ("OPENCV_FISHEYE 40 24 50 50 20 12 0 0 0 0", r"cameras.txt:2: has model OPENCV_FISHEYE"),
-        ("PINHOLE 40 24 50", "cameras.txt:2: is no camera"),
+        ("PINHOLE 40 24 50", "cameras.txt:2: is not a camera"),
         ("PINHOLE 40 24 50 51 20 12", "cameras.txt:2: has focal lengths 50 and 51"),
     ],
 )

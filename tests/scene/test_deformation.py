@@ -272,15 +272,15 @@ def test_true_values_move_the_scene(scene, tmp_path):
     [
         ([motion("bx")], "[0].motion.of", "there is no `bx` in the scene; did you mean `box`"),
         ([motion(["box", "camera"])], "[0].motion.of[1]", "`camera` is a PerspectiveCamera; shapes and emitters"),
-        ([motion("floor")], "[0].motion.of", "`floor` has neither vertices nor a place"),
+        ([motion("floor")], "[0].motion.of", "`floor` has neither vertices nor a position"),
         ([heightmap("ball")], "[0].heightmap.mesh", "`ball` is a Sphere; a heightmap displaces the vertices"),
         ([heightmap(["box", "bare"])], "[0].heightmap.mesh[1]", "`bare` has no texture coordinates"),
         ([motion("sun", "translation")], "[0].motion.free", "translation does not move `sun`, which is a direction"),
         ([motion("lamp", "rotation")], "[0].motion.free", "rotation about itself does not move `lamp`"),
         ([motion("spot", "scale")], "[0].motion.free", "scale about itself does not move `spot`"),
-        ([{"key": MESH}, motion("box")], "[1].motion.of", "is what parameters[0] recovers"),
-        ([motion("box"), {"key": MESH}], "[1].key", "follows from a motion or a heightmap"),
-        ([motion("box"), {"key": "*.vertex_positions"}], "[1].key", "follows from a motion or a heightmap"),
+        ([{"key": MESH}, motion("box")], "[1].motion.of", "is already recovered by parameters[0]"),
+        ([motion("box"), {"key": MESH}], "[1].key", "depends on a motion or a heightmap"),
+        ([motion("box"), {"key": "*.vertex_positions"}], "[1].key", "depends on a motion or a heightmap"),
         ([{"key": "ball.to_world"}], "[0].key", "is recovered as a motion (`motion: {of: ball}`)"),
         ([{"key": "box.faces"}], "[0].key", "belongs to a shape"),
         ([{"key": ["wall.reflectance.value", "floor.reflectance.data"]}], "[0].key[1]", "their shapes differ"),
@@ -289,12 +289,12 @@ def test_true_values_move_the_scene(scene, tmp_path):
         (
             [{"key": "wall.reflectance.value"}, {"key": ["ball.bsdf.reflectance.value", "wall.reflectance.value"]}],
             "[1].key[1]",
-            "is matched by parameters[0] already",
+            "is already matched by parameters[0]",
         ),
         ([motion("box", initial={"translation": [1, 2]})], "[0].initial.translation", "takes 3 numbers"),
         ([motion("box", "scale", initial=[1, 2])], "[0].initial", "takes 1 number"),
         ([motion("box", bounds={"scale": [2, 3]})], "[0].bounds.scale", "exclude the initial value of `box.scale`, 1"),
-        ([motion("box", transform={"rotation": "log"})], "[0].initial", "`box.rotation` begins at 0"),
+        ([motion("box", transform={"rotation": "log"})], "[0].initial", "`box.rotation` starts at 0"),
         ([heightmap("box", bounds=(1, 2))], "[0].bounds", "exclude the initial value of `box.heightmap`, 0"),
     ],
 )
@@ -308,9 +308,9 @@ def test_refused(scene, parameters, where, what):
 @pytest.mark.parametrize(
     ("values", "what"),
     [
-        ({"box.rotation": 1.0}, "`box.rotation` belongs to a motion of `box`, and `parameters` have none that is so"),
+        ({"box.rotation": 1.0}, "`box.rotation` belongs to a motion of `box`, and `parameters` has none of this kind"),
         ({"box.translation": [1.0, 2.0]}, "takes 3 numbers"),
-        ({MESH: 0.0}, "follows from `box.translation`"),
+        ({MESH: 0.0}, "depends on `box.translation`"),
     ],
 )
 def test_true_values_are_refused_where_they_stand(scene, values, what):

@@ -240,7 +240,7 @@ print(mi.load_file({str(moved / "scene.xml")!r}))"""
 @pytest.mark.parametrize(
     ("key", "reason"),
     [
-        ("Spot_1.texture.value", "an image for Mitsuba; recover its intensity"),
+        ("Spot_1.texture.value", "an image as a spot's texture; recover the spot's intensity"),
         ("Cylinder_1.bsdf.brdf_0.clearcoat.value", "no such lobe .* had no effect"),
     ],
 )

@@ -144,7 +144,7 @@ MENDED = [
         "<emitter> has no attribute `version` in Mitsuba 3: left out",
     ),
     ("pose", PARTS["pose"].replace("lookat", "lookAt"), "`<lookAt>` is unknown to Mitsuba 3: read as <lookat>"),
-    ("pose", PARTS["pose"].replace("to_w", "toW"), "`toWorld` is spelled as before Mitsuba 2: read as `to_world`"),
+    ("pose", PARTS["pose"].replace("to_w", "toW"), "`toWorld` has the spelling before Mitsuba 2: read as `to_world`"),
     ("film", PARTS["film"].replace("hdr", "ldr"), "there is no film `ldrfilm` in Mitsuba 3: read as `hdrfilm`"),
     (
         "film",
@@ -169,7 +169,7 @@ MENDED = [
     (
         "sampler",
         '<sampler type="sobol"/>',
-        "there is no sampler `sobol` in Mitsuba 3: left out (an `independent` one takes its place)",
+        "there is no sampler `sobol` in Mitsuba 3: left out (replaced by an `independent` one)",
     ),
     ("shape", PARTS["shape"].replace("sphere", "Sphere"), "there is no shape `Sphere` in Mitsuba 3: read as `sphere`"),
     (
@@ -180,7 +180,7 @@ MENDED = [
     (
         "shape",
         PARTS["shape"].replace("<ref", '<sampler type="independent"/><ref'),
-        "sphere has no use for a <sampler> in Mitsuba 3: left out",
+        "sphere does not use a <sampler> in Mitsuba 3: left out",
     ),
     ("shape", PARTS["shape"] + "<comment>mine</comment>", "`<comment>` is unknown to Mitsuba 3: left out"),
     (
@@ -196,7 +196,7 @@ MENDED = [
     (
         "paint",
         PARTS["paint"].replace("reflectance", "diffuseReflectance"),
-        "`diffuseReflectance` is spelled as before Mitsuba 2: read as `reflectance`",
+        "`diffuseReflectance` has the spelling before Mitsuba 2: read as `reflectance`",
     ),
     (
         "paint",
@@ -408,7 +408,7 @@ def test_a_mended_spectrum_is_named_with_its_line(tmp_path: Path, caplog: pytest
     file = write_spectrum(tmp_path, IRREGULAR.format('name="reflectance"'))
     with caplog.at_level(logging.WARNING):
         load_scene(file)
-    line = f"{file}:3: RGB variants have no spectrum `irregular`: read as the colour of it"
+    line = f"{file}:3: RGB variants have no spectrum `irregular`: read as its colour"
     assert [record.getMessage() for record in caplog.records] == [line]
 
 
@@ -420,12 +420,12 @@ def test_a_mended_spectrum_is_named_with_its_line(tmp_path: Path, caplog: pytest
         (REGULAR.replace("0.1, 0.5, 0.8", "0.1"), "regular needs two wavelengths or more"),
         (REGULAR.replace("680", "420"), "regular: wavelength_max must be above wavelength_min"),
         (REGULAR.replace("wavelength_min", "lambda_min"), "regular needs a parameter `wavelength_min`"),
-        (IRREGULAR.replace('"0.1, ', '"-0.1, '), r"values: must be numbers from 0 on, not `-0\.1, 0\.5 0\.8`"),
-        (IRREGULAR.replace('"0.1, ', '"x, '), "values: must be numbers from 0 on"),
+        (IRREGULAR.replace('"0.1, ', '"-0.1, '), r"values: must be numbers of at least 0, not `-0\.1, 0\.5 0\.8`"),
+        (IRREGULAR.replace('"0.1, ', '"x, '), "values: must be numbers of at least 0"),
         (IRREGULAR.replace('name="wavelengths"', 'name="lambdas"'), "irregular needs a parameter `wavelengths`"),
-        (IRREGULAR.replace("{}", ""), "<spectrum> `irregular` needs a name: that of what it is for"),
+        (IRREGULAR.replace("{}", ""), "<spectrum> `irregular` needs a name, that of a parameter"),
         ('<spectrum type="blackbody" {}><float name="temperature" value="3000"/></spectrum>',
-         "a blackbody is what an emitter emits; a bsdf can have <rgb>"),
+         "only emitters can have a blackbody; a bsdf can have <rgb>"),
     ],
 )  # fmt: skip
 def test_what_is_no_spectrum_is_one_located_line(tmp_path: Path, xml: str, reason: str) -> None:
@@ -458,7 +458,7 @@ def test_constants_of_spectra_are_no_parameters() -> None:
 def test_what_a_hair_is_not_given_is_no_parameter() -> None:
     scene = mi.load_dict({"type": "scene", "a": {"type": "sphere", "bsdf": {"type": "hair"}}}, optimize=False)
     infos = {info.key.rpartition(".")[2]: info for info in list_parameters(mi.traverse(scene), values=True)}
-    assert (infos["sigma_a"].obstacle, infos["sigma_a"].value) == ("is not given in the scene file", None)
+    assert (infos["sigma_a"].obstacle, infos["sigma_a"].value) == ("is not in the scene file", None)
     assert infos["eumelanin"].obstacle is None
 
 

@@ -32,8 +32,8 @@ def write(folder: Path, text: str, name: str = "scene.xml") -> Path:
     [
         (HEAD + CIRCLE, 2, "circular reference detected: a -> b -> a"),
         (HEAD + '\n<include filename="scene.xml"/></scene>', 3, "files are included more than 15 levels deep"),
-        (HEAD + TEXTURE.format("pipe") + "</scene>", 3, "pipe is no regular file"),
-        (HEAD + TEXTURE.format("/dev/zero") + "</scene>", 3, "/dev/zero is no regular file"),
+        (HEAD + TEXTURE.format("pipe") + "</scene>", 3, "pipe is not a regular file"),
+        (HEAD + TEXTURE.format("/dev/zero") + "</scene>", 3, "/dev/zero is not a regular file"),
         (HEAD + '<include filename="pipe"/></scene>', 2, "pipe, which is a pipe, a socket or a device"),
     ],
 )  # fmt: skip
@@ -132,7 +132,7 @@ end_header
 @pytest.mark.parametrize(
     ("vertices", "last", "said"),
     [
-        (3, 3, "has a face with vertex 3, and 3 vertices; write it again"),
+        (3, 3, "has a face with vertex 3, but only 3 vertices; write it again"),
         (3, 2, ""),
     ],
 )
@@ -158,11 +158,11 @@ def test_a_texture_that_is_damaged_is_refused_where_it_is_named(tmp_path):
     file = write(tmp_path, f"{HEAD}{TEXTURE.format('a.hdr')}</scene>")
     with pytest.raises(ConfigError) as error:
         load_scene(file)
-    assert str(error.value) == f"{file}:3: filename: {tmp_path}/a.hdr: is damaged or cut off; copy or save it again"
+    assert str(error.value) == f"{file}:3: filename: {tmp_path}/a.hdr: is damaged or truncated; copy or save it again"
     (tmp_path / "a.hdr").write_bytes(b"P6\n8 0\n255\n" + bytes(24))  # of which Mitsuba makes a texture without texels
     with pytest.raises(ConfigError) as error:
         load_scene(file)
-    assert str(error.value) == f"{file}:3: filename: {tmp_path}/a.hdr: says that it is 8x0 pixels; save it again"
+    assert str(error.value) == f"{file}:3: filename: {tmp_path}/a.hdr: claims 8x0 pixels; save it again"
 
 
 @pytest.mark.usefixtures("llvm")

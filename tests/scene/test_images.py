@@ -71,7 +71,7 @@ def test_a_whole_file_is_read(image, capfd):
 def test_a_file_that_is_cut_off_is_refused(image, share, capfd):
     data = image.read_bytes()
     image.write_bytes(data[: min(int(share * len(data)), len(data) - 1)])
-    assert refused(image).startswith(("is cut off", "is damaged or cut off", "is not an image that can be read"))
+    assert refused(image).startswith(("is truncated", "is damaged or truncated", "is not a readable image"))
     assert capfd.readouterr() == ("", "")  # libjpeg's own words do not reach the terminal
 
 
@@ -88,7 +88,7 @@ def test_a_file_that_is_cut_off_and_padded_is_refused(image, share, padding, cap
         end = b"\xff\xd9"
     zeros = b"\0" * (len(data) - len(begin) - len(end)) if padding == "zeros" else b""
     image.write_bytes(begin + zeros + end)
-    assert "is damaged or cut off" in refused(image) or image.suffix == ".png"
+    assert "is damaged or truncated" in refused(image) or image.suffix == ".png"
     assert capfd.readouterr() == ("", "")
 
 
@@ -100,7 +100,7 @@ def test_a_hole_in_the_midst_of_a_jpeg_is_refused(tmp_path):
     data = bytearray(path.read_bytes())
     data[len(data) // 2 : len(data) // 2 + 512] = b"\0" * 512
     path.write_bytes(data)
-    assert "is damaged or cut off (Corrupt JPEG data" in refused(path)
+    assert "is damaged or truncated (Corrupt JPEG data" in refused(path)
 
 
 def test_what_libjpeg_says_is_heard_where_standard_error_is_closed(tmp_path, monkeypatch):
@@ -152,7 +152,7 @@ def test_what_says_that_it_is_huge_is_not_decoded(tmp_path, monkeypatch, name, d
     path = tmp_path / name
     path.write_bytes(data)
     monkeypatch.setattr(images, "mi", None)  # so that nothing can be
-    assert refused(path) == "is 60000x60000 pixels; more than 134217728 are not read"
+    assert refused(path) == "is 60000x60000 pixels; the limit is 134217728 pixels"
     assert refused(path, size=(6, 4)) == "is 60000x60000 pixels; it must be 6x4"
 
 
@@ -174,14 +174,14 @@ def test_what_says_that_it_is_huge_is_not_decoded(tmp_path, monkeypatch, name, d
 def test_heads_that_say_nothing(tmp_path, data):
     path = tmp_path / "a.png"
     path.write_bytes(data)
-    assert refused(path).startswith("is not an image that can be read (EXR, PNG")
+    assert refused(path).startswith("is not a readable image (EXR, PNG")
 
 
 def test_a_jpeg_of_empty_parts_takes_no_time(tmp_path, monkeypatch):
     monkeypatch.setattr(images, "_MOST_PARTS", 1000)
     path = tmp_path / "a.jpg"
     path.write_bytes(b"\xff\xd8" + b"\xff\xe0\0\x02" * 2000)
-    assert refused(path).startswith("is not an image")
+    assert refused(path).startswith("is not a readable image")
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "sparse"])
@@ -195,7 +195,7 @@ def test_what_is_no_regular_file_is_not_read(tmp_path, kind):
         path.touch()
         os.truncate(path, 2**40)
     assert refused(path).startswith(
-        "is not an image" if kind == "sparse" else "is a pipe, a socket or a device, not a regular"
+        "is not a readable image" if kind == "sparse" else "is a pipe, a socket or a device, not a regular"
     )
 
 
@@ -233,7 +233,7 @@ def test_the_lines_of_a_radiance_image_are_looked_at_before_they_are_decoded(wid
         (lines[2] + 4, b"\x00"),
     ):
         path.write_bytes(data[:place] + there + data[place + 1 :])
-        assert refused(path).startswith(("is cut off", "is damaged or cut off"))
+        assert refused(path).startswith(("is truncated", "is damaged or truncated"))
         with pytest.raises(images.DamagedImage):
             images.image_size(path)
 
@@ -345,13 +345,13 @@ def test_a_png_whose_exif_is_longer_than_its_file_is_cut_off(tmp_path):
     data = bytearray(path.read_bytes())
     data[33:37] = b"\x7f\xff\xff\xff"
     path.write_bytes(data)
-    assert refused(path).startswith("is cut off")
+    assert refused(path).startswith("is truncated")
 
 
 def test_a_texture_is_read_as_it_lies_and_that_is_said(tmp_path, caplog):
     path = with_orientation(tmp_path / "a.png", 8)
     assert read_image(path).shape == (5, 7, 3)
-    assert f"{path}: is read as it lies in the file, not turned by 90 degrees counter" in caplog.text
+    assert f"{path}: the stored orientation is used, not turned by 90 degrees counter" in caplog.text
 
 
 # Images: formats, colour spaces, and what is refused.
@@ -436,7 +436,7 @@ def test_missing_and_unreadable(tmp_path):
         read_image(tmp_path)
     for name in ("a.exr", "a.png", "a.txt"):
         (tmp_path / name).write_text("no image")
-        with pytest.raises(ConfigError, match="is not an image"):
+        with pytest.raises(ConfigError, match="is not a readable image"):
             read_image(tmp_path / name)
 
 

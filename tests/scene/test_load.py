@@ -101,7 +101,7 @@ def test_errors_are_located(tmp_path, text, options, where, what):
 @pytest.mark.parametrize(
     ("text", "what"),
     [
-        (None, "`mesh.obj`: no such file; looked for in "),
+        (None, "`mesh.obj`: no such file; searched in "),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "the mesh has no faces"),
     ],
 )
@@ -322,7 +322,7 @@ def test_faces_at_the_same_place_are_warned_of(tmp_path, caplog, bsdf, shapes, n
         assert lines == []
         return
     [line] = lines
-    assert f"faces of {names} are at the same place and differ" in line
+    assert f"faces of {names} coincide and differ" in line
     assert "remove one of each" in line
 
 
@@ -485,7 +485,7 @@ def test_an_id_that_no_key_can_hold_is_replaced(tmp_path, caplog, own):
     assert "Diffuse_1.reflectance.value" in keys(file)
     [record] = caplog.records
     assert record.getMessage().startswith(f"{file}:4: id `")
-    assert record.getMessage().endswith("cannot stand in a key: named Diffuse_1")
+    assert record.getMessage().endswith("cannot be part of a key: named Diffuse_1")
     assert record.getMessage().isprintable()
     assert len(record.getMessage()) < 200 + len(str(file))
 
@@ -494,7 +494,7 @@ def test_an_id_of_two_objects_is_kept_by_the_first(tmp_path, caplog):
     file = write(tmp_path, lit('<shape type="sphere" id="ball"/>\n<shape type="cube" id="ball"/>'))
     assert names(keys(file))[2:] == ["ball", "Cube_1"]
     [record] = caplog.records
-    assert record.getMessage() == f"{file}:5: id `ball` is that of {file}:4, too: named Cube_1"
+    assert record.getMessage() == f"{file}:5: id `ball` is also that of {file}:4: named Cube_1"
 
 
 def test_a_reference_to_two_objects_is_refused(tmp_path):

@@ -208,7 +208,7 @@ def test_light_that_camera_paths_cannot_find_is_refused_for_prb(make_scene):
     scene = make_scene()
     check_paths(scene, scene.sensors()[0], "prb")
     scene = make_scene(lamp={"type": "rectangle", "emitter": {"type": "directionalarea"}})
-    with pytest.raises(UnsupportedScene, match="`prb` cannot evaluate; take integrator"):
+    with pytest.raises(UnsupportedScene, match="`prb` cannot evaluate; use integrator"):
         check_paths(scene, scene.sensors()[0], "prb")
 
 
@@ -225,9 +225,9 @@ REF = {"type": "ref", "id": "group"}
         ({"fog": FOG}, "shape fog bounds a participating medium.*remove it from the scene file"),
         ({"group": {"type": "shapegroup", "fog": FOG}, "one": {"type": "instance", "g": REF}},
          "shape fog bounds a participating medium"),
-        ({"camera": {"type": "perspective", "inside": {"type": "homogeneous"}}}, "sensor camera stands in"),
-        ({"bulb": {"type": "point", "inside": {"type": "homogeneous"}}}, "emitter bulb stands in a participating"),
-        ({"sky": {"type": "timed_sunsky"}}, "take a `sunsky`"),
+        ({"camera": {"type": "perspective", "inside": {"type": "homogeneous"}}}, "sensor camera is inside"),
+        ({"bulb": {"type": "point", "inside": {"type": "homogeneous"}}}, "emitter bulb is inside a participating"),
+        ({"sky": {"type": "timed_sunsky"}}, "use a `sunsky`"),
         ({"ball": {"type": "sphere", "bsdf": WARM}}, "Mitsuba cannot evaluate bsdf bsdf: .*not implemented"),
     ],
 )  # fmt: skip
@@ -253,15 +253,15 @@ def test_a_medium_that_rays_cannot_meet_is_nobodys(make_scene):
 @pytest.mark.parametrize(
     ("changes", "way"),
     [
-        ({"camera": {"type": "orthographic"}}, "sensors; take integrator: {type: reslrb, paths: camera}"),
+        ({"camera": {"type": "orthographic"}}, "sensors; use integrator: {type: reslrb, paths: camera}"),
         (
             {"plane": {"type": "rectangle", "bsdf": {"type": "hair"}}},
-            "material; take integrator: {type: reslrb, paths: camera}",
+            "material; use integrator: {type: reslrb, paths: camera}",
         ),
-        ({"plane": {"type": "rectangle", "bsdf": GLASS}}, "surface, or take integrator: {type: reslrb, paths: both}"),
+        ({"plane": {"type": "rectangle", "bsdf": GLASS}}, "surface, or use integrator: {type: reslrb, paths: both}"),
         (
             {"camera": {"type": "orthographic"}, "lamp": BEAM},
-            "sensors; nor can other paths render it.*`prb` cannot",
+            "sensors; other paths cannot render it either.*`prb` cannot",
         ),
     ],
 )
@@ -275,9 +275,9 @@ def test_the_way_out_is_named_where_there_is_one(make_scene, changes, way):
 @pytest.mark.parametrize("paths", ["camera", "both"])
 def test_no_way_out_is_named_that_is_blocked(make_scene, paths):
     scene = make_scene(camera={"type": "orthographic"}, lamp=BEAM)
-    with pytest.raises(UnsupportedScene, match="nor can other paths render it") as error:
+    with pytest.raises(UnsupportedScene, match="other paths cannot render it either") as error:
         check_paths(scene, scene.sensors()[0], paths)
-    assert "take integrator" not in str(error.value)
+    assert "use integrator" not in str(error.value)
 
 
 @pytest.mark.usefixtures("_without_scenes_of_before")

@@ -120,10 +120,10 @@ def test_bounds_hold_for_the_nearest_float(make_scene):
         ([{"key": "lamp.sampling_weight"}], "key", "is not differentiable"),
         ([{"key": "floor.reflectance.to_uv"}], "key", "is not differentiable"),
         ([{"key": "plane.*"}], "key", "matches nothing that can be recovered"),
-        ([{"key": "allow_thread_reordering"}], "key", "no property of a material or a light"),
+        ([{"key": "allow_thread_reordering"}], "key", "not a property of a material or a light"),
         ([{"key": TEXTURE, "initial": [0.1, 0.2]}], "initial", "has 2 numbers"),
         ([{"key": LAMP, "initial": [1.0]}], "initial", "takes 3 numbers"),
-        ([{"key": LAMP, "resolution": [4, 4]}], "resolution", "is no texture"),
+        ([{"key": LAMP, "resolution": [4, 4]}], "resolution", "is not a texture"),
         ([{"key": TEXTURE, "resolution": [1, 4]}], "resolution", "at least [2, 2]"),
         (
             [{"key": TEXTURE, "bounds": [0.5, 1]}],
@@ -134,15 +134,15 @@ def test_bounds_hold_for_the_nearest_float(make_scene):
         (
             [{"key": LAMP, "initial": [1, 0, 1], "transform": "log"}],
             "initial",
-            "0 at entry 1; transform: log yields pos",
+            "0 at entry 1; transform: log yields only pos",
         ),
-        ([{"key": LAMP, "initial": -2.0, "transform": "softplus"}], "initial", "begins at -2 at entry 0"),
+        ([{"key": LAMP, "initial": -2.0, "transform": "softplus"}], "initial", "starts at -2 at entry 0"),
         (
             [{"key": LAMP, "bounds": [0, 3], "transform": "sigmoid"}],
             "initial",
-            "begins at 3 at entry 2; transform: sigmoid yields values between its bounds, 0 and 3 alone",
+            "starts at 3 at entry 2; transform: sigmoid yields only values between its bounds, 0 and 3",
         ),
-        ([{"key": LAMP, "initial": ImageFile(file="/none.exr")}], "initial", "is no texture; give a number"),
+        ([{"key": LAMP, "initial": ImageFile(file="/none.exr")}], "initial", "is not a texture; give a number"),
         ([{"key": TEXTURE, "initial": ImageFile(file="/none.exr")}], "initial.file", "/none.exr: no such file"),
     ],
 )
@@ -156,7 +156,7 @@ def test_refused(make_scene, specs, where, what):
 def test_overlapping_specs(make_scene):
     with pytest.raises(ConfigError) as error:
         select(make_scene(), {"key": "floor.*"}, {"key": TEXTURE})
-    assert str(error.value) == f"c.yaml: parameters[1].key: `{TEXTURE}` is matched by parameters[0] already"
+    assert str(error.value) == f"c.yaml: parameters[1].key: `{TEXTURE}` is already matched by parameters[0]"
 
 
 @pytest.mark.parametrize(
@@ -194,7 +194,7 @@ def test_nan_in_the_scene_itself(make_scene):
     values[2, 1, 0] = np.nan
     texture = {"type": "bitmap", "raw": True, "data": mi.TensorXf(values)}
     scene = make_scene(floor={"type": "diffuse", "reflectance": texture})
-    with pytest.raises(ConfigError, match=r"holds nan at texel \(1, 2\), channel 0"):
+    with pytest.raises(ConfigError, match=r"has nan at texel \(1, 2\), channel 0"):
         select(scene, {"key": TEXTURE})
 
 

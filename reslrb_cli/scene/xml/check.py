@@ -76,7 +76,7 @@ def _check_plugin(root: Element, element: Element) -> None:
     if not is_known(type):
         raise _unknown_plugin(root, element)
     if plugin_type(type) not in (mi.ObjectType.Unknown, _object_type(tag)):
-        raise element.fail("", f"{quoted(type)} is not a {tag}")
+        raise element.fail("", f"{quoted(type)} is no {tag}")
     needed = _NEEDED.get(type)
     if needed is not None and element.find(needed) is None:
         raise element.fail("", f"{type} needs a parameter `{needed}`")
