@@ -292,7 +292,7 @@ def lens_yaml(
     )
     also = ("\n   faces: [face, back]," if both else "") + (f" sun: {sun:g}," if sun else "")
     return f"""# The {surface.setting.kind} that throws {json.dumps(name)}: {surface.summary()}.
-# Begin with
+# Start with
 #     reslrb optimize lens.yaml
 scene:
   file: scene.xml

@@ -328,7 +328,7 @@ def solid_files(
 
     `numbers` and `pictures` are the content of the sheet for the workshop.
     """
-    from reslrb_cli.report.workshop import sheet as sheet_page
+    from reslrb_cli.report.page.workshop import sheet as sheet_page
 
     files: dict[str, Callable[[Path], object]] = {}
     for suffix, made in WRITERS.items():

@@ -1,4 +1,4 @@
-"""Figures and pictures of the sheet for the workshop that makes a lens or a mirror (`report/workshop.py`)."""
+"""Figures and pictures of the sheet for the workshop that makes a lens or a mirror (`report/page/workshop.py`)."""
 
 from __future__ import annotations
 

@@ -161,7 +161,7 @@ def check_paths(scene: Any, sensor: Any, paths: str, hide_emitters: bool = False
     kind = next((kind for kind, reason in reasons.items() if reason is None), None)
     if kind is not None:
         is_set = paths in ("camera", "both")  # the integrator has the option
-        way = f"take integrator.paths: {kind}" if is_set else f"use integrator: {{type: reslrb, paths: {kind}}}"
+        way = f"use integrator.paths: {kind}" if is_set else f"use integrator: {{type: reslrb, paths: {kind}}}"
         has_its_own = any(f"; {word} " in obstacle for word in ("give", "let", "take", "remove"))
         raise UnsupportedScene(f"{obstacle}{', or' if has_its_own else ';'} {way}")
     other = next((reason for reason in reasons.values() if reason != obstacle), None)

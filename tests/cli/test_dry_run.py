@@ -46,7 +46,7 @@ def test_memory_is_that_of_the_run(experiment: Path, capsys: pytest.CaptureFixtu
     call("--dry-run", "--set", f"run.adjoint={adjoint}")
     assert sorted(os.listdir(experiment)) == before
     printed = capsys.readouterr().out
-    told = re.search(r"memory of the iterations: ([\d.]+) MiB at the most", printed)
+    told = re.search(r"memory of the iterations: at most ([\d.]+) MiB", printed)
     assert told is not None, printed
     sizes = re.findall(r"^ +([\d.]+) (MiB|KiB|B) ", printed, re.MULTILINE)[:-2]  # but for thread-local, and process
     units = {"MiB": 1.0, "KiB": 2.0**-10, "B": 2.0**-20}
@@ -123,7 +123,7 @@ def test_what_comes_before_the_iterations_is_measured_once(
     auto += ["--set", "run.measuring=1000"]
     call("--dry-run", *auto)
     printed = capsys.readouterr().out
-    told = re.search(r"^ +([\d.]+ m?s)(, done now and kept)?  choosing how samples are drawn$", printed, re.MULTILINE)
+    told = re.search(r"^ +([\d.]+ m?s)(, done now and stored)?  choosing the sampling$", printed, re.MULTILINE)
     assert told is not None, printed
     assert (told[2] is not None) == keeps
     call(*auto)
@@ -132,7 +132,7 @@ def test_what_comes_before_the_iterations_is_measured_once(
     assert [manifest[name]["cached"] for name in ("guided", "sequence")] == [keeps, keeps]
     call("--dry-run", *auto)
     printed = capsys.readouterr().out
-    assert ("none, or kept from before" in printed) == keeps
+    assert ("none, or stored from before" in printed) == keeps
 
 
 @pytest.mark.parametrize(

@@ -272,7 +272,7 @@ def test_a_lamp_alone_is_recovered_if_that_is_asked_for(tmp_path: Path, monkeypa
         assert config.optimizer.scale == "auto"
         assert "  # - {key: plate.bsdf.reflectance.value, bounds: [0, 1]}" in text
     assert config.target.exposure == 1  # which no image tells from the lamp
-    assert "# exposure: auto  # one factor for the whole image; the lamps below make up for it" in text
+    assert "# exposure: auto  # one factor for the whole image; the lamps below compensate for it" in text
 
 
 def test_of_a_photograph_that_clips_lamps_are_left_for_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -432,7 +432,7 @@ def test_light_that_cannot_be_sampled_is_left_to_camera_paths(tmp_path: Path, mo
     assert reslrb("init", "shop.xml", "--target", write_noise(tmp_path / "photo.png", 8, 8)).exit_code == 0
     assert load(tmp_path / "shop.yaml").integrator.paths == "camera"
     text = (tmp_path / "shop.yaml").read_text()
-    assert "# by paths from the sensor, since light paths cannot render this: Mitsuba cannot sample the rays of" in text
+    assert "# paths from the sensor, because light paths cannot render this: Mitsuba cannot sample the rays of" in text
     assert "integrator.paths: camera" not in text
     refused = reslrb("optimize", "shop.yaml", *settings("integrator.paths=light"))
     assert refused.exit_code == 2
@@ -448,7 +448,7 @@ def test_it_says_why_paths_from_the_sensor_were_chosen(choices: Path) -> None:
     lines = (choices / "hall.yaml").read_text().splitlines()
     place = lines.index("integrator:")
     comment = [line.strip(" #") for line in lines[place + 1 : lines.index("  type: reslrb")]]
-    assert " ".join(comment) == f"by paths from the sensor, since light paths cannot render this: {reason}"
+    assert " ".join(comment) == f"paths from the sensor, because light paths cannot render this: {reason}"
     assert 1 <= len(comment) <= 2
     assert load(choices / "hall.yaml").integrator.paths == "camera"
     made = reslrb("init", "hall.xml", "--sensor", 1, "--force")

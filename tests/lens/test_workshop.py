@@ -22,8 +22,8 @@ from reslrb_cli.lens.workshop import (
 )
 from reslrb_cli.optimization.loading import load_configured
 from reslrb_cli.records.images import luminance, write_file
+from reslrb_cli.report.page.workshop import material, setup_facts
 from reslrb_cli.report.sketch import sketch
-from reslrb_cli.report.workshop import material, setup_facts
 from reslrb_cli.runs.export import read_solid
 from reslrb_cli.runs.setup import setup_of
 

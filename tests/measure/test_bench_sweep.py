@@ -300,7 +300,7 @@ def test_what_nobody_named_is_left_out_where_it_refuses():
 @pytest.mark.parametrize(("refusing", "default"), [("reslrb", False), ("ptracer", True)])
 def test_what_somebody_named_or_divides_by_is_not_left_out(refusing: str, default: bool):
     Pretended.refusing = {refusing}
-    with pytest.raises(Refused, match="what moves light"):
+    with pytest.raises(Refused, match="moving light"):
         play(sweep(default=default))
     assert Pretended.alive == 0
 

@@ -117,7 +117,7 @@ def test_an_independent_reference_that_ends_is_replaced(tmp_path: Path) -> None:
 def test_only_what_nobody_named_is_left_out(tmp_path: Path, default: bool) -> None:
     stage = Stage({"without": {"ptracer": "it emits wrongly"}})
     session, _, said = play(tmp_path, stage, plan(default=default, rounds=4))
-    assert ("left out: ptracer: it has wrong emission" in said) is default
+    assert ("left out: ptracer: it emits wrongly" in said) is default
     assert ("ptracer" in [m.label for m in session.of(Role.CASE)]) is not default
 
 

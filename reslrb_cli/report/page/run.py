@@ -29,9 +29,9 @@ from reslrb_cli.report.outcome import outcome_of
 from reslrb_cli.report.page.images import image_rows, seen_tables, view_table
 from reslrb_cli.report.page.layout import lay_out, soft
 from reslrb_cli.report.page.values import convergence, parameter_table, texture_pictures
+from reslrb_cli.report.page.workshop import CAPTIONS, VIEWS, workshop
 from reslrb_cli.report.run_summary import error_line, measured_line, warnings
 from reslrb_cli.report.sources import Run
-from reslrb_cli.report.workshop import CAPTIONS, VIEWS, workshop
 
 #: Number of first steps left out of medians, because they compile kernels.
 WARM_UP = 5
