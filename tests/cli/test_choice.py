@@ -71,7 +71,7 @@ def test_a_short_run_measures_nothing_and_says_so(experiment, capsys, monkeypatc
     assert f"guiding off: {because}it pays in long runs" in err.splitlines()
     code, err = optimize(capsys, *options, "run.measuring=1000")
     assert code == 0, err
-    assert "measuring what pays here" in err  # what was decided so is not remembered as measured
+    assert "measuring which sampling is most efficient" in err  # what was decided so is not remembered as measured
 
 
 @pytest.mark.parametrize(("light", "parallel"), [("point", True), ("area", False)])
