@@ -155,7 +155,7 @@ def test_scaled_emitters_are_refused_from_both_sides(make_scene, plugin):
         return make_scene(beam={"type": plugin, "to_world": turned @ mi.ScalarTransform4f().scale(scale)})
 
     scaled, plain = scene(2.0), scene(1.0)
-    with pytest.raises(UnsupportedScene, match=f"a `{plugin}` with a scale .*; remove the scale, or take .*: light$"):
+    with pytest.raises(UnsupportedScene, match=f"a `{plugin}` with a scale .*; remove the scale, or use .*: light$"):
         check_paths(scaled, scaled.sensors()[0], "both")
     check_paths(scaled, scaled.sensors()[0], "camera")
     check_paths(scaled, scaled.sensors()[0], "light")
