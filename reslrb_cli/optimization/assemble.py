@@ -192,11 +192,11 @@ def _check_plates(problem: Problem) -> None:
                      .min())  # fmt: skip
         if thin < plate.settings.thinnest:
             index = next(i for i, spec in enumerate(problem.config.parameters) if key in spec.names)
-            raise ConfigError(
-                problem.config.source, f"parameters[{index}].regularizers",
+            reason = (
                 f"`{key}` and `{plate.other}` start {thin:.3g} apart at their nearest point, but must stay "
                 f"{plate.settings.thinnest:.3g} apart, a tenth of `least`; lower `least`, or thicken the plate"
-            )  # fmt: skip
+            )
+            raise ConfigError(problem.config.source, f"parameters[{index}].regularizers", reason)
 
 
 def _check_values(selection: Selection, values: Mapping[str, Array]) -> None:

@@ -7,7 +7,7 @@ with the true values of the parameters (`make_targets`).
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import mitsuba as mi
@@ -34,6 +34,8 @@ from reslrb_cli.scene.visibility import interior, sees_specular, spread
 
 #: The seed of rendered targets.
 TARGET_SEED = 0
+#: Remarks on views that are said in full.
+FEW_REMARKS = 2
 #: What pixels of each kind are said to do.
 WORDS = {
     "specular": "show smooth glass or mirrors",
@@ -99,6 +101,7 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
     `say` is called with lines about slow work and excluded pixels. Raises ConfigError.
     """
     config, upright = problem.config, are_upright(problem.config)
+    remarks: list[str] = []
     for view in problem.views:
         wanted, film = view.wanted, problem.scene.sensors()[view.sensor].film()
         if wanted.file is None:
@@ -110,8 +113,9 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
             raise ConfigError(config.source, wanted.file_key, error.message) from None
         line = turned_line(wanted.file, upright)
         if line is not None:
-            say(line)
-        _see(problem, view, photo.image, photo, say)
+            remarks.append(line)
+        _see(problem, view, photo.image, photo, remarks.append)
+    _say_few(remarks, say)
     if problem.config.target.render is not None:
         problem = replace(problem, truth=_render_targets(problem, say))
         gc.collect()  # a second scene takes part in all that is traced, until it is gone
@@ -124,6 +128,14 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
         gc.collect()
     _check_light(problem, say)
     return problem
+
+
+def _say_few(remarks: Sequence[str], say: Callable[[str], None]) -> None:
+    """Say remarks on views; if there are many, the first ones and how many more there are."""
+    for line in remarks[:FEW_REMARKS]:
+        say(line)
+    if len(remarks) > FEW_REMARKS:
+        say(f"{len(remarks) - FEW_REMARKS} more remarks of this kind on other views; the page lists the masks")
 
 
 def _check_light(problem: Problem, say: Callable[[str], None]) -> None:
@@ -179,12 +191,15 @@ def _render_targets(problem: Problem, say: Callable[[str], None]) -> dict[str, A
     paths = paths_of(chosen, true_scene, problem.sensors, problem.moves)
     integrator = make_configured(config, chosen, paths)
     multiple = chosen.options().get("samples_per_pass")
-    for view in problem.views:
-        if view.wanted.file is not None:
-            continue
-        say(f"rendering the target of sensor {view.sensor}: {render.spp} spp")
+    rendered = [view for view in problem.views if view.wanted.file is None]
+    if rendered:
+        images = "the target image" if len(rendered) == 1 else f"{len(rendered)} target images"
+        say(f"rendering {images}: {render.spp} samples per pixel")
+    remarks: list[str] = []
+    for view in rendered:
         image = render_in_passes(integrator, true_scene, view.sensor, render.spp, TARGET_SEED, 0, "target", multiple)
-        _see(problem, view, image, None, say)
+        _see(problem, view, image, None, remarks.append)
+    _say_few(remarks, say)
     return truth
 
 

@@ -56,11 +56,10 @@ def test_a_short_run_measures_nothing_and_says_so(experiment, capsys, monkeypatc
         patch.setattr(Turns, "run", lambda *args: pytest.fail("measured"))
         code, err = optimize(capsys, *options)
     assert code == 0, err
-    assert "measuring" not in err
+    assert "measuring which" not in err
     because = "not measured (over 10 % of this run); "
-    paths = "paths both, 50 % light paths"
-    line = f"{because.replace('; ', ':')} {paths}, guiding off, sequence low_discrepancy"
-    assert line in err.splitlines()
+    chosen = "paths both, 50 % light paths, guiding off, sequence low_discrepancy, pixels even"
+    assert f"chosen without measuring: {chosen} (-v gives the reasons)" in err.splitlines()
     manifest = read_manifest(Path("runs/box"))
     assert manifest["plan"]["estimator"] == "stack"
     assert manifest["sequence"]["low_discrepancy"]
@@ -72,6 +71,9 @@ def test_a_short_run_measures_nothing_and_says_so(experiment, capsys, monkeypatc
     code, err = optimize(capsys, *options, "run.measuring=1000")
     assert code == 0, err
     assert "measuring which sampling is most efficient" in err  # what was decided so is not remembered as measured
+    assert "chosen by measurement: paths" in err
+    opening = err.splitlines()[: next(place for place, line in enumerate(err.splitlines()) if line.startswith("1/3: "))]
+    assert 0 < len(opening) <= 6, opening
 
 
 @pytest.mark.parametrize(("light", "parallel"), [("point", True), ("area", False)])

@@ -216,7 +216,8 @@ def test_a_run_says_so_once_remembers_it_and_writes_it_down(
     assert not found["cached"]
     gain = f"{found['gain']:.2g} times the efficiency here ("
     line = f"{option} {WORDS[option][True]}: {gain}"
-    assert f"{line}{found['low']:.2g} to {found['high']:.2g})" in said
+    chosen = f"{option} {WORDS[option][True]}"
+    assert f"chosen by measurement: {chosen} (-v gives the reasons)" in said
     assert f"{option}: auto" in (RUN / "config.yaml").read_text()
     assert line in (RUN / "report.html").read_text()
     _, values = read_state(RUN / "checkpoint" / STATE_FILE)
@@ -226,8 +227,9 @@ def test_a_run_says_so_once_remembers_it_and_writes_it_down(
     again = assemble(load("tiny.yaml", settings), told.append, PilotCache())
     record = getattr(again, name)
     assert record.to_json() == {**found, "cached": True}
-    assert told[-1] == record.line()
-    assert record.line(cost=True) == f"{told[-1]} (as an earlier run measured)"
+    assert told[-1] == f"chosen by measurement: {chosen} (-v gives the reasons)"
+    assert record.line() == f"{line}{found['low']:.2g} to {found['high']:.2g})"
+    assert record.line(cost=True) == f"{record.line()} (as an earlier run measured)"
     assert is_even(again) == (option == "sequence")
     row = next(line for line in inspected(capsys, str(RUN)) if part in line)
     assert row.split()[0] == "needed"

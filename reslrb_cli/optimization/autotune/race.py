@@ -87,7 +87,6 @@ class Tuner:
 
     def __init__(self, problem: Problem, say: Say, cache: PilotCache | None = None) -> None:
         self.problem, self.say, self._cache = problem, say, cache
-        self._unmeasured: list[Finding] = []
 
     def take(self, **decided: Any) -> None:
         """Change fields of `problem` from now on."""
@@ -100,15 +99,16 @@ class Tuner:
             self.take(memory=replace(memory, expected_bytes=expected))
 
     def tell(self) -> None:
-        """Say the decisions that were taken; all that there was no time to measure are one line."""
+        """Say the decisions in one line, or each with its reason in verbose runs."""
         decided = self.problem.sides, self.problem.guided, self.problem.sequence, self.problem.pixels
-        verbose, found = logger.isEnabledFor(logging.DEBUG), [each for each in decided if each is not None]
-        brief = [each for each in found if each in self._unmeasured and not verbose]
-        if brief and self.problem.allowance is not None:
-            self.say(f"{self.problem.allowance.note()}: {', '.join(each.decision() for each in brief)}")
-        for each in found:
-            if each not in brief:
-                self.say(each.line(cost=verbose))
+        found = [each for each in decided if each is not None]
+        if logger.isEnabledFor(logging.DEBUG):
+            for each in found:
+                self.say(each.line(cost=True))
+        elif found:
+            measured = any(each.measure_s or each.cached for each in found)
+            chosen = ", ".join(each.decision() for each in found)
+            self.say(f"chosen {'by measurement' if measured else 'without measuring'}: {chosen} (-v gives the reasons)")
 
     def decide(
         self,
@@ -138,9 +138,7 @@ class Tuner:
                 pass  # nothing there, or nothing that this version wrote
         allowance = self.allowance(integrator)
         if not allowance.affords(*needs):
-            record = unmeasured(allowance.note())
-            self._unmeasured.append(record)
-            return record
+            return unmeasured(allowance.note())
         if not allowance.spent_s:
             self.say("measuring which sampling is most efficient")
         with allowance.spending(later if allowance.affords(*needs, *later) else ()):
