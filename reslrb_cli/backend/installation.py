@@ -58,8 +58,8 @@ def _is_registered(name: str) -> bool:
     """Whether Python has registered a plugin of this name for the current variant."""
     import mitsuba as mi
 
-    # Mitsuba can be asked only in a way that makes it load a library of that name where it finds one. A new resolver
-    # looks in the working folder alone.
+    # Mitsuba must be asked in a way that makes it load a library of that name where it finds one. A new resolver
+    # searches only the working folder.
     if re.fullmatch(r"[\w-]+", name) is None or any(Path("plugins").glob(f"{name}.*")):
         return False
     before = mi.file_resolver()
@@ -95,7 +95,7 @@ def plugin_type(name: str) -> mi.ObjectType:
 
     if name not in shipped_plugins() - _BUILT_IN:
         return mi.ObjectType.Unknown
-    with looking_in([]):  # Mitsuba loads it to learn that
+    with looking_in([]):  # Mitsuba loads the library to answer
         return mi.PluginManager.instance().plugin_type(name)
 
 
@@ -135,8 +135,8 @@ def python_command(code: str) -> list[str]:
 
 MISSING_LIBRARY = "run scripts/setup, or install the package that contains it"
 
-#: Of each package the versions that pyproject.toml has, the first of them and the first that is too new, and functions
-#: by which it is told from another package of its name.
+#: For each package: the versions that pyproject.toml allows (the first one, and the first that is too new), and
+#: functions that tell it from another package of the same name.
 _WANTED = {
     "drjit": ((1, 5), (1, 6), ("has_backend", "eval")),
     "mitsuba": ((3, 9), (3, 10), ("set_variant", "variants")),
@@ -154,7 +154,7 @@ def _load(name: str) -> ModuleType:
     mend = f"install it with `pip install '{name}>={_dotted(first)},<{_dotted(end)}'`"
     try:
         package = importlib.import_module(name)
-    except (Exception, SystemExit) as error:  # what stands there may be anything
+    except (Exception, SystemExit) as error:  # the import may run any code
         cause = error.__context__ or error  # a NameError in Dr.Jit's own handler covers the ImportError
         if isinstance(cause, ModuleNotFoundError) and cause.name == name:
             raise BackendError(f"Mitsuba cannot be loaded: the package {name} is missing; {mend}") from error
@@ -176,7 +176,7 @@ def _place(name: str) -> str:
     """Return the location of the package `name`, without importing it."""
     try:
         found = importlib.util.find_spec(name)
-    except (ImportError, ValueError):  # a module that is there has no specification
+    except (ImportError, ValueError):  # an imported module has no specification
         found = None
     return (found.origin if found is not None else None) or "an unknown place"
 

@@ -25,7 +25,7 @@ from reslrb_cli.errors import BackendError
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 MIN_VERSION = 19
 
-# scripts/setup unpacks Debian's packages here where the system lacks a library
+# scripts/setup unpacks Debian's packages here if the system lacks a library
 UNPACKED = Path(__file__).resolve().parents[2] / ".cache" / "lib"
 _NAME = re.compile(r"libLLVM(?:-(\d+)(?:\.\d+)*)?(?:\.so(?:\.(\d+)(?:\.\d+)*)?|(?:\.(\d+)(?:\.\d+)*)?\.dylib)")
 
@@ -48,7 +48,7 @@ def prepare() -> None:
         library, _ = choose()
         if library is not None:
             os.environ[VARIABLE] = str(library.path)
-    unpacked = sorted(UNPACKED.glob("libatomic.so*"))  # Dr.Jit's wheels need it; a minimal Debian has none
+    unpacked = sorted(UNPACKED.glob("libatomic.so*"))  # Dr.Jit's wheels need it; a minimal Debian lacks it
     chosen = Path(os.environ.get(VARIABLE, ""))
     for path in [*unpacked, *([chosen] if chosen.parent == UNPACKED else [])]:
         with suppress(OSError):
@@ -96,7 +96,7 @@ def candidates() -> list[Path]:
     found = [path for folder in _folders() for path in sorted(folder.glob("libLLVM*")) if _NAME.fullmatch(path.name)]
     unique: dict[Path, Path] = {}
     for path in [*found, *_loader_cache()]:
-        with suppress(OSError, RuntimeError):  # a link that leads nowhere or round in a circle
+        with suppress(OSError, RuntimeError):  # a broken or circular link
             unique.setdefault(path.resolve(strict=True), path)
     return list(unique)
 

@@ -19,13 +19,13 @@ import numpy as np
 
 from reslrb_cli.backend.doctor import gpu_bytes, memory_bytes, of_system
 
-#: What a thread's stack has where the system sets no limit: glibc's own.
+#: Stack size of a thread if the system sets no limit: glibc's default.
 _UNLIMITED_STACK = 2 * 2**20
 
-#: What of it is in use where a kernel begins.
+#: Part of the stack that is in use when a kernel starts.
 _IN_USE = 2**20
 
-#: Lanes of a vector by what the processor knows, the widest first; the backend takes the widest.
+#: Lanes of a vector by processor feature, the widest first; the backend uses the widest.
 _LANES = (("avx512vl", 16), ("avx", 8))
 
 
@@ -71,7 +71,7 @@ def own_memory(kind: type[Any], array: np.ndarray[Any, Any]) -> Any:
     """Return `array` (n,) as a flat array of type `kind`, bit by bit, evaluated."""
     given = kind(np.ascontiguousarray(array))
     copy = dr.empty(kind, dr.width(given))
-    # Gathered in its own order, an array would be returned as it is.
+    # A gather in index order would return the array itself.
     dr.scatter(copy, given, dr.arange(dr.uint32_array_t(kind), dr.width(given)))
     dr.eval(copy)
     return copy

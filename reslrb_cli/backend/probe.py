@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from reslrb_cli.backend.installation import MISSING_LIBRARY, python_command
 from reslrb_cli.backend.shared_library import missing_library
 
-# A constant that no kernel cache has seen makes the compiler run; `minimum` is what libLLVM 15 and 16 stumble over.
+# A constant that no kernel cache contains makes the compiler run; `minimum` is the instruction that libLLVM 15 and 16
+# fail on.
 _SCRIPT = """
 import json, sys, time
 import reslrb_cli
@@ -47,7 +48,7 @@ assert abs(t[0] - 2) < 1e-4, f"a ray met the unit sphere at {t[0]} instead of 2"
 print(json.dumps({"compile_ms": compile_ms, "run_ms": run_ms, "ray_ms": ray_ms}))
 """
 
-#: What stands before the line of an error of ours in a traceback.
+#: Prefix of the line of our own error in a traceback.
 _OURS = "reslrb_cli.errors.BackendError: "
 
 

@@ -70,7 +70,7 @@ def bundle_of(config: Config, values: Values) -> Bundle:
     bundle.files[INITIAL_FILE] = file.getvalue()
     data = config.model_dump(exclude_none=True, exclude={"fabrication"})
     scene, cameras = data["scene"], config.scene.cameras
-    if cameras is not None and cameras.suffix.lower() != ".json":  # COLMAP's, which are read in pairs
+    if cameras is not None and cameras.suffix.lower() != ".json":  # COLMAP's files, which are read in pairs
         beside = cameras.with_name("cameras.txt")
         for name, path in ((cameras.name, cameras), (beside.name, beside)):
             bundle.files[f"{FILES}/colmap/{name}"] = path.read_bytes()

@@ -37,7 +37,7 @@ class Steps:
     """The steps of finite differences, by parameter and way (`sampling.steps_of`)."""
 
     steps: Mapping[str, Sequence[Step]]
-    #: Of them all, as they were written here: elsewhere NumPy may write numbers otherwise.
+    #: Only values of this process: NumPy may write numbers differently elsewhere.
     digest: str
 
     def take(self, participants: Participants) -> None:
@@ -86,7 +86,7 @@ def _with_file(case: Listed, put: Callable[[str], str]) -> Listed:
     return replace(case, options={**case.options, "file": f"{put(file)}:{name}"})
 
 
-# --- where `gradcheck` runs -------------------------------------------------------------------------------------------
+# --- on the process that runs `gradcheck` -----------------------------------------------------------------------------
 
 
 def check_shareable(settings: CheckSettings) -> None:

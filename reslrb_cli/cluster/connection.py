@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-#: Processes that one machine may be asked for.
+#: Maximum number of processes on one machine.
 MOST_WORKERS = 1024
 _ADDRESS = re.compile(r"tls://(\[[0-9A-Fa-f:.]+\]|[^\s:/\[\]]+):([0-9]{1,5})")
 
-#: dask's settings. How many workers may die of one task before it is given up; a worker that is not heard of for so
-#: long counts as gone, and has to come to the end of its longest compilation before; a connection is given up after 30
-#: silent seconds. Large arguments are nothing to warn of.
+#: dask's settings. A task is given up after this many dead workers. A worker counts as lost after this silence, which
+#: must outlast its longest compilation. A connection is given up after 30 silent seconds. Large arguments need no
+#: warning.
 SETTINGS = {
     "distributed.scheduler.allowed-failures": 3,
     "distributed.scheduler.worker-ttl": "30 minutes",
@@ -41,7 +41,7 @@ SETTINGS = {
     "distributed.comm.timeouts.tcp": "30s",
     "distributed.admin.tick.limit": "1h",
     "distributed.admin.large-graph-warning-threshold": "1TB",
-    # What nobody looks at is not kept.
+    # Nobody reads this history.
     "distributed.admin.log-length": 100,
     "distributed.admin.low-level-log-length": 100,
     "distributed.admin.system-monitor.log-length": 60,
@@ -49,8 +49,8 @@ SETTINGS = {
     "distributed.diagnostics.computations.max-history": 1,
     "distributed.worker.profile.enabled": False,
 }
-#: Of the workers that are started here: nothing answers to who is not one of them; no task is put on disk; and Ctrl-C,
-#: which goes to all processes of a terminal, leaves them to the run, which ends after its iteration.
+#: Local workers: they accept connections only from each other, no task is written to disk, and Ctrl-C, which reaches
+#: all processes of a terminal, leaves them to the run, which stops after its iteration.
 OWN_SETTINGS = {
     "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
@@ -108,7 +108,7 @@ def connected(place: Place) -> Iterator[tuple[Client, Path]]:
         "distributed",
         "tornado",
         "asyncio",
-    ):  # what they would log is said in our own words, or is nothing to a user
+    ):  # we report these events in our own words, or they do not concern users
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with contextlib.ExitStack() as stack:
         folder = Path(tempfile.mkdtemp(prefix="reslrb-cluster-"))

@@ -40,20 +40,21 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-#: How many times as long as its calls take a worker may say nothing, and seconds beside that, until another is asked.
+#: Silence of a worker before another one gets its task: a multiple of the duration of its calls, plus seconds.
 LATE, LATE_S = 3.0, 0.2
-#: The same until dask is asked to start it anew, where others are there and where nobody is; seconds that dask has.
+#: Silence before dask restarts a worker: a multiple if there are other workers, a multiple if there are none, and
+#: seconds; then the seconds that dask may take.
 HUNG, HUNG_ALONE, HUNG_S, RESTART_S = 30.0, 10.0, 20.0, 20.0
-#: Seconds that a worker may take to come to what it works on, while kernels are compiled; and, once one is there, how
-#: many times as long as that one and seconds beside that the others are waited for.
+#: Seconds for the first call of a worker, which compiles kernels. Once one worker has answered, the others may take a
+#: multiple of its time plus seconds.
 OPENING_S, OTHERS, OTHERS_S = 900.0, 2.0, 10.0
-#: Seconds for which nobody may be there, and between looks at who is.
+#: Seconds without any worker before the run ends, and seconds between two checks.
 NOBODY_S, LOOK_S = 60.0, 1.0
-#: How many workers may fail in one call by a fault of their machine's; how often one is started anew for such faults.
+#: Faults of workers' machines per call that are tolerated, and restarts of one worker for such faults.
 FAULTS, RESTARTS = 3, 3
-#: Seconds for which a value may be on its way, again and again: each time from the beginning.
+#: Seconds to wait for a value in each of several attempts.
 GATHER_S = (5.0, 15.0, 60.0, 240.0)
-#: How often what has got lost is sent again in one round.
+#: Number of times that lost tasks are sent again in one round.
 LOSSES = 100
 
 
@@ -116,19 +117,20 @@ class Crew:
         self._done: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self._opening: dict[str, tuple[Future, float]] = {}
         self._own_threads: dict[str, int] = {}
-        #: When each worker that has come last said anything, or was asked; `_late` are those that take long.
+        #: Time at which each connected worker last answered or got a task; `_late` are the slow ones.
         self._heard: dict[str, float] = {}
         self._late: set[str] = set()
-        self._left_out: dict[str, str] = {}  # and why
-        self._anew: set[str] = set()  # those that are being started anew
+        self._left_out: dict[str, str] = {}  # with the reason
+        self._anew: set[str] = set()  # workers that are being restarted
         self._restarts: Counter[str] = Counter()
         self._looked = -LOOK_S
         self._nobody_since: float | None = None
-        self._seconds: dict[str, deque[float]] = {}  # from one answer of a worker to its next, by function
+        self._seconds: dict[str, deque[float]] = {}  # seconds between two answers of a worker, by function
         self._names: dict[str, str] = {}
         self.spent, self.by_worker = Spent(), dict[str, Spent]()
 
-    # --- who there is -------------------------------------------------------------------------------------------------
+    # --- workers
+    # ----------------------------------------------------------------------------------------------------------
 
     @property
     def ready(self) -> list[str]:
@@ -264,7 +266,7 @@ class Crew:
             try:
                 self.client.restart_workers([worker], timeout=RESTART_S, raise_for_error=False)
             except (ValueError, OSError, TimeoutError):
-                if self.client.status == "running":  # else the run has ended
+                if self.client.status == "running":  # otherwise the run has ended
                     self._left_out[worker] = f"{reason}, and nothing can restart it"
                     logger.warning(f"--cluster: nothing can restart {name}; it is not used")
             self._anew.discard(worker)
@@ -327,7 +329,7 @@ class Crew:
         if answer is None:
             if place is not None:
                 self._count_loss(todo)
-            time.sleep(min(0.02 * todo.losses, 0.5))  # until it is noticed who has ended
+            time.sleep(min(0.02 * todo.losses, 0.5))  # until the end of a worker is noticed
             return
         if isinstance(answer, Fault):
             self._take_fault(todo, answer, place)
@@ -340,7 +342,7 @@ class Crew:
             self._late.discard(answer.worker)
         if isinstance(answer, Lacks):
             self._count_loss(todo)
-            if answer.what == "opening":  # a worker that was started anew, at the same address
+            if answer.what == "opening":  # a worker that was restarted at the same address
                 self._forget(answer.worker)
                 self._looked = -LOOK_S
             else:
@@ -351,7 +353,7 @@ class Crew:
         elif isinstance(answer, Answer) and place in todo.left:
             del todo.left[place]
             for other in [other for other, (its, _) in todo.flying.items() if its == place]:
-                del todo.flying[other]  # nobody needs to begin with it
+                del todo.flying[other]  # another worker has the answer already
                 other.release()
             self._note(todo.name, max(answer.seconds, silent_s))
             todo.computing[answer.worker] = todo.computing.get(answer.worker, 0.0) + answer.seconds
@@ -380,7 +382,8 @@ class Crew:
     def _note(self, name: str, seconds: float) -> None:
         self._seconds.setdefault(name, deque(maxlen=64)).append(seconds)
 
-    # --- who says nothing ---------------------------------------------------------------------------------------------
+    # --- silent workers
+    # ---------------------------------------------------------------------------------------------------
 
     def _limit(self, todo: _Round, times: float, beside_s: float) -> float:
         """Return the seconds within which a worker must answer."""

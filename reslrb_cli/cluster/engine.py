@@ -39,7 +39,7 @@ from reslrb_cli.runs.prepare import RunProgress, digests
 
 Array = np.ndarray[Any, Any]
 
-#: Beside the files of an experiment: what the run has settled (`STATE_FILE`), and the targets of its views.
+#: Beside the files of an experiment: settled decisions of the run (`STATE_FILE`), and the targets of its views.
 TARGETS_FILE = "targets.npz"
 
 
@@ -120,7 +120,7 @@ def _warmed(problem: Problem) -> dict[str, float]:
     return found
 
 
-# --- where `optimize` runs --------------------------------------------------------------------------------------------
+# --- in the process that runs `optimize` ------------------------------------------------------------------------------
 
 
 def opening_of(course: RunProgress, folder: Path, own: bool) -> tuple[Opening, Bundle]:

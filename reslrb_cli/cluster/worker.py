@@ -76,7 +76,7 @@ class _State:
 
 _state: _State | None = None
 
-#: In a worker's environment: 1 where users' own code may run there, if whoever runs the experiment allows it, too.
+#: Environment variable of a worker: 1 allows users' own code there, if the experiment's user allows it, too.
 ALLOW_CODE = "RESLRB_ALLOW_CODE"
 
 
@@ -130,11 +130,11 @@ def open_state(opening: Opening, files: Mapping[str, bytes] | None, threads: int
         return Lacks(me, "files")
     _state = None
     _take_device(get_worker().name)
-    logging.getLogger("reslrb_cli").addHandler(logging.NullHandler())  # the run has said what there is to say
+    logging.getLogger("reslrb_cli").addHandler(logging.NullHandler())  # the run has reported it already
     try:
         unpack(files or {}, folder)
         value, seconds = opening.function(folder, threads, *opening.arguments)
-    except Exception as error:  # the run could load it: it is this machine that cannot
+    except Exception as error:  # the run could load it, so the fault is on this machine
         return Fault(me, f"cannot: {describe(error)}", is_out_of_memory(error))
     _state = _State(opening.digest, value)
     return Answer(me, seconds, time.perf_counter() - begin)

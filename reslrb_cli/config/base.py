@@ -22,7 +22,7 @@ from pydantic_core import CoreSchema, PydanticCustomError
 
 from reslrb_cli.config.files import PIXELS
 
-#: Largest seed plus one: Mitsuba's seeds are uint32.
+#: Number of seeds: Mitsuba's seeds are uint32.
 SEED_END = 2**32
 
 
@@ -115,7 +115,7 @@ def code_place(value: Any, info: ValidationInfo) -> str:
     return f"{config_path(path, info)}:{name}"
 
 
-#: FILE.py:NAME, of a user's own code.
+#: FILE.py:NAME of a user's own code.
 CodePlace = Annotated[str, BeforeValidator(code_place)]
 
 
@@ -130,8 +130,8 @@ WorkPath = Annotated[Path, BeforeValidator(lambda value: _path(Path.cwd(), value
 # --- unions -----------------------------------------------------------------------------------------------------------
 
 
-#: What the tags of unions' members begin with. pydantic puts tags among the keys of an error's location; no key of a
-#: file or a command line can hold this character.
+#: Prefix of the tags of unions' members. pydantic inserts tags into the location of an error; no key of a file or a
+#: command line can contain this character.
 MARK = "\0"
 
 

@@ -32,7 +32,7 @@ def load_named(file: Path, name: str, source: object, key: str) -> Callable[...,
     module.__file__ = str(file)
     if str(file.parent) not in sys.path:
         sys.path.append(str(file.parent))
-    sys.modules[module.__name__] = module  # dataclasses and pickle look it up there
+    sys.modules[module.__name__] = module  # dataclasses and pickle look the module up there
     with_place = Guard(source, key, file, "the file")
     with with_place:
         exec(compile(text, str(file), "exec"), module.__dict__)

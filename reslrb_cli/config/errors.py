@@ -36,7 +36,7 @@ _EXPECTED = {
 }
 
 
-#: What was removed, by the last two names of its key or by the value of a `type`, and what to do instead.
+#: Advice for removed settings, by the last two names of the key or by the value of a `type`.
 REMOVED = {
     "scene.sensors": "list them in `views`, such as views: [{sensor: 0}, {sensor: 1}]; all of scene.cameras are used",
     "views.loss": "all views have the loss that `loss` says",

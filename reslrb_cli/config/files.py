@@ -9,31 +9,31 @@ from typing import BinaryIO
 
 from reslrb_cli.errors import ConfigError, one_line
 
-#: Bytes of the name of a run's folder. File systems take 255; the rest is for what is put before and behind it.
+#: Maximum length in bytes of the name of a run folder. File systems allow 255; the rest is for prefixes and suffixes.
 NAME_BYTES = 200
 
-#: Segments of a path that a limit can name; beyond it -1 says the same. Roulette lets at most 95 % of the paths go on
-#: at each vertex: of 10^20 paths not one is a thousand vertices longer than `rr_depth`.
+#: Largest path length of a limit; -1 means no limit. Roulette lets at most 95 % of the paths continue at each vertex,
+#: so none of 10^20 paths is a thousand vertices longer than `rr_depth`.
 PATH_LENGTH = 2**16 - 1
 
-#: Entries of an array in a kernel's thread-local memory: Dr.Jit's bound.
+#: Largest array in a kernel's thread-local memory: Dr.Jit's limit.
 LOCAL_ENTRIES = 2**16
 
-#: Connections, or events, that are kept of a path. Each is code of its own in the kernel, and the time to compile it
-#: grows faster than their number: on two cores 64 took seconds, 256 most of a minute.
+#: Maximum number of kept connections or events per path. Each has its own code in the kernel, and the compile time
+#: grows faster than their number: on two cores, 64 took seconds and 256 most of a minute.
 CAPACITY = 1024
 
-#: Light paths of one pass: their numbers have 32 bits.
+#: Light paths of one pass; their indices have 32 bits.
 PASS_PATHS = 2**32 - 1
 
-#: Samples per pixel of one pass. In single precision a sum loses terms below a 2^24th of it, and thousands of such
-#: passes can be added to one another.
+#: Samples per pixel of one pass. A sum in single precision loses terms below 2^-24 of it, but thousands of such passes
+#: can be added.
 PASS_SAMPLES = 2**18
 
-#: Passes of a step, each of which is launched by itself and has a seed that is made before the first of them.
+#: Passes of a step. Each is launched separately, and its seed is drawn before the first pass.
 PASSES = 2**16
 
-#: Pixels of an image: 16384 x 8192, the largest environment map in use. Decoded they take 1.5 GiB.
+#: Pixels of an image: 16384 x 8192, the largest environment map in use, 1.5 GiB decoded.
 PIXELS = 2**27
 
 
@@ -52,7 +52,7 @@ def open_file(path: Path) -> BinaryIO:
     Refuses pipes, sockets and devices: to read one may take for ever.
     """
     try:
-        mode = os.stat(path).st_mode  # before it is opened: to open some devices does something already
+        mode = os.stat(path).st_mode  # before it is opened, because opening some devices has side effects
         if stat.S_ISDIR(mode):
             raise ConfigError(path, "", "is a folder, not a file")
         if not stat.S_ISREG(mode):
@@ -60,7 +60,7 @@ def open_file(path: Path) -> BinaryIO:
         return path.open("rb")
     except FileNotFoundError:
         raise ConfigError(path, "", "no such file") from None
-    except (OSError, ValueError) as error:  # ValueError: a null character, or half of a surrogate pair
+    except (OSError, ValueError) as error:  # ValueError: a null character or half of a surrogate pair
         raise ConfigError(path, "", f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 

@@ -55,7 +55,7 @@ _CAPACITY = must(
     ),
 )
 
-#: Samples per pixel of one part of a derivative.
+#: Samples per pixel for one part of a derivative.
 Samples = Annotated[int, Field(ge=0, le=PASS_SAMPLES)]
 
 
@@ -103,7 +103,7 @@ ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
     "stack": (),
 }
 
-#: Options that a run decides by measurement if they are `auto`, and their values if nothing is measured.
+#: Options that a run chooses by measurement if they are `auto`, and their values without a measurement.
 UNDECIDED: dict[str, str | float] = {
     "paths": "light",
     "light_share": 0.5,
@@ -112,7 +112,7 @@ UNDECIDED: dict[str, str | float] = {
     "pixels": "even",
 }
 
-#: The estimator of `auto`: the only one with derivatives of camera paths and of both `follow` and `stay`.
+#: The estimator for `auto`: only `stack` has derivatives of camera paths and both `follow` and `stay`.
 AUTO_ESTIMATOR = "stack"
 
 #: All options that select or configure the estimator.
@@ -183,7 +183,7 @@ class Reslrb(AttachingTracer):
     @model_validator(mode="after")
     def _leave_off(self) -> Self:
         """Turn off the measured options that are not given if an estimator is named."""
-        if self.estimator != "auto":  # not by assignment, which would count them among those that were given
+        if self.estimator != "auto":  # without assignment, which would mark them as given
             self.__dict__.update({name: off for name, off in UNDECIDED.items() if name not in self.model_fields_set})
         return self
 

@@ -22,9 +22,9 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import UNFIT, Location, format_location, parse, write
 from reslrb_cli.errors import ConfigError, one_line
 
-#: Mappings whose keys are the user's own and may hold dots: what follows their name is one key.
+#: Mappings with keys of the user that may contain dots: the text after their name is one key.
 FREE_MAPPINGS: tuple[Location, ...] = (("scene", "options"), ("target", "render", "parameters"))
-#: Who is to blame for an override that a script gives.
+#: Source in error messages about an override from a script.
 OVERRIDDEN = "overrides"
 _PART = re.compile(r"\[(\d+)\]|(?:^|\.)([^.\[\]]+)")
 
@@ -159,7 +159,7 @@ def plain(value: Any, source: object, key: str = "") -> Any:
         return [plain(each, source, f"{key}[{place}]") for place, each in enumerate(value)]
     if isinstance(value, Path):
         return str(value)
-    if hasattr(value, "tolist"):  # of NumPy, which is not imported here
+    if hasattr(value, "tolist"):  # types of NumPy, which is not imported here
         return plain(value.tolist(), source, key)
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
@@ -270,7 +270,7 @@ def _validate(raw: dict[str, Any], path: Path) -> tuple[Config | None, list[Prob
     data = {key: value for key, value in raw.items() if value is not None or key not in Config.model_fields}
     run = data.setdefault("run", {})
     if isinstance(run, dict) and run.get("name") is None:
-        data["run"] = {**run, "name": path.stem.encode(errors="replace").decode()}  # bytes that are no UTF-8 as `?`
+        data["run"] = {**run, "name": path.stem.encode(errors="replace").decode()}  # invalid UTF-8 as `?`
     try:
         config = Config.model_validate(data, context={"folder": path.absolute().parent})
     except ValidationError as error:

@@ -128,7 +128,7 @@ def _check_single(loss: Loss) -> Loss:
     return loss
 
 
-#: One loss, or a list of losses that are added up.
+#: One loss, or a list of losses that are summed.
 Losses = Annotated[
     Annotated[AnyLoss, AfterValidator(_check_single), mark("mapping")]
     | Annotated[list[AnyLoss], Field(min_length=1, max_length=16), AfterValidator(_check_list), mark("list")],

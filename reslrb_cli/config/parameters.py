@@ -36,12 +36,12 @@ from reslrb_cli.config.files import PIXELS
 
 Numbers = Annotated[list[float], Field(min_length=1)]
 
-#: The parts of a motion, applied in reverse order. An axis is that part of a translation.
+#: The parts of a motion, applied in reverse order. Translations along an axis are parts of a translation.
 Word = Literal["translation", "x", "y", "z", "rotation", "scale"]
 WORDS: tuple[Word, ...] = ("translation", "x", "y", "z", "rotation", "scale")
 AXES: tuple[Word, ...] = ("x", "y", "z")
 
-#: Name of a heightmap's parameter, below the name of its mesh.
+#: Name of a heightmap's parameter, appended to the name of its mesh.
 HEIGHTMAP = "heightmap"
 
 
@@ -116,7 +116,7 @@ class MotionRates(ByWord):
     scale: Positive | None = Field(default=None, description="Learning rate of the scale factor.")
 
 
-# --- what moves -------------------------------------------------------------------------------------------------------
+# --- moving objects ---------------------------------------------------------------------------------------------------
 
 Name = Annotated[str, Field(min_length=1)]
 _NAME = {"type": "string", "minLength": 1}
@@ -305,7 +305,7 @@ class Thickness(Regularizer, json_schema_extra={"required": ["type", "thickness"
         return self.thinnest - self.thickness
 
 
-#: Fraction of `least` that a plate always keeps.
+#: Fraction of `least` that a plate keeps at all times.
 _HELD = 0.1
 
 

@@ -22,10 +22,11 @@ from reslrb_cli.config.files import NAME_BYTES
 from reslrb_cli.config.optimizers import Stage, StopRule
 from reslrb_cli.config.views import SensorName
 
-#: Names of devices on Windows, with any suffix. A folder with such a name cannot be copied there.
+#: Names of devices on Windows, with any suffix. Windows cannot copy a folder with such a name.
 _RESERVED = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9])(\..*)?", re.IGNORECASE)
 
-#: Paths: text that starts at a root or a home, or has `.` or `..` as a part. A slash between words is no path.
+#: Paths: text that starts at a root or a home folder, or contains `.` or `..` as a part. Words with a slash between
+#: them are no path.
 _PATH = re.compile(r"^([/\\~]|[A-Za-z]:[/\\])|(^|[/\\])\.\.?($|[/\\])")
 
 
@@ -78,7 +79,7 @@ def _check_memory(value: Any) -> Any:
     return value
 
 
-#: A number of MiB, or text with a unit (B, kB, KiB, MB, MiB, GB, GiB), stored as it was written.
+#: A number of MiB, or text with a unit (B, kB, KiB, MB, MiB, GB, GiB), stored as written.
 Memory = Annotated[
     int | float | str,
     BeforeValidator(_check_memory),
@@ -113,7 +114,7 @@ def _without_default(schema: dict[str, Any]) -> None:
     del schema["default"]
 
 
-#: Largest number of shards of `auto`.
+#: Largest number of shards for `auto`.
 AUTO_SHARDS = 16
 
 _Shards = Annotated[

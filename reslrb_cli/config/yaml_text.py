@@ -14,16 +14,16 @@ import yaml
 
 from reslrb_cli.errors import ConfigError
 
-#: Text, lists, mappings, null: what PyYAML builds of its own that is plain data in YAML 1.2 too.
+#: Text, lists, mappings, null: types that PyYAML builds and that are plain data in YAML 1.2, too.
 _KEPT = ("str", "seq", "map", "null", "bool")
 _TAG = "tag:yaml.org,2002:"
 
-#: Tags that a key may have: it is text, or `<<`.
+#: Tags of valid keys: text, or `<<`.
 TEXT_TAGS = (f"{_TAG}str", f"{_TAG}merge")
 FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$")
 INTEGER = re.compile(r"[-+]?[0-9]+$|0o[0-7]+$|0x[0-9a-fA-F]+$")
 DIGITS = list("-+.0123456789")
-#: Integers are below this, and above its negative: nothing that a file counts has more than 64 bits.
+#: Integers lie between this and its negative: no quantity in a file needs more than 64 bits.
 INTEGER_END = 2**64
 
 
@@ -91,10 +91,10 @@ Loader.add_constructor(None, _refuse)
 
 Location = tuple["str | int", ...]
 
-#: What no key holds: control characters, and halves of surrogate pairs.
+#: Characters that no key contains: control characters and halves of surrogate pairs.
 UNFIT = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
-#: What an alias begins with, up to where YAML or a reader would take it to end.
+#: Start of an alias, up to the character at which YAML or a reader would end it.
 _ALIAS = re.compile(r"\*[^\s,\]}]*")
 
 
@@ -140,7 +140,7 @@ def parse(text: str, source: str, name_line: bool = True, example: Callable[[str
         raise ConfigError(at(line), "", f"not valid YAML: {reason}") from None
     except RecursionError:
         raise ConfigError(source, "", "lists and mappings are nested too deeply") from None
-    except (ValueError, KeyError, AttributeError, TypeError):  # PyYAML on `!!bool x`
+    except (ValueError, KeyError, AttributeError, TypeError):  # PyYAML's message for `!!bool x`
         raise ConfigError(source, "", "not valid YAML: a value contradicts its explicit !! tag") from None
 
 

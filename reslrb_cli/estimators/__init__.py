@@ -19,7 +19,7 @@ ESTIMATORS: dict[str, type[Estimator]] = {
     "stack": Stack,
 }
 
-#: The estimators of the same names where light moves.
+#: The estimators of the same names for moving light.
 ATTACHED: dict[str, type[Estimator]] = {"reservoir": AttachedReservoir, "stack": AttachedStack}
 
 

@@ -63,7 +63,7 @@ from reslrb_cli.transport.walk import (
     segment,
 )
 
-# ---- A segment is done again ----
+# ---- Evaluate a segment again ----
 
 
 @dataclass
@@ -109,8 +109,8 @@ def reach(
     stayed, reaching, factor = find_following_vertex(ray, pi, stays)
     with dr.suspend_grad():
         other, other_bsdf = before[0].point.interaction(plan, stays)
-    # What f changes by its own parameters belongs to the vertex before: where they are resumed, the direction alone
-    # is. (A variable that is made under one selective scope counts as suspended under another.)
+    # Derivatives of f by its own parameters belong to the previous vertex, so if parameters are resumed here, only the
+    # direction is. (A variable that is made in one selective scope counts as suspended in another.)
     with dr.suspend_grad(when=parameters), dr.resume_grad(reaching.d, when=parameters):
         f = evaluate(plan, other, other_bsdf, other.to_local(reaching.d), stays)
     changed = dr.select(stays & (f != 0), dr.replace_grad(mi.Spectrum(1), f / dr.detach(f)), 1) * factor
@@ -198,7 +198,7 @@ class AttachedFrame:
             later = dr.select(scattered, this.scattering.weight * B, 0)
             moved = dr.dot(following.o, adjoint.origin) + dr.dot(following.d, adjoint.direction)
             dr.backward_from(dr.dot(P, reached * (own + later)) + dr.select(scattered, moved, 0))
-            # What a lane without light computes may be no number: none of it goes on to the vertices before.
+            # A lane without light may compute NaN, which must not reach earlier vertices.
             B = dr.detach(own + later) * self.roulette
             return Adjoint.where(connected | scattered, dr.grad(ray.o), dr.grad(ray.d), B)
 
@@ -261,7 +261,7 @@ class AttachedSweep(VertexHooks):
 
     def _useful(self, state: AttachedState, vertex: Vertex) -> mi.Bool:
         """Return the lanes in which the vertex, or one before it, depends on a parameter."""
-        plan = self.p.plan  # where B_0 is asked for, all of them
+        plan = self.p.plan  # if B_0 is needed, all of them
         return (state.stack.count > 0) | (mi.Bool(True) if concerns_emission(plan) else begins(plan, vertex))
 
 
@@ -280,7 +280,7 @@ class AttachedStack(Estimator):
         if p.adjoint is not None:
             return self._sweep(p)
         assert p.block is not None
-        return p.walk(Splat(p.samples, p.block))  # nothing is kept of a path: it is traced again
+        return p.walk(Splat(p.samples, p.block))  # no path is kept; the path is traced again
 
     def backward(self, p: Pass, state: Any) -> None:
         differentiate_start(p, state if isinstance(state, Adjoint) else self._sweep(p))

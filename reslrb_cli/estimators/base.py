@@ -73,9 +73,9 @@ class Estimator(ABC):
     """
 
     OPTIONS: ClassVar[dict[str, Any]] = {}
-    exact: ClassVar[bool] = False  # every connection of a path counts, as under naive AD of the same paths
-    stack_size: int = STACK_SIZE  # that of stacks of vertices, where there are any
-    attached: Estimator | None = None  # the estimator of the same name where light moves; None: there is none
+    exact: ClassVar[bool] = False  # every connection of a path counts, as in naive AD of the same paths
+    stack_size: int = STACK_SIZE  # the capacity of vertex stacks, if there are any
+    attached: Estimator | None = None  # the estimator of the same name for moving light; None if there is none
 
     def of(self, plan: Plan) -> Estimator:
         """Return this estimator, or `attached` if the plan needs attached derivatives."""
@@ -197,7 +197,7 @@ def differentiate_passage(
     def differentiate(transmission: mi.Spectrum, hit: mi.Bool) -> None:
         weight = adjoint_of_factor(adjoint, mi.Int32(NO_ZERO), dr.detach(transmission), 0)
         objective = dr.select(hit, weight * transmission, 0)
-        # Masks may be there and have no parameter that is differentiated.
+        # The scene may have masks without differentiated parameters.
         dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
 
     with dr.resume_grad(when=p.plan.differentiate_null):

@@ -22,7 +22,7 @@ from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEven
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Vertex
 
-#: No light may reach what is differentiated.
+#: A differentiated parameter may receive no light.
 _MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
@@ -71,7 +71,7 @@ class CameraSweep(CameraHooks):
 
     def __init__(self, p: Pass, ring: Ring, end: mi.UInt32 | None = None) -> None:
         self.p, self.ring, self.end = p, ring, end
-        self.delta = mi.Spectrum(0)  # set at the start
+        self.delta = mi.Spectrum(0)  # assigned at the start
 
     def start(self, first: FilmRay) -> CameraState:
         self.delta = self.p.delta(first.u, first.active) * first.weight

@@ -61,10 +61,10 @@ from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Numbers, Samples
 from reslrb_cli.transport.walk import Vertex
 
-#: Vertices that are not specular in one block of a chain.
+#: Nonspecular vertices in one block of a chain.
 BLOCK = 10
 
-#: By how much a ray turns with the one before it, where its Jacobian would have no inverse (`segment_jacobian`).
+#: Rotation of a ray with the previous one, if its Jacobian would be singular (`segment_jacobian`).
 JACOBIAN_DAMPING = 0.1
 
 
@@ -365,7 +365,7 @@ def differentiate(p: Pass, kept: list[KeptConnection], damping: float) -> None:
             B += adjoint_of_factor(one.adjoint, mi.Int32(0), dr.detach(emission.weight), 1)
             origin, direction = origin + by_o, direction + by_d
         differentiate_start(p, dr.detach(Adjoint(origin, direction, B)))
-    if p.plan.moving_shapes or p.plan.differentiate_bsdfs:  # else no segment has a parameter, and Dr.Jit refuses it
+    if p.plan.moving_shapes or p.plan.differentiate_bsdfs:  # otherwise there is no parameter, and Dr.Jit refuses it
         replay = ChainReplay(p, kept, damping)
         p.walk(replay, replay.last > 0)
 
@@ -443,7 +443,7 @@ def segment_jacobian(
         factors = [reached * scattering.weight]
         if evaluates:
             factors.append(reached * connection.f * connection.weight)
-        # Selected: no other of these hangs on what that makes, which would be cleared on the way.
+        # `select` makes new variables: no other output depends on them, so clearing them on the way is harmless.
         outputs = [dr.select(scattered, value, 0) for value in (following.o, following.d, factors[0])]
         if evaluates:
             outputs += [dr.select(connected, value, 0) for value in (factors[1], connection.u)]

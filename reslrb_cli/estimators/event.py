@@ -51,7 +51,7 @@ from reslrb_cli.transport.walk import Vertex
 class EventSlot:
     """Selected pair of a connection and an event."""
 
-    w: mi.Float  # selection weight of the connection; 0: nothing kept
+    w: mi.Float  # selection weight of the connection; 0 if none is kept
     C: Product
     u: mi.Point2f
     event: Event
@@ -106,15 +106,15 @@ class EventSelection(VertexHooks):
         w = dr.select(connection.active, selection_weight(p, self.weight, connection, C), 0)
         q = dr.select(plan.differentiates(vertex.bsdf), mi.Float(1), 0)
         if plan.differentiate_null:
-            q = mi.Float(1)  # the masks between vertex and sensor may have something to differentiate
+            q = mi.Float(1)  # masks between vertex and sensor may have differentiated parameters
         Q = state.Q + q
-        w = at_least_share(w, state.W / dr.maximum(Q, 1))  # 1: the least Q that is not 0
+        w = at_least_share(w, state.W / dr.maximum(Q, 1))  # 1 is the smallest positive Q
         W = dr.fma(w, Q, state.W)
         this = Event.of_connection(plan, vertex, connection)
         slots = []
         for k, slot in enumerate(state.slots):
             event = state.prefix[k]
-            if plan.differentiate_bsdfs:  # else emission is the one event
+            if plan.differentiate_bsdfs:  # otherwise emission is the only event
                 event = dr.select(numbers[2 * k] * Q < q, this, event)
             pair = EventSlot(w, C.stored(), connection.u, event)
             slots.append(dr.select(is_taken(numbers[2 * k + 1], w * Q, W), pair, slot))

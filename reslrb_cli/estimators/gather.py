@@ -34,7 +34,7 @@ from reslrb_cli.transport.factors import NO_ZERO, Product, showing
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
 
-WORDS = 2  # of visibility bits, 32 vertices each
+WORDS = 2  # of visibility bits for 32 vertices each
 
 
 @dataclass
@@ -42,7 +42,7 @@ class Visibility:
     """Visibility of a path's connections: one bit for each of 32 * WORDS vertices, and the last visible vertex."""
 
     words: list[mi.UInt32]
-    # The last vertex that there is need to visit again, mostly the last with a visible connection; 0: none.
+    # Last vertex that must be visited again, usually the last with a visible connection; 0 if none.
     last: mi.UInt32
 
     @staticmethod
@@ -97,7 +97,7 @@ class AdjointSum:
             return AdjointSum(value, rest, [])
         term = delta * C.nonzero
         for c, zero in enumerate(C.zero):
-            # A connection whose own factor is the zero one has a derivative there, and none in the prefix.
+            # If the connection's own factor is the zero one, the derivative is here and not in the prefix.
             term[c] = dr.select((zero >= 0) & (zero != mi.Int32(index)), term[c], 0)
         return AdjointSum(value, rest, list(self._add(self.behind_zero[0], self.behind_zero[1], term)))
 
@@ -146,7 +146,7 @@ class Gathering(VertexHooks):
 
     def start(self, product: Product) -> GatherState:
         p = self.p
-        # The sum is all that derivatives of emission need.
+        # Derivatives of emission need only the sum.
         traced_again = p.adjoint is None or p.plan.differentiate_bsdfs
         visibility = Visibility.none(vertices(p.plan) if traced_again else 0)
         if p.adjoint is None:
@@ -160,7 +160,7 @@ class Gathering(VertexHooks):
         p, depth, last = self.p, vertex.depth, vertex.depth
         C = contribution(p, vertex, connection)
         p.splat(connection.u, C.value(), connection.active)
-        # The latest vertex with anything to differentiate up to this one; 0: none.
+        # The latest differentiable vertex up to this one; 0 if none.
         latest = [dr.select(p.plan.concerns(vertex.bsdf), depth, before) for before in state.latest]
         if latest:
             last = needed(latest[0], depth)
@@ -249,7 +249,7 @@ class Gather(Estimator):
         if not state.S:
             state = p.walk(Summing(p, visibility), visibility.last > 0)
             visibility = Visibility(visibility.words, state.visibility.last)
-            dr.eval(state.S, visibility)  # the emission and the replay both read them
+            dr.eval(state.S, visibility)  # both the emission and the replay read them
         [S] = state.S
         differentiate_emission(p, S.adjoint_of_emission)
         if p.plan.differentiate_bsdfs:

@@ -49,7 +49,7 @@ class SurfacePoint:
     def hit(self) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f]:
         """Return the intersection and its ray; stored in scenes whose BSDFs read geometry."""
         pi = dr.zeros(mi.PreliminaryIntersection3f)
-        pi.valid = mi.Bool(True)  # not kept: a masked write of booleans to thread-local memory ends the process
+        pi.valid = mi.Bool(True)  # not kept: a masked write of booleans to local memory crashes the process
         pi.t, pi.prim_uv, pi.prim_index, shape, instance, o, d = self.numbers
         pi.shape = dr.reinterpret_array(mi.ShapePtr, shape)
         pi.instance = dr.reinterpret_array(mi.ShapePtr, instance)

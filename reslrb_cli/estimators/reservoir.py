@@ -56,7 +56,7 @@ class Slot:
     """
 
     w: mi.Float  # its selection weight
-    last: mi.UInt32  # the last vertex before its own with anything to differentiate; 0: none
+    last: mi.UInt32  # the last differentiable vertex before its own; 0 if none
     C: Product  # its contribution
     u: mi.Point2f  # its film position
     event: list[Event]
@@ -66,9 +66,9 @@ class Slot:
 class ReservoirState:
     """Stored data of a path."""
 
-    W: mi.Float  # sum of all candidates' weights
+    W: mi.Float  # sum of the weights of all candidates
     slots: list[Slot]
-    latest: list[mi.UInt32]  # on the way: the latest vertex with anything to differentiate; 0: none
+    latest: list[mi.UInt32]  # during the walk: the latest differentiable vertex; 0 if none
 
     @staticmethod
     def empty(plan: Plan, capacity: int) -> ReservoirState:
@@ -101,7 +101,7 @@ class ReservoirSelection(VertexHooks):
         C = contribution(self.p, vertex, connection)
         self.p.splat(connection.u, C.value(), connection.active)
         plan, candidate = self.p.plan, connection.active
-        if not plan.differentiate_emission:  # else every connection counts
+        if not plan.differentiate_emission:  # otherwise every connection counts
             candidate = candidate & (self.concerned(state) | plan.concerns(vertex.bsdf))
         w = at_least_share(dr.select(candidate, selection_weight(self.p, self.weight, connection, C), 0), state.W)
         W = state.W + w

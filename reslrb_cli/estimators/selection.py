@@ -22,7 +22,7 @@ from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
 
 S = TypeVar("S")
-SHARE = 0.01  # the least share of a candidate in the weights up to it
+SHARE = 0.01  # minimum share of a candidate in the weights up to it
 
 
 class Chosen(Protocol):
@@ -62,7 +62,7 @@ def at_least_share(w: mi.Float, W: mi.Float) -> mi.Float:
     minimum, because the heavy one depends on their parameters, too.
     """
     least = SHARE * W
-    return dr.select((w != 0) & (w < least), least, w)  # a comparison: what is not a number stays
+    return dr.select((w != 0) & (w < least), least, w)  # a comparison, so that NaN is kept
 
 
 def inverse_probability(W: mi.Float, slot: Chosen, capacity: int) -> mi.Float:

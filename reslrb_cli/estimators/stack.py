@@ -188,7 +188,7 @@ def pop(p: Pass, form: Any, ring: Ring, state: StackState, top: mi.UInt32, botto
     return adjoint
 
 
-# ---- A vertex whose directions do not move ----
+# ---- A vertex with fixed directions ----
 
 
 @dataclass
@@ -335,7 +335,7 @@ class Stack(Estimator):
         differentiate_emission(p, lambda E: showing(B))
 
     def kept(self, plan: Plan) -> Any:
-        return [Visibility.none(vertices(plan)), mi.Spectrum(0)]  # `forward` keeps one of the two
+        return [Visibility.none(vertices(plan)), mi.Spectrum(0)]  # `forward` keeps one of them
 
     def scratch_bytes(self, plan: Plan) -> int:
         return stack_bytes(plan, self.stack_size)

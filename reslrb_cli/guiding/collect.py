@@ -132,11 +132,11 @@ def walk_back(trail: Trail) -> tuple[mi.Float, mi.Float, mi.Float]:
 
 
 NAMES = ("onward", "frame")  # of its arrays
-KEEP = 0.75  # what of the past counts beside the newest walk
+KEEP = 0.75  # weight of the past relative to the newest walk
 SURE = 16.0
 LEAN = 100.0
 FLOOR = 0.1
-RAY = 0.2  # what a ray costs that meets nothing, in vertices
+RAY = 0.2  # cost of a ray that hits nothing, in vertices
 
 
 @dataclass
@@ -240,8 +240,8 @@ def _cubes(values: Array, level: int) -> Array:
     return np.asarray(values.reshape(len(values), few, each, few, each, few, each, SHAPE[-1]).sum((2, 4, 6)))
 
 
-MOST_BSDFS = 6  # that are heard apart; the others are heard together
-BINS = 1024  # of sums over all paths, so that none loses small numbers
+MOST_BSDFS = 6  # that have separate sums; the others share one
+BINS = 1024  # of sums over all paths, so that small terms are not lost
 
 
 def bsdf_groups(plan: Plan) -> list[tuple[mi.BSDF, ...]]:
@@ -282,7 +282,7 @@ class Heard:
     image: mi.Float
     light: mi.Float
     trail: Trail
-    factor: list[mi.Float]  # r of the vertex, where paths are aimed
+    factor: list[mi.Float]  # r of the vertex, if paths are aimed
 
 
 class Hearing(Hooks):
@@ -296,7 +296,7 @@ class Hearing(Hooks):
         assert samples.guide is not None
         self.survival = samples.guide.table.survival
         self.film = film_blocks(samples.sensor) if samples.plan.aimed else None
-        # Squares by voice and block of the film, where paths are aimed.
+        # Squares by group and block of the film, if paths are aimed.
         self.places = [dr.zeros(mi.Float, voices(samples.plan) * self.film.count)] if self.film else []
 
     def start(self, product: Product) -> Heard:
@@ -335,7 +335,7 @@ class Hearing(Hooks):
         return replace(state, counts=counts, sums=sums, image=state.image + image, trail=trail)
 
     def aimed(self, state: Heard, factor: mi.Float) -> Heard:
-        # Part of what paths say, other than the weight of a roulette that is being learned for.
+        # Leave out the weight of a roulette that is being learned from.
         return replace(state, factor=[factor])
 
     def survived(self, state: Heard, weight: mi.Float) -> Heard:
@@ -393,7 +393,7 @@ def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
     heard: Heard = walk(samples, hooks)
     sampler = samples.sampler()
     sample_time(plan, samples.sensor, sampler)
-    drawn = samples.drawn(*samples.emission_numbers(sampler))  # as the walk had them
+    drawn = samples.drawn(*samples.emission_numbers(sampler))  # the numbers that the walk used
     assert drawn is not None
     squares = [dr.squared_norm(total) for total in heard.sums] + [heard.image]
     cells = plan.grid.cells
@@ -402,7 +402,7 @@ def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
         value = square / dr.square(drawn.weight)
         counts = dr.isfinite(value) & (value > 0)
         dr.scatter_reduce(dr.ReduceOp.Add, sums, value, drawn.cell + voice * cells, counts)
-    # All is one kernel: what is evaluated apart would be traced again.
+    # One kernel: a later evaluation would trace everything again.
     whole = _sums([*squares, heard.light, mi.Float(heard.trail.count)], samples.width)
     said = Said(sums, *walk_back(heard.trail), whole, hooks.places)
     dr.eval(said)

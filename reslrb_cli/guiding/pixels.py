@@ -36,11 +36,11 @@ from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples, passes
 from reslrb_cli.transport.walk import Vertex
 
-NOTED_SPP = 16  # camera paths through each pixel that are noted
-BLOCK = 9  # pixels, side of the blocks that means are taken over
-MOST = 8.0  # of the mean, that a pixel is given
-NOTING_STREAM = 0x9072E5  # seed of the samples that are noted
-LEAST_PATHS, MOST_PART = 1e7, 0.02  # of a run that has time for it, and what may be noted beside its samples
+NOTED_SPP = 16  # recorded camera paths through each pixel
+BLOCK = 9  # side length in pixels of the blocks for means
+MOST = 8.0  # maximum density of a pixel, as a multiple of the mean
+NOTING_STREAM = 0x9072E5  # seed of the recorded samples
+LEAST_PATHS, MOST_PART = 1e7, 0.02  # for a run that has time for it, and the recording beside its samples
 
 
 @dataclass
@@ -123,11 +123,11 @@ def density_of(
 ) -> NDArray[np.float32]:
     """Return the density of camera paths over the pixels (H, W), with mean 1, from the means that `note` returns and
     the loss's curvature (H, W)."""
-    from scipy import ndimage  # here: few commands come here, and all import this module
+    from scipy import ndimage  # imported here: few commands need it, and all import this module
 
-    # The variance of each pixel first, then the mean over a block: that of a block's pixels together would also count
-    # edges, and the surroundings of a lamp, as noise. The curvature comes before the mean, too: the noise of a lamp's
-    # edge counts little in relative_l2, and nothing where it is left out.
+    # The variance of each pixel comes first, then the mean over a block: the joint variance of a block would count
+    # edges and the surroundings of a lamp as noise. The curvature also comes before the mean: the noise at a lamp's
+    # edge counts little in relative_l2, and not at all in excluded pixels.
     w = np.ones_like(rows[-1]) if curvature is None else curvature
     variances = np.square(w) * np.maximum(rows[-1] - np.square(rows[-2]), 0)
     *said, variance = (ndimage.uniform_filter(row, BLOCK, mode="nearest") for row in (*rows[:-2], variances))
@@ -135,10 +135,10 @@ def density_of(
     for K, row in zip(entries, said, strict=True):
         whole = np.sum(w * row)
         weight += K * np.square(row / whole) if whole > 0 else 0
-    # The filter's running sums leave values just below 0 where there is nothing.
+    # The filter's running sums leave values just below 0 in empty regions.
     density = np.where(w > 0, np.sqrt(np.maximum(variance, 0) * weight), 0)
     if not density.sum() > 0:
         return np.ones_like(variance, np.float32)
-    for _ in range(8):  # what is cut off raises all others
+    for _ in range(8):  # clipping raises all others
         density = np.minimum(density / density.mean(), MOST)
     return np.asarray(density / density.mean(), np.float32)

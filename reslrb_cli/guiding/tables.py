@@ -32,11 +32,10 @@ from reslrb_cli.transport.samples import Samples
 
 Array = np.ndarray[Any, Any]
 
-#: Of neighbouring cells, along each number. A quarter in place of the twentieth leaves a cell a sixteenth of what was
-#: heard of it, and rooms 1.3 to 1.4 times the squares; with none, cells that few paths have met count for what these
-#: few said.
+#: Blur over neighbouring cells along each number. With 1/4 instead of 1/20, a cell keeps a sixteenth of its value, and
+#: second moments in rooms grow by 1.3 to 1.4; without blur, cells with few paths are trusted too much.
 BLUR = (0.05, 0.9, 0.05)
-FINE = 2.0  # cells, at most, for each path that has been heard
+FINE = 2.0  # maximum number of cells per recorded path
 
 
 def most_cells(paths: int) -> float:
@@ -149,7 +148,7 @@ def _add(sums: Array, heard: Array, means: Array) -> list[float]:
 
 def _blurred(grid: Grid, values: Array) -> Array:
     """Return weighted sums over neighbouring cells; cells of different emitters are not neighbours."""
-    from scipy import ndimage  # here: few commands ever learn, and all import this module
+    from scipy import ndimage  # imported here: few commands learn, and all import this module
 
     result = values.reshape(grid.shape)
     for axis in range(1, result.ndim):
@@ -158,14 +157,14 @@ def _blurred(grid: Grid, values: Array) -> Array:
     return result.ravel()
 
 
-EVERY = 16  # gradients of a sensor from one time that its table learns to the next; at first after 1, 2, 4 and 8
-WRONG = 1.5  # `Learned.worse` of a table that does harm; one that is worth nothing, and right, has 1
-LEAST_BITS = 16  # cells, log2, however many sensors there are
-MOST_BYTES = 2**26  # of all tables together; sensors for which there is no room share
-NOW = 0.2  # of the paths aimed for a gradient: by its own dL/dI, where that is known; the others by what was said
+EVERY = 16  # gradients of a sensor between two updates of its table; the first updates come after 1, 2, 4 and 8
+WRONG = 1.5  # `Learned.worse` of a harmful table; a useless but correct table has 1
+LEAST_BITS = 16  # log2 of the number of cells, for any number of sensors
+MOST_BYTES = 2**26  # of all tables together; sensors beyond it share
+NOW = 0.2  # share of the paths of a gradient that use its own dL/dI, if known; the others use the recorded values
 LEARNING_STREAM = 0x1EA2  # seeds of the samples that tables learn from
 
-#: Names of the arrays of each sensor in what has been learned.
+#: Names of the arrays of each sensor in the learned state.
 KNOWN = ("sums", "draws", "film", *NAMES)
 
 
@@ -207,10 +206,10 @@ class Guiding:
     def __init__(self) -> None:
         self.images, self.held, self.lessons = True, False, 0
         self.grid: Grid | None = None
-        self._emission: tuple[list[bool], list[float], int] | None = None  # what `grid_for` is to know of a scene
-        self.box = np.zeros((2, 3), np.float32)  # of the scene, as it was first seen
-        self.learned: dict[int, Learned] = {}  # by the number of their sensor
-        self.films: dict[int, Blocks] = {}  # of sensors whose paths may be aimed
+        self._emission: tuple[list[bool], list[float], int] | None = None  # scene data that `grid_for` needs
+        self.box = np.zeros((2, 3), np.float32)  # of the scene, as first seen
+        self.learned: dict[int, Learned] = {}  # by the number of the sensor
+        self.films: dict[int, Blocks] = {}  # of sensors with paths that may be aimed
         self._tables: dict[tuple[int, Purpose], tuple[Table, Array]] = {}
 
     def clear(self) -> None:
@@ -372,7 +371,7 @@ class Guiding:
         heard, draws = said.by_start(self.grid.cells), paths * (counts / self.grid.slots)
         learned = before.with_more(self.grid, heard, draws, onward, said.by_block())
         if learned.worse > WRONG and learned.calls % EVERY == 0:
-            learned.calls = 0  # the scene has changed: it learns as often as it did at first
+            learned.calls = 0  # the scene has changed, so it learns as often as at the start
         self.learned[number] = learned
         self.lessons += 1
         for purpose in Purpose:

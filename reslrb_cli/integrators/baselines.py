@@ -66,7 +66,7 @@ class Replayed(Reversed):
 
     def __init__(self, plugin: mi.Integrator) -> None:
         self.plugin = plugin
-        self._scene: mi.Scene | None = None  # held, so that no other scene gets its address
+        self._scene: mi.Scene | None = None  # kept alive, so that no other scene gets its address
         self._surroundings = Surroundings()
 
     def _surround(self, scene: mi.Scene) -> None:
@@ -82,7 +82,7 @@ class Replayed(Reversed):
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
         self._surround(job.scene)
-        # Isolated, so that another view's propagation finds the edges above the scene's parameters intact.
+        # Isolated, so that the propagation of another view finds the edges above the scene's parameters intact.
         with dr.isolate_grad():
             self.plugin.render_backward(job.scene, job.params, gradient, job.sensor, job.seed, job.spp)
 
@@ -97,7 +97,7 @@ class Projective(Replayed):
         try:
             for name, spp in given.items():
                 setattr(self.plugin, name, job.spp if spp is None else spp)
-            # Mitsuba ignores all three if it is given a sample count. It warns of the film's border, and of no shadows.
+            # Mitsuba ignores all three if a sample count is given. It warns of the film's border, but not of shadows.
             with _no_word_of_signals():
                 super().backward(replace(job, spp=0), gradient)
         finally:
@@ -128,20 +128,20 @@ class NaiveAD(Replayed):
     image_apart = False
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
-        self.correlated(job, lambda image: gradient)  # as Mitsuba does, which raises where no path meets anything
+        self.correlated(job, lambda image: gradient)  # as in Mitsuba, which raises if no path hits anything
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
         self._surround(job.scene)
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False), dr.isolate_grad():
             with _no_word_of_signals():
                 image = self.plugin.render(job.scene, job.sensor, job.seed, job.spp, develop=True, evaluate=False)
-            # Where no path of a few meets anything, evaluated loops end before the image depends on a parameter.
+            # If none of a few paths hits anything, evaluated loops end before the image depends on a parameter.
             flags = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
             dr.backward_from(image * derivative(dr.detach(image)), flags=flags)
         return dr.detach(image)
 
 
-#: No light may reach what is differentiated.
+#: A differentiated parameter may receive no light.
 _MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
@@ -208,7 +208,7 @@ class Trajectory(LightTracer, Reversed):
             adjoint = parts[0].film.adjoint(gradient)
 
             def differentiate(part: Samples, block: mi.ImageBlock | None) -> None:
-                with dr.isolate_grad():  # as in `replay_all`; without it the derivatives of textures are lost
+                with dr.isolate_grad():  # as in `replay_all`; without it, the derivatives of textures are lost
                     reverse_recorded(part, adjoint)
 
             in_passes(parts, differentiate, None, job.params)

@@ -51,8 +51,8 @@ class Renewal:
         self._surroundings = Surroundings()
         self._infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())
         self._lamps = [lamp.shape for lamp in graph.find_lamps(scene) if lamp.faces_by_area]
-        # Vertices as they were when meshes were last found to be flat, so that interpolated normals need no correction.
-        # They are held, so that other arrays do not get their place.
+        # Vertices at the last check that meshes are flat, so that interpolated normals need no correction. They are
+        # kept alive, so that other arrays do not get their addresses.
         smooth = [shape for shape in graph.shapes() if interpolates_normals(shape)]
         self._before = [(shape, _vertices(shape)) for shape in smooth]
         self._bent = False
@@ -60,13 +60,14 @@ class Renewal:
     def renew(self, plan: Plan, scene: mi.Scene) -> Plan:
         """Return the current plan of `scene`."""
         for mesh in self._lamps:
-            mesh.surface_area()  # else Mitsuba adds up its faces when they are first sampled, in the midst of tracing
+            mesh.surface_area()  # otherwise Mitsuba sums the face areas at the first sample, during tracing
         if self._infinite:
             plan = replace(plan, horizon=self._surroundings.follow(scene))
         for number, (shape, before) in enumerate(self._before if not self._bent else []):
             now = _vertices(shape)
             if [array.index for array in now] != [array.index for array in before]:
-                # Once needed, kept: a mesh that bends and is flat again would have kernels compiled anew each time.
+                # Kept once needed: otherwise a mesh that bends and becomes flat again would recompile kernels each
+                # time.
                 self._bent = self._bent or is_bent(shape)
                 self._before[number] = shape, now
         return with_shading_normals(plan) if self._bent else plan
@@ -103,9 +104,9 @@ class AboutParameters:
 
     which: Differentiated
     track_zeros: bool = False
-    #: Whether vertices have to stay, by sensor.
+    #: Whether vertices stay, by sensor.
     stays: dict[mi.Sensor, bool] = field(default_factory=dict)
-    #: How camera paths are shared out over the pixels of each sensor, (H, W), by its number.
+    #: Distribution of camera paths over the pixels (H, W), by the number of the sensor.
     noted: dict[int, NDArray[np.float32]] = field(default_factory=dict)
 
 
@@ -116,17 +117,17 @@ class AboutScene:
     sensors: list[mi.Sensor]
     #: Plans of images, by sensor and kind of paths.
     plans: dict[tuple[mi.Sensor, str], Plan] = field(default_factory=dict)
-    #: BSDFs of its surfaces that use a node, and under None all of them.
+    #: BSDFs of its surfaces that use a node; the entry None has all of them.
     owners: dict[mi.Object | None, list[mi.BSDF]] = field(default_factory=dict)
-    #: By the parameters, and the objects that have them.
+    #: By parameters and the objects that have them.
     parameters: dict[tuple[tuple[str, mi.Object], ...], AboutParameters] = field(default_factory=dict)
     renewal: Renewal | None = None
-    #: The densities of emitters, by what they were made from.
+    #: The densities of emitters, by their sources.
     emitters: dict[tuple[Any, ...], EmitterDensities] = field(default_factory=dict)
     recordings: Recordings = field(default_factory=Recordings)
-    #: By sensor, number of paths, and the density that they follow.
+    #: By sensor, number of paths, and their density.
     shares: dict[tuple[int, int, int], PixelShares | None] = field(default_factory=dict)
-    #: Samples per pixel that the cells of guided emission are made for.
+    #: Samples per pixel for which the cells of guided emission are made.
     met: int = 0
 
 
@@ -137,12 +138,12 @@ class Preparation:
         self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion, guided: bool = False,
         low_discrepancy: bool = False,
     ) -> None:  # fmt: skip
-        #: Whether camera paths are shared out over the pixels. How, by sensor, (H, W), may be `given` for all scenes
-        #: with the same sensors; else it is noted of each scene and its parameters.
+        #: Whether camera paths are distributed over the pixels by need. The distribution by sensor, (H, W), may be
+        #: `given` for all scenes with the same sensors; otherwise it is kept for each scene and its parameters.
         self.shares_out = False
         self.given: dict[int, NDArray[np.float32]] = {}
         self.guiding = Guiding() if guided else None
-        #: Samples per pixel of the passes that tables learn from, where somebody said; else as passes come.
+        #: Samples per pixel of the passes that tables learn from, if set; otherwise those of the passes.
         self.expected: int | None = None
         self._low_discrepancy = low_discrepancy
         self._depths, self._hide_emitters, self._motion = (max_depth, rr_depth), hide_emitters, motion
@@ -172,7 +173,7 @@ class Preparation:
 
     def draw_from(self, guiding: Guiding, scene: mi.Scene) -> None:
         """Sample guided paths of this scene from shared tables."""
-        self._turn_to(scene)  # at first sight of a scene all is forgotten
+        self._turn_to(scene)  # a new scene forgets everything
         self.guiding = guiding
 
     def plan(
@@ -205,7 +206,7 @@ class Preparation:
         if moves:
             plan = attach(plan, which, self._motion, scene, sensor)
         if plan.stays and self._motion.sampling == "auto":
-            if sensor not in about.stays:  # once, since kernels would be compiled anew for another answer
+            if sensor not in about.stays:  # once, because another answer would recompile kernels
                 about.stays[sensor] = bounces(plan, scene, sensor)
             if not about.stays[sensor]:
                 return replace(plan, stays=False, glossy_follows=False)
@@ -228,7 +229,7 @@ class Preparation:
         made = self._found.shares
 
         def shares(paths: int) -> PixelShares | None:
-            key = number, paths, id(known)  # which `given` or `AboutParameters` holds
+            key = number, paths, id(known)  # held by `given` or `AboutParameters`
             if key not in made:
                 rows, columns = (np.arange(n) * m // n for n, m in zip(size[::-1], known.shape, strict=True))
                 made[key] = PixelShares.of(known[np.ix_(rows, columns)].ravel(), paths)
@@ -275,7 +276,7 @@ class Preparation:
 
         The owner of a parameter does not change, but whether it tracks derivatives or is zero may change.
         """
-        with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
+        with dr.resume_grad():  # with suspended gradients, nothing shows that it tracks them
             values = {key: entry_value(params, key) for key in params.properties}
             enabled = {key: value for key, value in values.items() if dr.grad_enabled(value)}
         these = tuple((key, params.properties[key][2]) for key in enabled)
@@ -283,7 +284,7 @@ class Preparation:
         if these not in known:
             known[these] = AboutParameters(Differentiated.of(params, enabled))
         about = known[these]
-        # Once needed, kept: otherwise kernels would be compiled anew whenever a texel enters or leaves zero.
+        # Kept once needed: otherwise kernels would be recompiled whenever a texel becomes or stops being zero.
         least = about.which.least.items()
         about.track_zeros |= any(_has_singular(key, enabled[key], value) for key, value in least)
         return about
@@ -311,14 +312,14 @@ class Preparation:
         """
         if self.expected is None and (self._found.met == 0 or (differentiated and spp > self._found.met)):
             self._found.met = spp
-            self._found.plans.clear()  # they have the grid
+            self._found.plans.clear()  # they contain the grid
 
     def _turn_to(self, scene: mi.Scene) -> None:
         """Start with new facts about another scene."""
         sensors = scene.sensors()
         if self._scene is None or self._scene[0] != scene.ptr or self._found.sensors != sensors:
-            # The scene's own integrator does not hold the scene: neither would ever be freed. It holds the scene's
-            # sensors: another scene at the same address has others.
+            # The scene's own integrator does not hold the scene, because neither would be freed. It holds the scene's
+            # sensors, because another scene at the same address has other sensors.
             tracer = getattr(scene.integrator(), "tracer", None)
             own = getattr(tracer, "preparation", None) is self
             self._scene = (scene.ptr, None if own else scene)

@@ -27,10 +27,10 @@ from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import passes
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
-#: Where a parameter of a BSDF is this small, paths are followed and chosen in spite of it.
+#: Below this value of a BSDF parameter, paths are still followed and chosen.
 NEARLY_ZERO = 1e-2
 
-#: What is a factor of a BSDF's value, where a roughness, say, is none.
+#: Parameters that are factors of a BSDF's value, unlike a roughness.
 FACTORS = ("reflectance", "transmittance", "base_color", "opacity", "weight")
 
 
@@ -119,7 +119,7 @@ def stays(plan: Plan, sampling: str, bsdfs: Iterable[mi.BSDF]) -> tuple[bool, bo
     smooth = [bsdf.flags() for bsdf in bsdfs if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)]
     glossy = [mi.has_flag(flags, mi.BSDFFlags.Glossy) for flags in smooth]
     if sampling == "follow" or plan.max_depth <= 2 or not glossy:
-        return False, False  # no light goes on behind a vertex that is not specular
+        return False, False  # no light continues behind a nonspecular vertex
     return (True, False) if sampling == "stay" else (not all(glossy), any(glossy))
 
 
@@ -160,10 +160,10 @@ def with_shading_normals(plan: Plan) -> Plan:
     return replace(plan, needs=replace(plan.needs, has_shading_normals=True))
 
 
-#: Light paths that are looked at: of what they do not meet, the part in a derivative is small.
+#: Light paths for the check; surfaces that they miss contribute little to a derivative.
 PATHS = 2**16
 
-#: What is found is to be the same for all runs of a scene.
+#: Fixed seed: all runs of a scene must find the same.
 SEED = 0xB0A2CE
 
 

@@ -90,7 +90,7 @@ class TangentSplat(Hooks):
     k_p is the filter's weight of pixel p. If light does not move, du is 0.
     """
 
-    connects = False  # they evaluate connections themselves, with their derivatives
+    connects = False  # they evaluate connections themselves, including derivatives
 
     def __init__(self, samples: Samples, block: mi.ImageBlock, dE: mi.Spectrum) -> None:
         self.samples, self.block, self.dE = samples, block, dE
@@ -111,7 +111,7 @@ class TangentSplat(Hooks):
             return self._attached(state, vertex, connection, scattering)
         seen, through, d_through = tangent_of_passage(s, vertex, connection)
         with dr.resume_grad(when=plan.differentiate_bsdfs):
-            # Two indirect calls: Dr.Jit cannot forward-propagate through one of our own (`tracked_factors`) that reads
+            # Two indirect calls: Dr.Jit cannot forward-propagate through one of our own calls (`tracked_factors`) with
             # several parameters.
             f_c = evaluate(plan, vertex.si, vertex.bsdf, connection.wo, seen)
             f_s = tracked_factor(plan, vertex.si, vertex.bsdf, scattering, scattering.active)
@@ -141,7 +141,7 @@ class TangentSplat(Hooks):
             dr.set_grad(ray.d, d_direction)
             this, reached = segment_again(s, state.before, ray, vertex.pi, drawn, seen, scattered)
             following, taps = this.next_ray(attached=True), s.film.taps(this.connection.u, plan.attached_normalization)
-            # Selected: no other of these hangs on what that makes, which would be cleared on the way.
+            # `select` makes new variables: no other output depends on them, so clearing them on the way is harmless.
             there, sampled = this.connection, this.scattering
             c, weight = reached * there.f * there.weight, reached * sampled.weight
             outputs = [dr.select(seen, c, 0)]
@@ -257,7 +257,7 @@ def splat_tracked(samples: Samples, block: mi.ImageBlock) -> None:
     """Add the contributions with tracked derivatives to the block: naive AD, with memory proportional to depth."""
     with dr.resume_grad():
         splat_visible_emission(samples, block, "evaluated")
-        for u, C, active in moving_splats(samples):  # twice, so that the image stays as it is
+        for u, C, active in moving_splats(samples):  # twice, so that the image stays the same
             samples.film.put(block, u, C, active, samples.plan.attached_normalization)
             samples.film.put(block, dr.detach(u), -dr.detach(C), active)
         for side in samples.sides():

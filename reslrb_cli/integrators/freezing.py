@@ -21,23 +21,22 @@ from reslrb_cli.transport.samples import Samples
 
 logger = logging.getLogger(__name__)
 
-#: Paths beyond which nothing is recorded: Python does not show beside them, and the trials of a recording would.
+#: Paths above which nothing is recorded: Python's time is hidden there, and the trials of a recording would cost more.
 MOST_PATHS = 2**22
 
-#: Paths beyond which what comes once in a while is not: the trials take as long as three more passes.
+#: Paths above which rare calls are not recorded: the trials take as long as three more passes.
 MOST_PATHS_APART = 2**17
 
-#: Recordings of one kind of call that are kept, for inputs that change in more than their values.
+#: Maximum number of recordings of one kind of call, for inputs that differ in more than their values.
 KEPT = 4
 
-#: Calls after which a recording is in use, at most: Dr.Jit makes some twice before it trusts them.
+#: Maximum number of calls before a recording is used: Dr.Jit makes some twice before it trusts them.
 TRIALS = 4
 
-#: A call that is recorded more often than that gains nothing by it, and is made plainly from then on. Dr.Jit would warn
-#: after ten.
+#: A call with more recordings gains nothing and is no longer recorded. Dr.Jit would warn after ten.
 MOST_RECORDINGS = 8
 
-#: Calls that are recorded: a script that makes a new sensor for every image would go on for ever.
+#: Maximum number of recorded calls: a script that makes a new sensor for every image would record forever.
 MOST_CALLS = 256
 
 
@@ -45,7 +44,7 @@ class Recordings:
     """Recordings of calls on the samples of one scene, by kind, plan and sensor."""
 
     def __init__(self) -> None:
-        self._functions: dict[Any, Any] = {}  # None where a call is not recorded: it cannot be, or gains nothing by it
+        self._functions: dict[Any, Any] = {}  # None if a call is not recorded, or would gain nothing
 
     def clear(self) -> None:
         """Clear all recordings, for a new scene."""
@@ -60,8 +59,8 @@ class Recordings:
         to be recorded again and again. Raises UnsupportedScene if a recording exists but does not fit any more.
         """
         s = samples
-        # Sensors that share a recording have it made anew whenever another one's turn comes. The key holds its sensor:
-        # no other sensor gets its address.
+        # Sensors that share a recording would remake it at every change of sensor. The key holds the sensor, so no
+        # other sensor gets its address.
         widths = tuple(side.width for side in s.sides())
         key = (kind, s.plan, s.spp, widths, tuple(s.film.size), s.sensor)
         plain = _on_samples(samples, function)
@@ -109,12 +108,12 @@ def _record(
         zeros = dr.zeros(type(inputs[0]), inputs[0].shape)
         dr.make_opaque(zeros)
         inputs = (zeros, *inputs[1:])
-    gc.collect()  # scenes that are done with
+    gc.collect()  # scenes that are no longer used
     try:
         with _without_garbage_collection():
             for done in range(TRIALS):
                 recorded(*common, *inputs)
-                dr.sync_thread()  # else a trial's memory may or may not be free for the next one, and peaks vary
+                dr.sync_thread()  # frees the memory of a trial before the next, so peaks do not vary
                 if recorded.n_recordings <= done:
                     break
     except RuntimeError as error:
@@ -139,7 +138,7 @@ def _without_garbage_collection() -> Iterator[None]:
 
 def _on_samples(samples: Samples, function: Callable[..., Any]) -> Callable[..., Any]:
     """Return `function` with every input of a recording as a separate argument."""
-    # Only these: arrays would be constants of the recording, and a scene would never be freed.
+    # Only these: arrays would become constants of the recording, and a scene would never be freed.
     sides = [(side.plan, side.spp, side.width) for side in samples.sides()]
 
     def on_samples(scene: mi.Scene, sensor: mi.Sensor, *given: Any) -> Any:

@@ -25,7 +25,7 @@ class OwnIntegrator(Reversed):
     The file runs when an image or a gradient is first needed, or in `ready`.
     """
 
-    #: Its gradient is a pass of its own; naive AD of one whose `render` alone is differentiable is Mitsuba's affair.
+    #: The gradient takes a separate pass; if only `render` is differentiable, Mitsuba does naive AD.
     image_apart = True
 
     def __init__(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from reslrb_cli.guiding.tables import sensor_bytes
 from reslrb_cli.transport.plan import Plan
 
-#: Names of features that runs choose, and give reasons of their own for (`with_reason`).
+#: Names of features that runs choose and explain themselves (`with_reason`).
 PATHS_FROM = "camera paths"
 GUIDED = "guided emission"
 SEQUENCE = "low-discrepancy numbers"

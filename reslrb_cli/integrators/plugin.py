@@ -63,10 +63,10 @@ def _plugin_class() -> type[mi.CppADIntegrator]:
         """Light tracer under `mi.render`."""
 
         def __init__(self, type: str, props: mi.Properties) -> None:
-            # Of all that stays unread Mitsuba says that there is no such option; what is asked for counts as read.
+            # Mitsuba reports every unread option as unknown; queried options count as read.
             names = _option_names(type, props.get("estimator", None) if type == "reslrb" else None)
             options = {name: props.get(name) for name in names if name in props}
-            # Before the base class sees it, which has another idea of a pass and warns.
+            # Before the base class sees it, which means something else by a pass and warns.
             if "samples_per_pass" in props:
                 del props["samples_per_pass"]
             super().__init__(props)

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 #: From an image (H, W, C) to dL/dI, of the same shape.
-Derivative: TypeAlias = "Callable[[mi.TensorXf], mi.TensorXf]"  # text: the type is there once a variant is set
+Derivative: TypeAlias = "Callable[[mi.TensorXf], mi.TensorXf]"  # a string: the type exists only after a variant is set
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Job:
 class StepIntegrator(Protocol):
     """Images and gradients; images and dL/dI are tensors (H, W, C), and gradients are added to the job's parameters."""
 
-    #: Whether `correlated` has image and dL/dI evaluated before the rest of its work begins; naive AD has not.
+    #: Whether `correlated` evaluates the image and dL/dI before the rest of its work; naive AD does not.
     image_apart: bool
 
     def image(self, job: Job) -> mi.TensorXf:

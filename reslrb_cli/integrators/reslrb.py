@@ -54,7 +54,7 @@ class LightTracer:
         "samples_per_pass": None,
     }
     image_apart = True
-    #: Which paths there are, and the share of light paths in the samples where there are both kinds.
+    #: Kinds of paths, and the share of light paths in the samples if there are both.
     paths: str = "light"
     light_share: float = 0.5
 
@@ -137,7 +137,7 @@ class LightTracer:
             paths = "light" if light_share else "camera"
         self.paths, self.light_share = paths, light_share
         self.preparation.paths, self.preparation.whole = paths, whole or paths != "light"
-        if paths == "camera":  # of which none begins where a table says
+        if paths == "camera":  # no path starts from a table
             self.preparation.guiding = None
 
     def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
@@ -157,7 +157,7 @@ class LightTracer:
         unit = min(self.samples_per_pass or spp, spp)
         purpose = purpose or (Purpose.IMAGE if job.params is None else Purpose.GRADIENT)
         asked = self.preparation, purpose is Purpose.IMAGE, unit
-        if asked not in job.plans:  # once a step, and not once a batch
+        if asked not in job.plans:  # once per step, not once per batch
             job.plans[asked] = self.preparation.plan(job.scene, job.sensor, job.params, unit, asked[1])
         plan, table = job.plans[asked], None
         guiding = self.preparation.guiding
@@ -221,7 +221,7 @@ class LightTracer:
     def image(self, job: Job, evaluate: bool = True) -> mi.TensorXf:
         """Return the image (H, W, C), without derivatives."""
         with dr.suspend_grad():
-            parts = self.passes(job, Purpose.IMAGE)  # an image has no use for what derivatives ask of a walk
+            parts = self.passes(job, Purpose.IMAGE)  # an image needs nothing that derivatives need
             if not evaluate:
                 return image_of(parts)
             image = self.launch("image", parts, image_of)
@@ -431,7 +431,7 @@ def trace_image(estimator: Estimator, samples: list[Samples]) -> tuple[mi.Tensor
         film = samples[0].film
         block = film.block()
         state = forward(samples[0], estimator, block)
-        # One kernel: all that it yields is evaluated together, since what came later would trace everything again.
+        # One kernel: all outputs are evaluated together, because a later evaluation would trace everything again.
         dr.schedule(block.tensor())
         dr.eval(state)
         image = film.develop(block)
@@ -466,8 +466,8 @@ def replay_all(
     if state is None:
         differentiate_passes(samples, estimator, None, adjoint, params)
         return
-    # Isolated: on their way to the parameters gradients are evaluated, and with them all that they hang on, which is to
-    # be one kernel. They set out once, at the end.
+    # Isolated: on their way to the parameters, gradients are evaluated with everything they depend on, which must be
+    # one kernel. They start together at the end.
     with dr.isolate_grad():
         replay(samples[0], estimator, state, adjoint)
 

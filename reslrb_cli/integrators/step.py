@@ -34,10 +34,10 @@ from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator, hal
 Adjoint = Literal["correlated", "independent", "batched"]
 Objective: TypeAlias = "Callable[[mi.TensorXf], mi.Float | mi.TensorXf]"
 
-#: Told of an image and of the dL/dI that its samples were differentiated with.
+#: Called with an image and the dL/dI with which its samples were differentiated.
 OnSamples: TypeAlias = "Callable[[mi.TensorXf, mi.TensorXf], None]"
-BATCH_STREAM = 0xBA7C4E5  # keeps the batches' seeds apart from those of passes and of the second samples
-HALF_STREAM = 0x4A1F5  # and those of halves from all of these
+BATCH_STREAM = 0xBA7C4E5  # separates the batches' seeds from those of passes and of the second samples
+HALF_STREAM = 0x4A1F5  # separates the seeds of halves from all of these
 NONE = 0xFFFFFFFF
 
 
@@ -57,7 +57,7 @@ class Refused:
         """Return dL/dI with 0 for entries that are not finite, and add them to the count; neither is evaluated here."""
         self.shape, flat = gradient.shape, gradient.array
         bad = ~dr.isfinite(flat)
-        # Atomics of the lanes that are not finite alone: none where nothing is wrong.
+        # Only lanes with non-finite values use atomics: none if nothing is wrong.
         dr.scatter_reduce(dr.ReduceOp.Add, self.count, mi.UInt32(1), mi.UInt32(0), bad, dr.ReduceMode.Direct)
         index = dr.arange(mi.UInt32, dr.width(flat))
         dr.scatter_reduce(dr.ReduceOp.Min, self.first, index, mi.UInt32(0), bad, dr.ReduceMode.Direct)
@@ -101,8 +101,8 @@ def make_integrator(type: str, **options: Any) -> StepIntegrator:
     properties = mi.Properties(type)
     for name, value in given.items():
         properties[name] = value
-    # `mi.load_dict` would look for a library `plugins/prb.so`, and so run one that lies in the working folder: it does
-    # not know of plugins that are written in Python.
+    # `mi.load_dict` would search for a library `plugins/prb.so` and run one from the working folder: it does not know
+    # plugins written in Python.
     integrator = mi.PluginManager.instance().create_object(properties)
     if properties.unqueried():
         raise ValueError(f"{type} has no option {', '.join(properties.unqueried())}")
@@ -113,7 +113,7 @@ def interface_of(integrator: StepIntegrator | mi.Integrator) -> StepIntegrator:
     """Return the step interface of a plugin, or of an object that already is one."""
     if not isinstance(integrator, mi.Integrator):
         return integrator
-    tracer: StepIntegrator | None = getattr(integrator, "tracer", None)  # of the plugins that are made here
+    tracer: StepIntegrator | None = getattr(integrator, "tracer", None)  # of the plugins that are created here
     if tracer is not None:
         return tracer
     if isinstance(integrator, mi.AdjointIntegrator):
@@ -158,7 +158,7 @@ class Halves:
             self.work.correlated(second, of_second)
             return gradients[0]
 
-        self.work.correlated(first, of_first)  # the first half is traced, then the second; then both are differentiated
+        self.work.correlated(first, of_first)  # trace the first half, then the second, then differentiate both
         return images[0]
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:

@@ -20,19 +20,19 @@ from reslrb_cli.lens import transport
 from reslrb_cli.lens.solid import ply_file
 from reslrb_cli.lens.surface import Array, Rays, Setting, Surface, transmitted
 
-#: Reflectance of the receiver, and its width in pictures.
+#: Reflectance of the receiver, and its width in widths of the picture.
 ALBEDO, SCREEN = 0.8, 3.0
 
-#: Of the distance, where the camera stands before the receiver.
+#: Distance of the camera before the receiver, as a multiple of the receiver's distance.
 _CAMERA = 0.75
 
-#: Between the lamp of a lens and its plane face, in mm.
+#: Distance between a lens's lamp and its plane face, in mm.
 _GAP = 1.0
 
-#: Directions in which the light of a sun comes; each of them is parallel.
+#: Number of directions of sunlight; the light of each is parallel.
 SUNS = 19
 
-#: Of the longer side: a plate that is thinner costs, so that the face keeps off its back.
+#: Thickness as a fraction of the longer side; a thinner plate is penalised, so that the face stays away from the back.
 _LEAST = 0.02
 
 
@@ -46,7 +46,7 @@ def leaving(surface: Surface) -> float:
     x, y = transport.grid((ny, nx), setting.size)
     light = float(np.sum(Rays(setting).arriving(x, y, h, gx, gy))) * np.prod(setting.size) / (nx * ny)
     if setting.kind == "lens" and not np.isfinite(setting.light_distance):
-        light = light * float(transmitted(np.array(1.0), setting.ior))  # a point light has that of its plane face in it
+        light = light * float(transmitted(np.array(1.0), setting.ior))  # a point light's value includes its plane face
     return float(light)
 
 
@@ -70,7 +70,7 @@ def at_vertices(surface: Surface, nx: int, ny: int) -> Array:
         h = np.moveaxis(h, 0, axis)
     cells = surface.heights.shape
     at = [np.linspace(0.5, n + 0.5, count) for n, count in zip(cells, (ny, nx), strict=True)]  # of the padded map
-    # not ndimage's spline, which takes what lies beyond the edges for a mirror image: a dome's edge would be bent
+    # not ndimage's spline, which mirrors the map at its edges and would bend the edge of a dome
     spline = RectBivariateSpline(*(np.arange(n) for n in h.shape), h)
     return np.asarray(spline(*at))
 
@@ -143,13 +143,13 @@ def lamps(surface: Surface, power: float, sun: float) -> str:
     wide, high = setting.size[0] * float(np.cos(np.radians(setting.incidence))), setting.size[1]
     start = np.array([0.0, 0.0, -setting.thickness - _GAP]) if setting.kind == "lens" else -beam * setting.distance
     if setting.kind == "mirror" and setting.outline == "rectangle":
-        # oblique light meets what stands out of the plane beside it; what passes the mirror is lost
+        # oblique light meets parts beside it that stand out of the plane; light that passes the mirror is lost
         wide += 2 * surface.relief * abs(float(np.sin(np.radians(setting.incidence))))
     shape = "rectangle" if setting.outline == "rectangle" else "disk"
     if not sun:
         return _plane(shape, "lamp", (wide, high), start, beam, np.array([0.0, 1, 0]), _emitter("beam", power))
-    # A sunflower's spiral of directions, each as much of the disk; the lamps stand so far away that none hides another,
-    # and their beams are wider than the face by what an end of it lies nearer than the middle.
+    # Directions on a sunflower spiral, with equal areas of the disk each. The lamps are so far away that none hides
+    # another, and their beams are wider than the face by the depth of its tilt.
     radius = np.radians(sun) / 2
     far = 4 * max(setting.size) / (radius * np.sqrt(np.pi / SUNS))
     side, up, parts = np.cross(np.array([0.0, 1, 0]), beam), np.array([0.0, 1, 0]), []
@@ -225,7 +225,7 @@ def scene_xml(
         rays.up, f'<bsdf type="diffuse">\n            <rgb name="reflectance" value="{ALBEDO:g}"/>\n        </bsdf>',
     )  # fmt: skip
     camera = rays.middle - away * rays.normal
-    # Behind an opaque receiver a camera sees nothing. A mirrored one before it sees the same as one behind it.
+    # Behind an opaque receiver a camera sees nothing. A mirrored camera before it sees the same as one behind it.
     mirrored = '\n            <scale x="-1"/>' if setting.through else ""
     return f"""<?xml version="1.0" encoding="utf-8"?>
 <!-- A {setting.kind} that throws a picture; written by reslrb lens. Millimetres, y up: docs/lens.md, "Axes". -->

@@ -27,13 +27,13 @@ from reslrb_cli.lens.workshop import cutter
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-#: From the lowest place of a face's edge down to its rim, in mm: walls of no height would be triangles of no area.
+#: From the lowest point of a face's edge to its rim, in mm: walls without height would be triangles without area.
 RIM_STEP = 0.1
 
-#: Vertices nearer to a round outline than this part of the grid's pitch are moved onto it: no slivers are cut off.
+#: Vertices closer to a round outline than this part of the grid's pitch are moved onto it, which avoids slivers.
 _NEAR = 0.1
 
-#: Of the size of a face: what counts as the same place, and as the size that was asked for.
+#: Tolerances relative to the size of a face, for equal positions and for the requested size.
 _SAME, _SIZE = 1e-5, 1e-3
 
 
@@ -154,7 +154,7 @@ def make_solid(sheets: Sequence[Sheet], plan: Fabrication) -> Solid:
     if len(sheets) == 2:
         build.zip(build.add_face(sheets[1], plan, -1), outer)
     else:
-        # A point in its middle and the outline: the flat back needs no grid.
+        # A point in the middle and the outline suffice: the flat back needs no grid.
         below = build.copy(outer, -plan.thickness)
         build.zip(below, outer)
         middle_point = build.add(np.array([[0.0, 0.0, -plan.thickness]]))[0]
@@ -276,7 +276,7 @@ def cut_round(sheet: Sheet, half: tuple[float, float]) -> tuple[Array, Indices]:
         if (p, q) not in known:
             a, d = points[p, :2] / axes, (points[q, :2] - points[p, :2]) / axes
             half_b, c = a @ d, a @ a - 1
-            t = -c / (half_b + np.sqrt(half_b**2 - (d @ d) * c))  # the root above 0, without cancellation
+            t = -c / (half_b + np.sqrt(half_b**2 - (d @ d) * c))  # the positive root, without cancellation
             known[p, q] = len(points) + len(made)
             made.append(points[p] + t * (points[q] - points[p]))
         return known[p, q]
@@ -296,7 +296,7 @@ def cut_round(sheet: Sheet, half: tuple[float, float]) -> tuple[Array, Indices]:
     return everything[used], renamed.reshape(-1, 3).astype(np.int64)
 
 
-# ---- what a maker wants to know
+# ---- data for the maker
 
 
 def within(sheet: Sheet, plan: Fabrication) -> NDArray[np.bool_]:
@@ -456,7 +456,7 @@ def stl(solid: Solid) -> bytes:
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     records: NDArray[Any] = np.zeros(len(corners), [("normal", "<f4", 3), ("at", "<f4", (3, 3)), ("extra", "<u2")])
     records["normal"], records["at"] = normal, corners
-    # Not "solid": by that word files in text begin.
+    # Not "solid": text files start with this word.
     return b"reslrb, millimetres".ljust(80) + np.uint32(len(corners)).astype("<u4").tobytes() + records.tobytes()
 
 
@@ -503,7 +503,7 @@ def three_mf(solid: Solid) -> bytes:
     corners = (lib3mf.Triangle * len(triangles)).from_buffer_copy(triangles.tobytes())
     mesh.SetGeometry(positions, corners)
     model.AddBuildItem(mesh, wrapper.GetIdentityTransform())
-    before = locale.setlocale(locale.LC_ALL)  # lib3mf leaves it at C, where files of text are taken for ASCII
+    before = locale.setlocale(locale.LC_ALL)  # lib3mf leaves the locale at C, in which text files are read as ASCII
     try:
         with tempfile.TemporaryDirectory(prefix="reslrb-3mf-") as folder:
             path = Path(folder) / "solid.3mf"
@@ -513,5 +513,5 @@ def three_mf(solid: Solid) -> bytes:
         locale.setlocale(locale.LC_ALL, before)
 
 
-#: What writes a solid, by the suffix of its file.
+#: Writers of a solid, by file suffix.
 WRITERS: dict[str, Callable[[Solid], bytes]] = {".stl": stl, ".3mf": three_mf, ".obj": obj, ".ply": ply}

@@ -117,7 +117,7 @@ class Rays:
             bent = self.toward / s.ior
             bent[2] = np.sqrt(1 - bent[0] ** 2 - bent[1] ** 2)
             return self._everywhere(bent, x), np.full(np.shape(x), bent[2])
-        # a point light's rays pass the plane face at a radius r about its foot, and meet the other at `radius`
+        # a point light's rays cross the plane face at radius r from its foot, and meet the other face at `radius`
         gap, deep = -s.thickness - self.light[2], h + s.thickness
         dx, dy = x - self.light[0], y - self.light[1]
         radius = np.maximum(np.hypot(dx, dy), 1e-9)
@@ -154,7 +154,7 @@ class Rays:
 
     def arriving(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
         d, plane = self.incoming(x, y, h)
-        meets = (d[2] - d[0] * gx - d[1] * gy) / d[2]  # of a sloped face more or less than of a plane
+        meets = (d[2] - d[0] * gx - d[1] * gy) / d[2]  # a sloped face changes it slightly
         light = plane * np.maximum(meets, 0)
         if self.setting.kind == "lens":
             cosine = (d[2] - d[0] * gx - d[1] * gy) / np.sqrt(1 + gx * gx + gy * gy)
@@ -204,7 +204,7 @@ def shape_surface(
     target = on_receiver(np.asarray(picture, np.float64), setting.through)
     start, chosen = _start(rays), floor == "auto"
     if floor == "auto":
-        with np.errstate(invalid="ignore", divide="ignore"):  # of trials that send light nowhere
+        with np.errstate(invalid="ignore", divide="ignore"):  # of trials that send no light
             found = transport.least_floor(rays, target, setting.size, setting.picture_size, start)
             is_lit = found is not None or transport.least_floor(
                 rays, target, setting.size, setting.picture_size, start, [0.9]
@@ -228,7 +228,7 @@ def shape_surface(
 
     made = solved(floor)
     if chosen and floor < transport.FOR_LINES and made.residual > transport.UNSOLVED:
-        floor = transport.FOR_LINES  # of dark lines that the trials' grid does not see
+        floor = transport.FOR_LINES  # of dark lines that are too fine for the trials' grid
         made = solved(floor)
     target = transport.lifted(target, floor)
     if not made.converged:
@@ -276,7 +276,7 @@ def _start(rays: Rays) -> Array:
     return np.concatenate([[0.0], fit.x])
 
 
-# ---- what cannot be
+# ---- impossible designs
 
 
 def is_even(picture: Array) -> bool:

@@ -29,15 +29,15 @@ Array = NDArray[np.float64]
 
 #: Cells along the shorter side of the first grid.
 COARSEST = 16
-#: Steps on a grid, and the root mean square of (1)'s logarithm at which it is left.
+#: Steps on a grid, and the root mean square of (1)'s logarithm at which the grid is left.
 STEPS, TOLERANCE = 12, 2e-3
-#: What residual a solution may have, and how much the picture is blurred (pixels) where sharp it led to none.
+#: Accepted residual of a solution, and the blur of the picture (pixels) if the sharp picture has no solution.
 GOOD, BLURS = 0.05, (4.0, 2.0, 1.0, 0.5, 0.0)
-#: Powers of picture and light that lead up to these, on the first grid.
+#: Exponents of picture and light before the full ones, on the first grid.
 CONTRASTS = (0.2, 0.4, 0.6, 0.8)
-#: Light outside of an aperture that does not fill its rectangle, as a fraction of the most within.
+#: Light outside an aperture that does not fill its rectangle, as a fraction of the maximum inside.
 DIM = 0.01
-#: Cells over which it fades there.
+#: Number of cells over which it fades.
 FADE = 0.7
 
 
@@ -110,7 +110,7 @@ def _shares(old: int, new: int, between: bool) -> Array:
     edges = np.arange(new + 1) * (old / new)
     low = np.maximum(edges[:-1, None], np.arange(old))
     shares = np.maximum(np.minimum(edges[1:, None], np.arange(1, old + 1)) - low, 0)
-    # Rounding leaves slivers, through which a clipped or infinite cell would reach cells that it does not overlap.
+    # Rounding leaves slivers, through which a clipped or infinite cell would reach cells without overlap.
     shares[shares < 1e-6] = 0
     return np.asarray(shares / shares.sum(axis=1, keepdims=True))
 
@@ -155,12 +155,12 @@ def solve(
         state = _State(*_even(start, n, size), size, start) if state is None else _finer(state, n)
         nu = _shrunk(picture, max(n[0] / picture.shape[0], n[1] / picture.shape[1]))
         nu = nu / nu.mean()
-        if n == levels[-1]:  # from even light to the picture's contrasts
+        if n == levels[-1]:  # from uniform light to the picture's contrasts
             for contrast in CONTRASTS:
                 _newton(state, optics, nu, target, STEPS, contrast)
         before = _copied(state)
         _newton(state, optics, nu, target, STEPS)
-        if state.residual > GOOD:  # steps end at the picture's edges: from a picture without any
+        if state.residual > GOOD:  # steps end at the picture's edges, so start with a picture without edges
             steps, state = state.steps, before
             for width in BLURS:
                 trial = _copied(state)
@@ -285,7 +285,7 @@ class _Equation:
             np.stack([np.stack([self.D[1, 1], -self.D[0, 1]]), np.stack([-self.D[1, 0], self.D[0, 0]])]) / self.det
         )
         middle = (self.B[0][..., 1:] + self.B[0][..., :-1]) / 2
-        A = np.einsum("ab...,bc...->ac...", inverse, middle)  # (1) is A : D^2 v, and terms of lower order
+        A = np.einsum("ab...,bc...->ac...", inverse, middle)  # (1) is A : D^2 v plus terms of lower order
         scale = 2 / (A[0, 0] + A[1, 1])
         self.scale, self.inverse = scale, inverse * scale
         self.weights = float(np.mean(A[0, 0] * scale)), float(np.mean(A[1, 1] * scale))
@@ -319,7 +319,7 @@ class _Equation:
             spectrum[0, 0] = 0
             return scipy.fft.idctn(spectrum, norm="ortho", workers=-1)
 
-        def apply(w: Array) -> Array:  # the mean of w stands for the constant up to which (1)'s logarithm is known
+        def apply(w: Array) -> Array:  # (1)'s logarithm is known up to a constant, which is the mean of w
             w = w.reshape(shape)
             return (self.along(potential(w)) + self.scale * w.mean()).ravel()
 
@@ -422,7 +422,7 @@ def _copied(state: _State) -> _State:
 
 def _finer(state: _State, shape: tuple[int, int]) -> _State:
     """Return the state on a finer grid, by cubic splines, including the slopes at the edges."""
-    ring = 8  # for splines, whose reach is that of a few cells
+    ring = 8  # for splines, which reach over a few cells
     p = np.pad(_padded(state.h, state.slopes, state.cell), ring, mode="reflect", reflect_type="odd")
     ny, nx = state.h.shape
     places = np.meshgrid(
@@ -448,7 +448,7 @@ def _told(state: _State, optics: Optics, picture: Array, target: tuple[float, fl
     D = equation.D * np.array([state.size[0] / target[0], state.size[1] / target[1]])[:, None, None, None]
     result.folded = float(np.mean((equation.det <= 0)[lit]))
     ways = np.moveaxis(D, (0, 1), (-2, -1))[lit]
-    seen = bool(np.all(np.isfinite(ways)))  # else light is totally reflected, or misses the receiver
+    seen = bool(np.all(np.isfinite(ways)))  # otherwise light is totally reflected or misses the receiver
     result.stretch = float(np.max(np.linalg.norm(ways, 2, axis=(-2, -1)))) if seen else np.inf
     coarse = (min(picture.shape[0], state.h.shape[0]), min(picture.shape[1], state.h.shape[1]))
     picture = resized(picture, coarse)
@@ -501,11 +501,11 @@ def through_tent(picture: Array) -> Array:
 # ---- dark tones
 
 
-#: Floors that are tried under dark tones, as fractions of the picture's maximum, on a grid of at most so many cells.
+#: Floors tried under dark tones, as fractions of the picture's maximum, on a grid with at most this many cells.
 FLOORS, TRIAL = (0.0, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3), 64
-#: How much more than evenly anything may be lengthened before that counts as a tear.
+#: Stretch beyond that of uniform light that counts as a tear.
 TORN = 8.0
-#: The residual above which a grid has no solution as sharp as the picture, and the floor for lines finer than `TRIAL`.
+#: Residual above which a grid has no solution as sharp as the picture, and the floor for lines finer than `TRIAL`.
 UNSOLVED, FOR_LINES = 0.03, 0.1
 
 
@@ -527,7 +527,7 @@ def least_floor(
         made = solve(optics, lifted(small, floor), size, target, shape, start)
         return made.converged and not made.folded and made.stretch < TORN
 
-    low, high = -1, len(floors)  # the last that is known to be too low, the first that is known to do
+    low, high = -1, len(floors)  # the highest floor known to be too low, and the lowest that suffices
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if good(floors[middle]) else (middle, high)

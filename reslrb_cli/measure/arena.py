@@ -20,11 +20,11 @@ from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.workers import Begin
 from reslrb_cli.records.measurements import BenchStatus
 
-#: Where all together hold more than this share of the memory, each releases its own after a step.
+#: If all processes together hold more than this share of the memory, each releases its own after a step.
 MEMORY_SHARE = 0.7
 MIB = 2**20
 
-#: Starts a process by its first message and the name of what it does.
+#: Starts a process from its first message and the name of its task.
 Start = Callable[[dict[str, Any], str], Any]
 Worker = TypeVar("Worker", bound=Contestant)
 Item = TypeVar("Item")
@@ -50,10 +50,10 @@ class Arena(Generic[Measured, Worker]):
     and are continued. Raises ConfigError if they belong to another measurement.
     """
 
-    #: The most rounds.
+    #: Maximum number of rounds.
     MOST_ROUNDS = 256
 
-    #: Share of the budget, and seconds beside it, that are left for the statistics and the picture.
+    #: Share of the budget, and seconds, that are reserved for the statistics and the plot.
     AFTERWARDS, AFTERWARDS_S = 0.03, 2.0
 
     def __init__(
@@ -141,7 +141,8 @@ class Arena(Generic[Measured, Worker]):
         self._warn(opening or {})
         return opening
 
-    # --- what is said -------------------------------------------------------------------------------------------------
+    # --- messages
+    # ---------------------------------------------------------------------------------------------------------
 
     def _first(self, config: Config, arrays: str) -> dict[str, Any]:
         """Return the first message to a worker, with the file of the referee's arrays under the name `arrays`."""

@@ -26,7 +26,7 @@ from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import BenchRecord, BenchStatus, Spread
 
-#: What is measured of every step.
+#: Measured quantities of every step.
 TIMES = ("step_ms", "kernel_ms", "codegen_ms", "tracing_ms")
 
 
@@ -124,7 +124,7 @@ def _ratio(run: BenchRun, baseline: BenchRun, key: str) -> Spread | None:
     return Spread.of(ratios) if ratios else None
 
 
-#: First steps that take longer are told of as they are done, in seconds.
+#: First steps that take longer are reported when they are done, in seconds.
 SLOW = 10.0
 
 
@@ -239,7 +239,7 @@ class Bench(Arena[Sweep, BenchRun]):
             self._say(
                 f"{name}: together the cases need more than the available memory; each releases its memory after a step"
             )
-        # Rounds go on from those of an earlier session, whose numbers made the seeds, until all have enough of them.
+        # Rounds continue after those of an earlier session, whose numbers set the seeds, until all have enough.
         first = 1 + max((round for run in self.members for round in run.steps), default=-1)
         return self._take_rounds(self._alive, first, min((len(run.steps) for run in self._alive()), default=0))
 
@@ -248,6 +248,6 @@ class Bench(Arena[Sweep, BenchRun]):
         late, warm = sum(run.late for run in self.members), len(self._alive())
         if warm == 0:
             return "; nothing had compiled by then, so allow several times as much"
-        # What has not compiled is taken to take as long as what has; deeper paths take longer.
+        # Kernels that are not compiled yet are assumed to take as long as the compiled ones; deeper paths take longer.
         further = late / warm + sum(GROWTH**k for k in range(1, left))
         return f"; everything takes about {self._pace.spent_s + self._pace.depth_s * further:.0f} s"

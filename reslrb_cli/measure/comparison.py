@@ -36,8 +36,8 @@ from scipy import stats
 
 from reslrb_cli.records.measurements import Comparison, Verdict
 
-#: Probability that a comparison of two equal expectations fails, for each of its two criteria. Seeds are fixed, so that
-#: a test that passes once passes always.
+#: Probability that a comparison of two equal expectations fails, for each of its two criteria. Seeds are fixed, so a
+#: test that passes once always passes.
 ALPHA = 1e-4
 
 
@@ -53,7 +53,7 @@ def z_scores(a: np.ndarray, b: np.ndarray, rounding: float = 1e-5) -> np.ndarray
     error = np.sqrt(var_a + var_b + floor)
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.where(mean_a == mean_b, 0.0, (mean_a - mean_b) / error)
-        # The rounding floor counts as known exactly.
+        # The rounding floor has no uncertainty.
         spread = var_a**2 / (len(a) - 1) + var_b**2 / (len(b) - 1)
         freedom = np.where(spread > 0, (var_a + var_b + floor) ** 2 / spread, np.inf)
     return _normal_scores(t, freedom)
@@ -76,7 +76,7 @@ def paired_z_scores(difference: np.ndarray, floor: Any = 0.0, bias: Any = 0.0) -
 def _normal_scores(t: np.ndarray, freedom: np.ndarray) -> np.ndarray:
     """Return the standard normal z of the same probability as Student's t."""
     z = -np.sign(t) * stats.norm.ppf(stats.t.sf(np.abs(t), np.minimum(freedom, 1e6)))
-    # Beyond what doubles resolve: as bad as t says.
+    # Beyond the resolution of doubles, the t distribution decides.
     return np.where(np.isfinite(z), z, t)
 
 
@@ -112,13 +112,13 @@ def effective_entries(samples: np.ndarray) -> float:
     return max(1.0, entries / (1 + (moving - 1) * correlation))
 
 
-#: Tiles of a texture along each side, the finest division first.
+#: Tiles of a texture along each side, the finest first.
 TILES = (8, 4, 2, 1)
 
-#: Parameters with no more entries than these may be compared entry by entry.
+#: Largest number of entries that are compared one by one.
 FEW = 48
 
-#: Projections of a parameter that has more.
+#: Number of projections of a larger parameter.
 PROJECTIONS = 16
 
 
@@ -155,7 +155,7 @@ def overall(samples: np.ndarray) -> np.ndarray:
     if size <= FEW:
         return total
     random = np.random.default_rng(size)
-    # One after the other: together they would take more memory than the samples.
+    # One by one: together they would take more memory than the samples.
     projections = [samples @ (2.0 * random.integers(0, 2, size) - 1.0) for _ in range(PROJECTIONS)]
     return np.concatenate([np.stack(projections, 1), total], 1)
 
@@ -166,28 +166,28 @@ def entry_count(shape: tuple[int, ...]) -> int:
     return parts(none, shape, divisions(shape)[0]).shape[1] + overall(none).shape[1]
 
 
-#: Probability with which a deviation of the size `detectable` is seen.
+#: Probability of detecting a deviation of the size `detectable`.
 POWER = 0.9
 
-#: Relative error that single precision alone may cause in a sum over many samples, added to the standard error.
+#: Relative error of single precision in a sum over many samples, which is added to the standard error.
 ROUNDING = 1e-4
 
-#: Where not even a deviation by this fraction of the gradient would have been seen, as of one that is missing, nothing
-#: is said.
+#: If a deviation by this fraction of the gradient, such as that of a missing gradient, would not be detected, the
+#: comparison is open.
 RESOLUTION = 1.0
 
-#: Tails are too heavy for z scores where the mean kurtosis of the entries' samples lies above this fraction of the way
-#: from that of normal deviates to the greatest that N samples can have, which is that of one outlier.
+#: Tails are too heavy for z scores if the mean kurtosis of the entries' samples exceeds this fraction of the way from
+#: normal deviates to the largest value of N samples, which is that of one outlier.
 TAIL = 0.5
 
-#: A parameter is divided no finer than its tiles have tails lighter than this: z of skewed samples is too large.
+#: Only divisions into tiles with lighter tails are used: z scores of skewed samples are too large.
 TILE_TAIL = 0.12
 
-#: Tails of noise below so many times what rounding may cause do not matter, nor those of noise so many times below what
-#: the reference may be wrong by: no z score is large for them.
+#: Tails do not matter if the noise is less than this many times the rounding error, or this many times smaller than the
+#: error of the reference: no z score becomes large.
 NOISY = 10
 
-#: Fewer seeds than these say nothing of tails.
+#: Fewer seeds tell nothing about tails.
 TAIL_SEEDS = 8
 
 

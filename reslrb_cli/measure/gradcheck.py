@@ -33,11 +33,10 @@ from reslrb_cli.measure.sampling import NAIVE, Engine, Name, Sampling
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
 
-#: What a stock integrator on the same paths differs by from this one, relative to the entries: whether a point is
-#: visible is another matter of rounding to each.
+#: Relative difference of a stock integrator on the same paths: it rounds the visibility of points differently.
 STOCK_ROUNDING = 1e-3
 
-#: References that know the gradient along a few directions alone.
+#: References that know the gradient only along a few directions.
 ALONG_DIRECTIONS = (Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE)
 
 

@@ -332,8 +332,8 @@ DEFAULTS = {
     "image": "ptracer,prb,reslrb:stack,reslrb:stack(paths=camera),reslrb:stack(paths=both)",
 }
 
-#: Default reference for errors. Its paths are `both`, with a fixed share, if the scene allows it, and otherwise the
-#: paths that can render the scene.
+#: Default reference for errors. It uses both kinds of paths with a fixed share if the scene allows it, and otherwise
+#: the kind that can render the scene.
 REFERENCE = "reslrb:stack(paths=auto)"
 
 #: An `rr_depth` at which Russian roulette never starts.
@@ -377,7 +377,7 @@ class Plan(Measurement):
         """
         spp = self.config.run.spp
         sides = [self._has_camera_paths(self.config_of(case, spp)) for case in self.cases]
-        named = self._has_camera_paths(self.reference_config)  # the reference counts, too
+        named = self._has_camera_paths(self.reference_config)  # the reference is one of them
         return {"camera": named or any(sides), "named": named or not self.default,
                 "light": not (named and all(sides))}  # fmt: skip
 

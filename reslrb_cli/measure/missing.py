@@ -55,10 +55,10 @@ from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.needs import camera_finds_all
 from reslrb_cli.statistics import jackknife_variance
 
-#: Seeds that steps are chosen with, and the fewest that a share is made of.
+#: Seeds for choosing steps, and the minimum for a share.
 PILOT_SEEDS, FEWEST = 4, 4
 
-#: How often the largest step is halved.
+#: Number of times that the largest step is halved.
 HALVINGS = 8
 
 
@@ -115,7 +115,7 @@ def share_of(whole: np.ndarray, missing: np.ndarray, left: np.ndarray) -> tuple[
     found = _ratio(missing, whole)
     if np.square(part).sum() <= NOTHING**2 * (np.square(error) + left).sum():
         return found, float(np.sqrt((np.square(error) + left).sum() / size))
-    # The part's own noise and that of the whole: by leaving out one seed after the other (jackknife).
+    # The noise of the part and of the whole: leave out one seed at a time (jackknife).
     without = [_ratio(np.delete(missing, i, 0), np.delete(whole, i, 0)) for i in range(len(whole))]
     variance = jackknife_variance(np.array(without))
     truncation = (np.square(part) @ left) / np.square(part).sum() / size
@@ -135,7 +135,7 @@ def _with_step(case: Case, differenced: Any, direction: Direction, spp: int) -> 
     pilot = seeds(PILOT_SEEDS, 9)
     found = np.transpose([_differences(case, differenced, direction, steps, seed, spp) for seed in pilot])
     change, noise = _mean(np.diff(extrapolated(found[1:], found[:-1]), axis=0).T)
-    # From step to step; one that agrees with both its neighbours is no coincidence.
+    # Difference from step to step; agreement with both neighbours is no coincidence.
     changed = np.abs(change) + noise
     return replace(direction, step=steps[2 + int(np.argmin(changed[:-1] + changed[1:]))])
 
@@ -151,13 +151,13 @@ def _mean(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return samples.mean(0), samples.std(0, ddof=1) / np.sqrt(len(samples))
 
 
-#: Light paths of the image that dL/dI is taken at.
+#: Light paths of the image at which dL/dI is taken.
 IMAGE_PATHS = 2**22
 
-#: What is kept says that it is of this.
+#: Kind of measurement in the file of samples.
 KIND = "gradcheck --missing"
 
-#: The estimator whose gradient is looked at: exact, and attached where anything moves.
+#: Estimator of the checked gradient: exact, and attached if anything moves.
 ESTIMATOR = "stack"
 
 
@@ -187,7 +187,7 @@ class MissingCheck:
         self._differenced = make_integrator("walk_ad", **shared, rr_depth=NEVER if ends(depth) else options["rr_depth"])
         count_of_each = along or MOVING_DIRECTIONS
         self._directions = all_directions(self.case, problem.selection, count_of_each, count_of_each)
-        #: By parameter, as far as they have been looked at, in the order of `case.keys`.
+        #: By parameter, in the order of `case.keys`, as far as measured.
         self._found: dict[str, Missing] = {} if earlier is None else self._restore(earlier)
 
     def conditions(self) -> str:
@@ -250,17 +250,17 @@ class MissingCheck:
             raise ConfigError(
                 self.source, "loss", "has no derivative at the initial values, which equal those of the target"
             )
-        # Its size has no part in a share, and tiny numbers would vanish beside the rounding of a sum.
+        # The size of dL/dI does not affect a share, and tiny numbers would vanish in the rounding of a sum.
         self.case.weigh(weights / np.abs(weights).mean())
 
 
 # --- before a run's first iteration -----------------------------------------------------------------------------------
 
-#: Steps of the differences, in tenths of the size of what moves. The longer one has less noise at edges. It is taken
-#: where the shorter one tells too little, and both agree.
+#: Steps of the differences, in tenths of the size of the moving object. The longer step has less noise at edges. It is
+#: used if the shorter one is too noisy and both agree.
 SHORT, LONG = 0.01, 0.25
 
-#: Seeds and views, at most.
+#: Maximum numbers of seeds and views.
 MOST_SEEDS, MOST_VIEWS = 64, 4
 
 
@@ -292,7 +292,7 @@ def measure_missing(problem: Problem) -> list[MissingRecord]:
     """
     selection, kind = problem.selection, problem.config.integrator.type
     moving = [key for key in selection.keys if key not in selection.factors and moves_light(selection.params, key)]
-    if not moving or kind == "custom" or kind.endswith("_projective"):  # which have edges, or may have
+    if not moving or kind == "custom" or kind.endswith("_projective"):  # these have edge terms, or may have them
         return []
     problem.apply()
     try:

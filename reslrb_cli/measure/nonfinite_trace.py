@@ -120,7 +120,7 @@ def purposes(problem: Problem, view: View) -> list[tuple[int, str, Purpose]]:
     return found
 
 
-#: What may not be finite; `Suspect.kind` is the index.
+#: Quantities that may be non-finite; `Suspect.kind` is the index.
 QUANTITIES = (
     "nothing",
     "emission E",
@@ -407,7 +407,7 @@ def find_offenders(problem: Problem, iteration: int) -> list[Offender]:
     apart = problem.config.shards != 1
     views = {view.sensor: view for view in problem.views}
     seeds = [(sensor, "", seed(problem.config.run.seed, iteration, sensor, "image")) for sensor in views]
-    if guiding_of(problem) is not None:  # what is not drawn in this iteration has taught no table anything
+    if guiding_of(problem) is not None:  # a sensor that was not drawn in this iteration has updated no table
         drawn = {view.sensor for view, _ in problem.drawn(iteration)}
         seeds = [each for each in seeds if each[0] in drawn]
     if apart:
@@ -431,12 +431,12 @@ def _of_view(problem: Problem, view: View, step_seed: int, word: str) -> Offende
     guiding = guiding_of(problem)
     witness = None if guiding is None else Witness(guiding)
     if witness is not None and problem.config.shards != 1:
-        witness.held = True  # as it is while shards are computed
+        witness.held = True  # as during the computation of shards
     if witness is not None:
         problem.integrator.preparation.draw_from(witness, problem.scene)
     step = _take_step(problem, view, step_seed)
     if problem.config.integrator.type not in LIGHT_TRACERS:
-        return _of_step(step, view, None)  # whose paths are not ours
+        return _of_step(step, view, None)  # their paths are not ours
     if not is_attached(problem):
         _set_tangents(problem)
     pixel = None if step.refused is None else step.refused[:2]
@@ -463,12 +463,12 @@ def _parts(
     names = ("max_depth", "rr_depth", "hide_emitters", "sequence")
     shared = {name: given[name] for name in names if name in given}
     own = problem.integrator
-    if shared.get("sequence") == "auto" and isinstance(own, Reslrb):  # which the run decided
+    if shared.get("sequence") == "auto" and isinstance(own, Reslrb):  # as the run decided
         shared["sequence"] = "independent" if own.plan(scene, sensor).sequence is None else "low_discrepancy"
     tracer = Reslrb.of(estimator="gather", **shared)
     if isinstance(own, Reslrb):
         tracer.have_paths(own.paths, own.light_share, own.preparation.whole)
-    # Of what moves light, contributions alone are looked at: `gather` has no derivatives of it.
+    # For moving light, only contributions are checked: `gather` has no derivatives of them.
     params = None if is_attached(problem) else problem.selection.params
     options = problem.config.step_options(shard=True)
     if problem.config.in_rounds:
@@ -477,7 +477,7 @@ def _parts(
     tables: list[Table | None] = [None] * len(sets)
     if witness is not None:
         tracer.expect(pass_spp(problem.config))
-        tracer.preparation.draw_from(witness, scene)  # for the sake of its grid
+        tracer.preparation.draw_from(witness, scene)  # to get its grid
         wanted, noted = purposes(problem, view), iter(witness.drawn[:])
         tables = [next(noted) if witness.serves(purpose) else None for _, _, purpose in wanted]
         sets = [(sets[place][0] + word, *sets[place][1:]) for place, word, _ in wanted]
@@ -495,7 +495,7 @@ def _parts(
 def _set_tangents(problem: Problem) -> None:
     """Give every entry of every parameter the tangent 1, as far as the scene uses it."""
     params, keys = problem.selection.params, problem.selection.keys
-    keys = [key for key in keys if key in params]  # an exposure is no part of any path
+    keys = [key for key in keys if key in params]  # an exposure is not part of any path
     for key in keys:
         leaf = problem.optimizer[key]
         dr.set_grad(leaf, 1.0)

@@ -32,29 +32,29 @@ from reslrb_cli.scene.graph import SceneGraph
 
 Array = np.ndarray
 
-#: Seeds of each measurement; the reference has twice as many, whose first half is the direction. Where these show
-#: nothing, there are `MORE` times as many.
+#: Seeds of each measurement; the reference has twice as many, and its first half is the direction. If these are
+#: inconclusive, there are `MORE` times as many.
 SEEDS, MORE = 16, 4
 
-#: Noise and time of a gradient are measured at so many seeds at least, and at more while so many seconds last.
+#: Minimum number of seeds for the noise and time of a gradient, and seconds during which more are taken.
 LEAST_SEEDS, COST_SECONDS = 4, 10.0
 
-#: Paths are looked at up to so many segments.
+#: Maximum path length that is examined.
 DEEPEST = 5
 
-#: A ratio is another than 1 where it is so many standard errors, and by so much, away.
+#: A ratio differs from 1 if it is this many standard errors and this much away.
 ERRORS, LEAST = 5.0, 0.01
 
-#: What ends so is emission that images are linear in.
+#: Endings of emission parameters in which images are linear.
 LINEAR = (".value", "scale")
 
-#: Of the same paths, sums taken in another order scatter by less.
+#: Relative scatter of sums of the same paths in another order.
 SAME_PATHS = 1e-3
 
-#: BSDFs whose values are linear in the reflectances in them, and by how much these, or lamps, are made darker.
+#: BSDFs whose values are linear in their reflectances, and the factor by which reflectances or lamps are darkened.
 SCALING, DARKER = {"SmoothDiffuse", "TwoSidedBRDF", "BlendBSDF"}, 16.0
 
-#: Constants that slip in, with how they are written.
+#: Frequent wrong constants, and their notation.
 CONSTANTS = {"2": 2.0, "1/2": 0.5, "pi": np.pi, "1/pi": 1 / np.pi, "2 pi": 2 * np.pi, "1/(2 pi)": 0.5 / np.pi,
              "4 pi": 4 * np.pi, "1/(4 pi)": 0.25 / np.pi, "-1": -1.0}  # fmt: skip
 
@@ -277,7 +277,8 @@ class Looking:
             _check(self._stop)
             yield seed
 
-    # --- saying -------------------------------------------------------------------------------------------------------
+    # --- messages
+    # ---------------------------------------------------------------------------------------------------------
 
     def sentence(self, failing: Iterable[GradcheckRecord]) -> str:
         """Return the sentence that says where to look."""

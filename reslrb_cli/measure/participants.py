@@ -41,33 +41,33 @@ from reslrb_cli.records.measurements import Reference
 from reslrb_cli.scene.catalog import parameter_kind, value_shape
 from reslrb_cli.scene.visibility import interior
 
-#: Light paths of one gradient, as near as whole samples per pixel come.
+#: Light paths of one gradient, rounded to whole samples per pixel.
 PATHS = 2**16
 
 #: Directions of finite differences and of forward mode for each parameter.
 DIRECTIONS = 2
 
-#: The same of parameters that move light.
+#: The same for parameters that move light.
 MOVING_DIRECTIONS = 3
 
-#: A depth at which roulette never begins.
+#: A depth at which roulette never starts.
 NEVER = 1_000_000
 
-#: What attached derivatives that are compared with each reference have, where that is not as the user has it. Naive AD
-#: follows everywhere, and `ptracer` does not differentiate the filter's normalisation, as differences do.
+#: Settings of attached derivatives for each reference that differ from the user's. Naive AD follows everywhere;
+#: `ptracer` does not differentiate the filter's normalisation, but differences do.
 ALIKE: dict[Reference, dict[str, str]] = {
     Reference.WALK_AD: {"attached_sampling": "follow"},
     Reference.PTRACER: {"attached_sampling": "follow", "filter_normalization": "detached"},
     Reference.FINITE_DIFFERENCE: {"filter_normalization": "attached"},
 }
 
-#: The integrator whose images are differenced: ours, without roulette where paths end without.
+#: Integrator of the differenced images: ours, without roulette if paths have a maximum length.
 DIFFERENCED = "differenced"
 
-#: Steps that tables learn from before guided steps are compared with unguided ones.
+#: Steps that update tables before guided and unguided steps are compared.
 LESSONS = 8
 
-#: Seeds that the step of finite differences is chosen with.
+#: Seeds for choosing the step of finite differences.
 PILOT_SEEDS = 2
 
 
@@ -161,7 +161,7 @@ class Participants:
     def __init__(self, settings: CheckSettings) -> None:
         config, configs, self.known = settings.config, settings.configs(), settings.known
         self._configs = configs
-        # Whatever moves, an estimator that follows it can be made.
+        # Every moving object has an estimator that follows it.
         able = [case.label for case in settings.integrators if _attaches(case)]
         first = (configs[able[0]] if able else next(iter(configs.values()))).with_exposures_fixed()
         built_in = config.scene.file == small.FILE
@@ -178,7 +178,7 @@ class Participants:
         depth = config.integrator.max_depth
         self._situation = Situation.of_problem(problem, sensor)
         self.attached, moved = self._situation.attached, self._situation.moved
-        #: Whether there is a forward mode: of emitters that move there is none.
+        #: Whether there is a forward mode; moving emitters have none.
         nodes = [self.case.params.properties[key][2] for key in moved]
         self.forward_mode = not any(
             isinstance(node, mi.Emitter) or (isinstance(node, mi.Shape) and node.is_emitter()) for node in nodes
@@ -195,7 +195,7 @@ class Participants:
         }
         self.each_way = list(dict.fromkeys(self.ways.values()))
         asked = config.integrator.options().get("guiding", "off")
-        #: By the label of each estimator that a run would guide, or may: the integrator of its unguided steps.
+        #: The integrator of the unguided steps, by the label of each estimator that a run would guide or may guide.
         self.unguided = {
             label: label if configs[label].integrator.options()["guiding"] == "off" else f"{label}, unguided"
             for label, case in ((case.label, case) for case in self.listed if case.type == "reslrb")
@@ -206,7 +206,7 @@ class Participants:
             attached = naive if way.paths == "light" else {**naive, "attached": False}
             self.integrators |= {
                 way.named("walk_ad"): make_integrator("walk_ad", **shared, **attached, **way.options),
-                # With roulette differences are heavy-tailed: now and then a path ends for one of the values alone.
+                # With roulette, differences have heavy tails: sometimes a path ends for only one of the two values.
                 way.named(DIFFERENCED): make_integrator(
                     "walk_ad", **shared | ({"rr_depth": NEVER} if ends(depth) else {}), **way.options
                 ),
@@ -230,7 +230,7 @@ class Participants:
             by_light = {Reference.PTRACER: ptracer_image(at)}
             self.images[way] = choose(by_camera | by_light if divides_by_film(way.paths) else by_light | by_camera)
         seen = {reference for reference, _ in self.images.values()}
-        #: Whether images, and what they are compared with, leave out the film's border.
+        #: Whether images and their references leave out the film's border.
         self.masked = self._are_unlike(seen)
         self._weigh(self._are_unlike({*self.stock.values(), *seen}))
         along = all_directions(self.case, problem.selection, MOVING_DIRECTIONS, DIRECTIONS)
@@ -282,7 +282,7 @@ class Participants:
                 own.ready()  # before anything is rendered
                 made[label] = own
                 continue
-            if self._situation.moved:  # as the run
+            if self._situation.moved:  # as in the run
                 options |= {"paths": "light", "light_share": 0.5}
             if kind == "reslrb":  # as in a run
                 options["freeze"] = True
@@ -312,7 +312,7 @@ class Participants:
 
     def of_own(self, key: str, way: Way) -> list[Reference]:
         """Return the references for a user's own integrator: all that the scene allows for the gradient of `key`."""
-        if self._situation.moved:  # derivatives of camera paths are ours to no longer than light rests
+        if self._situation.moved:  # our derivatives of camera paths hold only if nothing moves
             return [Reference.FINITE_DIFFERENCE]
         stock = self.stock[way.named(key)]
         found = [] if stock is None else [stock]

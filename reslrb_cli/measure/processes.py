@@ -28,14 +28,14 @@ from reslrb_cli.records.measurements import BenchStatus
 
 POLL_SECONDS = 0.05
 
-#: How long the end of a killed process is waited for: it may still be writing into its folder.
+#: Maximum wait for the end of a killed process, which may still be writing into its folder.
 ABANDON_SECONDS = 5.0
 
-#: A process that crashes with as much of its limit in use is taken to have died of it. The last look at it is from
-#: before its end, and from half of a limit to all of it takes microseconds.
+#: If a process crashes with this much of its limit in use, the limit is taken as the cause. The last reading is from
+#: before the end, and memory grows from half of a limit to all of it in microseconds.
 CLOSE_TO_LIMIT = 0.25
 
-#: Signals by which a program ends when it goes on after an allocation that failed.
+#: Signals that end a program that continues after a failed allocation.
 _CRASHES = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS)
 
 
@@ -75,7 +75,7 @@ class Process:
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     stderr=words,
-                    start_new_session=True,  # Ctrl-C is for us
+                    start_new_session=True,  # only this process handles Ctrl-C
                 )
             _at_work.append(self)
         self.ask(first | {"cache": self._folder.name})
@@ -145,10 +145,10 @@ class Process:
         return (BenchStatus.OUT_OF_MEMORY if memory else BenchStatus.FAILED), reason
 
 
-#: Those that have not been closed.
+#: Processes that are not closed.
 _at_work: list[Process] = []
 
-#: Held while one is made, and from `abandon_all` on.
+#: Held while a process is created, and after `abandon_all`.
 _making = threading.Lock()
 
 
@@ -213,7 +213,7 @@ class Contestant:
             if stop():
                 raise
             self.late = True
-        self.close()  # what it held is for the others
+        self.close()  # releases its resources for the others
         return None
 
     def close(self) -> None:
@@ -223,7 +223,7 @@ class Contestant:
             self.process = None
 
 
-#: Steps after the cold one until no new kernel comes, at most.
+#: Maximum number of steps after the cold one until no new kernel is compiled.
 MAX_WARM_UPS = 4
 
 
@@ -267,10 +267,10 @@ class Stepping(Contestant):
 MIN_ROUNDS = 3
 MAX_ROUNDS = 25
 
-#: How much more of the time is for the next depth, whose kernels take longer to compile and to run.
+#: Factor on the time for the next depth, whose kernels take longer to compile and to run.
 GROWTH = 1.3
 
-#: What is said of what a budget did not suffice for.
+#: Message about measurements that exceed the budget.
 NO_TIME = "the budget was spent; allow more with --budget"
 
 

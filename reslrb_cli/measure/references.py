@@ -70,9 +70,9 @@ def _is_inside(sphere: mi.Shape, sensor: mi.Sensor) -> bool:
     return bool(np.linalg.norm(origin - centre) < radius)
 
 
-#: Longest paths that are traced without roulette; naive AD of stock integrators keeps all of them.
+#: Longest paths without roulette; naive AD of stock integrators keeps all segments.
 DEEPEST = 64
-#: BSDFs whose sampling does not depend on their parameters, but for a roughness.
+#: BSDFs whose sampling does not depend on their parameters, except a roughness.
 _FIXED_SAMPLING = ("SmoothDiffuse", "TwoSidedBRDF", "SmoothConductor", "RoughConductor", "SmoothDielectric")
 _ROUGHNESS = ("alpha", "alpha_u", "alpha_v")
 
@@ -112,7 +112,7 @@ class Situation:
         moved = tuple(key for key in problem.selection.scene_keys if moves_light(params, key))
         attached, seen = options.get("attached") is True or bool(moved), problem.scene.sensors()[sensor]
         depth, hidden = options["max_depth"], options["hide_emitters"]
-        # Stock integrators, which may stand in a problem too, are judged as the light paths that they stand beside.
+        # Stock integrators in the problem itself are compared like light paths.
         paths = problem.paths if problem.config.integrator.type == "reslrb" else "light"
         return cls.of(problem.scene, seen, params, depth, hidden, attached, moved, paths)
 
@@ -191,7 +191,7 @@ def prb_image(at: Situation) -> str | None:
         return "camera paths cannot find a `directionalarea` emitter"
     if at.has_pointlike and at.needs.has_null:
         return "it cannot find point or parallel lights through masks"
-    # What it does not find by glass and mirrors, other paths from the sensor do not, either.
+    # Light that glass and mirrors hide from it is hidden from other paths from the sensor, too.
     if at.has_pointlike and at.needs.has_delta_lobes and at.paths != "camera":
         return "camera paths cannot find point or parallel lights through glass or mirrors"
     if at.paths != "light":
@@ -254,7 +254,7 @@ def prb_gradient(at: Situation, key: str) -> str | None:
 def bsdfs_of(at: Situation, key: str) -> list[Any]:
     """Return the BSDFs that a parameter belongs to, nested and enclosing ones."""
     node = at.params.properties[key][2]
-    if isinstance(node, mi.Shape):  # an attribute, which some texture of its BSDF reads
+    if isinstance(node, mi.Shape):  # an attribute that a texture of its BSDF reads
         return at.graph.nested_bsdfs(node.bsdf())
     return at.graph.bsdfs_above(node)
 

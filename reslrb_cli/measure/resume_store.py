@@ -18,19 +18,19 @@ from reslrb_cli.records.measurement_files import Kept, read_samples, samples_fil
 if TYPE_CHECKING:
     import numpy as np
 
-#: What samples are of, in words: an integrator, a parameter.
+#: Name of samples: an integrator, a parameter.
 Name = tuple[str, ...]
 
-#: Of what is kept; another one is not gone on from.
+#: Version of the file of samples; other versions are not continued.
 VERSION = 4
 
-#: Where the settings have digests of files.
+#: Settings that contain digests of files.
 FILES = "files"
 
-#: What a setting is called that one side does not have.
+#: Text for a setting that one side lacks.
 _ABSENT = "not given"
 
-#: Characters that are shown of a setting.
+#: Maximum number of shown characters of a setting.
 _SHOWN = 60
 
 
@@ -115,7 +115,7 @@ def kept(
     kind: str, settings: Mapping[str, Any], samples: Mapping[Any, Sequence[np.ndarray]], **content: Any
 ) -> Kept | None:
     """Return the data to store for samples, by `Name`, in the order of their seeds; None if there are none."""
-    import numpy as np  # whoever asks for help of a command has no need of it
+    import numpy as np  # the help of a command does not need it
 
     taken = {name: rows for name, rows in samples.items() if len(rows)}
     arrays = {f"samples/{number}": np.stack(rows) for number, rows in enumerate(taken.values())}

@@ -22,17 +22,17 @@ from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.optimization.shards import in_order, serially
 from reslrb_cli.records.measurement_files import Kept
 
-#: What is kept says that it is of this.
+#: Kind of measurement in the file of samples.
 KIND = "gradcheck"
 
-#: What samples are of: `gradient` or `image` and an integrator's label, `differences` or `tangents` and a parameter.
+#: Name of samples: `gradient` or `image` and an integrator's label, or `differences` or `tangents` and a parameter.
 Name = tuple[str, str]
 
-#: The step of a direction of finite differences, and the error that it brings.
+#: The step of a direction of finite differences, and its error.
 Step = tuple[float, float]
 
-#: What takes samples: of who takes part, a function of that and of further arguments, and these arguments. Yields place
-#: and result of each, in any order (`shards.serially`).
+#: Takes samples: calls a function with the participants and further arguments. Yields position and result of each call,
+#: in any order (`shards.serially`).
 Engine = Callable[[Participants, Callable[..., Any], Sequence[tuple[Any, ...]]], Iterable[tuple[int, Any]]]
 
 
@@ -59,19 +59,19 @@ def settings(checked: CheckSettings, variant: str, device: str) -> dict[str, Any
     return resume_store.settings(checked.config, codes, variant, device, estimators=labels, spp=checked.spp)
 
 
-#: Seeds, where no number is given: so many of everything, more of what is cheap, as the budget allows.
+#: Default seeds: the same number of everything, and more of cheap samples as the budget allows.
 LEAST_SEEDS, MOST_SEEDS = 8, 64
 
-#: Fewer seeds have no standard error worth the name, and are not judged.
+#: Fewer seeds give no useful standard error and are not judged.
 FEWEST = 3
 
-#: Shares of the budget: what more than LEAST_SEEDS are taken of has the larger one.
+#: Shares of the budget: samples with more than LEAST_SEEDS get the larger one.
 LARGE_SHARE, SMALL_SHARE = 3, 1
 
-#: Whose gradients are naive AD, and compile for much longer than any other.
+#: References by naive AD, which compile much longer than any other.
 NAIVE = ("walk_ad", "ptracer")
 
-#: Bytes that samples may take.
+#: Maximum memory of samples in bytes.
 MEMORY = 2**30
 
 
@@ -96,7 +96,7 @@ class Sampling:
         self._end = self._start + settings.budget_s
         self.participants = Participants(settings)
         self._samples: dict[Name, list[np.ndarray]] = {}
-        #: Parameters, by way, of whose directions the steps have been chosen: differences go on with the same ones.
+        #: Parameters, by way, with chosen steps of their directions: differences keep them.
         self._chosen: list[str] = []
         if earlier is not None:
             self._samples = {(kind, of): list(rows) for (kind, of), rows in earlier.samples.items()}
@@ -107,8 +107,8 @@ class Sampling:
         self.between: Callable[[], None] = lambda: None
         self._taken: set[Name] = set()
         self._to_do, self._expected = list[Name](), list[Name]()
-        self._later_s = 0.0  # how long any other sample took, at most
-        self._first_s: dict[tuple[str, bool], float] = {}  # how long a first sample took, at most, by kind
+        self._later_s = 0.0  # longest duration of a later sample
+        self._first_s: dict[tuple[str, bool], float] = {}  # longest duration of a first sample, by kind
 
     def expect(self, names: Iterable[Name]) -> None:
         """Announce names, so that each gets its share of the time."""
@@ -157,7 +157,7 @@ class Sampling:
             self._later_s = max(self._later_s, next_s if len(samples) > begun + 1 else 0.0)
             before = now
             if len(samples) == begun + 1:
-                first_s, next_s = now - begin, 0.0  # which says nothing of the next one
+                first_s, next_s = now - begin, 0.0  # it does not predict the next one
                 self._first_s[_kind(name)] = max(first_s, self._first_s.get(_kind(name), 0.0))
                 ends = self._ends(name, now)
             if limited and now + next_s >= next(end for least, end in ends if len(samples) < least):
@@ -175,7 +175,7 @@ class Sampling:
             return None
         lacking = [name for name in self._expected if len(self._samples.get(name, ())) < FEWEST]
         later_s = (FEWEST - 1) * self._later_s
-        # The steps of differences are chosen first, which compiles too.
+        # The steps of differences are chosen first, which also compiles kernels.
         firsts_s = sum((1 + (name[0] == "differences")) * self._expected_s(name) for name in lacking)
         return self._now() - self._start + firsts_s + len(lacking) * later_s
 
@@ -216,7 +216,7 @@ class Sampling:
         fitting = MEMORY // (4 * self.participants.case.size * (len(self.participants.integrators) + 2))
         most = max(LEAST_SEEDS, min(MOST_SEEDS, fitting))
         if name[0] == "gradient" and not self.participants.exact:
-            # More than the stock reference has are compared with nothing.
+            # Only samples with a stock reference are compared.
             stock = sorted({reference.value for reference in self.participants.stock.values() if reference is not None})
             names = [("gradient", label) for label in stock]
             counts = [len(self._samples[name]) - self._before.get(name, 0) for name in names if name in self._taken]

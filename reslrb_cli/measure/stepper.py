@@ -170,7 +170,7 @@ class Stepper(Steps):
         if cold:
             reset_peak()
         else:
-            # What other processes did since the last step, to caches above all, is to cost this one nothing.
+            # Other processes may have changed the caches since the last step, which must not cost this one.
             new_kernels = self.gradient(at, self._given, run.spp)[1].new_kernels
         times = self.gradient(at, self._given, run.spp)[1]
         answer = {

@@ -21,14 +21,14 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.lens.solid import Array, Sheet
 from reslrb_cli.records.images import luminance
 
-#: Of the distance, of the index, and in degrees: by how much each is off.
+#: Assumed errors of the distance, of the index, and of rotations in degrees.
 DISTANCE, INDEX, TURN = 0.02, 0.005, 1.0
 
-#: Rays that tell where light goes: shares of 0.1 % to a twentieth of themselves. And how often each may meet a face.
+#: Rays for the shares of lost light, which are 0.1 % to 5 %, and the maximum number of faces that each ray meets.
 RAYS, BOUNCES = 2**19, 8
 
-#: Directions of a light as wide as the sun, by its radius: its middle, and six on a circle, on average as far from the
-#: middle (squared: a half) as those of an even disc.
+#: Directions within a light as wide as the sun, in units of its radius: the centre, and six on a circle with the mean
+#: squared distance of an even disc (one half).
 _DIRECTIONS = [(0.0, 0.0), *((np.cos(a) * (7 / 12) ** 0.5, np.sin(a) * (7 / 12) ** 0.5)
                              for a in np.arange(6) * np.pi / 3)]  # fmt: skip
 
@@ -39,7 +39,7 @@ def closed_by_ball(heights: Array, pitch: Sequence[float], radius: float) -> Arr
     `pitch`: the distance of columns and of rows, in the unit of the heights.
     """
     relief = float(np.ptp(heights))
-    widest = radius if relief >= radius else (2 * radius * relief - relief**2) ** 0.5  # what can touch anything
+    widest = radius if relief >= radius else (2 * radius * relief - relief**2) ** 0.5  # parts that can touch
     reach = [max(1, int(widest / step)) for step in pitch]
     y, x = np.mgrid[-reach[1] : reach[1] + 1, -reach[0] : reach[0] + 1]
     far = (x * pitch[0]) ** 2 + (y * pitch[1]) ** 2
@@ -97,7 +97,7 @@ def where_light_goes(
     light = mi.Float(mi.luminance(weight) if mi.is_rgb else weight.x)
     context = mi.BSDFContext(mi.TransportMode.Importance)
     left, active = dr.zeros(mi.Bool, RAYS), light > 0
-    dr.make_opaque(ray, light, left, active)  # so that each turn launches one kernel
+    dr.make_opaque(ray, light, left, active)  # so that each rotation launches one kernel
     totals = dict.fromkeys(("inside", "beside", "beyond"), 0.0)
     for _ in range(BOUNCES):
         si = scene.ray_intersect(ray, active)
@@ -233,7 +233,7 @@ class OpticalBench:
     def sun(self, spp: int) -> Array:
         """Render light with the angular diameter `plan.sun`: the mean over its directions."""
         half, images = self.plan.sun / 2, []
-        for i, (x, y) in enumerate(_DIRECTIONS):  # each with noise of its own, so that it averages out
+        for i, (x, y) in enumerate(_DIRECTIONS):  # each has its own noise, so that it averages out
             angle = float(np.hypot(x, y))
             turned = {} if angle == 0 else self.turned(self.lamps, (x / angle, y / angle, 0), half * angle)
             images.append(self.image(turned, max(1, spp // len(_DIRECTIONS)), i))

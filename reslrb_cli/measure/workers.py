@@ -18,11 +18,11 @@ from reslrb_cli.errors import BackendError, ConfigError, is_out_of_memory, menti
 
 _BITS = {"i1": 8, "half": 16, "float": 32, "double": 64, "ptr": 64}
 
-#: One array holds its entries for all lanes of a vector (LLVM): `alloca float, i32 112`.
+#: One array of its entries for all lanes of a vector (LLVM): `alloca float, i32 112`.
 _LLVM_ARRAY = re.compile(r"%arr_\w+ = alloca (\w+), i32 (\d+)")
 _LLVM_LANES = re.compile(r"%index_next = add i64 %index, (\d+)")
 
-#: ... or those of one thread (CUDA): `.local .align 4 .b32 arr_12[7];`.
+#: ... or for one thread (CUDA): `.local .align 4 .b32 arr_12[7];`.
 _PTX_ARRAY = re.compile(r"\.local \.align \d+ \.[a-z]+(\d+) arr_\w+\[(\d+)\]")
 
 
@@ -43,10 +43,10 @@ def _of_kernel(ir: str) -> int:
     return bits // 8
 
 
-#: A case that has begun: what it says first, and what answers each question.
+#: A started case: its first message, and the function that answers each question.
 Begun = tuple[dict[str, Any], Callable[[dict[str, Any]], dict[str, Any]]]
 
-#: Begins a case, by the message that describes it.
+#: Starts a case from the message that describes it.
 Begin = Callable[[dict[str, Any]], Begun]
 
 
@@ -64,7 +64,7 @@ class Warnings(logging.Handler):
 
 def _serve(first: dict[str, Any], load: Callable[[], Begin], questions: IO[str], answers: IO[str]) -> None:
     os.environ |= {
-        # Where Dr.Jit keeps compiled kernels, by default and if told: a cold step is to find none.
+        # Dr.Jit's folders for compiled kernels: a cold step must find none.
         "HOME": first["cache"],
         "DRJIT_CACHE_DIR": first["cache"],
         "OPTIX_CACHE_PATH": first["cache"],
@@ -75,7 +75,7 @@ def _serve(first: dict[str, Any], load: Callable[[], Begin], questions: IO[str],
     set_variant(first["variant"])
 
     begin = load()
-    # Only now: a library that finds no room looks like one that is not there.
+    # Set late, because a library without memory looks like a missing one.
     _limit(first["memory_limit"])
     warnings = Warnings()
     logging.getLogger("reslrb_cli").addHandler(warnings)
@@ -95,13 +95,13 @@ def _limit(memory_limit: int | None) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
 
-#: What the C++ library says of a thread that cannot be made: under a limit, for want of address space for its stack.
+#: The C++ library's message if a thread cannot be created, because the limit leaves no address space for its stack.
 _NO_THREAD = "Resource temporarily unavailable"
 
 
 def _failure(error: Exception, limited: bool) -> dict[str, Any]:
     words = " ".join(str(error).split())
-    memory = is_out_of_memory(error) or mentions_memory(words)  # also as the reason of another error
+    memory = is_out_of_memory(error) or mentions_memory(words)  # also as the cause of another error
     memory = memory or (limited and _NO_THREAD in words)
     refused = isinstance(error, ConfigError | BackendError) and not memory
     return {
@@ -131,4 +131,4 @@ def run(load: Callable[[], Begin]) -> None:
         _answer(answers, _failure(error, limited))
         code = 1
     sys.stderr.flush()
-    os._exit(code)  # what is left to tidy up may take long, or fail where memory is out
+    os._exit(code)  # the remaining cleanup may take long, or fail if memory is exhausted

@@ -223,7 +223,7 @@ def at_stage(problem: Problem, number: int, values: Mapping[str, Array] | None =
     config, film = problem.config.without_stages(), _film_at(problem, number)
     scene = config.scene if film is None else config.scene.model_copy(update={"size": film})
     config = config.model_copy(update={"parameters": _specs_at(problem, number), "scene": scene})
-    # What is doubtful in the scene was told of the whole problem's.
+    # Warnings about the scene were given for the whole problem.
     made = assemble_scene(config, load_configured(config, warn=False), values)
     if values is None:
         made.selection.set_arrays({key: bounded(made, key, resized(made, key, value))

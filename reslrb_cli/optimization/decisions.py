@@ -50,7 +50,7 @@ class MemoryPlan(Jsonable):
         return f"run.memory_budget: {used / MIB:.1f} MiB were used, more than the budget of {allowed}"
 
 
-#: Time as a multiple of what a run has: kernels to compile, in those of one step, and iterations' worth of work.
+#: Cost relative to the run: kernels to compile, in those of one step, and iterations of work.
 Need = tuple[float, float]
 
 

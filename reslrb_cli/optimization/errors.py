@@ -15,7 +15,7 @@ import numpy as np
 from reslrb_cli.scene.values import resample
 from reslrb_cli.statistics import Array, rms
 
-#: What emitters emit; parameters of the same quantity have the same unit.
+#: Parameters of emission; parameters of the same quantity have the same unit.
 _EMITTED = {
     "AreaLight": "radiance",
     "ConstantBackgroundEmitter": "radiance",
@@ -66,7 +66,7 @@ class ErrorMeter:
             if mask.any():
                 self._masks[key] = mask
                 self._truth[key] = on_grid(true, grid).astype(np.float64)[mask]
-        #: The root mean square of each truth, over the same entries; a truth of zeros has none.
+        #: Root mean square of each truth over the same entries; a truth of zeros has none.
         self.scales = {key: scale for key, true in self._truth.items() if (scale := rms(true)) > 0}
         self.one_unit = len({(quantities or {}).get(key, "") for key in self._truth}) <= 1
 

@@ -33,13 +33,14 @@ from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.clock import MIB
 from reslrb_cli.records.metrics import Record
 
-#: Seconds of a step beyond which steps of fewer samples stand for it, and that those are to take.
+#: Seconds of a step above which steps with fewer samples are measured instead, and the seconds for them.
 LONG_STEP, SHORT_STEP = 2.0, 0.7
 
-#: Seconds of a step up to which two of them are taken for their memory.
+#: Seconds of a step up to which two steps are run to measure their memory.
 WAIT = 15.0
 
-#: Steps until all is compiled and recorded; steps that are timed, at least, at most, and for so many seconds.
+#: Maximum number of steps until everything is compiled and recorded; minimum and maximum number of timed steps, and
+#: their seconds.
 WARM_UP, LEAST, MOST, SECONDS = 5, 4, 40, 5.0
 
 
@@ -121,7 +122,7 @@ def _highest(problem: Problem, records: Sequence[Record]) -> int:
 def _measure(problem: Problem, spp: int) -> Steps:
     """Measure a few iterations of `spp` samples per pixel."""
     records: list[Record] = []
-    taught: list[int] = []  # how often tables had learned after each
+    taught: list[int] = []  # number of table updates after each
     begin = time.perf_counter()
     with trial(problem, spp) as tried:
         guiding = guiding_of(tried)
@@ -155,7 +156,7 @@ def _with_learning(times: Sequence[float], learned: Sequence[int], mean: float) 
     return without + mean * max(sum(times) - len(times) * without, 0.0) / sum(learned)
 
 
-#: Steps, more or less, that the verdicts on the values take after the last one.
+#: Number of steps, approximately, for the verdicts on the values after the last iteration.
 VERDICTS = 30
 
 
@@ -203,7 +204,7 @@ def make_forecast(
     the problem before its first iteration, for measurements that no cache stores. Raises ConfigError and
     UnsupportedScene as the run would, and the errors of its steps.
     """
-    # Errors are no part of a step.
+    # Errors are not part of a step.
     problem = replace(assemble(with_short_target(config), say, cache), truth={})
     image_s, views = _image_seconds(problem), len(problem.views)
     begin = time.perf_counter()
@@ -211,7 +212,7 @@ def make_forecast(
     before_s = time.perf_counter() - begin
     say("measuring a few steps")
     steps, scratch, integrator = measure_steps(problem), 0, problem.integrator
-    if isinstance(integrator, Reslrb):  # of all paths that are traced at a time
+    if isinstance(integrator, Reslrb):  # of all paths traced at a time
         scratch = max(integrator.scratch_bytes(plan) for plan in plans(problem, integrator)) * resident_paths()
     run = config.run
     iterations = run.iterations
@@ -253,7 +254,7 @@ def with_short_target(config: Config) -> Config:
 def _image_seconds(problem: Problem) -> float:
     """Return the seconds per sample per pixel of a saved image, of the first view."""
     view, spp = problem.views[0], saved_spp(problem, between=True)
-    problem.render(view.sensor, spp, 0, "forecast")  # compiles, and records what is small: several times as long
+    problem.render(view.sensor, spp, 0, "forecast")  # compiles, and records small calls: several times as long
     begin = time.perf_counter()
     problem.render(view.sensor, spp, 1, "forecast")
     return (time.perf_counter() - begin) / spp

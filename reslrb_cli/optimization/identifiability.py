@@ -37,15 +37,15 @@ from reslrb_cli.statistics import Array
 
 logger = logging.getLogger(__name__)
 
-#: Paths in one pass of the gradient where naive AD keeps every vertex of each of them; light tracing keeps none.
+#: Paths in one pass of the gradient if naive AD keeps every vertex of each path; light tracing keeps none.
 PATHS_PER_PASS = 2**18
-#: Samples per pixel that say which entries light and sensor reach.
+#: Samples per pixel for finding the entries that light and sensor reach.
 REACH_SPP = 64
 #: The relative step h.
 STEP = 0.02
-#: Eigenvalues below it are taken for 0: two directions at less than a degree to each other.
+#: Eigenvalues below this count as 0: two directions with an angle of less than a degree.
 LEAST = 1e-4
-#: A value whose part in the eigenvector is smaller has none in the combination.
+#: Values with a smaller component in the eigenvector are left out of the combination.
 PART = 0.1
 
 
@@ -64,7 +64,7 @@ def find_reached(problem: Problem) -> Problem:
         mask: Array = sensitive[key] | (key in problem.selection.factors)  # every image shows its exposure
         if mask.ndim == 3:
             mask = np.any(mask, axis=2)
-            if key in problem.selection.params:  # a heightmap is no texture to be seen
+            if key in problem.selection.params:  # a heightmap is not a visible texture
                 mask = mask & _visible(problem, key)
         masks[key] = mask
     return replace(problem, masks=masks)
@@ -93,14 +93,14 @@ def _visible(problem: Problem, key: str, pixels: Sequence[Array | None] = ()) ->
 def sensitivity(problem: Problem) -> dict[str, Array]:
     """Return for each parameter which of its entries affect the mean image: booleans of the parameter's shape."""
     run, integrator, multiple = problem.config.run, unrecorded(problem.integrator), samples_per_pass(problem.config)
-    # A recording takes as long as some passes, of which there is mostly one.
+    # A recording takes as long as some passes, and there is usually only one.
     paths_per_pass = MOST_PATHS if isinstance(integrator, LightTracer) else PATHS_PER_PASS
     spp = -(-REACH_SPP // multiple) * multiple if multiple else REACH_SPP
     found: dict[str, Array] = {}
     for sensor in [view.sensor for view in problem.trained]:
         film = problem.scene.sensors()[sensor].film()
         width, height = (int(n) for n in film.crop_size())
-        # dL/dI of the mean image: known before any path is traced, which some estimators ask for.
+        # dL/dI of the mean image: known before any path is traced, as some estimators require.
         ones = dr.ones(mi.TensorXf, (height, width, int(film.base_channels_count())))
         dr.make_opaque(ones)
         for number, part in enumerate(passes(spp, width * height, multiple, paths_per_pass)):

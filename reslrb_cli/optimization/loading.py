@@ -39,7 +39,7 @@ from reslrb_cli.seeds import seed
 #: Paths in one pass. Baselines keep the state of every path in memory; 2**22 of them stay below 2 GB.
 PATHS_PER_PASS = 2**22
 
-#: Samples per pixel of images that are saved between the first and the last, at least.
+#: Minimum number of samples per pixel of images saved between the first and the last.
 BETWEEN_SPP = 64
 
 
@@ -200,7 +200,7 @@ def make_configured(config: Config, integrator: Integrator, paths: str) -> StepI
         integrator = integrator.model_copy(update={"paths": paths})
     options: dict[str, Any] = integrator.options()
     if isinstance(integrator, ReslrbConfig):
-        options["freeze"] = True  # what a step launches is recorded, so that its Python runs once
+        options["freeze"] = True  # the launches of a step are recorded, so that its Python runs once
     if isinstance(integrator, Own):
         options["allowed"] = config.allows_code
     return make_integrator(integrator.type, **options)

@@ -37,8 +37,8 @@ from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record, Regularized
 from reslrb_cli.seeds import seed
 
-#: Of a run's progress (0 to 1) and the final fraction. The cosine is half a period of one (Loshchilov and Hutter 2017,
-#: without restarts); exponential is the same factor from each iteration to the next.
+#: Functions of a run's progress (0 to 1) and the final fraction. `cosine` is half a period (Loshchilov and Hutter 2017,
+#: without restarts); `exponential` has the same factor from each iteration to the next.
 SCHEDULES: dict[str, Callable[[float, float], float]] = {
     "constant": lambda progress, final: 1.0,
     "cosine": lambda progress, final: final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * progress)),
@@ -53,12 +53,12 @@ def learning_rate_factor(
 
     `least` (0 to 1) is the minimum progress of a run that ends before its last iteration.
     """
-    if schedule == "plateau":  # which goes by losses (`stopping.lowered`)
+    if schedule == "plateau":  # which depends on losses (`stopping.lowered`)
         return 1.0
     return SCHEDULES[schedule](max(iteration / max(iterations - 1, 1), least), final_fraction)
 
 
-#: Iterations between two looks at what is held out.
+#: Iterations between two evaluations of held-out views.
 HELD_OUT_EVERY = 10
 
 
@@ -200,7 +200,7 @@ class Split:
 
     def start(self) -> None:
         """Start a view."""
-        if self._start is not None:  # the view before never came to `image`
+        if self._start is not None:  # the previous view never reached `image`
             self.primal_ms = None
         self._start = time.perf_counter()
 
@@ -233,7 +233,7 @@ def gradient(
     apart = config.shards != 1
     if apart:
         if not config.in_rounds:
-            split.start()  # no moment in which all images are there
+            split.start()  # there is no moment with all images
         loss, refused = add_gradient(problem, iteration, split.start, split.image)
         total = mi.Float(loss)
         gradients = {key: problem.optimizer.gradient(key) for key in problem.selection.keys}
@@ -250,7 +250,7 @@ def gradient(
             on_image=split.image,
             on_samples=problem.on_samples(view),
         )
-        # One view's kernels are not to wait for the next one's: memory would grow with the number of views.
+        # One view's kernels must not wait for the next one's: memory would grow with the number of views.
         gradients = problem.gradients()
         dr.eval(step.loss, gradients)
         total = total + step.loss

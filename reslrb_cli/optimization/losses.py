@@ -18,7 +18,7 @@ import mitsuba as mi
 
 from reslrb_cli.integrators.protocol import halves_of
 
-#: A loss with its options bound, of an image, its target, and weights, if there are any.
+#: A loss with bound options, as a function of an image, its target, and optional weights.
 Loss = Callable[..., "mi.Float"]
 
 
@@ -47,7 +47,7 @@ def relative_l2(
     return _mean(dr.square(image - target) / (dr.square(target) + epsilon), weights)
 
 
-#: Of the Gaussian window of SSIM: standard deviation and side in pixels, and the constants K_1 and K_2 (Wang et al.).
+#: SSIM's Gaussian window, standard deviation and side in pixels, and the constants K_1 and K_2 (Wang et al.).
 SSIM_SIGMA, SSIM_SIDE, SSIM_K = 1.5, 11, (0.01, 0.03)
 
 
@@ -68,7 +68,7 @@ def ssim(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = 
     most = dr.max(target.array if weights is None else dr.select(weights.array > 0, target.array, 0))
     extent = dr.select(most > 0, most, 1)
     first, second = (dr.square(factor * extent) for factor in SSIM_K)
-    # About the means of the images, which the variances do not depend on: squares of bright pixels lose digits.
+    # About the means of the images, on which variances do not depend: squares of bright pixels lose digits.
     level = dr.detach(dr.mean(target, axis=None).array)
     i, t = image - level, target - level
     at_i, at_t = mean_i - level, mean_t - level
@@ -98,7 +98,7 @@ def _windows(image: mi.TensorXf) -> mi.TensorXf:
         start = lane // inner * (step * extent) + lane % inner
         total = dr.zeros(mi.Float, math.prod(shape))
         for place, factor in enumerate(factors):
-            # Entries have several places to go, in one kernel: the derivative is added up by atomics.
+            # Entries have several destinations in one kernel, so atomics add up the derivative.
             total += factor * dr.gather(mi.Float, image.array, start + place * step)
         image = mi.TensorXf(total, tuple(shape))
     return image
@@ -106,7 +106,7 @@ def _windows(image: mi.TensorXf) -> mi.TensorXf:
 
 LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2, "relative_l2": relative_l2, "ssim": ssim}
 
-#: Those whose derivative is linear in the image, so that its noise averages out.
+#: Losses with a derivative linear in the image, so that its noise averages out.
 QUADRATIC = ("l2", "relative_l2")
 
 

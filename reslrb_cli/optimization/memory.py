@@ -33,40 +33,42 @@ from reslrb_cli.transport.plan import Plan
 
 logger = logging.getLogger(__name__)
 
-#: Images of the film's size that a step has at once: block, image, loss's parts, gradient, adjoint; a batch's too.
+#: Images of the film's size in memory during a step: block, image, parts of the loss, gradient, adjoint; also those of
+#: a batch.
 FILM_IMAGES = 12
 
-#: Copies of a parameter: gradients, the optimiser's moments, their next values, the best of a run.
+#: Copies of a parameter: gradients, the optimiser's moments, their next values, the best values of a run.
 PARAMETER_COPIES = 9
 
-#: And those of a clamp: what is usual, the sums over the iterations, and their next values.
+#: Further copies for a clamp: the usual size, the sums over the iterations, and their next values.
 CLAMP_COPIES = 7
 
-#: Bytes that an entry of a parameter takes at the least: value, the optimiser's, gradient, and the array it is set by.
+#: Minimum bytes per entry of a parameter: value, the optimiser's copy, gradient, and the array for updates.
 ENTRY_BYTES = 4 * 4
 
-#: Bytes that a pixel takes at the least: five images (block, image, dL/dI, its adjoint, target) of three floats.
+#: Minimum bytes per pixel: five images (block, image, dL/dI, its adjoint, target) of three floats.
 PIXEL_BYTES = 5 * 3 * 4
 
-#: Bytes that every machine has; and those of a step of which a word is said at once, since to make them takes a while.
+#: Bytes that every machine has, and bytes of a step above which a message appears at once, because such a step takes a
+#: while.
 SMALL, MUCH = 2**28, 2**31
 
-#: What a step takes at the least of what is estimated, by `run.adjoint`: 0.93, 0.58 and 0.44 of it were seen.
+#: Minimum share of the estimated memory that a step takes, by `run.adjoint`: 0.93, 0.58 and 0.44 were measured.
 SURE = {"batched": 0.8, "independent": 0.5, "correlated": 0.4}
 
-#: Integrators whose loops are evaluated, and bytes of a path's state there at the least: ray, throughput, generator.
+#: Integrators with evaluated loops, and minimum bytes of a path's state there: ray, throughput, generator.
 NAIVE, PATH_BYTES = ("ptracer", "walk_ad"), 48
 
-#: Bytes of thread-local memory that `trajectory` records of a vertex, as `bench` measured it.
+#: Bytes of thread-local memory per vertex in `trajectory`, as measured by `bench`.
 RECORD_BYTES = 60
 
-#: Light paths of a run beyond which a word is said of them, and how many a second that word reckons with.
+#: Light paths of a run above which the duration is mentioned, and the assumed number per second.
 MANY_PATHS, RATE = 1e11, 1e7
 
 COARSER = "use a smaller film or coarser textures"
 
 
-# --- what a step takes ------------------------------------------------------------------------------------------------
+# --- memory of a step -------------------------------------------------------------------------------------------------
 
 
 def pixels_of(scene: mi.Scene, sensors: Sequence[int]) -> list[int]:
@@ -96,7 +98,7 @@ def estimate(problem: Problem, integrator: Reslrb, samples: int, fixed: int) -> 
     for index, plan, count in zip(problem.sensors, plans(problem, integrator), pixels, strict=True):
         film, width = problem.scene.sensors()[index].film(), samples * count
         if problem.config.adjoint == "correlated" and samples == problem.config.share_spp:
-            # Else dL/dI is known before the paths are traced, and nothing of them outlives the kernel.
+            # Otherwise dL/dI is known before the paths are traced, and nothing of them outlives the kernel.
             width = round(width * integrator.share_of_light(plan))
             paths = max(paths, sum(allocated(size * width) for size in entry_bytes(integrator.kept(plan))))
         block = int(dr.prod(film.crop_size())) * (film.base_channels_count() + 1)
@@ -171,7 +173,7 @@ def _replicas(entries: int) -> int:
     return allocated(4 * entries * threads)
 
 
-# --- whether there is room --------------------------------------------------------------------------------------------
+# --- checks of memory -------------------------------------------------------------------------------------------------
 
 
 def check_announced(config: Config) -> None:
@@ -189,7 +191,7 @@ def check_described(config: Config, description: Description) -> None:
     """
     film = min(film_sizes(description), key=lambda size: size.cropped, default=None)
     if film is None or not film.cropped:
-        return  # a file that does not say has Mitsuba's own film, which is small
+        return  # without a size in the file, Mitsuba's own film is used, which is small
     key = "scene.file" if config.scene.size is None else "scene.size"
     is_whole = film.cropped == film.width * film.height
     _check_film(config, key, (film.width, film.height) if is_whole else (film.cropped, 1))
@@ -198,7 +200,7 @@ def check_described(config: Config, description: Description) -> None:
     texels = {name: width * height * ENTRY_BYTES for name, (width, height) in textures.items()}
     if (
         isinstance(config.integrator, ReslrbConfig) and config.run.memory_budget is None
-    ):  # else passes are not estimated
+    ):  # otherwise passes are not estimated
         sure = SURE[config.adjoint]
         pixels = int((FILM_IMAGES + 1) * allocated(4 * film.cropped * (film.channels + 1)) * sure)  # with one target
         texels = {name: int(PARAMETER_COPIES * allocated(4 * w * h) * sure) for name, (w, h) in textures.items()}
@@ -274,7 +276,7 @@ def check_memory(problem: Problem, integrator: Reslrb) -> None:
     config = problem.config
     if config.run.memory_budget is not None:
         return
-    expected = estimate(problem, integrator, pass_spp(config), 0)  # what stands is taken already
+    expected = estimate(problem, integrator, pass_spp(config), 0)  # existing arrays are allocated already
     free = free_for(expected.total)
     if expected.total * SURE[config.adjoint] <= free:
         return

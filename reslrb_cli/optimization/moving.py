@@ -98,10 +98,10 @@ def is_at_border(samples: Samples, u: mi.Point2f) -> mi.Bool:
     return inside < radius
 
 
-#: The share of moving light at the border from which on it is worth a word.
+#: Share of moving light at the border above which a warning appears.
 NOTICED = 0.01
 
-#: Samples per pixel that it is measured with.
+#: Samples per pixel for measuring it.
 SPP = 8
 
 
@@ -153,7 +153,7 @@ def check_moving(problem: Problem) -> None:
             key = f"integrator.{error.option}" if error.option else "scene.file"
             raise ConfigError(config.source, key, str(error)) from error
         return
-    for index in problem.sensors:  # the splats of Mitsuba's own light tracer have no derivative through a box filter
+    for index in problem.sensors:  # splats of Mitsuba's own light tracer have no derivative through a box filter
         sensor = problem.scene.sensors()[index]
         if sensor.film().rfilter().is_box_filter():
             reason = f"sensor {sensor.id()} has a box filter, whose splats do not change while they move within a "

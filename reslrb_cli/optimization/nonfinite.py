@@ -17,7 +17,7 @@ import drjit as dr
 
 OnNonFinite = Literal["stop", "skip", "zero"]
 
-#: Iterations in a row in which something sat out, after which a run ends.
+#: Consecutive iterations with skipped updates after which a run ends.
 PATIENCE = 10
 
 
@@ -56,7 +56,7 @@ class Findings:
     @property
     def by_parameter(self) -> dict[str, int]:
         """Number of entries of gradients and updates by parameter."""
-        return {**self.gradients, **self.updates}  # what has no finite gradient is not updated
+        return {**self.gradients, **self.updates}  # entries without a finite gradient are not updated
 
     @property
     def whose_loss(self) -> str:

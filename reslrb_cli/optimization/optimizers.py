@@ -52,7 +52,7 @@ from reslrb_cli.records.metrics import Clamped
 
 Bounds = tuple[float, float] | None
 
-#: Where u ends: x keeps off the sigmoid's bounds by 1e-7 of their distance, and neither under- nor overflows.
+#: Limit of u: x stays away from the sigmoid's bounds by 1e-7 of their distance, and neither underflows nor overflows.
 SIGMOID_END, EXPONENT_END = 16.0, 80.0
 
 
@@ -96,11 +96,11 @@ def _logistic(u: Any) -> Any:
 
 def _softplus(u: Any) -> Any:
     small = dr.exp(-dr.abs(u))
-    return dr.maximum(u, 0.0) + 2 * dr.atanh(small / (2 + small))  # log(1 + s), exact for a small s too
+    return dr.maximum(u, 0.0) + 2 * dr.atanh(small / (2 + small))  # log(1 + s), accurate for a small s, too
 
 
 def _inverse_softplus(x: Any) -> Any:
-    half = 0.5 * dr.minimum(x, 60.0)  # beyond, the logarithm of exp(x) - 1 = 2 sinh(x/2) exp(x/2) is x
+    half = 0.5 * dr.minimum(x, 60.0)  # above this, the logarithm of exp(x) - 1 = 2 sinh(x/2) exp(x/2) is x
     return x + dr.log(2 * dr.sinh(half)) - half
 
 
@@ -122,7 +122,7 @@ class Variable:
         """Return x for v."""
         u = self._u(v)
         x = u if self.transform is None else self.transform.forward(u)
-        return x if self.bounds is None else dr.clip(x, self.bounds[0], self.bounds[1])  # rounding may have left them
+        return x if self.bounds is None else dr.clip(x, self.bounds[0], self.bounds[1])  # rounding may exceed them
 
     def from_scene(self, x: Any) -> Any:
         """Return v for x."""
@@ -140,7 +140,7 @@ class Variable:
             return dr.clip(v, *(_opaque(v, end / self.length) for end in ends))
         u = self._u(v)
         if not dr.any(flat((u < ends[0]) | (u > ends[1])))[0]:
-            return v  # as it is: there and back, it would be rounded anew in each step
+            return v  # unchanged: transforming back and forth would round it again in each step
         return self.smoother.roughen(dr.clip(u, *ends)) * _opaque(v, 1 / self.length)
 
     def chain(self, v: Any, gradient: Any) -> Any:
@@ -189,9 +189,9 @@ class Optimizer:
         named = {"alpha" if name == "decay" else name: value for name, value in options.items()}
         self._own = {key: OPTIMIZERS[type](lr=self._rates[key], **named) for key in values}
         self._variables: dict[str, Variable] = {}
-        #: The scene's values of the parameters that have a variable.
+        #: The scene's values of the parameters with variables.
         self._scene: dict[str, Any] = {}
-        #: The state at which it stands, of a run's iterations; None in the midst of a step, and where none was asked.
+        #: The state of the run that it holds; None during a step, and if no state was requested.
         self.stands_at: object = None
         for key, value in values.items():
             self._own[key][key] = value
@@ -246,7 +246,7 @@ class Optimizer:
         overflow. Such a parameter keeps its old value and state.
         """
         self.stands_at = None
-        # Dr.Jit makes the rate opaque, so that one that changes compiles no new kernel.
+        # Dr.Jit makes the rate opaque, so a changing rate compiles no new kernel.
         moved, before, counts = [key for key in self._own if key not in skip], {}, {}
         for key in moved:
             own = self._own[key]
@@ -387,8 +387,8 @@ def clamp(value: Any, bounds: tuple[float, float] | None) -> Any:
 DECAY = 0.95
 
 
-#: What the clamp keeps of a parameter's gradients: m, which starts at 0 (corrected for as in Adam), and the sums of R
-#: and of g.
+#: State of the clamp for a parameter's gradients: m, which starts at 0 (corrected as in Adam), and the sums of R and of
+#: g.
 SUMS = ("usual", "removed", "total")
 
 
@@ -408,7 +408,7 @@ def clamp_gradients(
         before = iterations.get(key, 0)
         m, removed, total = (known[key][name] for name in SUMS) if before else (zero, zero, zero)
         if before:
-            # Opaque: as a literal it would compile a kernel each iteration.
+            # Opaque: a literal would compile a kernel each iteration.
             usual = m * dr.opaque(mi.Float, 1 / (1 - DECAY**before))
             limit = factor * dr.maximum(usual, dr.mean(flat(usual)))
             clamped = dr.clip(g, -limit, limit)

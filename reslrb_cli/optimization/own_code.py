@@ -38,7 +38,7 @@ class OwnLoss:
             code = getattr(self._function, "__code__", None)
             self._file = None if code is None else Path(code.co_filename)
         self._takes_weights: bool | None = None
-        #: Of a function that was handed over, which is like no other; a file has its contents.
+        #: Digest of a given function, which equals no other; for a file, the digest of its contents.
         self.token = "" if self._function is None else secrets.token_hex(8)
         self._even: mi.TensorXf | None = None
 
@@ -55,7 +55,7 @@ class OwnLoss:
     def __call__(self, image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float:
         """Return the loss, of width 1, attached. Raises ConfigError for an invalid result."""
         function, what = self.function(), "it"
-        # copies: what a function changes in place is its own
+        # copies, because a function may change its arguments in place
         given = [None if each is None else mi.TensorXf(each) for each in (image, target, weights)]
         if not self._takes_weights:
             self._check_even(weights)

@@ -66,23 +66,23 @@ class Problem:
     truth: dict[str, Array] = field(default_factory=dict)
     masks: dict[str, Array] = field(default_factory=dict)
     quantities: dict[str, str] = field(default_factory=dict)
-    #: The integrator's own bound on the samples of a pass.
+    #: The integrator's own limit on the samples of a pass.
     samples_per_pass: int | None = None
-    #: Which paths make the images: `light`, `camera`, or `both` (`loading.paths_of`).
+    #: Kinds of paths of the images: `light`, `camera`, or `both` (`loading.paths_of`).
     paths: str = "light"
-    #: Whether parameters move anything that light leaves from or meets.
+    #: Whether parameters move emitters or surfaces on light paths.
     moves: bool = False
-    #: What measuring before the first iteration may take, where anything was left to it, and was not known already.
+    #: Limit for measuring before the first iteration, if any option is measured and not cached.
     allowance: Allowance | None = None
-    #: What was measured and planned before the first iteration, where it was.
+    #: Results of measuring and planning before the first iteration.
     sides: PathsRecord | None = None
     guided: GuidedRecord | None = None
     sequence: SequenceRecord | None = None
     pixels: PixelsRecord | None = None
     memory: MemoryPlan | None = None
-    #: What values cost by themselves, by key and type.
+    #: Regularizers of the values, by key and type.
     regularizers: dict[str, dict[str, Cost | Plate]] = field(default_factory=dict)
-    #: What computes the shards of a step (`shards.Engine`); None: this process, one after the other.
+    #: Computes the shards of a step (`shards.Engine`); None: this process, one by one.
     engine: Callable[..., Any] | None = None
 
     def decisions(self) -> dict[str, dict[str, Any] | None]:
@@ -111,7 +111,7 @@ class Problem:
         integrator = self.integrator
         if isinstance(integrator, LightTracer):
             integrator = integrator.afresh()
-            for sensor in self.sensors:  # what it finds out about the scene is no part of the first iteration
+            for sensor in self.sensors:  # scene facts that it collects are not part of the first iteration
                 integrator.plan(self.scene, self.scene.sensors()[sensor])
         fresh = replace(self, integrator=integrator, optimizer=make_optimizer(self.config, self.selection))
         fresh.apply()
@@ -196,7 +196,7 @@ class Problem:
             height = np.array(dr.detach(self.optimizer[key]))
             if isinstance(plate, Plate):
                 there = np.array(dr.detach(self.optimizer[plate.other]))
-                rounding = 1e-5 * plate.settings.thickness  # two of single precision are added
+                rounding = 1e-5 * plate.settings.thickness  # sums of two single-precision values
                 thin = plate.thickness(height, there) <= plate.settings.thinnest + rounding
             else:
                 lowest = next(each.lowest for each in self.selection.spec(key).regularizers

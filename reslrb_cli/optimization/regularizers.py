@@ -28,10 +28,10 @@ from reslrb_cli.config.parameters import Curvature, Laplacian, Regularizer, Slop
 
 Array = np.ndarray[Any, Any]
 
-#: A value of a parameter, as an array: what it costs, and the derivative of that, of the array's shape.
+#: Takes a parameter's value as an array; returns the cost and its derivative, of the same shape.
 Cost = Callable[[Array], tuple[float, Array]]
 
-#: A map: positions (N, 3) and texture coordinates (N, 2) of the mesh that it is laid over, and its shape (H, W, ...).
+#: A map: positions (N, 3) and texture coordinates (N, 2) of the mesh below it, and its shape (H, W, ...).
 Map = tuple[Array, Array, tuple[int, ...]]
 
 
@@ -207,7 +207,7 @@ def _between(of_norm: Callable[[Array], tuple[Array, Array]], spans: Spans) -> C
     return cost
 
 
-#: Central differences about a texel: of which neighbours (row, column), how often, and the powers of dx and dy below.
+#: Central differences about a texel: neighbours (row, column), their coefficients, and the powers of dx and dy.
 _STENCILS: tuple[tuple[dict[tuple[int, int], float], int, int], ...] = (
     ({(0, 1): 0.5, (0, -1): -0.5}, 1, 0),
     ({(1, 0): 0.5, (-1, 0): -0.5}, 0, 1),

@@ -57,7 +57,7 @@ class Best:
             loss = math.inf if record.held_out is None else record.held_out
         else:
             loss = sum(self.recent) / WINDOW if len(self.recent) == WINDOW else math.inf
-        if loss < (math.inf if self.least is None else self.least.loss):  # which what is not finite is not
+        if loss < (math.inf if self.least is None else self.least.loss):  # never true for non-finite losses
             self.least, self.values = Least(record.iteration, loss), dict(values)
 
     def to_json(self) -> dict[str, Any] | None:
@@ -68,7 +68,7 @@ class Best:
 
 Array = np.ndarray[Any, Any]
 
-#: An error has to rise by this share to be called worse, and in a run that is too short to know its wandering.
+#: Relative increase above which an error counts as worse, and the same in a run too short to know its fluctuation.
 WORSE, WORSE_IF_SHORT = 0.01, 0.1
 
 
@@ -86,7 +86,7 @@ def got_worse(errors: Sequence[float], final: float) -> bool:
     return min(final, *errors[-window(len(errors)) :]) > limit
 
 
-#: A parameter of at most so many numbers is told by them, a larger one by its mean and range.
+#: A parameter of at most this many numbers is printed in full, a larger one by its mean and range.
 MOST_NUMBERS = 4
 
 
@@ -169,7 +169,7 @@ class Results:
         first, last = self._first, self._last
         relative = self.meter.relative(first), self.meter.relative(last)
         worse = [key for key, error in last.items() if got_worse(self._errors.get(key, []), error)]
-        if self._iterations < min(run.iterations, LEAST_ITERATIONS):  # of a run that goes on nothing is known yet
+        if self._iterations < min(run.iterations, LEAST_ITERATIONS):  # a run that continues has no result yet
             worse = []
         found = {
             "rmse": {"initial": self.meter.total(first), "final": self.meter.total(last)},

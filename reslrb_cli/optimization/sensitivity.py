@@ -90,13 +90,13 @@ def unrecorded(integrator: Any) -> Any:
 
 _PURPOSE = "conditioning"
 
-#: The part of the image that a change of h replaces: aimed at, and good enough.
+#: Part of the image that a change of h should change: target and accepted range.
 AIM, LEAST, MOST = 0.03, 0.003, 0.3
-#: Renderings for each parameter, at most, until h is found.
+#: Maximum number of renderings for each parameter while h is searched.
 TRIALS = 8
-#: Gradient samples that a run takes.
+#: Gradient samples of a run.
 SAMPLES = 4
-#: What the optimiser moves in place of a parameter x, by transform.
+#: The optimiser's variable in place of a parameter x, by transform.
 _MOVED = {
     "none": "",
     "log": " in its logarithm",
@@ -105,7 +105,7 @@ _MOVED = {
 }
 
 
-#: What a spread is taken of.
+#: Quantities whose spread is measured.
 QUANTITIES = ("gradient", "change", "curvature", "length")
 
 
@@ -167,7 +167,7 @@ def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
     for key, gradients in rows.items():
         value = problem.selection.array(key)
         noise = rms(np.std(gradients, axis=0, ddof=1))
-        square = rms(np.mean(gradients, axis=0)) ** 2 - noise**2 / samples  # less what the noise adds to it
+        square = rms(np.mean(gradients, axis=0)) ** 2 - noise**2 / samples  # minus the contribution of noise
         row = Sensitivity(key, value.size, rms(value), math.sqrt(max(square, 0.0)), noise)
         downhill = dr.select(total[key] == 0, 0, -dr.sign(total[key]))
         found.append(_probe(problem, row, downhill, base, reference))
@@ -181,7 +181,7 @@ def _probe(
     """Return `row` with the sensitivity of the image along `direction`, if it changes."""
     key, value = row.key, dr.detach(problem.optimizer[row.key])
     low, high = problem.selection.spec(key).bounds or (-math.inf, math.inf)
-    # 1 % of the parameter, whatever its unit; of its range where it is 0; a guess where it has none.
+    # 1 % of the parameter, in any unit; of its range if it is 0; a guess if it has none.
     step = 0.01 * (rms(np.array(value)) or (high - low if math.isfinite(high - low) else 1.0))
     norm = math.sqrt(sum(float(np.square(r).sum()) for r in reference))
     for _ in range(TRIALS):
@@ -241,7 +241,7 @@ def rescale(problem: Problem) -> list[Scaled]:
     optimizer = problem.optimizer
     measured = [Scaled(**row.to_json()) for row in measure_sensitivities(problem, SAMPLES)]
     for place, row in enumerate(measured):
-        size = math.hypot(row.gradient, row.noise)  # of what one step hands the optimiser
+        size = math.hypot(row.gradient, row.noise)  # of the gradients of one step
         if row.length is None or size == 0:
             continue
         variable, value = optimizer.variable(row.key), dr.detach(optimizer[row.key])
@@ -251,7 +251,7 @@ def rescale(problem: Problem) -> list[Scaled]:
         unit.gain = 1 / rms(slope)
         optimizer.set_variable(row.key, unit)
         rate = problem.selection.spec(row.key).learning_rate or problem.config.optimizer.learning_rate
-        # By a learning rate upwards or downwards, whichever is farther.
+        # One learning rate up or down, whichever moves farther.
         at = unit.from_scene(value)
         up, down = (dr.abs(unit.to_scene(at + side * rate) - value) for side in (1, -1))
         measured[place] = replace(row, own_length=length, first_step=rms(np.array(dr.maximum(up, down))))
@@ -259,7 +259,7 @@ def rescale(problem: Problem) -> list[Scaled]:
     return measured
 
 
-#: Differences of gradients from which the largest curvature is taken.
+#: Differences of gradients for the largest curvature.
 POWER_ITERATIONS = 8
 
 
@@ -317,7 +317,7 @@ def _steepest(problem: Problem, key: str, v: Any, gradient: Array, base: Sequenc
         if not 0 < found < math.inf:
             return 0.0
         direction = bent / found
-        if before:  # as large a change of the image as before
+        if before:  # with the same change of the image as before
             step *= math.sqrt(before / found)
     return found
 
@@ -345,7 +345,7 @@ def own_length(transform: Transform | None, bounds: Bounds, value: Any, length: 
     if transform is None:
         return length
     low, high = bounds or (-math.inf, math.inf)
-    if math.isfinite(low) and math.isfinite(high):  # half way to the farther bound, at most
+    if math.isfinite(low) and math.isfinite(high):  # at most half way to the farther bound
         room = dr.select(value < 0.5 * (low + high), high - value, low - value)
         moved = value + dr.clip(room, -2 * length, 2 * length) / 2
     else:

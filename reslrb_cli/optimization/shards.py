@@ -46,8 +46,8 @@ Array = np.ndarray[Any, Any]
 S = TypeVar("S")
 T = TypeVar("T")
 
-#: What computes the shards: of the problem, a function of it and of further arguments, and these arguments, each with a
-#: task first. Yields place and result of each, in any order.
+#: Computes the shards: calls a function with the problem and further arguments, a task first. Yields position and
+#: result of each call, in any order.
 Engine = Callable[[Problem, Callable[..., Any], Sequence[tuple[Any, ...]]], Iterable[tuple[int, Any]]]
 
 
@@ -148,7 +148,7 @@ def shard_gradient(problem: Problem, task: Task, delta: Array | None = None) -> 
                 continue
             own |= config.step_options(shard=True)
             step = gradient_step(*at, scaled(view, part.scale), seed=part.seed, **own)
-            # One view's kernels are not to wait for the next one's.
+            # One view's kernels must not wait for the next one's.
             dr.eval(step.loss, problem.gradients())
             refused = int(step.refused.count[0]), int(step.refused.first[0]), tuple(step.refused.shape)
             found.append((float(step.loss[0]), refused, np.array(step.seen) if task.images else None))
@@ -186,7 +186,7 @@ def _held(problem: Problem) -> Iterator[None]:
             guiding.held = before
 
 
-# --- and their sums ---------------------------------------------------------------------------------------------------
+# --- sums of shards ---------------------------------------------------------------------------------------------------
 
 
 def serially(state: S, function: Callable[..., T], work: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, T]]:
@@ -299,7 +299,7 @@ def _count(refused: Refused, count: int, first: int, shape: tuple[int, ...]) -> 
 def _due(problem: Problem, guiding: Guiding, iteration: int) -> list[int]:
     """Count the iteration, and return the sensors whose tables learn in it."""
     sensors = [view.sensor for view, _ in problem.drawn(iteration)]
-    problem.integrator.plan(problem.scene, problem.scene.sensors()[sensors[0]])  # makes the grid
+    problem.integrator.plan(problem.scene, problem.scene.sensors()[sensors[0]])  # creates the grid
     return [sensor for sensor in sensors if guiding.due(sensor)]
 
 

@@ -36,16 +36,16 @@ class Stages:
     def __init__(self, whole: Problem) -> None:
         integrator = whole.integrator
         if isinstance(integrator, LightTracer) and any(stage.grain != (1, 1) for stage in whole.config.run.stages):
-            # A recording knows of one scene alone, and two live side by side.
+            # A recording holds one scene, and here two are in use.
             kept = integrator.with_options(samples_per_pass=integrator.samples_per_pass, freeze=False)
             whole = replace(whole, integrator=kept)
         self.whole, self._number, self._now = whole, len(whole.config.run.stages), whole
         guiding = guiding_of(whole)
-        #: What guided emission of `whole` knew before the first iteration.
+        #: State of guided emission of `whole` before the first iteration.
         self._learned = None if guiding is None else guiding.state()
-        #: The state with which the iteration that is at work began.
+        #: The state at the start of the current iteration.
         self.begun: State | None = None
-        #: The state at whose values `whole` stands, of those that are of another problem.
+        #: The state of another problem at whose values `whole` is.
         self._brought: State | None = None
 
     @property
@@ -70,7 +70,7 @@ class Stages:
             self._now = self.whole
         elif self.whole.config.stage(self._number).grain != self.whole.config.stage(number).grain:
             self._now = self.whole
-            gc.collect()  # another scene takes part in all that is traced, until it is gone
+            gc.collect()  # another scene takes part in all tracing until it is freed
             self._now = at_stage(self.whole, number)
         self._number = number
         return self._now
@@ -85,7 +85,7 @@ class Stages:
             return self.whole, state
         number = self.whole.config.stage_number(state.iteration / self.whole.config.run.iterations)
         if state.iteration:
-            number = max(number, state.stage)  # a run that goes on for longer does not go back
+            number = max(number, state.stage)  # a continued run does not return to an earlier stage
         if number == state.stage:
             return self.at(number), state
         if self.whole.config.stage(number).grain == self.whole.config.stage(state.stage).grain:
@@ -95,7 +95,7 @@ class Stages:
         base = {} if self.is_whole(number) else {key: np.array(value) for key, value in self.whole.values().items()}
         began = replace(state, stage=number, base=base, clamp={}, clamp_sums={}, scaling=None)
         began = standing(problem, began)
-        if number == self.last and self._learned is not None:  # whatever images it has rendered since
+        if number == self.last and self._learned is not None:  # independent of the images rendered since
             began = replace(began, guiding=self._learned[0], learned=self._learned[1])
             problem.optimizer.stands_at = None
         return problem, began

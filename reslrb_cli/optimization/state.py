@@ -153,7 +153,7 @@ def restore_tables(problem: Problem, calls: Mapping[str, int], learned: Mapping[
     sensors = {str(number) for number in range(len(problem.scene.sensors()))}
     if not set(calls) <= sensors or {f"{number}/{name}" for number in calls for name in KNOWN} != set(learned):
         return "guiding"
-    problem.integrator.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]])  # makes the grid
+    problem.integrator.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]])  # creates the grid
     wrong = guiding.restore(calls, learned.__getitem__)
     return None if wrong is None else f"guiding/{wrong}"
 
@@ -182,7 +182,7 @@ def _stored_values(problem: Problem, stored: Stored, prefix: str) -> dict[str, A
     return found
 
 
-# --- what was settled before the first iteration ----------------------------------------------------------------------
+# --- decisions before the first iteration -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ class Settled:
     initial_halo: Arrays = field(default_factory=dict, metadata=entry("initial with halo"))
     masks: Arrays = field(default_factory=dict, metadata=entry("mask"))
     pixels: PixelsRecord | None = None
-    #: How camera paths are shared out over the pixels, by the number of their sensor, (H, W).
+    #: Distribution of camera paths over the pixels (H, W), by the number of the sensor.
     shares: Arrays = field(default_factory=dict, metadata=entry("pixels"))
 
 
@@ -225,7 +225,7 @@ def decide_as(problem: Problem, stored: Stored) -> Problem:
     sides = settled.paths if is_auto(problem.config, "paths") else None
     pixels = settled.pixels if is_auto(problem.config, "pixels") else None
     if problem.memory is not None and settled.memory is not None:
-        before = settled.memory  # the passes decide in what order samples are summed up
+        before = settled.memory  # the passes determine the order of the sums
         plan = MemoryPlan(problem.memory.budget_bytes, before.samples_per_pass, before.passes, before.expected_bytes)
         problem = in_passes(problem, plan)
     integrator = as_decided(with_sides(problem.integrator, sides), guided, sequence)

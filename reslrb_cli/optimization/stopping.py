@@ -20,7 +20,7 @@ from reslrb_cli.optimization.state import State
 from reslrb_cli.optimization.trend import SPANS, levels_of, line, stands
 from reslrb_cli.records.metrics import Record
 
-#: The factor by which a plateau lowers the learning rate.
+#: Factor on the learning rate at a plateau.
 FACTOR = 0.5
 
 
@@ -31,7 +31,7 @@ def lowered(optimizer: AnyOptimizer, drops: int) -> float:
     return max(FACTOR**drops, optimizer.final_fraction)
 
 
-#: How `State.stopped` begins where `run.max_seconds` ended the run.
+#: Prefix of `State.stopped` if `run.max_seconds` ended the run.
 OUT_OF_TIME = "the time is up"
 
 

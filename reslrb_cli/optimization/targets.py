@@ -34,9 +34,9 @@ from reslrb_cli.scene.visibility import interior, sees_specular, spread
 
 #: The seed of rendered targets.
 TARGET_SEED = 0
-#: Remarks on views that are said in full.
+#: Remarks on views that are shown in full.
 FEW_REMARKS = 2
-#: What pixels of each kind are said to do.
+#: Descriptions of pixels of each kind.
 WORDS = {
     "specular": "show smooth glass or mirrors",
     "mixed": "show coats, blends or thin panes",
@@ -67,8 +67,8 @@ def mask_of(config: Config, wanted: Wanted, scene: mi.Scene, photo: Photo | None
             found.left_out["border"] = ~interior((height, width), sensor)
     if photo is not None:
         if mask.clipped:
-            # The image has there what the filter spreads of a lamp; the file, what it spread of a lamp of the greatest
-            # value. Beside one that is 45 times as bright as white they are half as bright as they should be.
+            # The image contains the filter's spread of the lamp itself; the file, that of a lamp clipped to white.
+            # Beside a lamp 45 times as bright as white, the file is half as bright as it should be.
             found.left_out["clipped"] = photo.clipped
             found.left_out["beside"] = spread(photo.clipped, sensor) & ~photo.clipped
         if mask.alpha:
@@ -118,7 +118,7 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
     _say_few(remarks, say)
     if problem.config.target.render is not None:
         problem = replace(problem, truth=_render_targets(problem, say))
-        gc.collect()  # a second scene takes part in all that is traced, until it is gone
+        gc.collect()  # a second scene takes part in all tracing until it is freed
     elif problem.config.target.truth:
         true_scene = load_configured(config, warn=False)
         problem = replace(
@@ -162,7 +162,7 @@ def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: C
     render, made_of = config.target.render, "camera"  # a photograph has all light
     if photo is None and render is not None:
         made_of = paths_of(render.integrator or config.integrator, problem.scene, problem.sensors, problem.moves)
-    # Light paths lack what the others have.
+    # Light paths miss light that other paths have.
     lacking = (made_of == "light") != (problem.paths == "light")
     view.masked = mask_of(config, wanted, problem.scene, photo, lacking)
     weights = view.masked.total(target.shape[:2])
@@ -207,7 +207,7 @@ def _truth(problem: Problem, true_values: Selection, say: Callable[[str], None])
     """Return the parameters' true values."""
     truth: dict[str, Array] = {}
     for key in problem.selection.keys:
-        if key in problem.selection.factors:  # the scene's own images are the target
+        if key in problem.selection.factors:  # the target is an image of the scene itself
             truth[key] = np.ones_like(problem.selection.array(key))
             continue
         truth[key] = true_values.array(key)

@@ -34,28 +34,28 @@ import numpy as np
 
 from reslrb_cli.statistics import Array
 
-#: The most runs, as a share, that may be stopped though their loss falls by `relative` a window.
+#: Maximum share of runs that stop although their loss falls by `relative` per window.
 CHANCE = 0.04
 
-#: Numbers of windows over which a loss may stand: more windows show less noise, fewer show an end of the fall sooner.
+#: Numbers of windows for a flat loss: more windows have less noise, fewer detect the end of the fall earlier.
 SPANS = sorted(least << power for least in (3, 4, 5) for power in range(7))
 
-#: Shorter series are not judged, and no fewer losses make a level at the start or the end.
+#: Shorter series are not judged, and this is the minimum number of losses for a level at the start or the end.
 LEAST_ITERATIONS, LEAST_WINDOW = 20, 5
 
-#: How sure a change has to be (one-sided).
+#: Confidence for a change (one-sided).
 CONFIDENCE = 0.99
 
-#: The chance that is left to the ends alone: their losses are compared one by one, and may be correlated.
+#: Probability for the ends only: their losses are compared one by one, and may be correlated.
 SURE_ENDS = 1e-4
 
-#: A fall by less than this share of the start counts as none.
+#: A fall by less than this share of the start does not count.
 MOST_FALL = 0.25
 
-#: The first losses that show a fall that is over soon.
+#: Losses at the start that can show a short fall.
 EARLY = 3
 
-#: Parts of a series that the line of `find_trend` goes through.
+#: Parts of a series for the line of `find_trend`.
 PARTS = 10
 
 
@@ -185,6 +185,6 @@ def _level(values: Array) -> Level:
 
 def _quantile(freedom: int, chance: float) -> float:
     """Return the quantile of Student's t that is exceeded with this probability."""
-    from scipy.special import stdtrit  # late: imports of the command line are to be fast
+    from scipy.special import stdtrit  # late, because the command line must start fast
 
     return -float(stdtrit(freedom, chance))

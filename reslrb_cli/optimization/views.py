@@ -38,7 +38,7 @@ from reslrb_cli.scene.visibility import sees_specular
 
 Array = np.ndarray[Any, Any]
 
-#: The key of an exposure that all views share.
+#: Key of an exposure shared by all views.
 SHARED = "exposure"
 
 
@@ -74,7 +74,7 @@ class Exposure:
     def add_gradient(self, leaf: Any, channels: int, image: mi.TensorXf, gradient: mi.TensorXf) -> None:
         """Add dL/dE to the gradient of `leaf`, for an image (H, W, `channels` or more) and its dL/dI."""
         product = first_channels(image, channels) * first_channels(gradient, channels)
-        # A pixel that is left out may hold anything, and has no derivative.
+        # Excluded pixels may hold any value and have no derivative.
         each = dr.select(first_channels(gradient, channels).array != 0, product.array, 0)
         if dr.size_v(leaf) == 3:
             pixel = dr.arange(mi.UInt32, dr.width(each) // 3)
@@ -243,7 +243,7 @@ class View:
             return
         seen = sees_specular(scene, scene.sensors()[self.sensor])
         weights = np.where(seen.alone, np.float32(0), self.fixed)
-        if weights.any():  # glass before the whole film leaves nothing to go by: the mask stays
+        if weights.any():  # glass before the whole film would leave no pixels, so the mask stays
             self.weigh(weights)
 
     def compare(self, image: mi.TensorXf) -> mi.Float:
@@ -261,7 +261,7 @@ class View:
             image = whole_of(image)
         if self.weights is None:
             return loss(image, target)
-        # Whatever stands in a pixel that is left out, also if it is not finite, has neither loss nor derivative.
+        # Excluded pixels, even with non-finite values, have neither loss nor derivative.
         return loss(dr.select(self.weights > 0, image, target), target, self.weights)
 
     def curvature(self, known: bool) -> Array:
@@ -361,7 +361,7 @@ def expose(views: list[View], scene: mi.Scene, selection: Selection) -> None:
             view.exposure = Exposure(fixed=kind)
             continue
         view.exposure = Exposure(key=key, values=selection.factors)
-        if key not in selection.factors:  # recovered in its logarithm, from 1 on
+        if key not in selection.factors:  # recovered as a logarithm, starting at 1
             each = kind == "per_channel" and color_channels(scene.sensors()[view.sensor].film()) == 3
             one = mi.Color3f(1) if each else mi.Float(1)
             selection.add_factor(key, one + dr.opaque(mi.Float, 0), Settings(initial=1.0, transform="log"))

@@ -21,10 +21,10 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.images import FORMATS, image_size
 from reslrb_cli.scene.xml.read import Description, Element
 
-#: By how much the focal lengths of rows and columns may differ, relative to them.
+#: Maximum relative difference between the focal lengths of rows and columns.
 SQUARE = 1e-3
 
-#: COLMAP's models without a fisheye, and the names of their parameters; `f` is both focal lengths.
+#: COLMAP's models without fisheyes, and the names of their parameters; `f` is both focal lengths.
 MODELS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -35,7 +35,7 @@ MODELS = {
 }
 
 _DISTORTION = re.compile(r"[kp]\d")
-#: From a camera's axes to the sensor's: of NeRF (x right, y up, looking along -z) and of COLMAP (y down, along +z).
+#: From a camera's axes to the sensor's: NeRF (x right, y up, view along -z) and COLMAP (y down, view along +z).
 _NERF, _COLMAP = np.diag([-1.0, 1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
@@ -175,7 +175,7 @@ def _check_square(source: object, key: str, fx: float, fy: float) -> None:
 
 
 def _colmap(file: Path) -> list[Camera]:
-    from scipy.spatial.transform import Rotation  # late: few scenes have such a file
+    from scipy.spatial.transform import Rotation  # late, because few scenes have such a file
 
     models = dict(_models(file.with_name("cameras.txt")))
     cameras = []

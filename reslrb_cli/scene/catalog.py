@@ -26,11 +26,11 @@ from reslrb_cli.scene.needs import (
     unsupported_part,
 )
 
-#: Spectra by wavelength, which RGB variants cannot evaluate: their numbers describe what stands in the scene file.
+#: Spectra by wavelength, which RGB variants cannot evaluate: their numbers only describe the scene file.
 _SPECTRA = ("RegularSpectrum", "IrregularSpectrum", "BlackBodySpectrum")
-#: What a mesh has besides attributes such as `vertex_color`.
+#: Parameters of a mesh besides attributes such as `vertex_color`.
 _MESH_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex_count", "face_count", "faces")
-#: Numbers that are written out one by one; of more, their mean and range.
+#: Maximum number of printed values; larger arrays show mean and range.
 _FEW = 4
 
 
@@ -150,7 +150,7 @@ def _encoded_value(array: np.ndarray, texture: mi.Texture) -> Value:
     table = np.arange(256, dtype=np.float32) / 255
     if not re.search(r"^ *raw = 1,$", str(texture), re.MULTILINE):
         table = np.array(dr.srgb_to_linear(mi.Float(table)))
-    # By rows, since it is counted as integers of 8 bytes.
+    # By rows, because bincount converts to integers of 8 bytes.
     counts = np.sum([np.bincount(row.ravel(), minlength=256) for row in array], axis=0)
     there = table[counts > 0]
     numbers = [float(table[level]) for level in array.ravel()] if array.size <= _FEW else None
@@ -197,7 +197,7 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
         return f"is not a property of a material or a light; {only}"
     if kind == "emitter" and name in BEAMS:
         return f"{BEAMS[name]}; only the emission of an emitter has derivatives"
-    if coarse is not None:  # not differentiable for that reason alone
+    if coarse is not None:  # not differentiable only for that reason
         return None
     bits = _storage_bits(value)
     if bits is not None and bits < 32:

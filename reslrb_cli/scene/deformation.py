@@ -34,21 +34,21 @@ from reslrb_cli.scene.graph import bounds, face_normals, triangles
 
 #: Analytic shapes whose `to_world` moves their surface interactions and their samples.
 MOVING_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
-#: What of a mesh moves light.
+#: Parameters of a mesh that move light.
 MOVING_MESH = ("vertex_positions", "vertex_normals")
-#: Emitters without a surface that can move, and what moves them.
+#: Emitters without a surface that can move, and their parameters.
 MOVING_EMITTERS = {
     "PointLight": "position",
     **dict.fromkeys(("SpotLight", "Projector", "DirectionalEmitter"), "to_world"),
 }
-#: Parameters that say where an emitter is.
+#: Parameters with the position of an emitter.
 PLACES = ("position", "to_world")
-#: Parameters of emitters that are flagged as differentiable, and change where light goes as well.
+#: Parameters of emitters that are flagged as differentiable, and also change the directions of light.
 BEAMS = {
     **dict.fromkeys(("cutoff_angle", "beam_width", "sun_aperture"), "shapes the beam"),
     "sun_direction": "moves the light",
 }
-#: Parameters that say where an object is: a rectangle has its vertices besides.
+#: Parameters with the position of an object; a rectangle also has vertices.
 _PLACED = ("to_world", "vertex_positions", "position")
 
 
@@ -67,7 +67,7 @@ def moving_obstacle(node: mi.Shape | mi.Emitter, key: str) -> str | None:
         if kind in ("EnvironmentMapEmitter", "SunskyEmitter"):
             return f"a rotating {kind} has no derivative here: its directions are sampled by its radiance in each"
         return f"a moving {kind} has no derivative here"
-    if node.is_mesh() and kind not in MOVING_SHAPES:  # Mitsuba takes a rectangle for a mesh, too
+    if node.is_mesh() and kind not in MOVING_SHAPES:  # Mitsuba treats a rectangle as a mesh, too
         moving = " and ".join(MOVING_MESH)
         return None if name in MOVING_MESH else f"of a mesh, {moving} have derivatives, not {name}"
     if kind in MOVING_SHAPES and name == "to_world":
@@ -159,9 +159,9 @@ def where_moved(params: mi.SceneParameters, keys: list[str]) -> list[Movable]:
     return found
 
 
-#: By how much a sphere that has become too small is larger than need be: kernels are compiled for each one.
+#: Margin of a sphere that has become too small, because each size compiles kernels.
 MARGIN = 1.25
-#: A sphere this many times as large as need be wastes light paths.
+#: A sphere larger than this multiple of the needed size wastes light paths.
 TOO_LARGE = 2.0
 
 
@@ -196,7 +196,7 @@ class Surroundings:
         bounded = scene
         if before is not None:
             radius *= MARGIN
-            # An emitter asks a scene for its bounds, and nothing else; this one has those that it is to know.
+            # An emitter only asks a scene for its bounds; this scene has the required bounds.
             corner = mi.ScalarTransform4f().translate([x, y, z]).scale(radius / 3**0.5)
             bounded = mi.load_dict({"type": "scene", "box": {"type": "cube", "to_world": corner}})
         self._horizon = Horizon((x, y, z), radius)
@@ -270,7 +270,7 @@ class Deformation:
 
     params: mi.SceneParameters
     values: dict[str, Any] = field(default_factory=dict)
-    #: `length`, `degrees` or `scale`, by name: what has one of these units adds up.
+    #: `length`, `degrees` or `scale`, by name: values of the same unit can be added.
     quantities: dict[str, str] = field(default_factory=dict)
     _moved: dict[str, _Moved] = field(default_factory=dict)
     _corners: dict[tuple[str, int, int], tuple[list[mi.UInt32], list[mi.Float]]] = field(default_factory=dict)
@@ -341,7 +341,7 @@ class Deformation:
             dr.clear_grad(moved.leaf)
             dr.enqueue(dr.ADMode.Backward, moved.tracked)
         if tracked:
-            # Edges stay, for the next step from the same values.
+            # Keep edges for the next step from the same values.
             dr.traverse(dr.ADMode.Backward, dr.ADFlag.ClearVertices)
 
     def push(self) -> None:
@@ -373,7 +373,7 @@ class Deformation:
             return dr.ravel(motion.matrix(self.values) @ mi.Point3f(base))
         if item.is_point or item.is_shape:
             return motion.matrix(self.values) @ base
-        # An emitter's frame has no scale: its place moves, and its directions turn.
+        # An emitter's frame has no scale: its position moves, and its directions rotate.
         to, place = mi.AffineTransform4f, base @ mi.Point3f(0)
         there, turned = motion.matrix(self.values) @ place, motion.matrix(self.values, scaled=False)
         return to().translate(there) @ turned @ to().translate(-place) @ base
@@ -433,7 +433,7 @@ def _centre(params: mi.SceneParameters, items: tuple[Movable, ...]) -> tuple[flo
     for item in items:
         if item.is_shape:
             corners += bounds(item.node)
-        elif item.node.class_name() != "DirectionalEmitter":  # which is nowhere
+        elif item.node.class_name() != "DirectionalEmitter":  # it has no position
             value = params[item.key]
             corners.append(np.ravel(value if item.is_point else value @ mi.Point3f(0)).astype(np.float64))
     if not corners:

@@ -62,17 +62,17 @@ def triple(owner: Element, tag: str, name: str, value: Array) -> Element:
 
 #: The exported scene, in its folder.
 SCENE = "scene.xml"
-#: Folders beside it: of recovered values, and of files from elsewhere than the scene's own folder.
+#: Folders beside it: recovered values, and files from outside the scene's folder.
 RECOVERED, ELSEWHERE = "recovered", "assets"
 #: Parameters of a mesh that a PLY file does not hold.
 _KEPT = ("face_normals", "flip_normals")
-#: What gives a place in another way than `to_world`, by tag.
+#: Other parameters of a position than `to_world`, by tag.
 _OTHER_PLACES = {"shape": ("center", "radius", "p0", "p1"), "emitter": ("direction", "position")}
 
-#: BSDFs whose `eta` is that of the inside over that of the outside.
+#: BSDFs whose `eta` is the index inside divided by that outside.
 _RELATIVE_INDEX = ("dielectric", "roughdielectric", "thindielectric", "plastic", "roughplastic")
 
-#: What Mitsuba leaves out of a `principled` BSDF for good where it begins at 0.
+#: Features that Mitsuba leaves out of a `principled` BSDF permanently if they start at 0.
 LOBES = (
     *("anisotropic", "clearcoat", "diff_trans", "flatness", "metallic"),
     *("sheen", "sheen_tint", "spec_tint", "spec_trans"),
@@ -103,7 +103,7 @@ class Replacing:
         if below:
             self._put_nested(owner, below, name, key)
         elif isinstance(node, mi.Mesh) and name != "to_world":
-            # The file has vertices as they stand in the world, faces and attributes.
+            # The file has vertices in world coordinates, faces and attributes.
             owner.children[:] = [item for item in owner.children if not item.is_value or item.name in _KEPT]
             owner.attributes["type"] = "ply"
             self._add_file(owner, file_stem(key.rpartition(".")[0]), ".ply", lambda path: node.write_ply(str(path)))
@@ -126,7 +126,7 @@ class Replacing:
         if name == "value" and len(below) == 1:
             self._put_spectrum(owner, below[0], key)
         elif name == "value" and below[0] == "bsdf" and len(below) == 2 and owner.tag == "shape":
-            # Mitsuba's own, where a shape has none.
+            # Mitsuba's default, if a shape has none.
             reflectance = colour(owner, below[1], self._array(key), bounded=True)
             owner.children.append(owner.new("bsdf", reflectance, type="diffuse"))
         else:
@@ -145,7 +145,7 @@ class Replacing:
         if owner.type == "spot" and name == "texture":
             raise self._fail(key, "Mitsuba requires an image as a spot's texture; recover the spot's intensity instead")
         if owner.type in _CONDUCTORS and name in ("eta", "k"):
-            # A material's name gives both, and either stands in its place with the other alone.
+            # A material's name sets both, so either must be written with the other.
             stem = key.rpartition(f".{name}.value")[0]
             for each in ("eta", "k"):
                 replace(owner, colour(owner, each, self._array(f"{stem}.{each}.value"), bounded=False), "material")
@@ -161,7 +161,7 @@ class Replacing:
         image = self._array(key)
         self._add_file(owner, file_stem(key), ".exr", lambda path: write_file(path, image, linear=True))
         if owner.tag == "texture":
-            # Its values are linear as they stand, in a file of floats, and not to be rounded to fewer bits.
+            # The file holds linear floats, which must not be rounded to fewer bits.
             replace(owner, owner.new("string", name="format", value="variant"), "color_space", "gamma")
 
     def _array(self, key: str) -> Array:
@@ -227,9 +227,9 @@ def same_values(a: object, b: object) -> bool:
     return bool(np.allclose(x, y, rtol=1e-5, atol=1e-6 * scale))
 
 
-#: What of a scene is no part of what it looks like.
+#: Parts of a scene that do not affect its appearance.
 _ASIDE = ("silhouette_sampling_weight", "sampling_weight")
-#: How Mitsuba names what has lost its id, as bitmaps do that nothing uses: by where it lies in memory.
+#: Mitsuba's names for objects without an id, such as unused bitmaps: their memory address.
 _ADDRESS = re.compile(r"object_\d+\.")
 
 
@@ -253,7 +253,7 @@ def export_scene(
     replacing, root = Replacing(description, params, source), description.root
     for key in keys:
         replacing.put(key)
-    replacing.writers |= beside or {}  # before assets, which take other names than these
+    replacing.writers |= beside or {}  # before assets, which then get other names
     replacing.copy_assets()
     options = [
         root.new({bool: "boolean", int: "integer"}.get(type(value), "float"), name=name, value=str(value).lower())
@@ -277,13 +277,13 @@ def export_scene(
 
 def _check(folder: Path, params: mi.SceneParameters, source: object) -> None:
     """Raise ConfigError if Mitsuba does not read the values of `params` from `folder`."""
-    with looking_in([folder]):  # for plugins, which it would take from the working folder as well
+    with looking_in([folder]):  # otherwise Mitsuba also loads plugins from the working folder
         try:
             found = mi.traverse(mi.load_file(str(folder / SCENE), optimize=False))
         except Exception as error:
             raise ConfigError(source, "", f"cannot be exported: Mitsuba does not read it back ({error})") from None
     for key in params.properties:
-        is_given = params.properties[key][0] is not None  # by the files; Mitsuba does not hand out what is not
+        is_given = params.properties[key][0] is not None  # set by the files; Mitsuba does not expose other parameters
         if not is_given or key.rpartition(".")[2] in _ASIDE or key.startswith("integrator."):
             continue
         if key not in found.properties and not _ADDRESS.match(key):

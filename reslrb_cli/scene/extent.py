@@ -24,14 +24,14 @@ from reslrb_cli.scene.graph import (
 )
 from reslrb_cli.scene.xml.read import quoted
 
-#: The largest ray offset, as a fraction of the scene's size, with which no loss of light is to be seen: that of a room
-#: of size 3 that stands about 150 from the origin, or measures a fiftieth across.
+#: Largest ray offset, as a fraction of the scene's size, without visible loss of light: that of a room of size 3 at
+#: about 150 from the origin, or of a room a fiftieth in size.
 LARGEST_OFFSET = 5e-3
-#: Rays from each sensor, and from the lights, that look for faces at the same place, along each side of a grid.
+#: Rays per side of a grid, from each sensor and from the lights, that search for coincident faces.
 _RAYS = 128
-#: Sensors that do.
+#: Sensors that send such rays.
 _SENSORS = 8
-#: Pairs of shapes that are named.
+#: Maximum number of named pairs of shapes.
 _NAMED = 2
 
 
@@ -76,7 +76,7 @@ def clipped(scene: Any, sensor: Any) -> tuple[bool, bool]:
     corners = np.array(list(product(*zip(*bounds(scene), strict=True))))
     beyond = bool(((corners - eye) @ axes[:, 2]).max() > far)
 
-    # The box, in the sensor's coordinates, around all that may be between the aperture and the near plane.
+    # The box, in sensor coordinates, that contains everything between the aperture and the near plane.
     width, height = (int(n) for n in sensor.film().size())
     shift = max((float(np.abs(value).max()) for key, value in params if key.startswith("principal_point")), default=0.0)
     tangent = np.tan(np.deg2rad(float(params["x_fov"][0])) / 2) * max(1, height / width) * (1 + 2 * shift)
@@ -95,7 +95,7 @@ def _touches(shape: Any, axes: np.ndarray, eye: np.ndarray, middle: np.ndarray, 
     beside = (np.abs(apart) > extent + np.abs(axes) @ half) | (np.abs(apart @ axes) > half + extent @ np.abs(axes))
     if beside.any():
         return False
-    if shape.class_name() == "Sphere":  # which a sensor may stand in
+    if shape.class_name() == "Sphere":  # a sensor may be inside it
         return bool(np.linalg.norm(apart) + np.linalg.norm(half) > extent.min() * 0.999)
     if not shape.is_mesh():
         return True
@@ -118,7 +118,7 @@ def _coincident(scene: Any) -> str | None:
     if not twins:
         return None
     pairs = {twins[key]: None for key in _met(scene, shapes) if key in twins}
-    if not pairs:  # as between two boxes that stand side by side
+    if not pairs:  # as between two boxes side by side
         return None
     named = [" and ".join(quoted(shapes[index].id()) for index in dict.fromkeys(pair)) for pair in sorted(pairs)]
     more = f" (and {len(named) - _NAMED} more pairs)" if len(named) > _NAMED else ""
@@ -129,8 +129,8 @@ def _coincident(scene: Any) -> str | None:
     )
 
 
-#: The number of a shape in `scene.shapes()` and that of one of its faces (of a mesh, else 0), and the shapes of it and
-#: of the face at the same place.
+#: From the number of a shape in `scene.shapes()` and of one of its faces (0 if no mesh), to the numbers of a shape and
+#: face at the same place.
 _Twins = dict[tuple[int, int], tuple[int, int]]
 
 
@@ -143,7 +143,7 @@ def _twin_faces(shapes: Sequence[Any]) -> _Twins:
     owner = np.repeat(meshes, [len(part) for part in corners])
     number = np.concatenate([np.arange(len(part)) for part in corners])
     faces = np.concatenate(corners) + np.float32(0)  # -0 is 0
-    # Hashes of corners, summed over them: equal in any order.
+    # Sums of hashes of corners, which do not depend on the order.
     factors = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
     hashes = (faces.view(np.uint32) * factors).sum(2, dtype=np.uint64)
     hashes = (hashes ^ (hashes >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -211,7 +211,7 @@ def _met(scene: Any, shapes: Sequence[Any]) -> set[tuple[int, int]]:
         sensor_rays(sensor, sensor.shutter_open(), place, mi.Point2f(*numbers[:2]))[0]
         for sensor in scene.sensors()[:_SENSORS]
     ]
-    with contextlib.suppress(UnsupportedScene):  # which is said where paths from the light are wanted
+    with contextlib.suppress(UnsupportedScene):  # a warning if light paths are used
         rays.append(emitted_rays(scene, numbers[0], mi.Point2f(*numbers[1:]), place)[0])
     index = {int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]): k for k, shape in enumerate(shapes)}
     met: set[tuple[int, int]] = set()
@@ -224,13 +224,14 @@ def _met(scene: Any, shapes: Sequence[Any]) -> set[tuple[int, int]]:
     return met
 
 
-#: Rays start so many offsets before the next surface, at least, where nothing is said.
+#: Minimum distance of a ray's origin from the next surface, in offsets, without a warning.
 LEAST_OFFSETS = 10
-#: Of the crossings that light meets, the share that may be nearer: at edges, and where it grazes a ball.
+#: Share of crossings that may be closer: at edges, and at grazing incidence on a sphere.
 SHARE = 0.01
-#: What rounding may put between the places where two rays meet one surface: in offsets, and of the longer ray's length.
+#: Maximum distance, by rounding, between the points where two rays meet one surface: in offsets, and relative to the
+#: longer ray.
 ROUNDING, FAR = 0.1, 1e-5
-#: Paths that are followed, and surfaces along each.
+#: Number of traced paths, and surfaces along each.
 _PATHS, _SURFACES = 4096, 8
 
 
@@ -247,10 +248,10 @@ def _thin_glass(scene: mi.Scene) -> str | None:
     numbers = [mi.Float(mi.sample_tea_float32(index, mi.UInt32(k))) for k in range(5)]
     try:
         ray, _ = emitted_rays(scene, numbers[0], mi.Point2f(*numbers[1:3]), mi.Point2f(*numbers[3:5]))
-    except UnsupportedScene:  # which is said where paths from the light are wanted
+    except UnsupportedScene:  # a warning if light paths are used
         return None
-    # Each surface of a shape is a program of its own to trace, in every interaction that is asked for: of thousands of
-    # shapes as many. So the loop is symbolic, and the way back, of which the distance alone is wanted, has none.
+    # Each shape adds code to every surface interaction, so thousands of shapes compile slowly. The loop is therefore
+    # symbolic, and the return ray, of which only the distance is needed, computes no interaction.
     first = scene.ray_intersect_preliminary(ray)
     si = first.compute_surface_interaction(ray, mi.RayFlags.Minimal)
     gaps = dr.full(mi.Float, dr.nan, _PATHS * _SURFACES)
@@ -266,8 +267,8 @@ def _thin_glass(scene: mi.Scene) -> str | None:
         hit = scene.ray_intersect_preliminary(ray, active=active)
         following = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
         onward = active & following.is_valid()
-        # Back from the next surface, on the line through p: to this one, or to what the ray on has jumped over. Rays
-        # are offset along the normal, so that they themselves run beside that line, and meet what is oblique elsewhere.
+        # From the next surface back, on the line through p, to this surface or to one that the onward ray has skipped.
+        # Rays are offset along the normal, so they run beside that line and hit oblique surfaces elsewhere.
         own = mi.math.RayEpsilon * (1 + dr.max(dr.abs(following.p)))
         behind = p + (dr.dot(following.p - p, d) - own) * d
         back = scene.ray_intersect_preliminary(mi.Ray3f(behind, -d), active=onward)

@@ -17,7 +17,7 @@ from reslrb_cli.records.run_folder import checkpoint_of
 from reslrb_cli.scene.cameras import read_cameras
 from reslrb_cli.scene.xml.read import read_description
 
-#: Bytes that are read at once.
+#: Bytes read at once.
 _PART = 2**20
 
 
@@ -35,7 +35,7 @@ def files_of(config: Config) -> dict[str, Path]:
     settings = config.model_dump(exclude={"run"})
     found = {key: path for key, path in _paths(settings, "") if path.exists()}
     for key, path in list(found.items()):
-        if path.is_dir():  # of a run, whose values are taken
+        if path.is_dir():  # of a run whose values are used
             found[key] = checkpoint_of(path)
     found |= {key: one.path for key, one in config.codes.items() if one.path is not None}
     beside: list[tuple[str, Path]] = []

@@ -103,7 +103,7 @@ class SceneGraph:
     def nested_bsdfs(self, bsdf: Any) -> list[Any]:
         """Return a BSDF and those nested in it."""
         found = [bsdf]
-        for item in found:  # which grows meanwhile
+        for item in found:  # the list grows during the loop
             found += [child for child in self.children[item] if isinstance(child, mi.BSDF) and child not in found]
         return found
 
@@ -198,11 +198,11 @@ def failure(call: Callable[[], object]) -> str | None:
     return None
 
 
-#: What a lamp's diameter on the film is below, in pixels.
+#: Maximum diameter on the film, in pixels, of a small lamp.
 SMALL = 1.0
-#: Lamps, at the most: of those, light is told from all other by comparing each in turn.
+#: Maximum number of lamps, because each hit is compared with every lamp.
 MOST = 64
-#: Points of a lamp along each side of a grid, by which it is found to be in view.
+#: Points of a lamp per side of a grid that decide whether it is in view.
 POINTS = 16
 
 
@@ -245,7 +245,7 @@ def bounds(item: Any) -> tuple[np.ndarray, np.ndarray]:
     box = item.bbox()
     low, high = np.ravel(box.min).astype(np.float64), np.ravel(box.max).astype(np.float64)
     if (low > high).any() and isinstance(item, mi.Mesh) and item.vertex_count():
-        # Mitsuba does not measure the mesh that it merges several shapes of one material into.
+        # Mitsuba computes no bounds for the mesh that it merges from shapes of one material.
         corners = triangles(item)
         low, high = corners.min((0, 1)), corners.max((0, 1))
     return low, high

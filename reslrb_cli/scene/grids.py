@@ -23,7 +23,7 @@ def make_grid(description: Description, id: str, size: tuple[int, int], place: P
     """
     element = description.root.by_id().get(id)
     if element is None or element.tag != "shape":
-        return  # what selects the parameter says why
+        return  # the selection of the parameter reports the reason
     kept = [item for item in element.children if not item.is_value or item.name in _KEPT_OF_GRID]
     if element.type != "rectangle":
         corners = _corners_of(element, description)
@@ -46,7 +46,7 @@ def make_grid(description: Description, id: str, size: tuple[int, int], place: P
     element.children[:] = [element.new("string", name="filename", value=str(_grid_file(*size, inside_out))), *kept]
 
 
-#: What a rectangle hands on to a grid of it.
+#: Parameters that a rectangle passes to its grid.
 _KEPT_OF_GRID = ("to_world", "flip_normals", "face_normals")
 
 

@@ -29,15 +29,15 @@ logger = logging.getLogger(__name__)
 FORMATS = "EXR, PNG, JPG, HDR, PFM, PPM or BMP"
 _NO_IMAGE = f"is not a readable image ({FORMATS})"
 _CUT_OFF = "is truncated: the file ends before its image; copy or save it again"
-#: Bytes in which a file says how large its image is; a preview may stand before it.
+#: Bytes that contain the size of an image; a preview may come first.
 _HEAD = 2**20
-#: Parts that a PNG or a JPEG has at most, so that one of nothing but empty parts takes no time.
+#: Maximum number of parts of a PNG or JPEG, so that a file with only empty parts is read fast.
 _MOST_PARTS = 2**20
-#: Bytes of what EXIF says: a segment of a JPEG has no more, and the orientation stands at its beginning.
+#: Bytes of EXIF data: a JPEG segment has no more, and the orientation is at its start.
 _EXIF_BYTES = 2**16
 Size = tuple[int, int]
 
-#: What is done to the pixels of a file to see them upright, by EXIF's number of the orientation; 1 is upright.
+#: Operations that turn the pixels upright, by EXIF's orientation number; 1 is upright.
 TURNS = {
     2: "mirrored left to right",
     3: "turned by 180 degrees",
@@ -107,7 +107,7 @@ def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> 
 
 def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """Return an image (H, W, ...) of this EXIF orientation upright; a view."""
-    if orientation >= 5:  # rows of the file are columns of what is seen
+    if orientation >= 5:  # rows of the file are columns of the view
         pixels = pixels.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
         pixels = pixels[::-1]
@@ -140,7 +140,7 @@ def _examine(path: Path) -> _Header:
         try:
             head = file.read(_HEAD) or b""
             reader = next((reader for magic, reader in _READERS.items() if head.startswith(magic)), None)
-            with suppress(struct.error, ValueError):  # a head that is cut off is none
+            with suppress(struct.error, ValueError):  # a truncated header does not count
                 header = None if reader is None else reader(path, head, file)
         except OSError as error:
             raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
@@ -152,9 +152,9 @@ def _examine(path: Path) -> _Header:
 # --- formats ----------------------------------------------------------------------------------------------------------
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
-#: How a JPEG's segment of EXIF begins, and the entry in it that says how the camera was held: a number of 16 bits.
+#: Start of a JPEG's EXIF segment, and the tag of the camera's orientation, a number of 16 bits.
 _EXIF, _ORIENTATION, _SHORT = b"Exif\0\0", 0x0112, 3
-#: The next marker after compressed data, in which 0xFF stands before 0, or before the number of a restart.
+#: The next marker after compressed data, in which 0xFF is followed by 0 or by the number of a restart.
 _MARKER = re.compile(rb"\xff+[\x01-\xcf\xd8-\xfe]")
 
 
@@ -166,7 +166,7 @@ def _png(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
     for _ in range(_MOST_PARTS):
         file.seek(position)
         length, kind = struct.unpack(">I4s", file.read(8).ljust(8, b"\0"))
-        position += 12 + length  # with its check sum
+        position += 12 + length  # including its checksum
         if position > end:
             raise ConfigError(path, "", _CUT_OFF)
         if kind == b"eXIf" and not exif:
@@ -207,7 +207,7 @@ def _orientation(exif: bytes) -> int:
     Only the entries of the first directory are read, each once.
     """
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
-    with suppress(struct.error):  # what stands outside of the data
+    with suppress(struct.error):  # offsets outside the data
         if order is not None:
             [place] = struct.unpack_from(f"{order}I", exif, 4)
             [count] = struct.unpack_from(f"{order}H", exif, place)
@@ -220,7 +220,7 @@ def _orientation(exif: bytes) -> int:
 
 def _exr(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
     position = 8
-    while True:  # attributes: a name and a type, each ended by a zero, the number of bytes, and these
+    while True:  # attributes: a name and a type that end with a zero, the number of bytes, and the bytes
         name, _, rest = head[position : position + 600].partition(b"\0")
         kind, _, _ = rest.partition(b"\0")
         position += len(name) + len(kind) + 2
@@ -238,7 +238,7 @@ def _hdr(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
     if found is None:
         return None
     width, height = int(found[2]), int(found[1])
-    if width * height <= PIXELS:  # else it is refused for that
+    if width * height <= PIXELS:  # larger images are refused anyway
         file.seek(found.end())
         if not _are_whole(file.read(), width, height):
             raise DamagedImage(path, "", "is damaged or truncated; copy or save it again")
@@ -290,7 +290,7 @@ _READERS: dict[bytes, Callable[[Path, bytes, BinaryIO], _Header | None]] = {
 }
 
 
-# --- what a C library says --------------------------------------------------------------------------------------------
+# --- messages of C libraries ------------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -301,11 +301,11 @@ def _heard(lines: list[str]) -> Iterator[None]:
     """
     try:
         before = os.dup(2)
-    except OSError:  # closed: nothing is heard
+    except OSError:  # closed: no messages
         yield
         return
     listening, speaking = os.pipe()
-    for end in (listening, speaking):  # what does not fit is not heard; neither end waits for the other
+    for end in (listening, speaking):  # messages beyond the buffer are dropped; neither end waits for the other
         os.set_blocking(end, False)
     os.dup2(speaking, 2)
     os.close(speaking)
@@ -383,7 +383,7 @@ def read_photo(
     alpha = raw[:, :, -1] if bitmap.has_alpha() else None
     colors = raw if alpha is None else raw[:, :, :-1]
     is_integer = raw.dtype.kind in "ui"
-    bitmap.set_srgb_gamma(False)  # values as they stand in the file; decoded below
+    bitmap.set_srgb_gamma(False)  # values as stored in the file; decoded below
     bitmap = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
     image = np.array(bitmap, dtype=np.float32).reshape(height, width, 3)
     if color_space == "srgb" or (color_space == "auto" and is_integer):

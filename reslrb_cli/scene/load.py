@@ -78,7 +78,7 @@ def load_scene(
         if len(objects) == 0:
             raise ConfigError(file, "", wrong)
     _check_meshes(file, scene)
-    lost = {note.element for note in unused}  # what else was done to them says nothing
+    lost = {note.element for note in unused}  # other notes on lost elements do not matter
     for line in warnings([*(note for note in found if note.element not in lost), *unused], root):
         warn_once(line)
     for doubt in doubts(scene) if warn else ():
@@ -87,7 +87,7 @@ def load_scene(
         if note.owner is not None:
             note.owner.children.remove(note.element)
     if _mark_floats(scene, description, keys):
-        scene = None  # before the other takes its memory
+        scene = None  # frees memory before the other is loaded
         scene = build(description)[0]
     return scene
 
@@ -130,7 +130,7 @@ def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str])
         if coarse_bits(params, key) is None or not any(key == each or fnmatchcase(key, each) for each in keys):
             continue
         owner, names = owners.place(params, key) or (description.root, [])
-        if owner.type == "bitmap" and names == ["data"]:  # else nothing is done, and to select it says why
+        if owner.type == "bitmap" and names == ["data"]:  # otherwise the selection of the parameter reports the reason
             warn_once(f"{owner.place}: `{key}` is read as floating point", logging.INFO)
             owner.drop("format")
             owner.children.append(owner.new("string", name="format", value="variant"))

@@ -16,16 +16,16 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene.extent import clipped
 from reslrb_cli.scene.graph import Lamp, SceneGraph, bent_faces, emitted_rays, failure, grid, sensor_rays, small_lamps
 
-#: Sensors to which a light path can connect: `sample_direction` is there, and its density is that of `sample_ray`.
+#: Sensors to which light paths can connect: they have `sample_direction`, with the density of `sample_ray`.
 SENSORS = ("PerspectiveCamera", "ThinLensCamera")
-#: Shapes whose shading normal is their geometric one.
+#: Shapes with equal shading and geometric normals.
 _PLAIN_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
 
 _SIMPLE_BSDFS = (
     *("SmoothDiffuse", "SmoothConductor", "RoughConductor", "SmoothDielectric", "RoughDielectric", "ThinDielectric"),
     *("TwoSidedBRDF", "Null"),
 )
-#: BSDFs that read nothing of a surface but its texture coordinates and local directions.
+#: BSDFs that read only texture coordinates and local directions of a surface.
 _PLAIN_BSDFS = (
     *_SIMPLE_BSDFS,
     "SmoothPlastic",
@@ -35,26 +35,26 @@ _PLAIN_BSDFS = (
     "BlendBSDF",
     "MaskBSDF",
 )
-#: BSDFs whose samples have the derivative of what they are samples of (`transport.bsdf.following`), and those
-#: that only wrap others.
+#: BSDFs whose samples have the derivative of the sampled function (`transport.bsdf.following`), and BSDFs that only
+#: wrap others.
 _FOLLOWED_BSDFS = (*_SIMPLE_BSDFS, "BumpMap", "NormalMap")
-#: Textures that do not, either, by their classes.
+#: Texture classes that read only texture coordinates.
 _PLAIN_TEXTURES = re.compile(r"BitmapTexture.*|.*Spectrum|Checkerboard")
-#: What rounding may make of a depth between the clip planes, of 0 to 1.
+#: Rounding error of a depth between the clip planes, in 0 to 1.
 _DEPTH_ROUNDING = 1e-5
-#: BSDFs that are not the same with light and view exchanged, by class: camera paths alone meet them as they are meant.
+#: Classes of BSDFs that are not symmetric: camera paths evaluate them as intended, light paths do not.
 _ONE_WAY = {"Hair": "hair", "Measured": "measured", "MeasuredPolarized": "measured_polarized"}
-#: Shapes on which Mitsuba draws no points: light cannot start there, but paths from the sensor find it.
+#: Shapes on which Mitsuba cannot sample points: light cannot start there, but paths from the sensor find it.
 _NO_POINTS = {"SDFGrid": "sdfgrid", "Ellipsoids": "ellipsoids", "EllipsoidsMesh": "ellipsoidsmesh"}
-#: Shapes that Mitsuba cannot have emit at all.
+#: Shapes that Mitsuba does not allow to emit.
 _NO_LAMPS = {"BSplineCurve": "bsplinecurve", "LinearCurve": "linearcurve"}
 _MEDIUM = (
     " a participating medium; no integrator here supports media (nor do Mitsuba's prb, path and ptracer): remove it "
     "from the scene file"
 )
-#: Surfaces along a primary ray that `surfaces_met` yields.
+#: Maximum number of surfaces along a primary ray in `surfaces_met`.
 CROSSINGS = 32
-#: Primary rays that look at a scene, along each side of a grid.
+#: Primary rays per side of the grid that samples a scene.
 LOOK = 128
 
 
@@ -82,9 +82,9 @@ class SceneNeeds:
     principal_point: bool
     near_clip: bool
     lens_clip: bool
-    unfollowed: tuple[mi.BSDF, ...] = ()  # surfaces' BSDFs whose sampling is not to be differentiated
+    unfollowed: tuple[mi.BSDF, ...] = ()  # BSDFs of surfaces whose sampling cannot be differentiated
     lamps: tuple[Lamp, ...] = ()  # shapes that emit
-    small_lamps: tuple[Lamp, ...] = ()  # those of them that the sensor sees as less than a pixel
+    small_lamps: tuple[Lamp, ...] = ()  # emitting shapes smaller than a pixel in view
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
     for bsdf in graph.surface_bsdfs():
         flags |= int(bsdf.flags())
     emitters, environment = list(scene.emitters()), scene.environment()
-    delta = int(mi.BSDFFlags.Delta) & ~int(mi.BSDFFlags.Null)  # `Delta` holds it too
+    delta = int(mi.BSDFFlags.Delta) & ~int(mi.BSDFFlags.Null)  # `Delta` includes it
     lamps = graph.find_lamps(scene)
     is_projective = sensor.class_name() in SENSORS
     near, far = clipped(scene, sensor) if is_projective else (False, False)
@@ -200,7 +200,7 @@ def scaled_emitter(scene: Any) -> str | None:
     return None
 
 
-#: Segments of the longest path whose light comes straight from an emitter to what the sensor sees.
+#: Length of the longest path with light directly from an emitter to a visible surface.
 DIRECT = 2
 
 
@@ -329,7 +329,7 @@ def _unknown_part(scene: Any, sensor: Any, graph: SceneGraph) -> str | None:
             return f"emitter {emitter.id()} is a `timed_sunsky`, {why}"
     if (lamp := _lamp_on(graph, _NO_LAMPS)) is not None:
         return f"{lamp}, which Mitsuba does not allow to emit; use a `cylinder` or a mesh as lamp"
-    # Such as one whose texture has too many channels.
+    # An example is a BSDF whose texture has too many channels.
     si, half, context = _somewhere(), mi.Point2f(0.5), mi.BSDFContext()
     calls = []
     for bsdf in _one_of_a_kind(graph, graph.surface_bsdfs()):
@@ -374,7 +374,7 @@ def _one_of_a_kind(graph: SceneGraph, items: Sequence[Any]) -> list[Any]:
 def _kind(item: Any, graph: SceneGraph) -> tuple[Any, ...]:
     """Return the structure of an object. A recursive closure would keep the scene alive."""
     name = item.class_name()
-    # The one texture that has one channel or three by what it was given.
+    # The only texture with one or three channels, depending on its value.
     size = np.size(mi.traverse(item)["value"]) if name == "RawConstantTexture" else 0
     used = (child for child in graph.children.get(item, ()) if isinstance(child, (mi.BSDF, mi.Texture, mi.Volume)))
     return (name, size, *(_kind(child, graph) for child in used))
@@ -447,5 +447,5 @@ def _focuses_outside(params: mi.SceneParameters) -> bool:
     default it focuses on the far plane.
     """
     near, far, focus = (float(np.ravel(params[key])[0]) for key in ("near_clip", "far_clip", "focus_distance"))
-    depth = (1 - near / focus) * far / (far - near) if focus > 0 else -np.inf  # as projected: 0 at near, 1 at far
+    depth = (1 - near / focus) * far / (far - near) if focus > 0 else -np.inf  # projected depth: 0 at near, 1 at far
     return not _DEPTH_ROUNDING < depth < 1 - _DEPTH_ROUNDING

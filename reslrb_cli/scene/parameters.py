@@ -224,7 +224,7 @@ def set_values(
     names = selection.deformation.values
     given: dict[str, str] = {}
     for pattern, value in values.items():
-        place = Place(source, f"{option}.{pattern}", lambda _: "")  # a value has no options
+        place = Place(source, f"{option}.{pattern}", lambda _: "")  # a number has no options
         for key in [pattern] if pattern in names else _matching(selection.params, pattern, place, [*names]):
             if key in given:
                 raise place.fail("", f"`{key}` is already matched by `{given[key]}`")
@@ -233,7 +233,7 @@ def set_values(
             given[key] = pattern
             slot = selection.slot(key)
             slot.set(initial_array(slot, value, None, place, any_size=key in names))
-    # What is tied has the value of the first, unless it is given one of its own.
+    # Tied parameters get the value of the first one, unless they have their own.
     followed = ((key, others) for key, others in selection.tied.items() if key in given)
     tied = {key: [other for other in others if other not in given] for key, others in followed}
     selection = replace(selection, tied=tied)
@@ -246,7 +246,7 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
     """Return the selection of `specs` in an unchanged scene, and the number of the spec of each key."""
     chosen: dict[str, Settings] = {}
     tied: dict[str, list[str]] = {}
-    origin: dict[str, int] = {}  # of what is recovered, and of all scene parameters that this determines
+    origin: dict[str, int] = {}  # of recovered parameters, and of all scene parameters that they determine
     deformation = Deformation(params)
     for index, spec in enumerate(specs):
         place = Place(source, f"parameters[{index}]")

@@ -77,21 +77,21 @@ def _means(image: Image, size: tuple[int, int]) -> Image:
     """Return the area-weighted means of an (H, W, C) image over the pixels of one of `size` (width, height)."""
     values = image.astype(np.float32)
     known = np.isfinite(values)
-    if not known.all():  # which would reach whole rows
+    if not known.all():  # otherwise NaN would spread over whole rows
         lost = _means(~known, size) > 0
         return np.where(lost, np.float32(np.nan), _means(np.where(known, values, 0), size))
     return np.asarray(resized(values, size[::-1]))
 
 
-#: Colours of materials, by which a photograph mostly differs from a scene.
+#: Colours of materials, in which a photograph usually differs most from a scene.
 _COLOUR = re.compile(r"(reflectance|base_color|color\d|vertex_color)(\.(value|data))?$")
-#: What is seen foremost of a rough surface without a diffuse lobe: its colour is its material's, and a factor of 1 on
-#: that is no colour that anybody chose.
+#: A rough surface without a diffuse lobe shows its material's colour; users do not choose its specular factor of 1 as a
+#: colour.
 _ROUGHNESS, _FACTOR = re.compile(r"\balpha(_u|_v)?\.value$"), re.compile(r"\bspecular_\w+\.value$")
-#: What a lamp in view shows of itself.
+#: Parameter that a visible lamp shows directly.
 _RADIANCE = re.compile(r"\bradiance\.value$")
 
-#: Bounds by the end of a key, and what it is; the first that fits.
+#: Bounds by the end of a key, and the quantity; the first match counts.
 _BOUNDS = (
     (r"(reflectance|transmittance|base_color|color\d)\.(value|data)$", "[0, 1]"),
     (r"\b(vertex|face)_\w*$", "[0, 1]"),
@@ -104,12 +104,11 @@ _BOUNDS = (
     (r"\.value$|\.data$|\.specular$", "[0, 1]"),
 )
 
-#: Rays along each axis of the film, by which shares are taken.
+#: Rays per axis of the film, for measuring shares.
 _RAYS = 64
-#: What takes less of the picture is left for later, and so are more parameters than these. A lamp is known by a few
-#: pixels.
+#: Minimum share of the picture, and maximum number of parameters; the rest can be added later. A lamp needs few pixels.
 LEAST_SHARE, LEAST_LAMP, MOST_FIRST = 0.02, 0.002, 8
-#: Texels along an axis with which a texture begins to be recovered.
+#: Texels per axis of a recovered texture at the start.
 TEXELS = 64
 
 
@@ -159,7 +158,8 @@ def propose(scene: mi.Scene, sensor: int, lamps: bool = False, wanted: Sequence[
     if wanted:
         first = [key for key in keys if any(fnmatch.fnmatchcase(key, glob) for glob in wanted)]
     else:
-        # A mask leaves out the pixels that see mirrors and smooth glass: only what these light shows their colours.
+        # A mask excludes pixels that see mirrors and smooth glass, so only materials that other pixels show are
+        # proposed.
         shown = [info for info, share in found if share >= LEAST_SHARE and info.key not in smooth]
         seen = {info.key for info in shown if _is_foremost(params, info)}
         if lamps:
@@ -178,7 +178,7 @@ def _is_foremost(params: mi.SceneParameters, info: ParameterInfo) -> bool:
         return True
     if is_glossy and _FACTOR.search(info.key) and info.value is not None and info.value.low == info.value.high == 1:
         return False
-    return bool(_COLOUR.search(info.key)) and (info.value is None or info.value.high > 0)  # a lamp's own is black
+    return bool(_COLOUR.search(info.key)) and (info.value is None or info.value.high > 0)  # a lamp's material is black
 
 
 def _is_left_out(params: mi.SceneParameters, info: ParameterInfo) -> bool:
@@ -194,7 +194,7 @@ def _above(params: mi.SceneParameters, key: str) -> list[Any]:
     chain: list[Any] = []
     kinds = (mi.BSDF, mi.Emitter)
     while node is not None and not isinstance(node, mi.Scene):
-        # A material belongs to all shapes that have it, and has a share of its own; a lamp may have a back.
+        # A material belongs to all shapes that use it, and each has its share; a lamp may have a back.
         if isinstance(node, kinds) or not any(isinstance(item, kinds) for item in chain):
             chain.append(node)
         node = params.hierarchy[node][0]
@@ -207,13 +207,13 @@ def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
     Rays also pass mirrors and clear glass.
     """
     sensor = scene.sensors()[index]
-    # One for each ray: an irradiance meter makes a single direction of a single one, which Dr.Jit fails to compile.
+    # One for each ray: an irradiance meter would give one direction for a single ray, which Dr.Jit fails to compile.
     aperture = dr.opaque(mi.Point2f, 0.5, shape=_RAYS**2)
     ray, _ = sensor_rays(sensor, sensor.shutter_open(), grid(_RAYS), aperture)
     graph, smooth = SceneGraph.of(scene), dr.zeros(mi.Bool, _RAYS**2)
     shares: dict[Any, float] = {}
     for si, reached in surfaces_met(scene, ray, dr.full(mi.Bool, True, _RAYS**2), mi.PCG32(_RAYS**2)):
-        active = reached & ~smooth  # a mask counts, and nothing behind it
+        active = reached & ~smooth  # a mask counts, but nothing behind it
         emitter = si.emitter(scene, active)  # an area light has a back
         shining = dr.select(dr.any(emitter.eval(si, active) > 0), emitter, dr.zeros(mi.EmitterPtr))
         bsdf = dr.select(active, si.bsdf(), dr.zeros(mi.BSDFPtr))
@@ -229,7 +229,7 @@ def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
                 shares[item] = min(shares.get(item, 0.0) + more, 1.0)
         smooth = smooth | (active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
         dr.schedule(smooth)
-    for bsdf in graph.of_type(mi.BSDF):  # what is nested is seen with what it is nested in
+    for bsdf in graph.of_type(mi.BSDF):  # nested BSDFs are visible together with their parent
         shares[bsdf] = max((shares.get(owner, 0.0) for owner in graph.owning_bsdfs(bsdf)), default=0.0)
     return shares
 

@@ -49,9 +49,9 @@ class ParameterValue:
         self.is_tensor = bool(dr.is_tensor_v(value))
         self.is_texture = self.is_tensor and len(value.shape) == 3
         self.halo = 0 if node is None else halo(node, value)
-        #: Whether its values may be negative, which those of colours are not: of what is none of the scene's own.
+        #: True for offsets and heights. Colours are never negative.
         self.is_signed = node is None
-        #: How many numbers a list has that fills the parameter.
+        #: Length of a list that fills the parameter.
         self.channels = _channels(node, key, value, self.is_tensor)
 
     def get(self) -> Array:
@@ -71,8 +71,8 @@ class ParameterValue:
             array = np.concatenate([array[:, -self.halo :], array, array[:, : self.halo]], axis=1)
         array = np.ascontiguousarray(array, dtype=np.float32)
         value = self.type(array) if self.is_tensor or array.ndim else self.type(float(array))
-        # A sum, since NumPy's own memory would be used as it is: kernels depend on its alignment, which is random, so
-        # that a later step, whose values are Dr.Jit's own, would compile them anew.
+        # A sum, because an array in NumPy's memory would be used directly. Kernels depend on its alignment, which is
+        # random, so a later step with Dr.Jit's own arrays would recompile them.
         value = self.type(value + dr.opaque(mi.Float, 0))
         dr.make_opaque(value)
         self.holder[self.key] = value
@@ -125,8 +125,8 @@ def check_transform(slot: ParameterValue, array: Array, spec: Settings, place: P
     low, high = (spec.bounds or (-np.inf, np.inf)) if bounded else (0.0, np.inf)
     outside = (array <= np.float32(low)) | (array >= np.float32(high))
     if isinstance(spec.initial, RunValue) and bounded:
-        # Between bounds that lie close beside each other rounding may have brought a run onto one; the optimiser
-        # begins at the nearest value that the transform yields.
+        # Between close bounds, rounding may have moved a run's value onto one; the optimiser starts at the nearest
+        # value that the transform can represent.
         outside = (array < np.float32(low)) | (array > np.float32(high))
     if (value := _first(array, outside)) is not None:
         yields = f"values between its bounds, {low:g} and {high:g}" if bounded else "positive values"
@@ -136,7 +136,7 @@ def check_transform(slot: ParameterValue, array: Array, spec: Settings, place: P
 
 def resample(array: Array, resolution: tuple[int, int]) -> Array:
     """Resample an (H, W, C) image to `resolution` (width, height): means over areas, linear where it grows."""
-    from reslrb_cli.lens.transport import resized  # late: SciPy takes a while to load
+    from reslrb_cli.lens.transport import resized  # late, because SciPy takes a while to load
 
     return np.asarray(resized(array, resolution[::-1], between=True), dtype=np.float32)
 

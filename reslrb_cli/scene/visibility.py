@@ -20,9 +20,9 @@ import numpy as np
 from reslrb_cli.scene.graph import SceneGraph, sensor_rays
 from reslrb_cli.scene.needs import LOOK, surfaces_met, what_is_seen
 
-#: Primary rays are spread over a pixel in so many rows and columns of cells.
+#: Primary rays of a pixel are spread over this many rows and columns of cells.
 CELLS = 4
-#: Points of the aperture, in [0, 1]^2, from which a lens looks for lamps.
+#: Points of the aperture, in [0, 1]^2, from which a thin-lens camera looks for lamps.
 _APERTURE = ((0.5, 0.5), (0.05, 0.5), (0.95, 0.5), (0.5, 0.05), (0.5, 0.95))
 
 
@@ -45,7 +45,7 @@ def interior(shape: tuple[int, ...], sensor: mi.Sensor) -> np.ndarray:
 
 def spread(pixels: np.ndarray, sensor: mi.Sensor) -> np.ndarray:
     """Return the pixels whose reconstruction filter reaches some of `pixels`, including these; boolean (H, W) each."""
-    from scipy.ndimage import maximum_filter  # here: a run that is refused, or needs none, does not wait for it
+    from scipy.ndimage import maximum_filter  # here, because some runs do not need it
 
     return np.asarray(maximum_filter(pixels, 2 * _margin(sensor) + 1))
 
@@ -98,7 +98,7 @@ def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
         cells |= np.array(what_is_seen(scene, sensor, point)[2]).reshape(LOOK, LOOK)
     if not cells.any():
         return np.zeros((height, width), dtype=bool)
-    from scipy.ndimage import maximum_filter  # here: a scene that shows no lamp does not wait for it
+    from scipy.ndimage import maximum_filter  # here, because scenes without visible lamps do not need it
 
     cells = np.asarray(maximum_filter(cells, 3))  # an edge may be anywhere between the centres of two cells
     for axis, size in enumerate((height, width)):
@@ -120,7 +120,7 @@ def _first_surfaces(scene: mi.Scene, ray: mi.Ray3f, count: int) -> tuple[mi.Bool
     return alone, mixed
 
 
-#: Primary rays for each pixel and for each texel, and in one pass.
+#: Primary rays for each pixel and each texel, and rays of one pass.
 _RAYS_PER_CELL, _MAX_RAYS, _RAYS_PER_PASS = 64, 2**25, 2**20
 
 
@@ -174,7 +174,7 @@ class _Texels:
         cell = mi.Point2f(u, v) * mi.Vector2f(self.size)
         inside = mi.Vector2f(cell - dr.floor(cell))
         inner = (dr.abs(inside.x - 0.5) < 0.25) & (dr.abs(inside.y - 0.5) < 0.25)
-        # Twice, since the remainder of what is below 0 is not above it.
+        # Twice, because the remainder of a negative number is not positive.
         x, y = ((mi.Int32(dr.floor(c)) % n + n) % n for c, n in zip((cell.x, cell.y), self.size, strict=True))
         return mi.UInt32(y * self.size[0] + x), si.is_valid() & is_owner & inner
 
@@ -202,11 +202,11 @@ def _mark_seen(
         dr.schedule(seen, random)
 
 
-#: Depths that are tried; the last one stands for all light.
+#: Depths to try; the last one counts as all light.
 DEPTHS = (8, 16, 32, 64)
-#: What may be missing of a pixel's light, on average.
+#: Mean share of a pixel's light that may be missing.
 LOST = 0.01
-#: Rays along each axis of the film, and paths for each of them.
+#: Rays per axis of the film, and paths for each of them.
 _RAYS, _PATHS = 48, 32
 
 
@@ -231,7 +231,7 @@ def find_depth(scene: mi.Scene, sensor: int) -> Depth:
     whole = _pixels(scene, sensor, DEPTHS[-1])
     lit = np.isfinite(whole) & (whole > 0)
     for segments in DEPTHS[:-1]:
-        # The mean over lit pixels of what they lack: no few bright ones decide.
+        # The mean missing share over lit pixels, so that no bright pixels dominate.
         lacking = 1 - _pixels(scene, sensor, segments)[lit] / whole[lit]
         missing = float(lacking.mean()) if lit.any() else 0.0
         if missing <= LOST:

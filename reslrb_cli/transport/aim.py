@@ -36,10 +36,10 @@ from reslrb_cli.transport.bsdf import Aimed
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.film import Blocks, film_blocks
 
-SHARE = 0.25  # of the paths that scatter
-AIM_UNIFORM = 0.2  # of these, how many are sent to places drawn evenly on the film, at least
+SHARE = 0.25  # share of aimed paths among the scattered ones
+AIM_UNIFORM = 0.2  # minimum share of aimed paths with a uniform target on the film
 AIM_SLOTS = 1 << 17
-REACHED = 1 - 1e-3  # of the distance to a point, where nothing stands in the way: as far as shadow rays look
+REACHED = 1 - 1e-3  # part of the distance to a point that must be free, as for shadow rays
 
 
 @dataclass
@@ -59,7 +59,7 @@ class Aim:
         density = AIM_UNIFORM * even + (1 - AIM_UNIFORM) * (
             wanted / total if np.isfinite(total) and total > 0 else even
         )
-        # One each, so that there is none that no path is sent to; the others rounded along the blocks' order.
+        # One each, so that every block gets paths; the rest is rounded along the order of the blocks.
         ends = np.rint(np.cumsum(density) * ((AIM_SLOTS - len(even)) / density.sum()))
         counts = 1 + np.diff(ends, prepend=0).astype(np.int64)
         return Aim(

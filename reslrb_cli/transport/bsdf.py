@@ -29,7 +29,7 @@ import mitsuba as mi
 
 from reslrb_cli.transport.plan import Plan
 
-DEFENSIVE = 0.2  # share of samples that a perturbed BSDF does not draw itself
+DEFENSIVE = 0.2  # share of samples that a perturbed BSDF does not sample itself
 
 
 def context_of(plan: Plan) -> mi.BSDFContext:
@@ -80,8 +80,8 @@ def _singular_factor(
         bs, weight = bsdf.sample(context_of(plan), si, sample_1, scattering.sample_2, delta)
         pdf = bs.pdf
         if plan.differentiate_null:
-            # A mask's weight carries the derivative of its opacity already, and so does its density. Other BSDFs divide
-            # by a density that may depend on their parameters (plastic).
+            # A mask's weight and density both carry the derivative of its opacity. Other BSDFs divide by a density that
+            # may depend on their parameters (plastic).
             pdf = dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null), dr.detach(pdf), pdf)
         f = dr.select(delta, weight * pdf, f)
     if plan.differentiate_null:
@@ -232,9 +232,9 @@ def shading_correction(
     if plan.needs.has_perturbed_normals:
         return dr.select(valid, dr.abs(wo_dot_n / wi_dot_n), 0), valid
     correction = dr.select(valid, dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n)), 0)
-    # On a mesh it swings about 1 within each face and jumps at its edges, however fine the mesh is. A derivative that
-    # knows the slopes and not the jumps is wrong by several percent where faces move through the light; without either
-    # it is right. `ptracer` has the slopes.
+    # On a mesh, the correction varies about 1 within each face and jumps at the edges, however fine the mesh is. A
+    # derivative with the slopes but without the jumps is wrong by several percent if faces move through the light;
+    # without both it is right. `ptracer` has the slopes.
     return (dr.detach(correction) if plan.attached_normalization else correction), valid
 
 
@@ -250,7 +250,7 @@ def scatter(
     """
     si, bsdf, context, drawn = hit.si, hit.bsdf, context_of(plan), sample_1
     ways_asked = plan.camera or plan.weighs
-    later = ways_asked and (mixes(plan) or aimed is not None)  # the direction is not the BSDF's own
+    later = ways_asked and (mixes(plan) or aimed is not None)  # the BSDF did not sample the direction
     densities: Sequence[mi.Float] = ()
 
     def both(
@@ -258,7 +258,7 @@ def scatter(
         connected: mi.Bool, active: mi.Bool, any_: mi.Bool,
     ) -> tuple[Any, ...]:  # fmt: skip
         bs, weight = self.sample(context, si, sample_1, sample_2, active)
-        here = None if weighed is None else connected  # nothing from outside of the call
+        here = None if weighed is None else connected  # without variables from outside the call
         ways = _ways(plan, si, self, wo, here, bs.wo, bs.pdf, active) if ways_asked and not later else ()
         return evaluate(plan, si, self, wo, connected), bs.wo, bs.pdf, bs.eta, bs.sampled_type, weight, *ways
 
@@ -269,7 +269,7 @@ def scatter(
             bs, weight = bsdf.sample(context, si, sample_1, sample_2, active)
             f_connection, sample = None, Sample(bs.wo, bs.pdf, weight, bs.eta, bs.sampled_type)
         else:
-            # The last argument is taken for the mask of the call as a whole.
+            # The last argument is used as the mask of the whole call.
             f_connection, wo, pdf, eta, lobe, weight, *densities = dr.dispatch(
                 bsdf, both, si, connection_wo, sample_1, sample_2, connected, active, active | connected
             )
@@ -293,7 +293,7 @@ def scatter(
         if plan.camera:
             valid = mi.Bool(True)
         is_null = mi.has_flag(lobe, mi.BSDFFlags.Null) if plan.needs.has_null else mi.Bool(False)
-        # BSDFFlags.Delta holds Null too.
+        # BSDFFlags.Delta includes Null.
         is_delta = mi.has_flag(lobe, mi.BSDFFlags.Delta) & ~is_null if plan.needs.has_delta_lobes else mi.Bool(False)
         if mixes(plan):
             correction = dr.select(is_delta, correction * _delta_correction(si.wi, wo, sample.eta), correction)
@@ -387,7 +387,7 @@ def _mixed(
     """
     hemisphere = mi.warp.square_to_cosine_hemisphere(sample_2)
     hemisphere.z = dr.mulsign(hemisphere.z, mi.Frame3f.cos_theta(si.wi))
-    singular = mi.has_flag(sample.lobe, mi.BSDFFlags.Delta) & ~defensive  # holds Null too
+    singular = mi.has_flag(sample.lobe, mi.BSDFFlags.Delta) & ~defensive  # includes Null
     wo = dr.select(defensive, hemisphere, sample.wo)
     same_side = mi.Frame3f.cos_theta(wo) * mi.Frame3f.cos_theta(si.wi) > 0
     other = dr.select(same_side, dr.abs(mi.Frame3f.cos_theta(wo)) * dr.inv_pi, 0)

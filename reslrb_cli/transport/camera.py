@@ -49,7 +49,7 @@ def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
     plan, sensor, size = samples.plan, samples.sensor, samples.film.size
     n_pixels = int(dr.prod(size))
     lane = dr.arange(mi.UInt32, samples.width)
-    count = dr.opaque(mi.UInt32, samples.width)  # as a literal it would give every sample count a kernel of its own
+    count = dr.opaque(mi.UInt32, samples.width)  # a literal would compile a kernel for every sample count
     time = sample_time(plan, sensor, sampler)
     if samples.width < n_pixels:
         per_pixel = mi.Float(count) / n_pixels
@@ -115,7 +115,7 @@ class NextEvent(Connection):
     scale: mi.Float
     ds: mi.DirectionSample3f
     through: mi.Spectrum
-    unseen: frozenset[mi.Emitter]  # emitters that cannot be asked for what arrives from them
+    unseen: frozenset[mi.Emitter]  # emitters without next event estimation
 
     def radiance(self, scene: mi.Scene, si: mi.SurfaceInteraction3f) -> mi.Spectrum:
         """Return the arriving radiance, with its derivative if it has one."""
@@ -196,7 +196,7 @@ def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = T
         pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         if not surrounded:
             active = active & pi.is_valid()
-            pi.valid = mi.Bool(True)  # in active lanes
+            pi.valid = mi.Bool(True)  # true in active lanes
         if not plan.needs.has_instances:
             pi.instance = dr.zeros(mi.ShapePtr)
         return pi, active
@@ -222,7 +222,7 @@ def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = T
         hit = path.active & si.is_valid() if surrounded else path.active
         goes_on = hooks.goes_on(state, vertex)
 
-        # ---- Light that is met ----
+        # ---- Light from hit emitters ----
         met = _meet(samples, path, si) if plan.needs.has_visible_emitters else None
 
         # ---- Sample an emitter, and scatter ----
@@ -242,7 +242,7 @@ def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = T
             _weigh(samples, path, arrived, si, event, scattering)
             event.f = f
             if not (hooks.tracked or plan.track_zeros):
-                event.active = event.active & ~dr.all(f * event.weight == 0)  # NaN arrives
+                event.active = event.active & ~dr.all(f * event.weight == 0)  # passes NaN on
             with dr.suspend_grad(when=not plan.differentiate_null):
                 seen = passage(plan, scene, si, path.depth, event, loop_mode=mode)
             event.active, event.through = seen
@@ -306,7 +306,7 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
     direct = path.events == 0
     if plan.hide_emitters:
         active &= ~direct
-    for lamp in plan.small_lamps:  # whose direct light `visible.py` has
+    for lamp in plan.small_lamps:  # `visible.py` renders their direct light
         active &= ~(direct & (emitter == mi.EmitterPtr(lamp.emitter)))
     for lamp in plan.needs.lamps:
         if lamp.parallel:
@@ -323,7 +323,7 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
                 even = dr.square(ds.dist) / (dr.abs(dr.dot(ds.n, ds.d)) * lamp.shape.surface_area())
                 here = indirect & (emitter == mi.EmitterPtr(lamp.emitter))
                 p_D = dr.select(here, scene.pdf_emitter(mi.UInt32(lamp.index)) * even, p_D)
-        # Points of a lamp whose texture is black everywhere have no density: they are met alone.
+        # Points of a lamp with a black texture have no density: paths only hit them.
         sampled = dr.select(dr.isfinite(p_D), p_D, 0)
         if not path.rivals:
             rivals = sampled * path.M[0]
@@ -426,7 +426,7 @@ def _behind(
     rivals = []
     for here in arrived:
         m = dr.select(path.events == 0, here.M, here.V * ways.back)
-        # Light paths go through none of the vertices at which directions lie on inconsistent sides.
+        # Light paths pass no vertex with directions on inconsistent sides.
         m = dr.select(ways.valid, m, 0)
         rivals.append(replace(here, V=dr.select(ways.valid, here.V, 0)).after(
             renewed, m, scattering, cosine(si, scattering.d)))  # fmt: skip

@@ -116,7 +116,7 @@ class Connection:
     f: mi.Spectrum | None = None
     c: mi.Spectrum | None = None
     through: mi.Spectrum | None = None
-    p_cam: mi.Float | None = None  # the density of area here of the camera paths of a pixel, where paths are weighed
+    p_cam: mi.Float | None = None  # area density here of the camera paths of a pixel, if paths are weighted
 
 
 def connect(
@@ -134,7 +134,7 @@ def connect(
             sees, target = _clip(plan, sensor, ds)
         if plan.needs.principal_point or plan.needs.lens_clip:
             importance = _importance(sensor, ds, sees)
-        # From the vertex itself, where `ptracer` takes the shadow ray's direction, which starts a little off it.
+        # From the vertex itself; the shadow ray of `ptracer` starts slightly off it.
         wo = si.to_local(ds.d)
         correction, valid = mi.Float(1), mi.Bool(True)
         if ray is not None:
@@ -208,7 +208,7 @@ def passage(
     """
     active, one = connection.active, mi.Spectrum(1)
     past_lamps = plan.passes_lamps
-    if past_lamps:  # where camera rays begin behind them
+    if past_lamps:  # if camera rays start behind them
         active = active & (si.emitter(scene) == dr.zeros(mi.EmitterPtr))
     if plan.needs.has_null or past_lamps:
         limit = plan.max_depth - depth - 1

@@ -22,7 +22,7 @@ from reslrb_cli.scene.graph import Lamp, SceneGraph
 from reslrb_cli.transport.lamps import DEFENSIVE
 from reslrb_cli.transport.plan import Plan
 
-EVEN, TEXTURED, ENVIRONMENT, PROJECTOR, UNSEEN = range(5)  # how the density of an emitter's rays is found
+EVEN, TEXTURED, ENVIRONMENT, PROJECTOR, UNSEEN = range(5)  # method for the density of an emitter's rays
 
 
 @dataclass
@@ -61,7 +61,7 @@ def _ray_density(plan: Plan, emitter: mi.Emitter, lamp: Lamp | None, surrounds: 
     disk = 0.0 if plan.horizon is None else 1 / (np.pi * plan.horizon.radius**2)
     if lamp is not None:
         if lamp.parallel:
-            return 0.0, UNSEEN  # its rays leave along the normal: neither next event nor a camera path finds them
+            return 0.0, UNSEEN  # its rays follow the normal: only light paths find it
         if lamp.texture is not None:
             return 1 / np.pi, TEXTURED
         return 1 / (np.pi * float(np.ravel(lamp.shape.surface_area())[0])), EVEN
@@ -78,7 +78,7 @@ def _ray_density(plan: Plan, emitter: mi.Emitter, lamp: Lamp | None, surrounds: 
 
 def _cosine_of_cutoff(spot: mi.Emitter) -> float:
     """Return the cosine of the cutoff angle of a spot's rays, which its plugin does not expose."""
-    rim = mi.Point2f(1 - 1e-7, 0.5)  # the end of the unit disk; it is the numbers of the place that it takes
+    rim = mi.Point2f(1 - 1e-7, 0.5)  # the rim of the unit disk, which the position sample selects
     axis = np.ravel(mi.traverse(spot)["to_world"] @ mi.Vector3f(0, 0, 1))
     d = np.ravel(spot.sample_ray(0, 0.5, rim, rim, True)[0].d)
     return min(float(axis @ d / (np.linalg.norm(axis) * np.linalg.norm(d))), 1 - 1e-7)

@@ -15,7 +15,7 @@ from reslrb_cli.transport.lamps import DEFENSIVE, lamp_ray
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import NumberStream, Samples
 
-PROBES = 1024  # light paths that are looked at
+PROBES = 1024  # light paths for the check
 
 
 def used_numbers(samples: Samples) -> list[bool]:
@@ -23,7 +23,7 @@ def used_numbers(samples: Samples) -> list[bool]:
     random = np.random.default_rng(1)
     first, other = (random.random((4, PROBES), np.float32) for _ in range(2))
     choice = random.random(PROBES, np.float32)
-    # All cases are lanes of one call, which has the code of every emitter in it: as they are, and one number changed.
+    # All cases are lanes of one call, which contains the code of every emitter: unchanged, and with one number changed.
     cases = np.stack([np.where(np.arange(4)[:, None] == changed, other, first) for changed in range(-1, 4)])
     x = [mi.Float(cases[:, k].ravel()) for k in range(4)]
     with dr.suspend_grad():
@@ -103,8 +103,8 @@ def _emitter_ray(
     placed = samples.plan.placed_lamps
     lamps = {lamp.emitter: (lamp, samples.areas(lamp), lamp in samples.plan.evened_lamps) for lamp in placed}
     if samples.plan.moving_emission:
-        # In an indirect call, although there may be one emitter alone: outside of one the derivative by each number of
-        # a transformation is a sum over all paths, for which they would be traced again.
+        # An indirect call, even for a single emitter: without it, the derivative by each number of a transformation is
+        # a sum over all paths, which would trace them again.
         def leave(
             self: mi.Emitter, time: mi.Float, number: mi.Float, position: mi.Point2f, direction: mi.Point2f,
             active: mi.Bool,
@@ -115,7 +115,7 @@ def _emitter_ray(
             return self.sample_ray(time, number, position, direction, active)
 
         return dr.dispatch(emitter, leave, time, number, position, direction, active)
-    # Forward mode does not get through an indirect call of ours.
+    # Forward mode cannot pass an indirect call of ours.
     ray, weight = emitter.sample_ray(time, number, position, direction, active)
     for lamp, areas, evened in lamps.values():
         here = emitter == mi.EmitterPtr(lamp.emitter)
@@ -159,10 +159,10 @@ def _any_direction(
         x = dr.select(uniform, sample.x / DEFENSIVE, (sample.x - DEFENSIVE) / (1 - DEFENSIVE))
         sample = mi.Point2f(x, sample.y)
         ds, _ = environment.sample_direction(reference, sample, True)
-        black = ~dr.isfinite(ds.d.y)  # the whole map: there is nothing in proportion to which to draw
+        black = ~dr.isfinite(ds.d.y)  # the whole map is black, so there is no density to sample
         ds.d = dr.select(uniform | black, mi.warp.square_to_uniform_sphere(sample), ds.d)
         own = environment.pdf_direction(reference, ds, True)
         pdf = dr.select(black, dr.inv_four_pi, (1 - DEFENSIVE) * own + DEFENSIVE * dr.inv_four_pi)
         seen = dr.zeros(mi.SurfaceInteraction3f)
-        seen.wi = -ds.d  # `eval_direction` goes by texture coordinates, which those drawn here do not have
+        seen.wi = -ds.d  # `eval_direction` uses texture coordinates, which sampled directions lack
     return ds, environment.eval(seen, True) / pdf

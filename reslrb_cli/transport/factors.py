@@ -19,8 +19,8 @@ import drjit as dr
 import mitsuba as mi
 
 NO_ZERO = -1  # no factor of this channel is zero
-MANY_ZEROS = -2  # two or more are: value and derivatives vanish
-DIM = 0.1  # the least that a factor counts in a weight, as a fraction of its stand-in
+MANY_ZEROS = -2  # two or more factors are zero: value and derivatives vanish
+DIM = 0.1  # minimum value of a factor in a weight, as a fraction of its stand-in
 
 
 def showing(value: mi.Float | mi.Spectrum) -> mi.Float | mi.Spectrum:

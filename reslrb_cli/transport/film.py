@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.transport.factors import showing
 
-N_COLOR = 3  # a film's block holds R, G, B, perhaps alpha, and a weight that light tracing leaves at 0
+N_COLOR = 3  # a film's block holds R, G, B, optional alpha, and a weight that light tracing leaves at 0
 
 
 class Film:
@@ -44,7 +44,7 @@ class Film:
         """Return an empty image block that covers the crop window; filter weights are normalised per splat."""
         block = self.film.create_block(normalize=not self.whole, borders=False)
         block.set_offset(self.offset)
-        block.set_coalesce(False)  # splats of neighbouring lanes land anywhere
+        block.set_coalesce(False)  # splats of neighbouring lanes land in arbitrary pixels
         return block
 
     def put(
@@ -60,7 +60,7 @@ class Film:
             value = value * dr.select(total != 0, dr.detach(total) / total, 1)
         color = [value[c % len(value)] for c in range(N_COLOR)]  # a mono variant fills all three
         if block.channel_count() != len("RGBW"):
-            color = [showing(c) for c in color]  # they are added up one by one, not as a packet
+            color = [showing(c) for c in color]  # they are added one by one, not as a packet
         block.put(u + mi.Vector2f(self.offset), color + [mi.Float(0)] * (block.channel_count() - N_COLOR), active)
 
     def taps(self, u: mi.Point2f, normalization: bool) -> list[tuple[mi.Point2u, mi.Float]]:
@@ -94,7 +94,7 @@ class Film:
         """
         self.film.prepare([])
         if block.channel_count() == len("RGBAW") and not tangent:
-            # Light tracing has no notion of coverage: every pixel is opaque.
+            # Light tracing computes no coverage: every pixel is opaque.
             alpha = dr.arange(mi.UInt32, dr.prod(self.size)) * block.channel_count() + N_COLOR
             dr.scatter(block.tensor().array, mi.Float(1), alpha)
         self.film.put_block(block)
@@ -114,7 +114,7 @@ class Film:
                 inside += dr.select((there >= 0) & (there < n), integral, 0)
             part *= inside
         if channels in (2, 4):
-            part = dr.select(lane % channels == channels - 1, 1, part)  # alpha is what it is
+            part = dr.select(lane % channels == channels - 1, 1, part)  # alpha is unchanged
         return mi.TensorXf(part, shape)
 
     def adjoint(self, image_gradient: mi.TensorXf) -> AdjointImage:
@@ -126,7 +126,7 @@ class Film:
             image = self.develop(block)
             dr.backward_from(image * dr.detach(image_gradient))
             gradient = dr.grad(before)
-        dr.eval(gradient)  # not in the midst of tracing, where it would cut a kernel in two
+        dr.eval(gradient)  # evaluated before tracing, where it would split a kernel
         return AdjointImage(self, mi.Float(gradient.array), block.channel_count())
 
 
@@ -146,7 +146,7 @@ class AdjointImage:
 
         Without `normalization`, the sum that divides the filter's weights has no derivative, as in Mitsuba.
         """
-        if self.filter.is_box_filter():  # 1 within a pixel, with or without division by its sum
+        if self.filter.is_box_filter():  # 1 within a pixel, with or without normalisation
             pixel = mi.Point2u(mi.Point2i(dr.floor(u)))
             inside = active & (pixel.x < self.film.size.x) & (pixel.y < self.film.size.y)
             return self._pixel(pixel, inside)
@@ -176,7 +176,7 @@ class AdjointImage:
         return delta * dr.select(total != 0, dr.rcp(total), 0)
 
 
-STEPS = 256  # of a filter's integral, in each pixel
+STEPS = 256  # for a filter's integral, in each pixel
 
 
 @functools.lru_cache(maxsize=64)
@@ -205,7 +205,7 @@ def filter_weights(
     return first, (columns, rows), sum(columns) * sum(rows)
 
 
-BLOCKS = 1 << 14  # of pixels, at most
+BLOCKS = 1 << 14  # maximum number of blocks of pixels
 
 
 @dataclass(frozen=True)
@@ -272,8 +272,8 @@ def film_blocks(sensor: mi.Sensor) -> Blocks:
     return Blocks.of((int(size[0]), int(size[1])))
 
 
-EVEN = 0.25  # of camera paths that are shared out, those that every pixel has alike, at least
-MOST_SLOTS = 4  # for each pixel
+EVEN = 0.25  # minimum share of camera paths that are spread evenly over the pixels
+MOST_SLOTS = 4  # per pixel
 
 
 @dataclass
@@ -299,12 +299,12 @@ class PixelShares:
         None if there are not more paths than pixels.
         """
         n = wanted.size
-        spare = min(int((1 - EVEN) * paths), paths - n)  # each pixel has one: what none finds would be lost
+        spare = min(int((1 - EVEN) * paths), paths - n)  # one per pixel: without it, light would be lost
         if spare <= 0 or not wanted.sum() > 0:
             return None
         slots = min(MOST_SLOTS * n, spare)
         rounds = spare // slots
-        # Rounded along the pixels' order, so that what one loses its neighbour gains.
+        # Rounded along the order of the pixels, so that neighbours balance.
         ends = np.rint(np.cumsum(wanted, dtype=np.float64) * (slots / wanted.sum(dtype=np.float64)))
         each = np.diff(ends, prepend=0).astype(np.uint32)
         first = np.cumsum(each, dtype=np.uint32) - each

@@ -29,7 +29,7 @@ from reslrb_cli.transport.roulette import Survival
 
 Array = np.ndarray[Any, Any]
 CELL_BITS = 19  # cells of all emitters together, log2
-MOST_EMITTERS = 1024  # that have cells of their own; of more, neighbours share theirs
+MOST_EMITTERS = 1024  # with their own cells; among more emitters, neighbours share cells
 
 
 def make_grid(used: Sequence[bool], weights: Sequence[float], cell_bits: int = CELL_BITS) -> Grid:
@@ -37,7 +37,7 @@ def make_grid(used: Sequence[bool], weights: Sequence[float], cell_bits: int = C
     numbers.
     """
     if not sum(weights) > 0:
-        weights = [1.0] * max(len(weights), 1)  # nothing shines; the grid is of no use, and does no harm
+        weights = [1.0] * max(len(weights), 1)  # no emitter emits; the grid has no use, and no effect
     total = np.append(0.0, np.cumsum(np.asarray(weights, np.float64)))
     groups = min(len(weights), MOST_EMITTERS)
     edges = (total / total[-1])[np.round(np.linspace(0, len(weights), groups + 1)).astype(int)]
@@ -52,7 +52,7 @@ def make_grid(used: Sequence[bool], weights: Sequence[float], cell_bits: int = C
 def apportion(grid: Grid, density: Array) -> Array:
     """Return the slots of each cell (int64): at least UNIFORM of its measure, the others in proportion to `density`."""
     least = least_slots(grid)
-    # Rounded along the cells' order, so that what one loses a neighbour gains.
+    # Rounded along the order of the cells, so that neighbours balance.
     ends = np.cumsum(density, dtype=np.float64)
     ends *= (grid.slots - least.sum()) / ends[-1]
     np.rint(ends, out=ends)
@@ -78,7 +78,7 @@ class Table:
     @staticmethod
     def of(grid: Grid, counts: Array, survival: Survival | None = None, aim: Aim | None = None) -> Table:
         """Return the table in which cell k has `counts[k]` slots, `grid.slots` in total."""
-        weights = grid.measures() * grid.slots  # 0 where there is no slot
+        weights = grid.measures() * grid.slots  # 0 without a slot
         weights /= np.maximum(counts, 1)
         return Table(
             own_memory(mi.UInt32, np.repeat(np.arange(grid.cells, dtype=np.uint32), counts)),
@@ -126,7 +126,7 @@ class Guide:
         for k, bits in enumerate(grid.bits):
             if bits > 0:
                 index = (cell >> shift) & ((1 << bits) - 1)
-                # Rounding may have it meet the next cell, but not leave the cube.
+                # Rounding may reach the next cell, but must not leave the cube.
                 numbers[k] = dr.minimum((mi.Float(index) + numbers[k]) * 2.0**-bits, below)
                 shift += bits
         if grid.emitters > 1:

@@ -23,7 +23,7 @@ import mitsuba as mi
 
 from reslrb_cli.scene.graph import Lamp
 
-DEFENSIVE = 0.1  # share of what is drawn uniformly, not in proportion to radiance that is differentiated
+DEFENSIVE = 0.1  # share of uniform samples, instead of samples proportional to differentiated radiance
 
 
 def lamp_ray(
@@ -38,7 +38,7 @@ def lamp_ray(
     si, weight = lamp_point(lamp, areas, time, position, active, evened)
     _, radiance = lamp.emitter.sample_wavelengths(si, wavelength_sample, active)
     if lamp.parallel:
-        d = mi.Vector3f(si.sh_frame.n)  # of a mesh the interpolated one, as Mitsuba has it
+        d = mi.Vector3f(si.sh_frame.n)  # for a mesh the interpolated normal, as in Mitsuba
     else:
         d, weight = si.to_world(mi.warp.square_to_cosine_hemisphere(direction)), weight * dr.pi
     si.time = time
@@ -64,7 +64,7 @@ def lamp_point(
         area = face_area(lamp.shape, face)
         weight = weight * (area / dr.detach(area))
         si = mi.SurfaceInteraction3f(ps, mi.Color0f())
-        si.n = lamp.shape.face_normal(face)  # rays start off the face; they leave about `ps.n`, which is interpolated
+        si.n = lamp.shape.face_normal(face)  # rays start off the face; directions are about `ps.n`, interpolated
         return si, weight
     return mi.SurfaceInteraction3f(ps, mi.Color0f()), weight
 
@@ -107,7 +107,7 @@ def _any_uv(texture: mi.Texture, sample: mi.Point2f, active: mi.Bool) -> tuple[m
         x = dr.select(even, sample.x / DEFENSIVE, (sample.x - DEFENSIVE) / (1 - DEFENSIVE))
         sample = mi.Point2f(x, sample.y)
         uv, density = texture.sample_position(sample, active)
-        black = ~dr.isfinite(density)  # the whole texture: there is nothing in proportion to which to draw
+        black = ~dr.isfinite(density)  # the whole texture is black, so there is no density to sample
         uv = dr.select(even | black, sample, uv)
         own = texture.pdf_position(uv, active)
         return uv, dr.select(black, 1, (1 - DEFENSIVE) * own + DEFENSIVE)

@@ -15,9 +15,9 @@ from reslrb_cli.scene.needs import SceneNeeds
 from reslrb_cli.transport.sobol import Coordinates
 
 Array = np.ndarray[Any, Any]
-GUIDE_UNIFORM = 0.25  # share of paths that start evenly, at least
-SLOTS_PER_CELL = 4  # one of them is the even share
-SLOTS_OF_SEVERAL = 8  # where emitters have unequal shares, which are rounded up to whole slots
+GUIDE_UNIFORM = 0.25  # minimum share of paths with uniform starts
+SLOTS_PER_CELL = 4  # one of them for the uniform share
+SLOTS_OF_SEVERAL = 8  # if emitters have unequal shares, which are rounded up to whole slots
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Grid:
         """
         bits = list(self.bits)
         while sum(bits) > 0 and self.emitters << sum(bits) > cells:
-            bits[3 - bits[::-1].index(max(bits))] -= 1  # the one that was cut last
+            bits[3 - bits[::-1].index(max(bits))] -= 1  # the last one that was cut
         return Grid((bits[0], bits[1], bits[2], bits[3]), self.edges)
 
     def summed(self, values: Array, coarser: Grid) -> Array:
@@ -85,7 +85,7 @@ class Grid:
 
 @functools.lru_cache(maxsize=4)
 def _measures(grid: Grid) -> Array:
-    # Every table that is made asks for them, several times.
+    # Every new table asks for them several times.
     result = np.repeat(np.diff(grid.edges) / (1 << sum(grid.bits)), 1 << sum(grid.bits))
     result.setflags(write=False)
     return result
@@ -117,39 +117,40 @@ class Plan:
     track_zeros: bool = False
     differentiate_bsdfs: bool = False
     differentiate_emission: bool = False
-    # Lamps whose texture is differentiated: also its black texels are drawn, which have derivatives as large as any.
+    # Lamps with a differentiated texture: black texels are sampled, too, because their derivatives can be as large as
+    # any.
     evened_lamps: tuple[Lamp, ...] = ()
-    # The BSDFs of surfaces that are differentiated, where not all of them are.
+    # The BSDFs of differentiated surfaces, if not all are.
     only_bsdfs: tuple[mi.BSDF, ...] = ()
-    # Whether any of those that are differentiated has delta lobes, or lets light pass straight through.
+    # Whether any differentiated BSDF has delta lobes, or lets light pass straight through.
     differentiate_delta: bool = False
     differentiate_null: bool = False
-    # Whether directions, hit points and film positions have derivatives too, and what moves by itself: shapes, and the
-    # rays that emitters send out.
+    # Whether directions, hit points and film positions have derivatives, too, and the moving objects: shapes, and the
+    # rays of emitters.
     attached: bool = False
-    # Whether, behind a vertex that is not specular, the next one stays where it is on its surface; else directions turn
-    # with the surface that they leave. `glossy_follows`: they do so at BSDFs with glossy lobes all the same.
+    # Whether, behind a nonspecular vertex, the next vertex stays at its place on its surface; otherwise directions
+    # rotate with the surface. `glossy_follows`: directions rotate at BSDFs with glossy lobes anyway.
     stays: bool = False
     glossy_follows: bool = False
     moving_shapes: tuple[mi.Shape, ...] = ()
     moving_emitters: tuple[mi.Emitter, ...] = ()
-    # Whether the normalisation of the reconstruction filter's weights has its derivative, and the correction for
-    # shading normals has none: so it matches finite differences, and otherwise `ptracer`.
+    # Whether the normalisation of the reconstruction filter has a derivative and the correction for shading normals has
+    # none, as in finite differences; otherwise as in `ptracer`.
     attached_normalization: bool = True
-    # Whether camera paths are shared out over the pixels as these need them.
+    # Whether camera paths are distributed over the pixels by need.
     shares_out: bool = False
     # The sphere that infinite emitters light.
     horizon: Horizon | None = None
-    # The cells that emission is guided by, where it is.
+    # The cells of guided emission, if emission is guided.
     grid: Grid | None = None
-    # Which paths there are: `light`, `camera`, or `both`; and whether this walk's begin at the sensor.
+    # Kinds of paths: `light`, `camera`, or `both`; and whether the paths of this walk start at the sensor.
     paths: str = "light"
     camera: bool = False
-    # Whether each pixel is divided by the part of its filter that lies on the film, as wherever camera paths may run.
+    # Whether each pixel is divided by the part of its filter on the film, as always if camera paths may run.
     whole: bool = False
-    # Whether guided paths may be aimed at what the sensor sees (`aim.py`), where nothing moves.
+    # Whether guided paths may be aimed at visible surfaces (`aim.py`), if nothing moves.
     aims: bool = False
-    # The numbers of low discrepancy, where there are any.
+    # The low-discrepancy numbers, if there are any.
     sequence: Coordinates | None = None
 
     @property

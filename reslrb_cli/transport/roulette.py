@@ -26,13 +26,13 @@ from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.transport.plan import Plan
 
 Array = np.ndarray[Any, Any]
-LIMIT = 0.95  # the largest probability of going on by throughput alone, as in `ptracer`
-DIMMEST = 1e-30  # the least emission that roulette knows, well above what single precision rounds to zero
+LIMIT = 0.95  # largest survival probability by throughput, as in `ptracer`
+DIMMEST = 1e-30  # smallest emission for roulette, well above values that single precision rounds to zero
 BITS = 4  # cubes along each axis of the box, log2
 OCTANTS = 8
 CELLS = OCTANTS << (3 * BITS)
 SHAPE = (1 << BITS, 1 << BITS, 1 << BITS, OCTANTS)  # of an array of all cells
-LEAST = 0.5  # the smallest probability of going on
+LEAST = 0.5  # smallest survival probability
 
 
 @dataclass
@@ -66,7 +66,7 @@ class Survival:
         place, most = dr.detach((o - self.corner) * self.cubes), (1 << BITS) - 1
         result = mi.UInt32(0)
         for k in range(3):
-            # A second bound in integers: what NaN becomes is not defined, and may not leave the table.
+            # A second bound in integers: the conversion of NaN is undefined, and the index must stay in the table.
             result = (result << BITS) | dr.minimum(mi.UInt32(dr.clip(place[k], 0, most)), most)
         for k in range(3):
             result = (result << 1) | dr.select(d[k] > 0, mi.UInt32(1), 0)
@@ -74,7 +74,7 @@ class Survival:
 
     def probability(self, o: mi.Point3f, d: mi.Vector3f, throughput: mi.Float) -> mi.Float:
         """Return q of a ray that leaves `o` along `d`; detached."""
-        # A throughput that is not a number has q = LEAST: it is to be seen, not to vanish.
+        # A throughput of NaN has q = LEAST, so that it stays visible.
         chance = dr.gather(mi.Float, self.chances, self.cell(o, d))
         return dr.fmin(dr.fmax(dr.detach(throughput) * chance, LEAST), 1)
 

@@ -53,7 +53,7 @@ class GradientSum:
     """Sum of the parameters' gradients over passes, separate from the gradients of the current pass."""
 
     def __init__(self, params: mi.SceneParameters) -> None:
-        with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
+        with dr.resume_grad():  # with suspended gradients, nothing shows that it tracks them
             enabled = [value for _, value in params.items() if dr.grad_enabled(value)]
             self.values = [array for value in enabled for array in _arrays(value)]
         self.totals: list[dr.ArrayBase] = []
@@ -85,15 +85,15 @@ def finish_pass(*results: object) -> None:
     dr.sync_thread()
 
 
-#: Names of the random streams beside the sampler's own, mixed into the seed.
-SELECTION_STREAM = 0x5E1EC7  # what hooks draw to select
+#: Names of the random streams other than the sampler's own, mixed into the seed.
+SELECTION_STREAM = 0x5E1EC7  # random numbers with which hooks select
 VISIBLE_STREAM = 0xD1EC7  # primary rays
 LAMP_STREAM = 0x1A3B5 << 12  # points of lamps; the lamp's number is added
-CAMERA_STREAM = 0xCA3E2A  # seeds of camera paths, beside those of light paths
-PASS_STREAM = 0x9A55E5  # seeds of the second pass and those after it
-SMALL_LAMP_STREAM = 0x57A25  # points of lamps that are smaller than a pixel
+CAMERA_STREAM = 0xCA3E2A  # seeds of camera paths, next to those of light paths
+PASS_STREAM = 0x9A55E5  # seeds of the second and later passes
+SMALL_LAMP_STREAM = 0x57A25  # points of lamps smaller than a pixel
 GUIDE_STREAM = 0x6D1DE  # cells of emission
-NET_STREAM = 0x5EC0E  # scrambles of numbers of low discrepancy
+NET_STREAM = 0x5EC0E  # scrambles of low-discrepancy numbers
 
 
 @dataclass
@@ -145,18 +145,18 @@ class Samples:
     fraction: mi.Float
     guide: Guide | None = None
     net: Net | None = None
-    #: Where paths from both sides are weighed against one another: all light paths over the camera paths of a pixel
-    #: (width 1), and the emitters' densities.
+    #: If paths from both sides are weighted: all light paths divided by the camera paths of a pixel (width 1), and the
+    #: emitters' densities.
     ratio: mi.Float | None = None
     emitters: EmitterDensities | None = None
-    #: How the camera paths are shared out over the pixels; None: evenly.
+    #: Distribution of the camera paths over the pixels; None: uniform.
     shares: PixelShares | None = None
-    #: The camera paths of the same pass, beside light paths.
+    #: The camera paths of the same pass, next to light paths.
     camera: Samples | None = None
-    _areas: list[mi.Float] = field(init=False)  # of the lamps that are reshaped: `sums_of_areas`
+    _areas: list[mi.Float] = field(init=False)  # of the reshaped lamps: `sums_of_areas`
 
     def __post_init__(self) -> None:
-        # Now: in the midst of tracing they would cut a kernel in two.
+        # Evaluated now: during tracing, they would split a kernel.
         lamps = self.plan.reshaped_lamps
         self._areas = sums_of_areas(lamps) if lamps else []
 
@@ -181,7 +181,7 @@ class Samples:
 
     def sampler(self) -> mi.Sampler:
         """Return a sampler at the beginning of the stream of these samples."""
-        if self.plan.paths != "light":  # whose number of paths may be any; the sensor's may ask for so many in a pixel
+        if self.plan.paths != "light":  # any number of paths works; the sensor's sampler may require a number per pixel
             sampler = mi.load_dict({"type": "independent"})
         else:
             sampler = self.sensor.sampler().clone()
@@ -220,7 +220,7 @@ class Samples:
         if self.net is None:
             return []
         assert self.plan.sequence is not None
-        # Their place in the sequence is behind that of emission's.
+        # Their dimensions in the sequence follow those of emission.
         points, _ = self._points(mi.Float(0), mi.Point2f(0), mi.Point2f(0))
         return [Early(points.next_2d(), points.next_1d()) for _ in range(self.plan.sequence.bounces)]
 
@@ -233,14 +233,15 @@ class Samples:
         """
         which = self.plan.sequence
         assert which is not None
-        # A guide stratifies the lanes itself, emitters among them: where in its share the choice lies says nothing.
+        # A guide stratifies the lanes itself, including emitters: the position of a choice within its share carries no
+        # information.
         guided = self.guide is not None
         points = Points(mi.sample_tea_32(self.seed, mi.UInt32(NET_STREAM))[0], self.width, None if guided else self.net)
         if which.choice and not guided:
             choice = points.next_1d(choice)
         direction = points.next_2d(direction, which.direction)
         place = points.next_2d(place, which.place)
-        points.net = None  # whether or not there was anything to stratify
+        points.net = None  # with or without stratified numbers
         return points, (choice, place, direction)
 
     def drawn(self, choice: mi.Float, position: mi.Point2f, direction: mi.Point2f) -> Drawn | None:
@@ -289,14 +290,14 @@ def passes(
             f"{spp} samples per pixel in passes of {min(unit, PASS_SAMPLES)} are more than {PASSES} passes"
         )
     sizes = _parts(unit) * (spp // unit)
-    # Opaque: a seed that reached the kernel as a literal would compile a new one each step.
+    # Opaque: a literal seed in the kernel would compile a new one each step.
     others = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(PASS_STREAM + p))[0] for p in range(1, len(sizes))]
     seeds = [mi.UInt32(seed), *others]
     dr.make_opaque(seeds)
-    if table is None:  # a plan has a grid where paths are guided, and nowhere else
+    if table is None:  # a plan has a grid only if paths are guided
         plan = replace(plan, grid=None, aims=False)
-    film, pixels = Film(sensor, plan.whole), int(dr.prod(sensor.film().size()))  # as for `ptracer`
-    # Opaque: as literals these would give every sample count kernels of its own.
+    film, pixels = Film(sensor, plan.whole), int(dr.prod(sensor.film().size()))  # as in `ptracer`
+    # Opaque: literals would compile kernels for every sample count.
     scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / (float(pixels) * spp))
 
     def part(size: int) -> Samples:

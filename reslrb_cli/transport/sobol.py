@@ -26,7 +26,7 @@ import mitsuba as mi
 
 DIGITS = 32
 
-#: Of each coordinate behind the first: the inner coefficients of its polynomial, one bit each, and its first numbers m.
+#: For each dimension after the first: the inner coefficients of its polynomial, one bit each, and its first numbers m.
 JOE_KUO: tuple[tuple[int, tuple[int, ...]], ...] = (
     (0, (1,)),
     (1, (1, 3)),
@@ -39,7 +39,7 @@ JOE_KUO: tuple[tuple[int, tuple[int, ...]], ...] = (
     (7, (1, 1, 7, 11, 19)),
 )
 
-#: Scattering events whose numbers are coordinates: through a pane of glass, or around a corner.
+#: Scattering events with their own dimensions: through a pane of glass, or around a corner.
 BOUNCES = 2
 
 
@@ -132,7 +132,7 @@ class Points:
 
     def __init__(self, seed: mi.UInt32, width: int, net: Net | None, used: int = 0) -> None:
         self.seed, self.lane, self.net, self.used = seed, dr.arange(mi.UInt32, width), net, used
-        # In coarse steps: another number of paths is to be no other kernel.
+        # In coarse steps, so that another number of paths uses the same kernel.
         self.digits = 24 if width <= 2**24 else DIGITS
 
     def next_1d(self, independent: mi.Float | None = None) -> mi.Float:

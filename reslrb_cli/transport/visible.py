@@ -39,7 +39,7 @@ def moving_splats(samples: Samples) -> Iterator[tuple[mi.Point2f, mi.Spectrum, m
     """
     for lamp in samples.plan.visible_moving_lamps:
         point = _points(samples, (lamp,), mi.UInt32(lamp.index), samples.numbers(LAMP_STREAM + lamp.index), True)
-        # Points stay where they are on the lamp, so that nothing that moves has a part in their radiance.
+        # Points stay at their place on the lamp, so moving parts do not affect their radiance.
         yield point.u, dr.select(point.active, dr.detach(point.radiance()) * point.weight, 0), point.active
 
 
@@ -93,7 +93,7 @@ def _points(
     def point(
         self: mi.Emitter, time: mi.Float, position: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
-        if self not in found:  # of this scene, or of another one
+        if self not in found:  # a shape of this scene, or of another one
             return dr.zeros(mi.SurfaceInteraction3f), mi.Float(0)
         lamp, areas, evened = found[self]
         return lamp_point(lamp, areas, time, position, active, evened)
@@ -134,7 +134,7 @@ def primary_ray(samples: Samples) -> PrimaryRay:
     n_pixels = int(size[0] * size[1])
     lane = dr.arange(mi.UInt32, width)
     pixel = lane % n_pixels
-    count = dr.opaque(mi.UInt32, width)  # as a literal it would give every sample count a kernel of its own
+    count = dr.opaque(mi.UInt32, width)  # a literal would compile a kernel for every sample count
     per_pixel = mi.Float(count // n_pixels + dr.select(pixel < count % n_pixels, mi.UInt32(1), 0))
     time = sample_time(plan, sensor, sampler)
     u = mi.Point2f(pixel % int(size[0]), pixel // int(size[0])) + sampler.next_2d()
@@ -185,7 +185,7 @@ def differentiate_visible_radiance(plan: Plan, scene: mi.Scene, primary: Primary
         if masks:
             behind = dr.select(transmission != 0, (total - radiance) / dr.detach(transmission), 0)
             objective += dr.select(state.active, adjoint * behind, 0) * transmission
-        # Masks may be there and have no parameter that is differentiated.
+        # The scene may have masks without differentiated parameters.
         dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
 
     with dr.resume_grad():
@@ -206,7 +206,7 @@ def _look(
     tangents: bool = False,
 ) -> _Look:  # fmt: skip
     def look(state: _Look) -> tuple[_Look]:
-        with dr.suspend_grad():  # where shapes move, `visible.py` has the derivative
+        with dr.suspend_grad():  # if shapes move, `visible.py` has the derivative
             si = scene.ray_intersect(state.ray, state.active)
         hit = state.active & si.is_valid()
         with dr.resume_grad(when=tangents):
@@ -215,7 +215,7 @@ def _look(
             if tangents:
                 d_Le, d_transmission = forward_derivatives(Le, transmission)
                 Le, transmission = dr.detach(Le), dr.detach(transmission)
-        if on_surface is not None:  # derivatives are taken here and now, none stays in the state
+        if on_surface is not None:  # derivatives are taken here, and none stays in the state
             on_surface(state, Le, state.radiance + dr.detach(Le) * state.transmittance, transmission)
             Le, transmission = dr.detach(Le), dr.detach(transmission)
         d_state = state.tangents

@@ -188,13 +188,13 @@ class Path:
 
     active: mi.Bool  # active lanes
     depth: mi.UInt32  # index of the current vertex; the first after the emitter is 1
-    ray: mi.Ray3f  # the ray that reaches it
-    pi: mi.PreliminaryIntersection3f  # where it does
+    ray: mi.Ray3f  # the ray that reaches this vertex
+    pi: mi.PreliminaryIntersection3f  # the intersection of this ray
     product: Product  # E s_1 ... s_{depth-1}, roulette weights included
-    eta: mi.Float  # accumulated relative index of refraction, for roulette alone; begins larger where emission is dim
-    early: list[Early]  # numbers of the first vertices, where they are of low discrepancy; never changed
-    pending: list[Pending]  # how the last event was aimed, where any are; a replay has no use for it
-    rivals: list[Rivals]  # where camera paths look for the same light
+    eta: mi.Float  # accumulated relative index of refraction, only for roulette; starts larger if emission is dim
+    early: list[Early]  # random numbers of the first vertices, if low-discrepancy; never changed
+    pending: list[Pending]  # how the last event was aimed, if any are; a replay does not use it
+    rivals: list[Rivals]  # if camera paths find the same light
 
 
 def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
@@ -232,13 +232,13 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         numbers = Numbers.draw(sampler, path.active).of_early(path.early, path.depth)
         slot = None if aim is None else sampler.next_1d(path.active)
         seen = None
-        for before in path.pending:  # one, or none
+        for before in path.pending:  # one or none
             assert aim is not None
             here = connect(plan, sensor, si, None, numbers.aperture, path.active & aims_from(bsdf))
             visible = here.active & ~scene.ray_test(si.spawn_ray_to(here.target), here.active)
             seen = Seen(visible)
             r = before.factor(aim, sensor, si, path.ray, here, visible)
-            path = replace(path, active=path.active & (r != 0), product=path.product.scaled(r))  # NaN goes on
+            path = replace(path, active=path.active & (r != 0), product=path.product.scaled(r))  # passes NaN on
             state = hooks.aimed(state, r)
         vertex = Vertex(si, bsdf, path.ray, path.pi, path.depth, path.product, path.active)
 
@@ -255,7 +255,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         )
         connection, scattering = this.connection, this.scattering
         rivals = []
-        for before_here in path.rivals:  # one, or none
+        for before_here in path.rivals:  # one or none
             arrived = before_here.arrive(si, path.ray)
             ways, cos = scattering.ways, cosine(si, scattering.d)
             N = samples.ratio_at(connection.u)
@@ -265,8 +265,8 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         chosen_by: list[mi.Float] = []
         if hooks.connects:
             if not (hooks.tracked or plan.track_zeros):
-                # No shadow ray where neither light nor its derivative would arrive.
-                connection.active = connection.active & ~dr.all(connection.f == 0)  # NaN arrives
+                # No shadow ray if neither light nor its derivative would arrive.
+                connection.active = connection.active & ~dr.all(connection.f == 0)  # passes NaN on
             with dr.suspend_grad(when=not plan.differentiate_null):
                 shadow = passage(plan, scene, si, path.depth, connection, seen or hooks.seen(vertex), loop_mode)
             connection.active, connection.through = shadow
@@ -278,7 +278,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
             chosen_by = [] if selection is None else [selection.next_float32() for _ in range(hooks.numbers)]
         state = hooks.vertex(state, vertex, connection, scattering, chosen_by)
         if hooks.replaying:
-            sampler.next_1d(active)  # roulette's
+            sampler.next_1d(active)  # the number of roulette
             active &= hooks.is_followed(state, vertex)
             path = replace(path, rivals=rivals)
             return _next(path, active, this.next_ray(hooks.attached)), state, sampler, selection

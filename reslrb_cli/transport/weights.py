@@ -40,7 +40,7 @@ from reslrb_cli.transport.emission import Emission
 from reslrb_cli.transport.lamps import lamp_point
 from reslrb_cli.transport.plan import Plan
 
-FROM_INFINITY = -1e30  # the length of a path that comes from there, so far
+FROM_INFINITY = -1e30  # the length so far of a path that comes from infinity
 
 
 @dataclass
@@ -62,9 +62,9 @@ class Rivals:
         d = self.distance + si.t
         cos = dr.maximum(dr.abs(dr.dot(si.n, ray.d)), 1e-12)
         M = self.M * dr.select(d < 0, 1, dr.square(d)) / cos
-        for number in self.sphere:  # one, or none
+        for number in self.sphere:  # one or none
             ds = dr.zeros(mi.DirectionSample3f)
-            ds.d, ds.dist, ds.n = -ray.d, d, mi.Normal3f(ray.d)  # the cone of directions is the same for all of them
+            ds.d, ds.dist, ds.n = -ray.d, d, mi.Normal3f(ray.d)  # the cone of directions is the same for all lanes
             shape = dr.reinterpret_array(mi.ShapePtr, number)
             p_D = shape.pdf_direction(si, ds, number != 0)
             M = dr.select(number != 0, self.M * p_D / cos, M)
@@ -114,7 +114,7 @@ def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission
             ds = dr.zeros(mi.DirectionSample3f)
             ds.d = -d
             return self.pdf_direction(dr.zeros(mi.Interaction3f), ds, active), one, mi.Point2f(0), one, far
-        # Directions are as long as a `to_world` makes them; up to the first vertex, distances are in units of that.
+        # Directions have the scale of `to_world`; up to the first vertex, distances are in units of it.
         distant = self.class_name() == "DirectionalEmitter"
         scaled = dr.norm(d) if distant else dr.norm(d) ** 3
         if self.class_name() == "Projector":
@@ -143,7 +143,7 @@ def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission
         for lamp in plan.needs.lamps:
             if lamp.parallel:
                 unseen |= emitter == mi.EmitterPtr(lamp.emitter)
-        # Nothing else finds what has no density.
+        # No other technique finds points without density.
         M, V = (dr.select(unseen | ~dr.isfinite(x), 0, x) for x in (M, surface / e))
         return Rivals(M, V, distance, sphere)
 

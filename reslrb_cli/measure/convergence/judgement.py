@@ -21,11 +21,10 @@ from reslrb_cli.records.measurements import (
     Verdict,
 )
 
-#: What a stock integrator differs by on the same paths, relative to the entries: whether a point is visible is another
-#: matter of rounding to each.
+#: Relative difference of a stock integrator on the same paths: it rounds the visibility of points differently.
 STOCK_ROUNDING = 1e-3
 
-#: What is said of noise with heavy tails.
+#: Remark on noise with heavy tails.
 HEAVY = "single steps dominate the variance: the intervals are too narrow; take more steps"
 
 
@@ -56,7 +55,7 @@ class Judgement:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._slices = session.slices() if session.facts else {}
-        #: What errors are taken from, by parameter and of all; nothing where there are too few steps of it.
+        #: References of the errors, by parameter and for all; empty if there are too few steps of the reference.
         self._whole: dict[str, ReferenceMean] = {}
         for found in session.of(Role.REFERENCE):
             if len(set(found.turns)) >= FEWEST and not found.message:
@@ -95,7 +94,7 @@ class Judgement:
             if member.refusal is not None:
                 continue
             for key, place in self._places().items():
-                if key == ALL and len(self._slices) == 1:  # all there is
+                if key == ALL and len(self._slices) == 1:  # there are no others
                     methods.append(replace(methods[-1], parameter=ALL))
                     points += [replace(point, parameter=ALL) for point in points if point.method == member.method]
                     continue
@@ -182,7 +181,7 @@ class Judgement:
         magnitude = samples
         if biased and references is not None and references[key].biased and key != ALL:
             judge = self._judge(member, key)
-            if judge is not None:  # what errors are taken from is biased itself
+            if judge is not None:  # the reference is biased itself
                 magnitude = MethodSamples(samples.deviations + samples.reference.mean, samples.turns, samples.seconds,
                                     ReferenceMean(self._rows(judge, place)))  # fmt: skip
         message = bias.message

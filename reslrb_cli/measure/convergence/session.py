@@ -24,10 +24,10 @@ from reslrb_cli.measure.processes import Contestant
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import Kept
 
-#: What the samples of all together may take in memory, in bytes.
+#: Maximum memory for the samples of all methods, in bytes.
 MEMORY = 2**30
 
-#: Light paths of a step of an independent reference, whose samples per pixel are its own: naive AD keeps all paths.
+#: Light paths of a step of an independent reference, which has its own sample count: naive AD keeps all paths.
 INDEPENDENT_PATHS = 2**18
 
 
@@ -126,7 +126,7 @@ class Session(Arena[Plan, Member]):
         for case, spp in plan.entries:
             if self._takes_part(case):
                 self._add(Role.CASE, case, plan.config_of(case, spp), plan.objective)
-        # Files of before it was known which paths there are had a reference that said so.
+        # In older files, which do not record the kinds of paths, the reference named them.
         reference = plan.settled_reference(facts.get("paths", "light"))
         known = reference.at(plan.config, plan.config.integrator.max_depth, True)
         self._add(Role.REFERENCE, reference, known, self._noise_free)
@@ -225,7 +225,7 @@ class Session(Arena[Plan, Member]):
             self._say(f"nothing had compiled by then: {advice}")
         if not warm or self.plan.rounds is not None:
             return
-        # What has not compiled is taken to take as long as what has.
+        # Kernels that are not compiled yet are assumed to take as long as the compiled ones.
         needed = self._budget_of(self._fewest, share=1 + len(late) / len(warm))
         advice = f"allow about {needed:.0f} s with --budget, name fewer --integrators, or use a smaller film"
         fact = f"results need {FEWEST} rounds" if self._before < FEWEST else "no round was added"

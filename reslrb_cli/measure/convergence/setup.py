@@ -35,22 +35,22 @@ from reslrb_cli.scene.catalog import value_shape
 from reslrb_cli.scene.visibility import interior
 from reslrb_cli.seeds import seed
 
-#: A turn of one that compares is as long as a step of the slowest, but no longer than so many seconds.
+#: A turn lasts as long as a step of the slowest method, but at most this many seconds.
 TURN_S = 2.0
 
-#: Steps of less than so many seconds are taken at least two a turn: the first makes good what others did to the caches.
+#: A turn has at least two steps that are shorter than this many seconds: the first one refills the caches.
 SHORT_S = 1.0
 
-#: The most steps of one turn.
+#: Maximum number of steps of one turn.
 MOST_STEPS = 8
 
-#: Turns of references, in those of all that are compared together.
+#: Turns of references, per turn of the compared methods.
 SHARES = {"reference": 0.5, "independent": 0.35}
 
-#: Steps of a turn where their number is not to depend on time.
+#: Steps of a turn if their number must not depend on time.
 FIXED = {"case": 2, "reference": 8, "independent": 4}
 
-#: The most steps of a reference's turn.
+#: Maximum number of steps of a reference's turn.
 MOST_REFERENCE_STEPS = 64
 
 
@@ -165,19 +165,19 @@ def _fitting(turn_s: float, step_s: float, least: int, most: int) -> int:
     return min(max(round(turn_s / max(step_s, 1e-4)), least), most)
 
 
-#: Light paths of the target, and of all images that dL/dI is held at together, where time does not count.
+#: Light paths of the target, and of all images with a fixed dL/dI together, without a time limit.
 PATHS = {"fixed": 2**21, "loss": 2**23}
 
-#: The most of them where it does.
+#: Their maximum with a time limit.
 MOST_PATHS = 2**24
 
-#: Share of the time that they may take, target and images.
+#: Share of the time for the target and the images.
 SHARE = {"fixed": 0.1, "loss": 0.25}
 
-#: Light paths that their speed is measured with.
+#: Light paths for measuring their speed.
 TRIAL = 2**16
 
-#: The purpose of those images' samples.
+#: Purpose of the samples of these images.
 _PURPOSE = "convergence, dL/dI"
 
 
@@ -286,7 +286,7 @@ def _unlike(config: Config) -> str | None:
 def affordable_paths(problem: Problem, pixels: int, seconds: float) -> int:
     """Return the number of light paths for this time: a power of 2, so that similar machines have the same images."""
     spp = multiple_of(TRIAL // pixels, problem.samples_per_pass)
-    for _ in range(2):  # the first one compiles
+    for _ in range(2):  # the first one compiles kernels
         began = time.perf_counter()
         problem.render(problem.sensors[0], spp, 0, "convergence, trial")
         taken = time.perf_counter() - began

@@ -25,18 +25,18 @@ from scipy import stats
 from reslrb_cli.records.measurements import Range
 from reslrb_cli.statistics import jackknife_variance
 
-#: Of all intervals.
+#: Confidence level of all intervals.
 CONFIDENCE = 0.95
 
-#: Fewer turns, or rows of a reference, have no standard error worth the name.
+#: Fewer turns, or rows of a reference, give no useful standard error.
 FEWEST = 3
 
-#: Steps from which on there are so many groups of them, which a slope's interval comes from; the longest average is as
-#: long as a group. The errors of shorter averages than these, of a single colour say, have logarithms so skewed that
-#: intervals are too narrow.
+#: Minimum number of steps, and number of groups for the interval of a slope; the longest average is as long as a group.
+#: The logarithms of errors of shorter averages, for example of a single colour, are so skewed that intervals are too
+#: narrow.
 GROUPS = {32: 8, 16: 4}
 
-#: Fewer steps have no slope.
+#: Fewer steps give no slope.
 FEWEST_FOR_SLOPE = min(GROUPS)
 
 
@@ -90,7 +90,7 @@ class ReferenceMean:
         count, deviations = len(self.rows), self.rows - self.mean
         moved = -deviations / (count - 1)
         squares = np.square(deviations).sum(1)
-        # The sum of squares about the mean of the rest is smaller by K / (K - 1) of the row's own.
+        # Leaving out a row lowers the sum of squares about the mean by K / (K - 1) times its own square.
         left = squares.sum() - squares * count / (count - 1)
         noise = left / max(count - 2, 1) / (count - 1)
         signal = np.square(self.mean + moved).sum(1) - noise
@@ -161,7 +161,7 @@ class MethodSamples:
             return None
         fit = _fit(lengths[usable])
         value, left, right = fit(whole[usable]), fit(all_but_one[usable]), fit(shifted[usable])
-        corrected = groups * value - (groups - 1) * left.mean()  # a logarithm of few averages is biased
+        corrected = groups * value - (groups - 1) * left.mean()  # the logarithm of few averages is biased
         return _joined(float(corrected), left, right)
 
     def efficiency(self, biased: bool = False) -> JackknifeEstimate | None:

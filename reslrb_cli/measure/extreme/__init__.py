@@ -21,7 +21,7 @@ LISTED = (
     *light.UNFOUND_CASES,
 )
 
-#: By name, of which no two cases have the same.
+#: By name; no two cases have the same name.
 CASES = {case.name: case for case in LISTED}
 
 

@@ -86,7 +86,7 @@ def _parallel(start: list[float], end: list[float], half: float, radiance: dict)
     return lit_square(radiance, look_at(start, end) @ transform(scale=half), "directionalarea")
 
 
-#: What paths from the sensor hardly find is compared with an image of paths from the light.
+#: Paths from the sensor hardly find this light, so the reference is an image of paths from the light.
 TRACED: dict[str, Any] = {"image": "ptracer", "spp": 512}
 
 GLASS_CASES = [
@@ -120,7 +120,7 @@ GLASS_CASES = [
 SIZE = 24
 TOP = "top.vertex_positions"
 
-#: Ten ray offsets where a thin slab is: 8.9e-5 (1 + max |p|) each.
+#: Ten ray offsets at a thin slab: 8.9e-5 (1 + max |p|) each.
 THIN = 10 * 8.9e-5 * (1 + 2.5)
 Moves = Callable[[Any], Sequence[Move]]
 
@@ -210,7 +210,7 @@ MOTION_CASES = [
     moved("slope_1e-6", "slopes of a millionth", surface(slope=1e-5)),
     moved("slope_0.3", "slopes of a third", surface(slope=3), 0.005),
     moved("sliding_faces", "a surface whose faces slide through the light", surface(), moves=sliding),
-    moved("total_reflection", "a surface with waves, beyond the critical angle",  # of light from within
+    moved("total_reflection", "a surface with waves, beyond the critical angle",  # light from inside
           lambda: pool(glass(), beam((-1.87, 1.0), (-1.6, 1.2), 0.12), slope=0.1, height=1.2, cells=256), 0.0015),
     moved("grazing_85", "light at 85 degrees on glass", lambda: grazing(85), 0.005, moves=bending(0.1)),
     moved("parallel_faces", "a slab with flat faces that begins to bend", moving_slab(0), depth=4),
@@ -331,7 +331,7 @@ def close() -> dict:
     }
 
 
-#: Of each kind of BSDF what stands around it, its options, the colour of its lobe and its roughness by their names, and
+#: For each kind of BSDF: its surroundings, its options, the names of the colour of its lobe and of its roughness, and
 #: whether the roughness is a parameter.
 KINDS: dict[str, tuple[Callable[[dict], dict], dict, str, str, bool]] = {
     "roughconductor": (reflected, {}, "specular_reflectance", "alpha", True),
@@ -349,7 +349,7 @@ def plate(kind: str, roughness: str) -> dict:
 
 ROUGHNESS = ("1", "0.1", "1e-2", "1e-4")
 
-#: Roughnesses whose derivative is decided where light follows them. `principled` chooses a lobe: it has none such.
+#: Roughnesses with a decided derivative on followed paths. `principled` chooses a lobe and has no such derivative.
 FOLLOWED = [(kind, roughness) for kind in ("roughconductor", "roughdielectric") for roughness in ("0.1", "1e-2")]
 NOISE = "the noise of a roughness's derivative grows as 1 / roughness: equal seeds decide"
 
@@ -383,18 +383,18 @@ def _followed(kind: str, roughness: str) -> ExtremeCase:
         made = plate(kind, roughness)
         if (kind, roughness) == ("roughdielectric", "1e-2"):
             made |= close()
-        made["camera"]["film"]["rfilter"] = FILTER  # a box filter has no derivative by where light lands
+        made["camera"]["film"]["rfilter"] = FILTER  # a box filter has no derivative by film position
         return made
 
     return ExtremeCase(
         followed(kind, roughness), f"how light follows the roughness {roughness} of a {kind}", scene, (),
         Extrapolated(0.05 * float(roughness), 2e-3), image="", spp=256, signed=True,
-        options={"max_depth": 3},  # from the plate to the floor, and no farther: beyond it are edges at rest
+        options={"max_depth": 3},  # from the plate to the floor: the edges beyond do not move
         ours={"attached": True}, equal=5e-4, moves=lambda scene: [Number("plate.bsdf.alpha.value")],
     )  # fmt: skip
 
 
-#: A plate throws light on a floor, and the camera sees that alone. The plate itself stays out of view: a nearly smooth
-#: lobe that is connected to the sensor has a variance that no number of samples settles.
+#: A plate throws light on a floor, and the camera sees only the floor. The plate stays out of view: connections of a
+#: nearly smooth lobe to the sensor have a variance that no sample count resolves.
 ROUGHNESS_CASES = [_case(kind, roughness) for kind in KINDS for roughness in ROUGHNESS]
 ROUGHNESS_CASES += [_followed(kind, roughness) for kind, roughness in FOLLOWED]

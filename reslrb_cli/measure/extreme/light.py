@@ -58,7 +58,7 @@ def bright(value: float) -> dict:
     return room(floor=matte(columns((value, value, value), (value, 0.3, value))), wall=matte(rgb(value, value, value)))
 
 
-#: It plays from the second vertex on.
+#: Roulette starts at the second vertex.
 ROULETTE = {"max_depth": 5, "rr_depth": 2}
 
 COLOURS_CASES = [
@@ -282,7 +282,7 @@ def spots() -> KnownScene:
     return texels_over_plane(texels)
 
 
-#: Lamps that no sample finds, or one in a thousand.
+#: Lamps that no sample finds, or one sample in a thousand.
 UNFOUND_CASES = [
     exact("lamp_of_a_thousandth_of_a_pixel", "a lamp in view that one primary ray in a thousand hits",
           lambda: speck_in_view(side=0.0037, radiance=(300, 200, 400)), {"radiance": LAMP}, 1, image="ptracer"),

@@ -239,10 +239,10 @@ def without_roulette(case: ExtremeCase) -> dict[str, Any]:
     return {key: value for key, value in case.options.items() if key != "rr_depth"}
 
 
-#: Of the root mean square of the sums.
+#: Relative to the root mean square of the sums.
 LIMIT = 1e-5
 
-#: What is kept says that it is of this.
+#: Kind of measurement in the file of samples.
 KIND = "gradcheck --suite"
 
 
@@ -275,10 +275,10 @@ def kept(settings: Mapping[str, Any], cases: Mapping[str, Sequence[GradcheckReco
     return resume_store.head(KIND, settings, cases=rows), {}
 
 
-#: All z scores of the suite are corrected for together; a little more than it has.
+#: Number of comparisons for the correction of all z scores of the suite; slightly more than it has.
 FAMILY = Family(rows=1500, entries=30000)
 
-#: What rounding may leave below zero, of the largest entry.
+#: Negative values up to this share of the largest entry count as rounding.
 BELOW_ZERO = 1e-5
 
 
@@ -296,7 +296,7 @@ def run_case(
         way = {name: value for name, value in members[0][1].items() if name != "estimator"}
         setup.weights = type(setup.weights)(plain)
         if way and case.moves is not None:
-            continue  # what moves light has derivatives on light paths alone
+            continue  # moving light has derivatives only on light paths
         reason = _hidden_from(case, setup) if way.get("paths") == "camera" else None
         if reason is not None:
             for label, _ in members:
@@ -306,10 +306,10 @@ def run_case(
         yield from _run_way(_seen_by(case, setup, way) if way else case, setup, members)
 
 
-#: Camera paths, beside the estimators on light paths, as `--estimators` has them.
+#: Label of camera paths, next to the estimators of light paths, as in `--estimators`.
 WAYS = ("stack(paths=both)", "stack(paths=camera)")
 
-#: Radius of a filter, in pixels, that does not reach over the film's border.
+#: Radius of a filter, in pixels, that does not reach beyond the film.
 BOX = 0.5
 
 
@@ -350,7 +350,7 @@ def _run_way(
 ) -> Iterator[GradcheckRecord]:
     """Run estimators that trace the same kinds of paths. `members` are their labels and options."""
     weights = np.array(setup.weights) if case.weights is None else case.weights(np.array(setup.weights))
-    # What is refused of dL/dI counts as zero; references are never shown it.
+    # Refused values of dL/dI count as zero, and references never get them.
     setup.weights = type(setup.weights)(np.where(np.isfinite(weights), weights, 0))
     reference = case.source.samples(case, setup)
     attached = {} if case.moves is None else {"attached": True}
@@ -394,7 +394,7 @@ def _steps(case: ExtremeCase, setup: Case, name: str) -> tuple[np.ndarray, np.nd
         images.append(np.array(result.image, np.float64)[:, :, :3])
         refused.append(int(result.refused.count[0]))
 
-    # Naive AD follows everywhere: at equal seeds it has the same derivatives of what follows alone.
+    # Naive AD follows everywhere: at equal seeds, it has the same derivatives as an integrator that follows everywhere.
     ours = {"attached_sampling": "follow"} | dict(case.ours)
     tracer = integrator("reslrb", **case.options, **ours, estimator=name)
     gradients = setup.gradients(tracer, seeds_of(case.seeds), case.spp, step=step)
@@ -423,7 +423,7 @@ def _comparisons(
             yield parameter, Reference.WALK_AD, kind, _settled(case, parameter, found, mine)
         if reference.along is None and parameter not in case.elsewhere:
             mine, its = ours[:, columns], reference.values[..., columns]
-            if len(ours) == 1:  # nothing to take a standard error of
+            if len(ours) == 1:  # no samples for a standard error
                 found = compare_equal_seeds(mine, np.atleast_2d(its), case.equal)
             else:
                 found = compare_expectations(mine, its, FAMILY, shape=shape, paired=reference.paired)

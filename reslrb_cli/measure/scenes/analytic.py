@@ -57,7 +57,7 @@ SLAB = {
     "reflectance": "top.bsdf.specular_reflectance.value",
 }
 
-#: The albedo of all planes here.
+#: Albedo of all planes here.
 ALBEDO = (0.7, 0.5, 0.3)
 DOWN, UP = ([1, 0, 0], 90), ([1, 0, 0], -90)
 
@@ -105,7 +105,7 @@ def slab_scene(ior: float = 1.5, degrees: float = 40, max_depth: int = 6) -> Kno
             "type": "scene",
             "camera": pinhole(beside, below, [0, 1, 0], 12),
             "lamp": lit_square(rgb(*radiance), look_at(start.tolist(), [0, 0, 0]), "directionalarea"),
-            # The lower surface faces down: the glass is between them.
+            # The lower surface faces down, so the glass is between them.
             "top": rectangle(bsdf, translate=[0, 0.025, 0], rotate=UP, scale=3),
             "bottom": rectangle({"type": "ref", "id": "glass"}, translate=[0, -0.025, 0], rotate=DOWN, scale=3),
             "plane": rectangle(diffuse(*ALBEDO), translate=below, rotate=UP, scale=6),
@@ -118,7 +118,7 @@ def slab_scene(ior: float = 1.5, degrees: float = 40, max_depth: int = 6) -> Kno
 FOV = 50
 RADIANCE = "lamp.emitter.radiance"
 
-#: Where the lamp over the plane is, beside what the camera sees: middle and half of its side.
+#: Position of the lamp over the plane beside the camera's view: centre and half of its side.
 MIDDLE, HALF = (1.0, 0.8, -0.2), 0.3
 
 
@@ -147,7 +147,7 @@ def speck_in_view(side: float, radiance: tuple = (3, 2, 4)) -> KnownScene:
     def scene() -> dict[str, Any]:
         return {
             "type": "scene",
-            # The camera looks along -z: x goes to the right, and the lamp faces it.
+            # The camera looks along -z: x points right, towards the lamp.
             "camera": pinhole([0, 0, 0], [0, 0, -1], [0, 1, 0], FOV),
             "lamp": lit_square(rgb(*radiance), translate=[*center, -distance], scale=side / 2),
             "wall": rectangle(diffuse(0.5, 0.5, 0.5), translate=[0, 0, -4], scale=6),
@@ -242,7 +242,7 @@ def point_through_surface(
     sin_2 = np.sin(theta) / ior
     cos_1, cos_2 = np.cos(theta), np.sqrt(1 - sin_2**2)
     slope = height / cos_1**2 + depth * cos_1 / (ior * cos_2**3)  # dx/dtheta_1
-    # sin(theta_1) / x, which is finite below the light
+    # sin(theta_1) / x, which stays finite below the light
     ratio = 1 / (height / cos_1 + depth / (ior * cos_2))
     passed = 1 - fresnel(theta, ior)
     per_pi = np.sum(passed * ratio / slope * weights, -1)[..., None] / np.pi

@@ -18,7 +18,7 @@ from reslrb_cli.scene.graph import SceneGraph
 
 Array = NDArray[np.float64]
 
-#: Waves of a surface: wave vectors, phases, and amplitudes for a mean slope of about 0.1.
+#: Waves of a surface: wave vectors, phases, and amplitudes with a mean slope of about 0.1.
 WAVES = (((5.1, 2.3), 0.4, 0.0135), ((-3.7, 5.9), 1.9, 0.012), ((7.9, -4.6), 4.1, 0.0062), ((2.2, -8.8), 2.7, 0.0055))
 
 
@@ -79,14 +79,14 @@ def vertices(scene: Any, name: str) -> np.ndarray:
     return np.array(mi.traverse(scene)[f"{name}.vertex_positions"], float).reshape(-1, 3)
 
 
-#: A filter so wide that what lands between two pixels counts as much as on one. That of the default width (0.5) changes
-#: the slope of a smooth dL/dI by a few percent within each pixel, which steps would have to be small against.
+#: A wide filter, so that light between two pixels counts as much as light on one. The default width (0.5) changes the
+#: slope of a smooth dL/dI by a few percent within each pixel, so steps would have to be small against a pixel.
 FILTER = {"type": "gaussian", "stddev": 0.7}
 
-#: The name of the amplitudes among the parameters.
+#: Name of the amplitudes among the parameters.
 AMPLITUDES = "amplitudes"
 
-#: Degrees that an amplitude of 1 turns by.
+#: Degrees of rotation for an amplitude of 1.
 DEGREES = 57.29577951308232
 
 
@@ -152,8 +152,8 @@ class Number:
         return type(initial)(initial + amplitudes[0])
 
 
-#: Something in a scene (`key`, as `mi.traverse` names it) that `size` amplitudes move; all zero, it stands as the scene
-#: has it. `value` is that of `key`, with its derivative by the amplitudes, of which each has width 1.
+#: A scene object (`key` as in `mi.traverse`) moved by `size` amplitudes; at zero it has the scene's values. `value` is
+#: the value of `key` with its derivative by the amplitudes, each of width 1.
 Move = Displacement | Pose | Number
 
 
@@ -185,7 +185,7 @@ class Displaced:
             moved.append(move.value(self._initial[move.key], own))
             self.params[move.key] = moved[-1]
         self.params.update()
-        # Normals follow the positions: left to the tracing that comes, they would be computed for each ray.
+        # Normals follow the positions now; otherwise the next tracing would compute them for each ray.
         dr.eval(moved, [mesh.vertex_normals_buffer() for mesh in self._meshes])
 
     def collect(self) -> None:

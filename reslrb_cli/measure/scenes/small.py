@@ -15,13 +15,13 @@ import numpy as np
 
 from reslrb_cli.errors import ConfigError
 
-#: What errors name in place of a file.
+#: Name in errors in place of a file.
 CORNELL_BOX_SOURCE = "the built-in Cornell box"
 
-#: What stands for the scene in `scene.file`.
+#: Placeholder of the scene in `scene.file`.
 FILE = Path("/cornell-box")
 
-#: No roulette, no directly visible emitters; `size` is the film's, `texture` the texture's, both squares.
+#: No roulette and no directly visible emitters; `size` of the square film, `texture` of the square texture.
 CORNELL_BOX = f"""\
 scene:
   file: {FILE}

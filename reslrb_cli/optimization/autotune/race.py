@@ -44,19 +44,18 @@ from reslrb_cli.records.manifest import versions
 from reslrb_cli.scene.files import file_digests, files_of
 from reslrb_cli.statistics import Array, jackknife_variance, sum_of_squares
 
-#: Iterations of the run that what measuring costs is a share of.
+#: Iterations of the run to which the cost of measuring is compared.
 ITERATIONS = 200
-#: Shares of a run of ITERATIONS, compilation left out: the limit for all measuring, and the plans for guiding, sequence
-#: and paths. If guiding is not decided after its plan, it may go on to the limit, less the plan for the sequence.
+#: Shares of a run of ITERATIONS without compilation: the limit for all measuring, and the plans for guiding, sequence
+#: and paths. If guiding is open after its plan, it may use the limit less the plan for the sequence.
 SHARE, GUIDING_SHARE, SEQUENCE_SHARE, PATHS_SHARE = 0.05, 0.025, 0.005, 0.015
-#: What measurements take at least that say anything. Compiling is that of both kinds of steps, and of walks that are
-#: learned from.
+#: Minimum cost of useful measurements. Compilation is that of both kinds of steps and of walks for learning.
 GUIDING_NEEDS, SEQUENCE_NEEDS, PATHS_NEEDS = (2.5, 3.0), (2.5, 1.0), (1.5, 2.0)
-#: The same of camera paths alone beside half of each kind: kernels are those of the run, whichever wins, and few steps
-#: of few samples tell.
+#: The same for camera paths only against half of each kind: the run uses the kernels of either outcome, and few steps
+#: with few samples suffice.
 CAMERA_NEEDS = (0.0, 3.0)
-#: The decisions by option: the time that is kept aside for each, and its plan.
-#: What it takes at the least would be too little where kernels are there: first steps take their time all the same.
+#: The decisions by option: the reserved time for each, and its plan. The minimum would be too little if kernels are
+#: cached, because first steps take their time anyway.
 LATER = {
     "paths": (PATHS_NEEDS[0], PATHS_SHARE * ITERATIONS),
     "guiding": (GUIDING_NEEDS[0], GUIDING_SHARE * ITERATIONS),
@@ -65,12 +64,12 @@ LATER = {
 #: Relative error of a single time that must not decide anything.
 TIMING_NOISE = 1.1
 CONFIDENCE = 0.95
-#: What is left of a sum where nothing should be, as a share of it.
+#: Rounding error of a sum that should vanish, as a share of it.
 ROUNDING = 1e-12
 Say = Callable[[str], None]
 Record = TypeVar("Record", bound=Finding)
 Gradients = dict[str, Array]
-#: A gain and the ends of its interval; nothing where it cannot be told.
+#: A gain and the ends of its interval; NaN if unknown.
 Gain = tuple[float, float, float] | tuple[None, None, None]
 NOTHING: Gain = (None, None, None)
 logger = logging.getLogger(__name__)
@@ -135,7 +134,7 @@ class Tuner:
                 if fits(kept):
                     return kept
             except TypeError:
-                pass  # nothing there, or nothing that this version wrote
+                pass  # absent, or written by another version
         allowance = self.allowance(integrator)
         if not allowance.affords(*needs):
             return unmeasured(allowance.note())
@@ -171,7 +170,7 @@ class Tuner:
 def is_auto(config: Config, option: str) -> bool:
     """Whether this option of the integrator is left to measurement."""
     options = config.integrator.options()
-    if option == "paths":  # of both kinds the share is measured alike
+    if option == "paths":  # `both` measures its share in the same way
         return options.get("paths") == "auto" or (options.get("paths"), options.get("light_share")) == ("both", "auto")
     return bool(options.get(option) == "auto")
 
@@ -226,7 +225,7 @@ class Step:
 
 def timed(times: StepTimes, wall_ms: float | None = None) -> Step:
     """Return a step with these times; `wall_ms` replaces the time of the clock if more was waited for."""
-    # Kernels are compiled side by side: their times can add up to more than was waited for.
+    # Kernels are compiled in parallel: their times can add up to more than the wait.
     waited_ms = max((times.wall_ms if wall_ms is None else wall_ms) - times.codegen_ms, times.kernel_ms)
     return Step(kernel_ms=times.kernel_ms, wall_ms=waited_ms, compile_ms=times.codegen_ms)
 
@@ -253,11 +252,11 @@ def compare(
     Gradients are those of each step by parameter (at least three steps), and times are those of steps in any unit.
     """
     units = scales([*own, *other])
-    found = [_log_variances(gradients, units) for gradients in (own, other)] if units else [None]  # of no light, say
+    found = [_log_variances(gradients, units) for gradients in (own, other)] if units else [None]  # such as no light
     known = [each for each in found if each is not None]
     if len(known) < 2:
         return NOTHING
-    from scipy.special import stdtrit  # late: every run imports this module, and few come here
+    from scipy.special import stdtrit  # late: every run imports this module, and few need SciPy
 
     times = statistics.median(own_ms) / max(statistics.median(other_ms), 1e-6)
     advantage = math.exp(known[0][0] - known[1][0]) * times
@@ -282,7 +281,8 @@ def _log_variances(gradients: Sequence[Gradients], scales: dict[str, float]) -> 
     count = len(rows)
     squares = np.square(rows - rows.mean(axis=0)).sum(axis=1) if rows.size else np.zeros(count)
     whole = float(squares.sum())
-    # What a row takes with it is its own distance, and that of the mean of the others from that of all.
+    # Leave-one-out: dropping a row lowers the sum of squares by its squared distance and that of the mean of the
+    # others.
     without = whole - squares * count / (count - 1)
     if not without.min() > ROUNDING * whole:
         return None
@@ -291,17 +291,16 @@ def _log_variances(gradients: Sequence[Gradients], scales: dict[str, float]) -> 
 
 # --- two ways in turns ------------------------------------------------------------------------------------------------
 
-#: Fewer rounds than these say nothing.
+#: Fewer rounds give no result.
 LEAST_ROUNDS = 4
-#: Whenever as many rounds have been taken as are planned for it is asked whether it is clear, so often at the most.
+#: Maximum number of checks whether the result is clear, one after each planned number of rounds.
 LOOKS = 3
-#: What is on before the last of these looks has to be surer than it would have to be at the end: looking again and
-#: again must not make what is worth nothing pass.
+#: Confidence needed before the last check, higher than at the end: repeated checks must not let a useless option pass.
 CLEAR = 0.99
-#: Steps' worth of time that the rounds are planned for.
+#: Time for the planned rounds, in steps.
 PLANNED = 3.4
-#: Samples of each walk that a table learns from, as a share of a step's, and walks that it learns from before it is
-#: tried, where there is time for more than one.
+#: Samples of each walk for learning, as a share of a step's, and number of such walks before the trial if there is time
+#: for more than one.
 LEARNING_SHARE, LEARNINGS = 0.4, 2
 
 
@@ -344,10 +343,10 @@ class Sizes:
         return max(min(int(LEARNING_SHARE * self.step), self.part), 1)
 
 
-#: A step as it is, or one the other way, of a round and so many samples per pixel; from what the table has learned,
-#: which stays as it is. Equal rounds have equal seeds, others than those of any walk that is learned from.
+#: Take a plain step or one with the option, given a round and the samples per pixel, with the learned table, which
+#: stays unchanged. Equal rounds have equal seeds, different from those of any walk for learning.
 Take = Callable[[bool, int, int], Step]
-#: Have the table learn, from a walk of a round and so many samples per pixel; what is not given is left at 0.
+#: Update the table from a walk of a round with these samples per pixel; unmeasured times stay 0.
 Learn = Callable[[int, int], Step]
 
 
@@ -359,7 +358,7 @@ class Turns(Generic[Record]):
     """
 
     LEAST, LOOKS = LEAST_ROUNDS, LOOKS
-    #: Whether it is decided apart for images that have samples of their own.
+    #: Whether the image, if it has its own samples, gets its own decision.
     APART = False
 
     def __init__(
@@ -369,8 +368,8 @@ class Turns(Generic[Record]):
         self._take, self._learn, self._sizes, self._views = take, learn, sizes, views
         self._share, self._most = share, max(share, most)
         self._apart = self.APART and sizes.alone
-        self._plain: list[Step] = []  # all steps as they are whose times count
-        self._steps: tuple[list[Step], list[Step]] = ([], [])  # of either kind
+        self._plain: list[Step] = []  # all plain steps with valid times
+        self._steps: tuple[list[Step], list[Step]] = ([], [])  # of both kinds
         self._walk = Step()
 
     def run(self) -> Record:
@@ -379,7 +378,7 @@ class Turns(Generic[Record]):
         self._spend(take(False, 0, spp), first=True)
         plain = self._spend(take(False, 0, spp))
         self._plain.append(plain)
-        # What Python takes is the same for both.
+        # Python's time is the same for both.
         kernels = (1 + self._sizes.longer) * (plain.kernel_ms + plain.image_ms)
         if not self._learned(kernels + 2 * plain.beside_ms):
             most = f"{self._most * ITERATIONS:.2g}"
@@ -406,7 +405,7 @@ class Turns(Generic[Record]):
             self._spend(walk, first=True)
             return False
         self._walk = self._spend(walk)
-        # What one walk more would gain is little beside what rounds that are too few leave open.
+        # One more walk gains little compared with the uncertainty of too few rounds.
         rounds = max(self._sizes.rounds // 2, self.LEAST)
         for number in range(1, LEARNINGS):
             if self._affords(self._walk.wall_ms + rounds * round_ms):
@@ -459,7 +458,7 @@ class Turns(Generic[Record]):
         """
         own, other = ([step.images for step in steps] for steps in self._steps)
         times = [self._times(each, False) for each in (False, True)]
-        if self._sizes.alone:  # what goes on beside kernels counts once, with the gradient
+        if self._sizes.alone:  # time outside kernels counts once, with the gradient
             times = [[step.image_ms for step in steps] for steps in self._steps]
         return compare(own, times[0], other, times[1])
 

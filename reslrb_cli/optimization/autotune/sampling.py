@@ -50,19 +50,19 @@ from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array
 from reslrb_cli.transport.film import PixelShares
 
-#: Rounds that are planned for, of gradients of many entries, and of few, which tell less each.
+#: Planned rounds for gradients with many entries, and with few, which tell less per round.
 ROUNDS, ROUNDS_OF_FEW, FEW_ENTRIES = 8, 16, 64
-#: A guided step, or one with low-discrepancy numbers, may take so many times as long as another.
+#: Maximum cost of a guided step, and of one with low-discrepancy numbers, relative to another.
 GUIDING_LONGER, SEQUENCE_LONGER = 3.0, 1.25
-#: The share of light paths that is begun with, and those that are tried then: fewer, as long as they are better, or,
-#: where none at all are, a few after all; else more. Steps of another share may take so many times as long. A share is
-#: tried where so much of the time is left for it.
+#: The first share of light paths, and the shares to try next: fewer as long as they are better, or a few if none are
+#: better; otherwise more. Then the maximum relative cost of a step with another share, and the minimum share of the
+#: time that must be left for a trial.
 FIRST_SHARE, FEWER, MORE, PATHS_LONGER, LEAST_TURNS = 0.5, (0.2, 0.05), (0.8, 0.95, 1.0), 2.0, 0.1
-#: What of the share the rounds of the sequence are planned for; the first step takes a part too, and is no round.
+#: Part of the share for which the sequence's rounds are planned; the first step also takes time, and is no round.
 ROUNDS_SHARE = 0.8
-#: Views that are looked at, spread over those that are trained on, and values of each one's image.
+#: Views for the comparison, spread over the training views, and values of each image.
 MOST_VIEWS, MOST_VALUES = 4, 2**15
-#: Samples of the image that dL/dI is held at, as a share of a step's.
+#: Samples of the image at which dL/dI is fixed, as a share of a step's.
 IMAGE_SHARE = 0.25
 
 
@@ -139,7 +139,7 @@ def with_sides(integrator: Any, sides: PathsRecord | None) -> Any:
 def settle_sampling(tuner: race.Tuner) -> None:
     """Decide open options of sampling: guided or not; then the sequence, instead of guiding or in addition."""
     config, plain, memory = tuner.problem.config, tuner.problem.integrator, tuner.problem.memory
-    trials: list[StepTrial] = []  # what was measured on so far
+    trials: list[StepTrial] = []  # trials so far
     if race.is_auto(config, "guiding") and (guided := _guided(tuner, trials)) is not None:
         if guided.guided and guides_light_alone(tuner.problem):
             sides, plain = _light_alone(tuner.problem.sides, guided), plain.afresh(light_share=1.0)
@@ -147,7 +147,7 @@ def settle_sampling(tuner: race.Tuner) -> None:
         tuner.take(guided=guided, integrator=as_decided(plain, guided, None))
         if guided.guided:
             tuner.set_aside(table_bytes(tuner.problem))
-    if isinstance(plain, Tracer) and plain.paths == "camera":  # nothing begins at the emitters
+    if isinstance(plain, Tracer) and plain.paths == "camera":  # no path starts at the emitters
         return
     if race.is_auto(config, "sequence"):
         sequence, found = _sequence(tuner, trials), tuner.problem.guided
@@ -231,7 +231,7 @@ def share_left(problem: Problem, allowance: Allowance, reserved: float = 0.0, ke
     return max(min(race.SHARE - spent - reserved, allowance.iterations_left(kernels) / race.ITERATIONS), 0.0)
 
 
-# --- what is decided --------------------------------------------------------------------------------------------------
+# --- decisions --------------------------------------------------------------------------------------------------------
 
 
 class GuidingPilot(race.Turns[GuidedRecord]):
@@ -319,7 +319,7 @@ def _paths(tuner: race.Tuner) -> PathsRecord:
     return tuner.decide(
         PathsRecord,
         of={"paths": 5},
-        # What is measured later is of light paths: where camera paths may do without, it can wait.
+        # Later measurements concern light paths; if camera paths may replace them, they can wait.
         needs=[needs] if alone else [needs, *later],
         integrator=problem.integrator,
         measure=measure,
@@ -363,9 +363,9 @@ def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord | None:
 
     return tuner.decide(
         GuidedRecord,
-        # Learning is a larger part of a short run, where tables learn most often at first.
+        # Learning is a larger part of a short run, because tables learn most often at the start.
         of={"guiding": 6, "lessons": plan.lessons} | _sides(problem),
-        # Where even numbers are likely to do better, to measure guiding alone would mislead.
+        # If low-discrepancy numbers are likely to win, measuring only guiding would mislead.
         needs=(race.GUIDING_NEEDS, *([] if why is None else 2 * [race.SEQUENCE_NEEDS])),
         integrator=problem.integrator,
         measure=measure,
@@ -394,8 +394,8 @@ def _sequence(tuner: race.Tuner, trials: list[StepTrial]) -> SequenceRecord:
     def measure(allowance: Allowance) -> SequenceRecord:
         if found is None or not found.guided:
             return pilot("sequence", None, share_left(problem, allowance, kernels=race.SEQUENCE_NEEDS[0]))
-        # Guided paths start in cells of their own, within which little is left to spread evenly: where numbers
-        # that are say nearly all, as under a beam through glass, they do better alone.
+        # Guided paths start in their own cells, which leave little to spread evenly. Low-discrepancy numbers without
+        # guiding do better where they determine nearly everything, as in a beam through glass.
         share = share_left(problem, allowance, kernels=2 * race.SEQUENCE_NEEDS[0])
         alone = replace(pilot("sequence alone", False, share / 2), alone=True)
         if alone.low_discrepancy:
@@ -430,7 +430,7 @@ class StepTrial:
     ) -> None:
         self._problem, self._what, self._clock = problem, what, StepClock()
         self._adjoint = problem.config.adjoint
-        # Of their own: tables and recordings of other sample counts end with them.
+        # Separate integrators, because other sample counts would drop the tables and recordings of the run.
         self._tracers = [one.with_options(samples_per_pass=None, freeze=one.freeze) for one in (plain, other)]
         self._guided = [one for one in self._tracers if one.preparation.guiding is not None]
         self.table: Guiding | None = earlier.table if earlier is not None and self._guided else None
@@ -438,7 +438,7 @@ class StepTrial:
             own = self._guided[0].preparation.guiding
             assert own is not None
             self.table = self.table or own
-            self.table.images, self.table.held = own.images, True  # steps are not to teach it
+            self.table.images, self.table.held = own.images, True  # steps must not update it
             for tracer in self._guided:
                 tracer.preparation.draw_from(self.table, problem.scene)
         problem.apply()
@@ -450,7 +450,7 @@ class StepTrial:
         count = min(len(trained), MOST_VIEWS)
         self.views = [trained[k * len(trained) // count] for k in range(count)]
         self._slopes = [self._slope(view) for view in self.views]
-        take_gradient(problem)  # recovered exposures have some of these
+        take_gradient(problem)  # recovered exposures have some of these entries
 
     def turns(self, kind: type[race.Turns[race.Record]], sizes: race.Sizes, share: float) -> race.Record:
         """Return the result of alternating steps."""

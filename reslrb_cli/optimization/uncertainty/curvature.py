@@ -46,23 +46,24 @@ from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array, rms
 
 _PURPOSE = "curvature"
-#: A parameter of at most so many entries is looked at entry by entry.
+#: Largest number of entries that are examined one by one.
 MOST_ENTRIES = 4
-#: Parts of keys of what mixes channels: a number is read out of such textures.
+#: Parts of keys of textures that mix channels into one number.
 MIXING = ("alpha", "roughness", "weight", "opacity", "normalmap", "bump", "metallic", "anisotropic")
-#: Entries over which curvature is averaged, at least.
+#: Minimum number of entries over which curvature is averaged.
 GROUP = 64
-#: A pixel shows a texture where it changes by this share of the most that any does.
+#: A pixel shows a texture if its change exceeds this share of the largest change.
 SHOWN = 0.05
-#: So many standard errors are taken off curvature, and added to noise of the target.
+#: Standard errors that are subtracted from curvature and added to the noise of the target.
 MARGIN = 1.0
-#: Values of the images that enter H along directions: of more, so many at random, the same for all. And blocks of B.
+#: Maximum number of image values in H along directions; of more, a random subset, the same for all. Also the number of
+#: blocks of B.
 MOST_VALUES = 2**18
-#: Images by which the target's noise is sampled, of as many samples where those are at most so many times a step's.
+#: Images for the target's noise, with the target's samples if these are at most a multiple of a step's.
 REPLICAS, AGAIN = 4, 4
-#: By this factor they are made brighter or darker, at most.
+#: Maximum factor by which they are made brighter or darker.
 MOST_ASTRAY = 10.0
-#: Samples of it by which large parameters are probed.
+#: Samples for probes of large parameters.
 PROBED = 2
 
 
@@ -147,7 +148,7 @@ def _wholes(problem: Problem, key: str, share: float) -> list[Change]:
         return []
     of = [np.where(np.arange(row.size) % channels == channel, row, 0.0) for channel in range(channels)]
     directions = [Direction(key, v, None if channels == 1 else c) for c, v in enumerate(of) if v.any()]
-    # Darker, so that no bound is passed but by what is negative.
+    # Darker, so that values exceed no bound except 0.
     return [Change({key: array * (1 - share)}, -share, directions)]
 
 
@@ -184,9 +185,9 @@ class Curvature:
 
     def __init__(self, problem: Problem, spp: int) -> None:
         self.problem, self.spp = problem, spp
-        #: What was done so far.
+        #: Progress.
         self.changes = self.probes = 0
-        #: By how many values of the images each texture is seen, of those that were changed as a whole.
+        #: Number of image values that show each texture, for textures changed as a whole.
         self.pixels: dict[str, int] = {}
         self.integrator = unrecorded(problem.integrator)
         self._base = [see_images(problem, spp, -1 - half, _PURPOSE) for half in (0, 1)]
@@ -195,7 +196,7 @@ class Curvature:
         random = np.random.default_rng(self._seed(0, 0))
         self._picked = None if values <= MOST_VALUES else np.sort(random.choice(values, MOST_VALUES, replace=False))
         self._thinned = max(values / MOST_VALUES, 1.0)
-        #: Samples of the targets' noise, by view; nothing where no target was rendered.
+        #: Samples of the targets' noise by view; empty if no target was rendered.
         self.noises = self._target_noises()
 
     def along(self, changes: Sequence[Change], go_on: Callable[[], bool]) -> tuple[list[Direction], Array, Array]:
@@ -315,7 +316,7 @@ class Curvature:
                 f"{_PURPOSE}, target", multiple,
             )  # fmt: skip
             images.append(view.kept(np.nan_to_num(image[:, :, : true.shape[2]].astype(np.float64))))
-        # Where noise has led the values astray the images are not as bright as the target.
+        # If noise has led the values astray, the images are not as bright as the target.
         bright = np.sum(view.kept(true)) * REPLICAS / max(float(np.sum(images)), 1e-300)
         images = [image * np.clip(bright, 1 / MOST_ASTRAY, MOST_ASTRAY) for image in images]
         if again:

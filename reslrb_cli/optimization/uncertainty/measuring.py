@@ -24,24 +24,22 @@ from reslrb_cli.statistics import Array, rms
 
 _PURPOSE = "certainty"
 
-#: A run of fewer iterations is not judged: what it would cost is no small part of it.
+#: Shorter runs get no verdicts, because verdicts would take a large part of their time.
 LEAST_ITERATIONS = 20
-#: Gradients at the final values: one for so many iterations, within these. They have the samples of a step, so that no
-#: kernel is compiled for them.
+#: Gradients at the final values: iterations per gradient, and the limits of their number. They have the samples of a
+#: step, so they compile no kernel.
 ITERATIONS_A_SAMPLE, LEAST_SAMPLES, MOST_SAMPLES = 40, 3, 16
-#: Random probes for parameters of many entries; renderings along directions, at most: so many, or one for so many
-#: iterations.
+#: Random probes for large parameters; minimum number of renderings along directions, and iterations per rendering.
 PROBES, LEAST_CHANGES, ITERATIONS_A_CHANGE = 4, 20, 10
-#: Share of the samples of a step that each of the two sets of samples has that curvature is measured with, and
-#: samples per pixel that are enough to have all of them; all, too, where noise hides the curvature of an entry.
+#: Divisor of a step's samples for each of the two sets that measure curvature, and samples per pixel below which all
+#: are used. All are also used if noise hides the curvature of an entry.
 PART, FEW = 4, 4
-#: Directions are differentiated over this share of a parameter's scale.
+#: Step of the differences along directions, as a share of a parameter's scale.
 STEP = 0.05
-#: Part of a run whose gradients, the last ones, are asked for their noise, and of small parameters for where they pull,
-#: those of at most so many iterations.
+#: Last part of a run whose gradients give the noise, and for small parameters the mean gradient; maximum number of
+#: iterations.
 RECENT, MOST_LAST = 0.2, 200
-#: Where curvature takes longer than this share of the run's time in iterations, and than so many of them, the rest is
-#: left out.
+#: Curvature that takes longer than this share of the run's iterations, and than this many of them, is left out.
 SHARE, MOST_STEPS = 0.25, 50
 
 
@@ -63,14 +61,14 @@ class Certainty:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self._initial = {key: row_of(problem, key) for key in problem.selection.keys}
-        #: What the optimiser kept of squares (`Optimizer.squares`) when that was noted, by key.
+        #: The optimiser's squares (`Optimizer.squares`) at that time, by key.
         self._seen, self.squares = 0, dict[str, Any]()
         #: Since then, by key of a small parameter: gradients of steps, and the values at which they were taken.
         self.last: dict[str, LastSteps] = {}
         self._paces: dict[str, list[tuple[int, float]]] = {key: [] for key in problem.selection.keys}
-        #: The texels (H, W) of each texture that some view shows and light reaches, once that was asked.
+        #: Texels (H, W) of each texture that are visible in some view and lit, once computed.
         self.shown: dict[str, Array] = {}
-        #: The factors of the learning rate so far, where no formula has them.
+        #: Factors of the learning rate so far, if no formula gives them.
         self.rates: list[float] = []
 
     @property
@@ -109,7 +107,7 @@ class Certainty:
             kept = {key: self.problem.optimizer.squares(key) for key in self._initial}
             self.squares = {key: each[0] for key, each in kept.items() if each is not None}
             self._seen, self.last = iterations, {}
-        # Twice as an iteration's number doubles, however many are planned, which a run that goes on may change.
+        # Twice per doubling of the iteration's number, independent of the planned number, which may change.
         if iterations % max((1 << iterations.bit_length()) // 4, 1) == 0:
             for key, looks in self._paces.items():
                 pace = self._pace(key)
@@ -127,7 +125,7 @@ class Certainty:
 
     def _pace(self, key: str) -> float:
         """Return the current movement of a parameter by a step per unit of gradient, for its steepest entries."""
-        with np.errstate(divide="ignore"):  # of what has not been moved yet
+        with np.errstate(divide="ignore"):  # of parameters that have not moved yet
             steepness = rms(1 / self.problem.optimizer.response(key))
         return 1 / max(steepness, 1e-300)
 
@@ -181,7 +179,7 @@ class Certainty:
                     curvature.changes += again.changes
                     if len(found[0]) == len(directions):
                         directions, H, B = found
-                # By entry, where a parameter has no directions of its entries.
+                # By entry, if a parameter has no directions for its entries.
                 seen = {direction.key for direction in directions if direction.entry is not None}
                 left = any(np.any(rows) for key, rows in gradients.items() if key not in seen)
                 diagonal = curvature.by_entry(PROBES, go_on) if left else {}
@@ -306,7 +304,7 @@ class _Budget:
     def __call__(self) -> bool:
         now = time.perf_counter()
         if self._last is not None:
-            # The longest is taken for one that compiled.
+            # The longest one is assumed to include a compilation.
             step = now - self._last
             self._longest, self._spent = max(self._longest, step), self._spent + step
         self._last = now

@@ -55,13 +55,13 @@ import numpy as np
 
 from reslrb_cli.statistics import Array
 
-#: A way to go of so many standard errors is no accident; and so are gradients.
+#: A distance of this many standard errors is significant; the same for gradients.
 SURE = 2.0
-#: Gradients so many standard deviations off what the model has of them say that it is wrong.
+#: Gradients this many standard deviations from the model's prediction contradict the model.
 SURPRISE = 3.0
-#: A value within this share of its scale of a bound is at it, however small the steps are.
+#: A value within this share of its scale of a bound counts as at the bound, however small the steps are.
 AT_BOUND = 1e-3
-#: Steps that a value at its bound may have been driven off it by noise.
+#: Steps by which noise may have moved a value away from its bound.
 STEPS_OFF = 3.0
 
 
@@ -109,10 +109,10 @@ class Measured:
 
     def __post_init__(self) -> None:
         noise = np.var(self.gradients, axis=0, ddof=1)
-        if self.is_small and self.recent is None:  # few samples: those of all entries
+        if self.is_small and self.recent is None:  # few samples: use the mean over all entries
             noise = np.where(noise > 0, noise.mean(), 0.0)
         mean = self.gradients.mean(axis=0)
-        if self.recent is not None:  # more of them, which few samples of heavy-tailed ones understate
+        if self.recent is not None:  # the longer average, because few samples of heavy-tailed gradients underestimate
             noise = np.maximum(noise, self.recent - mean**2)
         object.__setattr__(self, "mean", mean)
         object.__setattr__(self, "noise", noise)
@@ -143,7 +143,7 @@ class Measured:
         The gradient of the loss points upwards: at the lower bound, a positive gradient holds the value there.
         """
         low, high = (np.float32(bound) for bound in self.bounds)
-        step = self.response * self.rates[-1] * np.sqrt(self.noise)  # by which noise moved it in the last iteration
+        step = self.response * self.rates[-1] * np.sqrt(self.noise)  # the noise of the last step
         near = np.maximum(AT_BOUND * self.scale, STEPS_OFF * step)
         back = SURE * np.sqrt(self.noise / len(self.gradients))
         lower = (self.value - low <= near) & (self.mean >= np.where(self.value <= low, -back, back))
@@ -266,7 +266,7 @@ def _after(H: Array, response: Array, noise: Array, rates: Sequence[float] | Arr
     C, D, moved = np.eye(len(response)), np.zeros_like(H), response > 0
     if not moved.any():
         return C, D
-    # Steps are symmetric in units of the root of the response.
+    # Steps are symmetric in units of the square root of the response.
     q, free = np.sqrt(response[moved]), np.ix_(moved, moved)
     values, vectors = np.linalg.eigh(H[free] * np.outer(q, q))
     now = vectors.T @ np.diag(q**-2) @ vectors

@@ -41,15 +41,15 @@ from reslrb_cli.records.decisions import Jsonable
 from reslrb_cli.records.measurements import INCOMPLETE
 from reslrb_cli.statistics import Array, rms
 
-#: A value that is known to this share of its scale is settled.
+#: A value known to this share of its scale is settled.
 TOLERANCE = 0.1
-#: Where the others are known, what is left of the spread of a value that they make up for.
+#: Remaining share of a value's spread, given the others, below which they compensate for it.
 OTHERS = 0.5
-#: Of the entries that have an effect, so many have to be settled.
+#: Minimum share of settled entries among those with an effect.
 SETTLED_SHARE = 0.8
-#: Two entries whose offsets are so correlated make up for each other.
+#: Minimum correlation of the offsets of two entries that compensate for each other.
 LEAST_CORRELATION = 0.5
-#: The noise of gradients is at most so much like their curvature: some of it is each one's own.
+#: Maximum similarity of the gradients' noise and their curvature: part of the noise is independent.
 LIKE = 0.95
 Gradients = dict[str, Array]
 Values = list[float | None] | None
@@ -185,7 +185,7 @@ def judge_together(
     count, iterations = len(directions), len(next(iter(measured.values())).rates)
     scale = np.array([1.0 if d.entry is None else measured[d.key].prior for d in directions])
     response, noise, gradient, of_target, to_go, error = (np.zeros(count) for _ in range(6))
-    # Of the last iterations: how many, their mean gradient, and from where they came, at the mean and at the first.
+    # Of the last iterations: their number, the mean gradient, and the movement from the mean and from the first values.
     steps, pull, mean, came = (np.zeros(count) for _ in range(4))
     free, rows = np.ones(count, dtype=bool), []
     for place, direction in enumerate(directions):
@@ -289,14 +289,14 @@ def weigh(
 def _small(own: Measured, at: Sequence[int], found: Coordinates) -> ParameterCertainty:
     to_go, error = own.within(found.to_go[at]), found.error[at]
     of_run = np.hypot(to_go, error)
-    spread = np.maximum(found.spread[at], of_run)  # bounds may have shortened the way
+    spread = np.maximum(found.spread[at], of_run)  # bounds may have shortened the distance
     partners = [found.partners[place] for place in at]
     alone_ = np.where([partner is None for partner in partners], np.inf, found.alone[at])
     verdicts = judge(own, spread, of_run, alone_, to_go, error)
     verdict = summarise(shares(verdicts))
     named = [name for name, each in zip(partners, verdicts, strict=True) if name and each is verdict]
     partner = named[0] if named and verdict is Verdict.NOT_DETERMINED else None
-    # What stands at a bound may be as far from the optimum as that is beyond it.
+    # A value at a bound may be as far from the optimum as the optimum is beyond the bound.
     known = [each not in (Verdict.AT_BOUND, Verdict.NO_EFFECT) for each in verdicts]
     parts = (np.where(known, part, np.nan) for part in (spread, to_go, found.of_target[at]))
     return _certainty(verdict, verdicts, partner, *parts)
