@@ -92,7 +92,7 @@ def test_version_from_name(name: str, version: int | None) -> None:
 
 
 @pytest.mark.usefixtures("_forget")
-def test_the_newest_that_loads_is_chosen(machine: Machine) -> None:
+def test_the_newest_working_version_is_chosen(machine: Machine) -> None:
     machine(
         {
             "libLLVM-14.so.1": "must-not-be-tried",
@@ -111,7 +111,7 @@ def test_the_newest_that_loads_is_chosen(machine: Machine) -> None:
 
 
 @pytest.mark.usefixtures("_forget")
-def test_a_file_whose_name_tells_no_version_is_tried(machine: Machine) -> None:
+def test_a_file_without_a_version_in_its_name_is_tried(machine: Machine) -> None:
     machine({"libLLVM.so": "21.1.0", "libLLVM.so.20.1": "20.1.2"})
     library = llvm.require()
     assert library.version == "21.1.0"
@@ -128,14 +128,14 @@ def test_old_versions_are_refused(machine: Machine, name: str) -> None:
 
 @pytest.mark.usefixtures("_forget")
 @pytest.mark.parametrize("said", ["unknown", "16.0.6"])
-def test_an_old_version_behind_a_plain_name_is_refused(machine: Machine, said: str) -> None:
+def test_an_old_version_with_a_plain_name_is_refused(machine: Machine, said: str) -> None:
     machine({"libLLVM.so": said})
     with pytest.raises(BackendError, match="is too old"):
         llvm.require()
 
 
 @pytest.mark.usefixtures("_forget")
-def test_a_machine_without_one_is_told_what_to_install(machine: Machine) -> None:
+def test_without_a_library_the_installation_is_explained(machine: Machine) -> None:
     machine({})
     with pytest.raises(BackendError, match=r"none found\); install"):
         llvm.require()
@@ -150,7 +150,7 @@ def test_a_machine_without_one_is_told_what_to_install(machine: Machine) -> None
         ("other.so", "libedit.so.2: cannot open shared object file: No such file", "it needs libedit.so.2"),
     ],
 )
-def test_the_users_own_choice_is_refused_too(
+def test_an_old_version_chosen_by_the_user_is_refused_too(
     machine: Machine, monkeypatch: pytest.MonkeyPatch, name: str, behaviour: str, reason: str
 ) -> None:
     good, named = machine({"libLLVM.so.19.1": "19.1.7", name: behaviour})
@@ -162,7 +162,7 @@ def test_the_users_own_choice_is_refused_too(
 
 
 @pytest.mark.usefixtures("_forget")
-def test_prepare_hands_the_choice_to_dr_jit(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_prepare_passes_the_choice_to_dr_jit(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     (path,) = machine({"libLLVM.so.19.1": "19.1.7"})
     monkeypatch.setenv(llvm.VARIABLE, "")
     monkeypatch.delitem(sys.modules, "drjit", raising=False)
@@ -171,7 +171,7 @@ def test_prepare_hands_the_choice_to_dr_jit(machine: Machine, monkeypatch: pytes
 
 
 @pytest.mark.usefixtures("_forget")
-def test_prepare_leaves_the_users_choice_alone(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_prepare_keeps_the_choice_of_the_user(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     machine({"libLLVM.so.19.1": "19.1.7"})
     monkeypatch.setenv(llvm.VARIABLE, "/somewhere/libLLVM.so")
     llvm.prepare()
@@ -199,7 +199,7 @@ def test_missing_library(message: str, library: str | None) -> None:
 
 @pytest.mark.usefixtures("_forget")
 @pytest.mark.skipif(shutil.which("cc") is None or sys.platform != "linux", reason="needs a C compiler")
-def test_a_library_finds_its_needs_beside_it(tmp_path: Path) -> None:
+def test_a_library_finds_its_dependencies_beside_it(tmp_path: Path) -> None:
     (tmp_path / "a.c").write_text("int one(void) { return 1; }")
     (tmp_path / "b.c").write_text("int one(void); int two(void) { return one() + 1; }")
     build = ["cc", "-shared", "-fPIC", "-o"]
@@ -233,14 +233,14 @@ def test_the_command_line_exits_with_3(tmp_path: Path, name: str) -> None:
 # The choice of the variant: CUDA where a ray can be traced on it, LLVM elsewhere, and a reason where neither.
 
 
-def test_auto_takes_cuda_where_it_works(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_auto_uses_cuda_if_it_works(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(variant, "missing_cuda", lambda _name: "")
     assert variant.choose("auto") == ("cuda_ad_rgb", "")
     monkeypatch.setattr(variant, "missing_cuda", lambda _name: "no OptiX")
     assert variant.choose("auto") == ("llvm_ad_rgb", "; no CUDA: no OptiX")
 
 
-def test_a_driver_is_not_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_driver_alone_is_not_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(variant.ctypes, "CDLL", lambda _name: None)
     monkeypatch.setattr(variant, "probe", lambda _name: Probe("jit_optix_api_init(): could not be loaded"))
     assert "optix" in variant.missing_cuda()
@@ -253,7 +253,7 @@ def test_cuda_without_a_driver_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
     assert refused.value.exit_code is ExitCode.BACKEND
 
 
-def test_a_driver_that_hangs_has_no_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hanging_driver_counts_as_no_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program = tmp_path / "nvidia-smi"
     program.write_text("#!/bin/sh\necho 'A GPU, 1.2'\n[ -e hangs ] && exec sleep 30\n:\n")
     program.chmod(0o755)
@@ -289,12 +289,12 @@ def test_the_trial_compiles_and_traces(llvm: str) -> None:
         ("raise SystemExit(3)", "ended with code 3"),
     ],
 )
-def test_a_trial_that_fails_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch, script: str, failure: str) -> None:
+def test_a_failed_trial_is_one_line(monkeypatch: pytest.MonkeyPatch, script: str, failure: str) -> None:
     monkeypatch.setattr(probe_module, "_SCRIPT", script)
     assert failure in probe.__wrapped__("llvm_ad_rgb").failure
 
 
-def test_an_old_libllvm_taken_by_dr_jit_itself_is_refused(llvm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_old_libllvm_chosen_by_dr_jit_is_refused(llvm: str, monkeypatch: pytest.MonkeyPatch) -> None:
     import drjit as dr
 
     monkeypatch.setattr(dr.detail, "llvm_version", lambda: (15, 0, 6))
@@ -307,7 +307,7 @@ def test_an_unknown_variant_is_refused(llvm: str) -> None:
         variant.set_variant("llvm_ad_taste")
 
 
-def test_broken_mitsuba_is_told_in_a_line(llvm: str) -> None:
+def test_a_broken_mitsuba_is_one_line(llvm: str) -> None:
     script = (
         "import sys; sys.modules['drjit'] = None\n"
         "from reslrb_cli.backend.variant import set_variant; set_variant('llvm_ad_rgb')"
@@ -346,7 +346,7 @@ def lying_at(offset, values):
         ("Float", np.float32([7.0])),
     ],
 )
-def test_bits_are_kept_and_memory_is_not_numpy_s(kind, values, offset):
+def test_bits_are_kept_outside_the_memory_of_numpy(kind, values, offset):
     given = lying_at(offset, values)
     copy = own_memory(getattr(mi, kind), given)
     assert address(copy) % ALIGNMENT == 0
@@ -356,7 +356,7 @@ def test_bits_are_kept_and_memory_is_not_numpy_s(kind, values, offset):
 
 
 @pytest.mark.usefixtures("llvm")
-def test_whatever_is_taken_up_again_and_again_lies_so():
+def test_restored_arrays_are_copied():
     image = lying_at(16, np.arange(12, dtype=np.float32)).reshape(2, 2, 3)
     assert address(to_tensor(image).array) % ALIGNMENT == 0
     value = dr.ones(mi.TensorXf, (2, 2, 3))

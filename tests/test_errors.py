@@ -22,7 +22,7 @@ from reslrb_cli.seeds import seed
         ("\U000e0041", "\\U000e0041"),
     ],
 )
-def test_what_is_not_printable_is_escaped(text: str, shown: str) -> None:
+def test_unprintable_characters_are_escaped(text: str, shown: str) -> None:
     assert printable(text) == shown
     assert printable(shown) == shown
 
@@ -58,7 +58,7 @@ def test_a_seed_does_not_change_between_versions():
     assert seed(0, 0, 0, "image") == 2478797459
 
 
-def test_every_use_has_a_seed_of_its_own():
+def test_every_purpose_has_its_own_seed():
     uses = [
         (run, iteration, view, purpose)
         for run in range(3)
@@ -69,12 +69,12 @@ def test_every_use_has_a_seed_of_its_own():
     assert len({seed(*use) for use in uses}) == len(uses)
 
 
-def test_the_parts_are_kept_apart():
+def test_the_parts_of_a_seed_are_separated():
     assert seed(1, 11, 0, "image") != seed(11, 1, 0, "image")
     assert seed(1, 1, 10, "image") != seed(1, 11, 0, "image")
 
 
-def test_seeds_fill_their_range_evenly():
+def test_seeds_are_uniform_in_their_range():
     counts = [0] * 16
     for iteration in range(4096):
         counts[seed(0, iteration, 0, "image") >> 28] += 1

@@ -36,7 +36,7 @@ def test_its_commands_run_at_the_smallest_sizes(tmp_path: Path, llvm: str) -> No
 
 
 @pytest.mark.parametrize("small", [[], ["--small"]])
-def test_all_that_it_names_is_there(small: list[str]) -> None:
+def test_all_named_commands_exist(small: list[str]) -> None:
     listed = [line.split("\t") for line in gpu_check("--list", *small).stdout.splitlines()]
     assert [name for name, _, _ in listed] == NAMES
     assert all(0 < int(limit) <= 3600 for _, limit, _ in listed)
@@ -48,7 +48,7 @@ def test_all_that_it_names_is_there(small: list[str]) -> None:
         assert not test or f"def {test}(" in (ROOT / file).read_text(), test
 
 
-def test_a_command_that_fails_is_named_and_the_others_run(tmp_path: Path) -> None:
+def test_a_failing_command_is_named_and_the_others_run(tmp_path: Path) -> None:
     python = tmp_path / "python"
     python.write_text('#!/bin/sh\necho "$@"\ncase "$*" in *bench*) exit 3 ;; *optimize*) exit 124 ;; esac\n')
     python.chmod(0o755)
@@ -66,7 +66,7 @@ def test_a_command_that_fails_is_named_and_the_others_run(tmp_path: Path) -> Non
     assert gpu_check("docter").returncode == 2
 
 
-def test_a_variant_that_is_named_is_tested_or_fails() -> None:
+def test_a_named_variant_is_tested_or_fails() -> None:
     """Tests that are skipped for want of a GPU would look like tests that pass on it."""
     test = "tests/conformance/test_replay.py::test_no_light_no_replay"
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", test]

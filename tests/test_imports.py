@@ -124,7 +124,7 @@ def _names_in_text(path: Path, package: str) -> list[str]:
     return [name for text in said for name in re.findall(rf"\b{package}(?:\.\w+)+", text)]
 
 
-def test_no_files_need_one_another() -> None:
+def test_there_are_no_import_circles() -> None:
     assert circles(ROOT) == []
 
 
@@ -139,13 +139,13 @@ def test_no_files_need_one_another() -> None:
         ("import reslrb_cli.two", "import os", False),
     ],
 )
-def test_a_planted_circle_is_seen(tmp_path: Path, one: str, other: str, seen: bool) -> None:
+def test_a_planted_circle_is_found(tmp_path: Path, one: str, other: str, seen: bool) -> None:
     (tmp_path / "one.py").write_text(one)
     (tmp_path / "two.py").write_text(other)
     assert bool(circles(tmp_path)) is seen
 
 
-def test_imports_run_one_way() -> None:
+def test_imports_follow_the_layers() -> None:
     assert violations(ROOT) == []
 
 
@@ -168,7 +168,7 @@ def test_imports_run_one_way() -> None:
         ("estimators/base.py", "from reslrb_cli.transport import types", False),
     ],
 )
-def test_a_planted_violation_is_seen(tmp_path: Path, file: str, source: str, seen: bool) -> None:
+def test_a_planted_violation_is_found(tmp_path: Path, file: str, source: str, seen: bool) -> None:
     (tmp_path / file).parent.mkdir(exist_ok=True)
     (tmp_path / file).write_text(source)
     assert bool(violations(tmp_path)) is seen

@@ -71,7 +71,7 @@ PACKAGES = {
 
 
 @pytest.mark.parametrize("case", PACKAGES)
-def test_what_is_found_is_told(case: str, tmp_path: Path, llvm: str) -> None:
+def test_found_packages_are_reported(case: str, tmp_path: Path, llvm: str) -> None:
     name, text, what = PACKAGES[case]
     place = tmp_path / "path" / name
     place.parent.mkdir(parents=True)
@@ -93,11 +93,11 @@ def test_what_is_found_is_told(case: str, tmp_path: Path, llvm: str) -> None:
             break  # every command asks in the same way
 
 
-def test_the_installed_ones_are_those_that_are_wanted(llvm: str) -> None:
+def test_installed_packages_are_the_required_ones(llvm: str) -> None:
     assert [package.__name__ for package in installation.load_packages()] == ["drjit", "mitsuba"]
 
 
-def test_the_versions_are_those_of_pyproject() -> None:
+def test_versions_match_pyproject() -> None:
     text = (ROOT / "pyproject.toml").read_text()
     for name, (first, end, _) in installation._WANTED.items():
         found = re.search(rf'"{name}>=([\d.]+),<([\d.]+)"', text)

@@ -17,7 +17,7 @@ SCRIPTS = ["scripts/setup", "scripts/demo", "scripts/test", "scripts/paper", "sc
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_scripts_can_be_run_and_parsed(name: str) -> None:
+def test_scripts_are_executable_and_valid(name: str) -> None:
     assert os.access(ROOT / name, os.X_OK)
     assert subprocess.run(["bash", "-n", ROOT / name], check=False).returncode == 0
 
@@ -74,7 +74,7 @@ def make_program(path: Path, text: str) -> Path:
     return path
 
 
-def test_a_copied_folder_gets_an_environment_of_its_own(tmp_path: Path, python: Path) -> None:
+def test_a_copied_folder_gets_its_own_environment(tmp_path: Path, python: Path) -> None:
     """Its scripts would otherwise run the folder that was copied."""
     first, second = tmp_path / "a checkout", tmp_path / "a checkout 2"
     make_checkout(first)
@@ -113,7 +113,7 @@ mkdir -p "$3/usr/lib/chromium" && cp '{chromium}' "$3/usr/lib/chromium/chromium-
 
 
 @pytest.mark.parametrize("user", [0, 1000])
-def test_the_tests_setup_brings_a_chromium_where_one_can_be_had(tmp_path: Path, python: Path, user: int) -> None:
+def test_the_setup_of_the_tests_installs_chromium_if_possible(tmp_path: Path, python: Path, user: int) -> None:
     checkout, programs, log = tmp_path / "checkout", tmp_path / "programs", tmp_path / "log"
     make_checkout(checkout)
     programs.mkdir()
@@ -148,7 +148,7 @@ def test_the_tests_setup_brings_a_chromium_where_one_can_be_had(tmp_path: Path, 
     assert "setup: installing chromium" not in said
 
 
-def test_without_a_chromium_the_tests_say_so_in_one_line() -> None:
+def test_without_chromium_the_tests_say_so_in_one_line() -> None:
     script = (
         "import sys, pytest; sys.path.insert(0, 'tests'); from report import chromium; "
         "chromium.find_chromium = lambda: None; "
@@ -164,7 +164,7 @@ def test_without_a_chromium_the_tests_say_so_in_one_line() -> None:
     Path(sys.prefix) != ROOT / ".venv" or (ROOT / ".venv").is_symlink(),  # of another folder's, it would make anew
     reason="runs in the environment that scripts/setup made",
 )
-def test_a_second_setup_does_nothing() -> None:
+def test_a_second_setup_changes_nothing() -> None:
     start = time.perf_counter()
     done = subprocess.run([ROOT / "scripts/setup", "--test"], capture_output=True, text=True, check=True)
     assert time.perf_counter() - start < 3

@@ -52,7 +52,7 @@ def compiled(way: str, home: Path) -> tuple[str, dict[str, bytes]]:
     return done.stdout, {file.name: file.read_bytes() for file in folder.iterdir()}
 
 
-def test_values_are_those_of_optimised_kernels(tmp_path: Path, llvm: str) -> None:
+def test_values_equal_those_of_optimised_kernels(tmp_path: Path, llvm: str) -> None:
     path = Path(os.environ.get(library.VARIABLE, ""))
     if not path.is_file() or not compilation.is_silent(shared_library.load(path)):
         pytest.skip("there is no libLLVM that leaves passes out in silence")
@@ -66,7 +66,7 @@ def test_values_are_those_of_optimised_kernels(tmp_path: Path, llvm: str) -> Non
     assert compiled("inherited", tmp_path / "inherited") == (values, quick)
 
 
-def test_a_library_that_would_name_each_pass_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_library_that_names_each_pass_is_left_unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
     class Library:
         def LLVMGetVersion(self, *parts: object) -> None:
             for part, number in zip(parts, (19, 1, 7), strict=True):
@@ -135,7 +135,7 @@ def test_a_machine_of_one_core_reads_and_writes_images(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (0, "192.0\n"), done.stderr
 
 
-def test_tests_have_one(llvm: str, pytestconfig: pytest.Config) -> None:
+def test_tests_use_one_thread(llvm: str, pytestconfig: pytest.Config) -> None:
     import drjit as dr
 
     if os.environ.get("RESLRB_TEST_OPTIMISED") or "not long" not in pytestconfig.option.markexpr:

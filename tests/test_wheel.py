@@ -69,7 +69,7 @@ def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return installed(wheel, tmp_path_factory.mktemp("installed") / "environment")
 
 
-def test_the_wheel_has_all_that_is_no_module(wheel: Path) -> None:
+def test_the_wheel_contains_all_data_files(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     wanted = {path.relative_to(ROOT).as_posix() for path in PACKAGE.rglob("*.j2")}
     wanted |= {path.relative_to(ROOT).as_posix() for kind in ("*.js", "*.py") for path in PACKAGE.rglob(kind)}
@@ -83,7 +83,7 @@ def test_the_wheel_has_all_that_is_no_module(wheel: Path) -> None:
     assert wheel.stat().st_size < 3e6
 
 
-def test_examples_are_as_they_are_shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_examples_are_unchanged_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each can be copied, and loads as the same experiment, all of its files its own."""
     monkeypatch.chdir(tmp_path)
     assert {ROOT / "configs" / f"{name}.yaml" for name in examples()} == set((ROOT / "configs").rglob("*.yaml"))
@@ -116,7 +116,7 @@ def paths(value: str | list[str]) -> list[Path]:
         (["furnace", "-o", "file/below"], "-o: cannot write to file/below: Not a directory"),
     ],
 )
-def test_what_is_there_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], line: str) -> None:
+def test_existing_files_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], line: str) -> None:
     monkeypatch.chdir(tmp_path)
     Path("file").touch()
     for name in ("furnace.yaml", "scenes/stiff/wall.xml"):
@@ -212,7 +212,7 @@ def test_a_notebook_runs(
 
 
 @pytest.mark.long
-def test_a_notebooks_stop_button_and_a_loss_of_nan_keep_the_result(
+def test_the_stop_button_of_a_notebook_and_a_nan_loss_keep_the_result(
     python: Path, tmp_path: Path, llvm: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nbformat = pytest.importorskip("nbformat")

@@ -22,7 +22,7 @@ TINY = ("bench", "--values", "2", "--integrators", "reslrb:stack", "--rounds", "
         "--set", "run.spp=1")  # fmt: skip
 
 
-def test_the_pages_are_what_the_records_say() -> None:
+def test_the_pages_match_the_records() -> None:
     blocks = pages.Blocks()
     again = "`scripts/benchmarks write` makes it anew"
     assert pages.PAGE.read_text(encoding="utf-8") == pages.page(blocks), again
@@ -48,7 +48,7 @@ def test_every_measurement_is_recorded_by_its_own_command() -> None:
         assert origin["seconds"] > 0
 
 
-def test_every_record_says_at_which_commit_it_was_measured() -> None:
+def test_every_record_names_its_commit() -> None:
     found = benchmarks_measure.origins()
     assert {"depth", "optimize_grey_room", "figure1", "figure5", "figure6"} <= set(found)
     for name, origin in found.items():
@@ -58,7 +58,7 @@ def test_every_record_says_at_which_commit_it_was_measured() -> None:
             assert (ROOT / place).exists(), f"{name}: {place}"
 
 
-def test_every_table_of_records_says_at_which_commit_it_was_measured(folder: Path) -> None:
+def test_every_table_of_records_names_its_commit(folder: Path) -> None:
     for number, file in enumerate(sorted(folder.glob("*.jsonl"))):
         first, _, rest = file.read_text(encoding="utf-8").partition("\n")
         origin = json.loads(first) | {"commit": f"{number:012x}", "clean": number % 2 == 0}
@@ -80,7 +80,7 @@ def commit_all(folder: Path) -> None:
     subprocess.run([*git, "commit", "-qm", "x"], cwd=folder, check=True)
 
 
-def test_a_record_is_stale_once_the_code_that_it_measures_has_changed(
+def test_a_record_is_stale_after_a_change_of_the_measured_code(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name, content in {
@@ -125,7 +125,7 @@ def test_a_record_is_stale_once_the_code_that_it_measures_has_changed(
     assert benchmarks_measure.stale()[1] == "room: the commit that it was measured at is not known"
 
 
-def test_no_figure_is_typed() -> None:
+def test_no_figure_is_typed_by_hand() -> None:
     """Units with a figure before them stand in records alone; memory and time of the paper's machine are published."""
     published = ("142 MB",)
     for template in (RECORDS / pages.TEMPLATE, PAPER / "page.md"):
@@ -136,7 +136,7 @@ def test_no_figure_is_typed() -> None:
         assert pages.PLACE.findall(text)
 
 
-def test_all_that_the_pages_name_is_there() -> None:
+def test_all_names_on_the_pages_exist() -> None:
     for page in (pages.PAGE, ROOT / "docs" / "paper.md"):
         for name in re.findall(r"\]\(([^)#:]+)[^)]*\)", page.read_text(encoding="utf-8")):
             assert (page.parent / name).exists(), f"{page.name} names {name}"
@@ -151,7 +151,7 @@ NAMED = re.compile(
 NOT_HERE = {"docs/benchmarks/gpu.md"}
 
 
-def test_files_that_text_names_are_there() -> None:
+def test_files_named_in_text_exist() -> None:
     """The documentation may name any file; of other files' text the names of tests are looked at."""
     listed = subprocess.check_output(["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, text=True)
     files = [name for name in listed.split() if (ROOT / name).is_file()]
@@ -191,13 +191,15 @@ def change(file: Path, key: str, value: object) -> None:
         ("optimize_cornell_floor", "step_ms", 98765.0, "98765"),
     ],
 )
-def test_a_figure_of_a_record_is_the_pages_figure(folder: Path, name: str, key: str, value: object, shown: str) -> None:
+def test_a_figure_of_a_record_equals_that_of_the_page(
+    folder: Path, name: str, key: str, value: object, shown: str
+) -> None:
     assert shown not in pages.page(pages.Blocks(folder))
     change(folder / f"{name}.jsonl", key, value)
     assert shown in pages.page(pages.Blocks(folder))
 
 
-def test_the_readme_takes_its_figures_from_records(folder: Path) -> None:
+def test_the_readme_uses_figures_of_records(folder: Path) -> None:
     text = pages.README.read_text(encoding="utf-8")
     key = "floor.reflectance.data"
     change(folder / "optimize_cornell_floor.jsonl", "parameter_rmse", {key: {"initial": 0.987, "final": 0.0123}})
@@ -217,9 +219,7 @@ def test_the_readme_takes_its_figures_from_records(folder: Path) -> None:
         (False, "paths: light", None, "light, guided"),
     ],
 )
-def test_the_paths_of_a_run_are_those_of_its_manifest(
-    needed: bool, reason: str, chosen: dict | None, shown: str
-) -> None:
+def test_the_paths_of_a_run_match_its_manifest(needed: bool, reason: str, chosen: dict | None, shown: str) -> None:
     rows = [
         {"feature": "camera paths", "needed": needed, "reason": reason},
         {"feature": "guided emission", "needed": True, "reason": ""},
@@ -257,14 +257,14 @@ def test_a_measurement_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert read(tmp_path / "tiny.jsonl") == record
 
 
-def test_wrong_names_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_names_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["measure", "dept"]) == 2
     assert "there is no measurement `dept`; did you mean depth?" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
         main(["write", "depth"])
 
 
-def test_the_page_of_the_extreme_suite_has_a_line_for_each_case_and_a_column_for_each_estimator() -> None:
+def test_the_page_of_the_extreme_suite_has_rows_for_cases_and_columns_for_estimators() -> None:
     def record(case: str, estimator: str, z_max: float, verdict: str = "holds") -> dict[str, Any]:
         return {"case": case, "parameter": "floor.reflectance.data", "estimator": estimator, "kind": "expectation",
                 "reference": "ptracer", "seeds": 8, "verdict": verdict, "z_max": z_max, "z_max_limit": 5.9,
@@ -283,7 +283,7 @@ def test_the_page_of_the_extreme_suite_has_a_line_for_each_case_and_a_column_for
     ]
 
 
-def test_the_readme_says_of_the_extreme_suite_what_its_page_and_record_do(folder: Path) -> None:
+def test_the_readme_agrees_with_the_page_of_the_extreme_suite(folder: Path) -> None:
     page = (ROOT / "docs" / "extreme.md").read_text(encoding="utf-8")
     known = {"unresolved: roughness", "heavy tailed: roughness", "heavy tailed: image", "no reference: expectation"}
     assert set(re.findall(r"\*\*(.*?)\*\*", page)) <= known

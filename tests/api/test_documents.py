@@ -60,7 +60,7 @@ def quick_checkout(llvm: str, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("where", ["quick_checkout", pytest.param("checkout", marks=pytest.mark.long)])
-def test_the_pages_script_runs(where: str, request: pytest.FixtureRequest) -> None:
+def test_scripts_of_the_docs_run(where: str, request: pytest.FixtureRequest) -> None:
     folder: Path = request.getfixturevalue(where)
     lines = run(script_of(PAGE.read_text(encoding="utf-8")), folder)
     assert [line.split()[0] for line in lines[:6]] == ["0", "1", "2", "3", "4", "5"]
@@ -73,7 +73,7 @@ def test_the_pages_script_runs(where: str, request: pytest.FixtureRequest) -> No
 
 
 @pytest.mark.long  # its target has many samples
-def test_the_readmes_script_runs(checkout: Path) -> None:
+def test_scripts_of_the_readme_run(checkout: Path) -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     lines = run(block, checkout)
@@ -91,14 +91,14 @@ PYTHON = {"README.md": 1, "docs/python.md": 7, "docs/integrator.md": 2, "docs/st
           "docs/benchmarks.md": 1, "docs/benchmarks/page.md": 1, "docs/your_integrator.md": 1}  # fmt: skip
 
 
-def test_no_page_has_python_that_no_test_runs() -> None:
+def test_every_python_block_of_the_docs_is_run() -> None:
     pages = [ROOT / "README.md", *DOCS.rglob("*.md")]
     counts = {page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8").count("```python") for page in pages}
     assert {name: count for name, count in counts.items() if count} == PYTHON
     assert {name: len(blocks(name)) for name in PYTHON} == PYTHON
 
 
-def test_what_pages_do_with_a_run_does(checkout: Path) -> None:
+def test_statements_of_the_docs_about_a_run_hold(checkout: Path) -> None:
     """The slope of recovered values, the median step of a run, and a loss of one's own."""
     (slope,), (edges,) = blocks("docs/steps.md"), blocks("docs/losses.md")
     (steps,) = blocks("docs/benchmarks.md")
@@ -119,14 +119,14 @@ def test_what_pages_do_with_a_run_does(checkout: Path) -> None:
     assert peak > 0
 
 
-def test_the_reference_is_that_of_the_docstrings() -> None:
+def test_the_reference_matches_the_docstrings() -> None:
     text = PAGE.read_text(encoding="utf-8")
     assert text == python_page(text), "run `python scripts/make_reference.py`"
     for name in set(reslrb_cli.__all__) - {"__version__"}:
         assert f"### `{name}`\n" in text
 
 
-def test_what_the_page_links_to_is_there() -> None:
+def test_links_of_the_page_exist() -> None:
     for name in re.findall(r"\]\(([^)#:]+)[^)]*\)", PAGE.read_text(encoding="utf-8")):
         assert (DOCS / name).exists(), name
 
@@ -145,7 +145,7 @@ def test_a_notebook_is_valid_and_has_no_outputs(path: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_integrator_of_the_page_is_found_to_be_wrong(checkout: Path) -> None:
+def test_the_wrong_integrator_of_the_docs_is_found(checkout: Path) -> None:
     """And what the program says of it is what the page says; with two lines exchanged it is right."""
     page = (DOCS / "your_integrator.md").read_text(encoding="utf-8")
     code, (said,) = script_of(page), re.findall(r"^    mine.py:Replay: (its image holds.*)$", page, re.MULTILINE)

@@ -61,7 +61,7 @@ def experiment(**run: Any) -> dict[str, Any]:
 # --- load -------------------------------------------------------------------------------------------------------------
 
 
-def test_a_mapping_is_what_yaml_would_have_been(folder: Path) -> None:
+def test_a_mapping_equals_its_yaml(folder: Path) -> None:
     expected = load("tiny.yaml", ["run.spp=8", "parameters[0].bounds=[0, 0.9]"])
     overrides = {"run.spp": 8, "parameters[0].bounds": (0, 0.9)}
     assert dump(rl.load(experiment(), overrides)) == dump(expected)
@@ -122,7 +122,7 @@ def test_errors_are_located(folder: Path, call: Callable[[], Any], line: str) ->
     assert str(error.value).startswith(line)
 
 
-def test_every_way_of_change_keeps_the_own_loss_and_the_permission(folder: Path) -> None:
+def test_every_copy_keeps_the_own_loss_and_the_permission(folder: Path) -> None:
     given = load("tiny.yaml").with_loss(np.mean).with_code()
     alone = {"type": "reslrb", "estimator": "gather"}
     ways = {
@@ -176,7 +176,7 @@ def test_calls_keep_the_own_loss_and_the_permission(folder: Path, monkeypatch: p
 # --- looking ----------------------------------------------------------------------------------------------------------
 
 
-def test_an_image_is_that_of_the_command(folder: Path) -> None:
+def test_an_image_equals_that_of_the_command(folder: Path) -> None:
     done("render", "tiny.yaml", "-o", "command.exr", "--spp", "8")
     done("render", "tiny.yaml", "-o", "scene.exr", "--scene")
     images = rl.render("tiny.yaml", spp=8)
@@ -188,7 +188,7 @@ def test_an_image_is_that_of_the_command(folder: Path) -> None:
     assert [(sensor, image.shape) for sensor, image in rl.render(views).items()] == [(n, (8, 8, 3)) for n in range(3)]
 
 
-def test_values_stand_in_for_initial_ones(folder: Path) -> None:
+def test_given_values_replace_initial_ones(folder: Path) -> None:
     texture = np.random.default_rng(5).uniform(0, 1, (4, 4, 3))
     given = rl.render("tiny.yaml", values={KEY: texture, LAMP: 6})
     assert not np.array_equal(given[0], rl.render("tiny.yaml")[0])
@@ -197,7 +197,7 @@ def test_values_stand_in_for_initial_ones(folder: Path) -> None:
     assert np.array_equal(rl.render("tiny.yaml", values={KEY: 0.25, LAMP: 6})[0], expected[0])
 
 
-def test_the_gradient_is_that_of_the_first_iteration(folder: Path) -> None:
+def test_the_gradient_equals_that_of_the_first_iteration(folder: Path) -> None:
     run = rl.optimize("tiny.yaml", overrides=FAST)
     first = next(iter(run))
     loss, gradient = rl.gradient("tiny.yaml")
@@ -212,7 +212,7 @@ def test_the_gradient_is_that_of_the_first_iteration(folder: Path) -> None:
     assert rl.gradient("tiny.yaml", spp=8)[0] != loss
 
 
-def test_the_gradient_is_that_of_the_loss(folder: Path) -> None:
+def test_the_gradient_belongs_to_the_loss(folder: Path) -> None:
     """By differences along itself, at equal seeds and many samples: nothing here is discontinuous in the values."""
     smooth = rl.load("tiny.yaml", {"run.adjoint": "correlated", "run.spp": 256})
     at = {KEY: np.full((4, 4, 3), 0.4, np.float32), LAMP: np.float32([4, 5, 6])}
@@ -265,7 +265,7 @@ def lines_of(file: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in Path(file).read_text().splitlines()][1:]
 
 
-def test_gradcheck_has_the_records_of_the_command(folder: Path) -> None:
+def test_gradcheck_writes_the_records_of_the_command(folder: Path) -> None:
     done("gradcheck", "tiny.yaml", "--estimators", "stack", "--seeds", "3", "--spp", "4", "--json", "g.jsonl")
     records = rl.gradcheck("tiny.yaml", "stack", seeds=3, spp=4)
     found = [json.loads(record.to_json()) for record in records]
@@ -286,7 +286,7 @@ class Played(Session):
         super().__init__(plan, folder, stop, say, stage.start, stage.clock, earlier=given.get("earlier"))
 
 
-def test_convergence_has_the_records_of_the_command(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_convergence_writes_the_records_of_the_command(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(session, "Session", Played)
     given = ["--integrators", "reslrb:stack,ptracer", "--reference", "reslrb:stack", "--rounds", "8", "--spp", "4,8"]
     done("convergence", "tiny.yaml", *given, "--json", "c.jsonl")
@@ -327,7 +327,7 @@ class Interrupting(logging.Handler):
                               allow_code=True), "examining", "gradients, max_depth 1"),
     ],
 )  # fmt: skip
-def test_an_interrupt_ends_what_takes_long(
+def test_an_interrupt_ends_long_calls(
     folder: Path, caplog: pytest.LogCaptureFixture, call: Callable[[], Any], words: str, later: str
 ) -> None:
     """It is not kept waiting until all is measured."""
@@ -350,7 +350,7 @@ def test_convergence_measures(folder: Path) -> None:
     assert [record.to_json() for record in records][-1].startswith('{"kind": "summary"')
 
 
-def test_an_export_is_that_of_the_command(folder: Path) -> None:
+def test_an_export_equals_that_of_the_command(folder: Path) -> None:
     with rl.optimize("tiny.yaml", folder="runs/mine", overrides=FAST) as run:
         list(run)
     assert run.folder is not None
@@ -440,7 +440,7 @@ def test_users_type_checkers_see_the_types(tmp_path: Path) -> None:
         assert words in error
 
 
-def test_what_is_public_is_there_and_nothing_is_loaded_before() -> None:
+def test_public_names_exist_and_load_nothing() -> None:
     script = "import sys, reslrb_cli as rl; print({'numpy', 'mitsuba', 'click'} & set(sys.modules), rl.__all__)"
     out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
     assert out.startswith("set() ")

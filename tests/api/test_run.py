@@ -55,7 +55,7 @@ def status_of(folder: Path) -> str:
 
 
 @pytest.mark.parametrize("settings", [{}, {"optimizer.scale": "auto", "optimizer.clamp_gradient": 1.5}])
-def test_a_loop_comes_to_what_the_command_does(experiment: Path, settings: dict[str, Any]) -> None:
+def test_a_loop_gives_the_results_of_the_command(experiment: Path, settings: dict[str, Any]) -> None:
     """Bit by bit: parameters, state and records; without a folder too."""
     sets = [word for key, value in (SET | settings).items() for word in ("--set", f"{key}={json.dumps(value)}")]
     assert optimize("tiny.yaml", "--quiet", *sets) == 0
@@ -75,7 +75,7 @@ def test_a_loop_comes_to_what_the_command_does(experiment: Path, settings: dict[
     assert files(Path("runs")) == {f"{name}/{file}" for name in ("tiny", "mine") for file in files(run.folder)}
 
 
-def test_between_iterations_all_can_be_looked_at(experiment: Path) -> None:
+def test_everything_can_be_inspected_between_iterations(experiment: Path) -> None:
     """And that changes nothing."""
     plain = rl.optimize("tiny.yaml", overrides=SET)
     expected = [as_json(record) for record in plain]
@@ -101,7 +101,7 @@ def test_between_iterations_all_can_be_looked_at(experiment: Path) -> None:
     assert repr(run) == "<Run tiny.yaml: 6 of 6, finished>"
 
 
-def test_two_experiments_take_turns(experiment: Path) -> None:
+def test_two_experiments_alternate(experiment: Path) -> None:
     """Each is, bit by bit, what it is alone."""
     other = SET | {"run.iterations": 4, "run.seed": 7, "optimizer.type": "sgd"}
     alone = [list(map(as_json, rl.optimize("tiny.yaml", overrides=each))) for each in (SET, other)]
@@ -162,7 +162,7 @@ def leave_by_an_interrupt_at_work(run: rl.Run) -> None:
 
 @pytest.mark.parametrize("leave", [leave_by_break, leave_by_error, leave_by_return_from_live, leave_a_block,
                                    leave_by_an_interrupt, leave_by_an_interrupt_at_work])  # fmt: skip
-def test_a_loop_that_is_left_leaves_a_whole_folder(experiment: Path, leave: Callable[[rl.Run], None]) -> None:
+def test_leaving_a_loop_leaves_a_complete_folder(experiment: Path, leave: Callable[[rl.Run], None]) -> None:
     run = rl.optimize("tiny.yaml", folder="mine", overrides=SET)
     leave(run)
     assert run.folder is not None
@@ -175,7 +175,7 @@ def test_a_loop_that_is_left_leaves_a_whole_folder(experiment: Path, leave: Call
 
 
 @pytest.mark.parametrize("folder", ["mine", None])
-def test_a_loop_that_is_begun_again_goes_on(experiment: Path, folder: str | None) -> None:
+def test_a_second_loop_continues(experiment: Path, folder: str | None) -> None:
     whole = rl.optimize("tiny.yaml", folder=folder and "whole", overrides=SET)
     expected = [as_json(record) for record in whole]
     run = rl.optimize("tiny.yaml", folder=folder, overrides=SET)
@@ -193,7 +193,7 @@ def test_a_loop_that_is_begun_again_goes_on(experiment: Path, folder: str | None
     assert (run.status, run.iteration) == ("finished", 6)
 
 
-def test_a_run_is_gone_on_with_from_its_folder(experiment: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_run_continues_from_its_folder(experiment: Path, caplog: pytest.LogCaptureFixture) -> None:
     whole = rl.optimize("tiny.yaml", folder="whole", overrides=SET)
     assert len(list(whole)) == 6
     with rl.optimize("tiny.yaml", folder="mine", overrides=SET | {"run.iterations": 3}) as first:
@@ -219,7 +219,7 @@ def test_a_run_is_gone_on_with_from_its_folder(experiment: Path, caplog: pytest.
     assert len(records_of(Path("mine"))) == 6
 
 
-def test_a_folder_is_told_where_it_stands_in_for_another(experiment: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_replaced_folder_is_reported(experiment: Path, caplog: pytest.LogCaptureFixture) -> None:
     rl.optimize("tiny.yaml", folder="mine", overrides=SET)
     assert "run.output" not in caplog.text
     config = rl.load("tiny.yaml", {**SET, "run.output": "elsewhere"})
@@ -228,7 +228,7 @@ def test_a_folder_is_told_where_it_stands_in_for_another(experiment: Path, caplo
     assert [record.levelname for record in caplog.records if line in record.message] == ["WARNING"]
 
 
-def test_a_folder_whose_name_is_taken_has_a_number(experiment: Path) -> None:
+def test_a_taken_folder_name_gets_a_number(experiment: Path) -> None:
     for expected in ("mine", "mine-2"):
         run = rl.optimize("tiny.yaml", folder="mine", overrides=SET | {"run.iterations": 1})
         assert run.folder is None
@@ -236,7 +236,7 @@ def test_a_folder_whose_name_is_taken_has_a_number(experiment: Path) -> None:
         assert run.folder == experiment / expected
 
 
-def test_a_run_is_in_one_loop_at_a_time(experiment: Path) -> None:
+def test_a_run_is_in_only_one_loop(experiment: Path) -> None:
     run = rl.optimize("tiny.yaml", overrides=SET)
     for _ in run:
         with pytest.raises(RuntimeError, match="in a loop already"):
@@ -277,7 +277,7 @@ def test_errors_are_located(experiment: Path) -> None:
         rl.optimize(resume="mine", overrides={"run.seed": 5})
 
 
-def test_what_a_run_fails_of_is_raised(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failures_of_a_run_are_raised(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from reslrb_cli.optimization import loop
 
     work = loop.step
@@ -297,7 +297,7 @@ def test_what_a_run_fails_of_is_raised(experiment: Path, monkeypatch: pytest.Mon
     assert status_of(Path("mine")) == "failed"
 
 
-def test_a_folder_that_could_not_be_completed_is_told(
+def test_an_incomplete_folder_is_reported(
     experiment: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     run = rl.optimize("tiny.yaml", folder="mine", overrides=SET)
@@ -348,7 +348,7 @@ def test_an_interrupt_from_outside_keeps_the_result(experiment: Path) -> None:
     assert status_of(Path("mine")) == "interrupted"
 
 
-def test_threads_beside_the_main_one_iterate_too(experiment: Path) -> None:
+def test_other_threads_iterate_too(experiment: Path) -> None:
     found: list[int] = []
 
     def work() -> None:
@@ -360,7 +360,7 @@ def test_threads_beside_the_main_one_iterate_too(experiment: Path) -> None:
     assert found == [0, 1]
 
 
-def test_a_run_is_watched(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_can_be_watched(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A bar, and the figure that a notebook shows."""
     from reslrb_cli.api import live
 
@@ -371,7 +371,7 @@ def test_a_run_is_watched(experiment: Path, capsys: pytest.CaptureFixture[str]) 
     assert png.startswith(b"\x89PNG")
 
 
-def test_the_figure_is_shown_now_and_then(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_figure_is_shown_from_time_to_time(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """At once, and at the end; one that fails ends nothing."""
     from reslrb_cli.api import live
 

@@ -77,7 +77,7 @@ def test_a_short_run_measures_nothing_and_says_so(experiment, capsys, monkeypatc
 
 
 @pytest.mark.parametrize(("light", "parallel"), [("point", True), ("area", False)])
-def test_what_the_scene_has_decides_where_nothing_is_measured(experiment, light, parallel):
+def test_the_scene_decides_if_nothing_is_measured(experiment, light, parallel):
     from reslrb_cli.config.loader import load
     from reslrb_cli.optimization.assemble import assemble_scene
     from reslrb_cli.optimization.autotune import sampling
@@ -107,14 +107,14 @@ def test_other_settings_are_another_situation(experiment):
 
 
 @pytest.mark.long
-def test_auto_measures_anew_in_another_situation(experiment, capsys):
+def test_auto_measures_again_in_another_situation(experiment, capsys):
     for settings in ([], ["run.spp=8"]):
         code, err = optimize(capsys, "integrator.guiding=auto", *settings)
         assert code == 0, err
         assert "measuring" in err
 
 
-def test_measuring_leaves_the_run_as_it_was(experiment):
+def test_measuring_does_not_change_the_run(experiment):
     import drjit as dr
 
     from reslrb_cli.config.loader import load
@@ -138,7 +138,7 @@ def test_measuring_leaves_the_run_as_it_was(experiment):
     assert loss == pytest.approx(named[1], rel=1e-5)
 
 
-def test_measuring_has_seeds_of_its_own(experiment, monkeypatch):
+def test_measuring_has_its_own_seeds(experiment, monkeypatch):
     from reslrb_cli.config.loader import load
     from reslrb_cli.optimization import sensitivity
     from reslrb_cli.optimization.assemble import assemble_scene
@@ -169,7 +169,7 @@ def test_auto_works_with_batches_and_several_views(experiment, capsys):
     assert read_manifest(Path("runs/box"))["guided"]["spp"] in (4, 8)
 
 
-def test_auto_is_no_option_of_the_plugin(llvm):
+def test_auto_is_not_an_option_of_the_plugin(llvm):
     from reslrb_cli.integrators.step import make_integrator
 
     with pytest.raises(Exception, match="name one of reservoir"):
@@ -205,7 +205,7 @@ def test_a_memory_budget_is_kept(experiment, capsys, estimator):
 
 @pytest.mark.parametrize("adjoint", a_few(["independent", "batched"], ["batched"]))
 @pytest.mark.parametrize("estimator", a_few(["reservoir", "event"], ["event"]))
-def test_paths_take_no_memory_where_the_adjoint_is_known_before(experiment, capsys, estimator, adjoint):
+def test_paths_use_no_memory_if_the_adjoint_is_known(experiment, capsys, estimator, adjoint):
     settings = wide(f"integrator={{max_depth: 4, estimator: {estimator}}}", "run.spp=256", f"run.adjoint={adjoint}")
     peaks, memory = peaks_without_and_with(1.5, capsys, *settings)
     assert memory["passes"] == 1
@@ -215,7 +215,7 @@ def test_paths_take_no_memory_where_the_adjoint_is_known_before(experiment, caps
 
 
 @pytest.mark.parametrize("estimator", a_few(["reservoir", "event"], ["reservoir"]))
-def test_a_weight_that_needs_the_adjoint_goes_through_a_whole_run(experiment, capsys, estimator):
+def test_a_weight_with_the_adjoint_works_in_a_whole_run(experiment, capsys, estimator):
     """What is rendered or differentiated besides the steps (what light reaches, saved images) has to know it too."""
     code, err = optimize(capsys, f"integrator={{max_depth: 4, estimator: {estimator}, weight: adjoint}}")
     assert code == 0, err
@@ -232,7 +232,7 @@ def test_auto_under_a_budget(experiment, capsys):
     assert manifest["plan"]["estimator"] == "stack"
 
 
-def test_a_budget_that_is_exceeded_is_a_warning(experiment, capsys, monkeypatch):
+def test_exceeding_a_budget_is_a_warning(experiment, capsys, monkeypatch):
     from reslrb_cli.optimization import memory as budget
 
     monkeypatch.setattr(budget, "allocated", lambda size: 0)
@@ -244,7 +244,7 @@ def test_a_budget_that_is_exceeded_is_a_warning(experiment, capsys, monkeypatch)
     assert read_manifest(Path("runs/box"))["memory"]["exceeded"]
 
 
-def test_a_budget_that_nothing_can_keep_is_one_located_line(experiment, capsys):
+def test_an_impossible_budget_is_one_located_line(experiment, capsys):
     for integrator in ("{max_depth: 4}", "{max_depth: 4, estimator: stack}"):
         code, err = optimize(capsys, f"integrator={integrator}", "run.memory_budget=20 kB")
         lines = [line for line in err.splitlines() if not line.startswith("variant ")]
@@ -276,7 +276,7 @@ def test_peak_memory_is_flat_in_samples_under_a_budget(experiment, adjoint):
 
 
 @taking_turns("estimator", ["reservoir", "gather", "event", "stack"], "zeros", [True, False])
-def test_what_is_kept_of_a_path_is_what_is_counted(experiment, monkeypatch, estimator, zeros):
+def test_counted_memory_of_a_path_matches_its_stored_state(experiment, monkeypatch, estimator, zeros):
     from reslrb_cli.config.loader import load
     from reslrb_cli.estimators.base import entry_bytes
     from reslrb_cli.integrators import reslrb
@@ -304,7 +304,7 @@ def test_what_is_kept_of_a_path_is_what_is_counted(experiment, monkeypatch, esti
 
 
 @taking_turns("estimator", ["reservoir", "gather", "event", "stack"], "adjoint", ["batched", "correlated"])
-def test_all_sample_counts_have_the_same_kernels(experiment, estimator, adjoint):
+def test_all_sample_counts_share_kernels(experiment, estimator, adjoint):
     """Kernels of a measurement would otherwise be compiled for nothing."""
     from reslrb_cli.config.loader import load
     from reslrb_cli.optimization.assemble import assemble

@@ -41,23 +41,23 @@ def offered(kind: type[ShellComplete], *words: str) -> list[tuple[str, str]]:
         (["example", "cornell"], [("plain", "cornell_floor")]),
     ],
 )  # fmt: skip
-def test_what_is_offered(kind, words, found):
+def test_completions(kind, words, found):
     assert offered(kind, *words) == found
 
 
-def test_every_command_is_offered():
+def test_every_command_is_completed():
     assert {text for _, text in offered(BashComplete, "")} == set(main.list_commands(None))
     assert {text for _, text in offered(BashComplete, "example", "")} == set(examples())
 
 
-def test_keys_are_those_of_overrides():
+def test_completed_keys_are_valid_overrides():
     keys = setting_keys()
     assert {"run.spp", "optimizer.learning_rate", "integrator.estimator", "target.render.integrator.max_depth",
             "parameters[0].regularizers[0].weight", "run.checkpoint_every.seconds"} <= set(keys)  # fmt: skip
     assert all(format_location(parse_override(f"{key}=1").location) == key for key in keys)
 
 
-def test_a_bash_completes():
+def test_bash_completes():
     """Evaluate the line of docs/commands.md in a bash, and call the function that it defines as Tab does."""
     program = (
         'eval "$(_RESLRB_COMPLETE=bash_source reslrb)"\n'
@@ -72,7 +72,7 @@ def test_a_bash_completes():
 
 
 @pytest.mark.parametrize("words", ["optimize a.yaml --set run.sp", "swe", "example c"])
-def test_completing_loads_nothing_heavy(words):
+def test_completion_loads_nothing_heavy(words):
     script = (
         "import sys; sys.argv[0] = 'reslrb'\n"
         "from reslrb_cli.cli import run\n"

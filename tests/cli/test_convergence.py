@@ -44,9 +44,7 @@ def read(path: Path) -> list[dict]:
     return lines[1:]
 
 
-def test_a_scene_from_end_to_end(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_scene_end_to_end(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Each exact method agrees with ptracer, and the error of averages falls as it should."""
     names = ["ptracer", "reslrb:reservoir(capacity=2)"]
     args = ["--integrators", ",".join(names), "--rounds", "16", "--json", "out/c.jsonl", "--set", "run.spp=16"]
@@ -87,7 +85,7 @@ def test_a_scene_from_end_to_end(
 
 
 @pytest.mark.long
-def test_the_loss_catches_what_is_correlated(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_loss_reveals_correlated_samples(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     args = ["--objective", "loss", "--rounds", "64", "--json", "c.jsonl", "--set", "run.spp=4", "--set", "loss.type=l2"]
     cases = "reslrb:stack(adjoint=correlated),reslrb:stack(adjoint=independent)"
     assert call("tiny.yaml", *args, "--integrators", cases) == 0
@@ -107,7 +105,7 @@ def test_the_image(folder: Path) -> None:
     assert [(line["label"], line["parameter"], line["biased"]) for line in methods] == [("prb", "image", False)]
 
 
-def test_a_budget_that_is_too_small_says_so(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_too_small_budget_is_reported(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert call("tiny.yaml", "--budget", "1", "--integrators", "reslrb:stack") == 1
     printed = capsys.readouterr()
     assert "the budget of 1 s was spent before dL/dI was known" in printed.out
@@ -148,7 +146,7 @@ def test_bad_input_is_one_located_line(
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut off"])
-def test_steps_that_cannot_be_gone_on_from(folder: Path, content: bytes, capsys: pytest.CaptureFixture[str]) -> None:
+def test_steps_that_cannot_be_continued(folder: Path, content: bytes, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "c.jsonl").write_text("kept\n")
     (folder / "c.samples.npz").write_bytes(content)
     assert call("tiny.yaml", "--json", "c.jsonl") == 2
@@ -157,7 +155,7 @@ def test_steps_that_cannot_be_gone_on_from(folder: Path, content: bytes, capsys:
 
 
 @pytest.mark.long
-def test_going_on(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_continuing(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     args = ["--integrators", "reslrb:stack", "--rounds", "4"]
     assert call("tiny.yaml", *args, "--json", "c.jsonl") == 0
     assert call("tiny.yaml", *args[:-1], "8", "--json", "c.jsonl") == 0
@@ -170,7 +168,7 @@ def test_going_on(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.long
-def test_a_method_that_cannot_do_the_scene_is_located(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_method_that_does_not_support_the_scene_is_located(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = (folder / "scene.xml").read_text().replace('type="area"', 'type="directionalarea"')
     (folder / "scene.xml").write_text(text)
     assert call("tiny.yaml", "--rounds", "3", "--integrators", "prb") == 2
@@ -178,7 +176,7 @@ def test_a_method_that_cannot_do_the_scene_is_located(folder: Path, capsys: pyte
 
 
 @pytest.mark.long
-def test_an_interrupt_keeps_what_is_done(folder: Path) -> None:
+def test_an_interrupt_keeps_finished_work(folder: Path) -> None:
     script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
     args = ["convergence", "tiny.yaml", "--integrators", "reslrb:stack", "--rounds", "100000", "--json", "c.jsonl"]
     environment = {**os.environ, "PYTHONPATH": search_path(ROOT), "PYTHONUNBUFFERED": "1"}

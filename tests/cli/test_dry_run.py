@@ -41,7 +41,7 @@ def call(*words: str) -> None:
 
 
 @pytest.mark.parametrize("adjoint", ["batched", pytest.param("correlated", marks=pytest.mark.long)])
-def test_memory_is_that_of_the_run(experiment: Path, capsys: pytest.CaptureFixture[str], adjoint: str) -> None:
+def test_memory_matches_the_run(experiment: Path, capsys: pytest.CaptureFixture[str], adjoint: str) -> None:
     before = sorted(os.listdir(experiment))
     call("--dry-run", "--set", f"run.adjoint={adjoint}")
     assert sorted(os.listdir(experiment)) == before
@@ -59,7 +59,7 @@ def test_memory_is_that_of_the_run(experiment: Path, capsys: pytest.CaptureFixtu
     assert float(told[1]) == pytest.approx(peak, rel=0.15)
 
 
-def test_long_steps_are_measured_by_shorter_ones(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_steps_are_extrapolated_from_shorter_ones(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By steps whose cost is known: as much as a constant and so much a sample."""
     taken = []
 
@@ -87,7 +87,7 @@ def test_long_steps_are_measured_by_shorter_ones(experiment: Path, monkeypatch: 
     assert taken == [4, 12, 24, 400]  # whole steps of 8.1 s are no long wait
 
 
-def test_each_trial_begins_where_the_run_does(experiment: Path) -> None:
+def test_each_trial_starts_at_the_initial_values(experiment: Path) -> None:
     """Else texels that a trial has moved to 0 would have the next one trace, and keep, what the run does not need."""
     problem = assemble(load(experiment / "tiny.yaml", [*SETS, "optimizer.learning_rate=0.4"]))
     problem = replace(problem, truth={})
@@ -101,7 +101,7 @@ def test_each_trial_begins_where_the_run_does(experiment: Path) -> None:
     assert losses[0] == losses[1]
 
 
-def test_steps_are_timed_without_their_compilation(experiment: Path) -> None:
+def test_steps_are_timed_without_compilation(experiment: Path) -> None:
     forecast = make_forecast(load(experiment / "tiny.yaml", SETS), lambda line: None)
     assert 0 < forecast.iteration_s < forecast.elapsed_s
     assert forecast.peak / MIB > 0.5
@@ -111,7 +111,7 @@ def test_steps_are_timed_without_their_compilation(experiment: Path) -> None:
 
 
 @pytest.mark.parametrize("keeps", [True, pytest.param(False, marks=pytest.mark.long)])
-def test_what_comes_before_the_iterations_is_measured_once(
+def test_work_before_the_iterations_is_measured_once(
     experiment: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, keeps: bool
 ) -> None:
     """Decisions are measured now, for the run that follows; without a cache the run measures them again."""
@@ -155,6 +155,6 @@ def test_passes(spp: int, per_pass: int | None, pixels: int, said: str | None) -
         assert passes_obstacle(spp, most, pixels) is None
 
 
-def test_words() -> None:
+def test_wording() -> None:
     found = [in_words(n) for n in (0, 2**19, 1.5 * 2**20, 2**30, 3 * 2**31, 2**42)]
     assert found == ["0 B", "512 KiB", "1.5 MiB", "1 GiB", "6 GiB", "4 TiB"]

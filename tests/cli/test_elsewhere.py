@@ -62,7 +62,7 @@ def name_scenes_from_elsewhere(request: pytest.FixtureRequest, tmp_path: Path, m
 
 
 @pytest.mark.usefixtures("llvm")
-def test_init_finds_what_can_be_recovered(name_scenes_from_elsewhere: str) -> None:
+def test_init_finds_recoverable_parameters(name_scenes_from_elsewhere: str) -> None:
     looked = reslrb("inspect", "scene.xml")
     assert looked.exit_code == 0, looked.output
     made = reslrb("init", "scene.xml", "--target", "photo.png", "-o", "room.yaml")
@@ -74,7 +74,7 @@ def test_init_finds_what_can_be_recovered(name_scenes_from_elsewhere: str) -> No
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.long
-def test_no_command_stumbles(name_scenes_from_elsewhere: str) -> None:
+def test_every_command_works(name_scenes_from_elsewhere: str) -> None:
     assert reslrb("init", "scene.xml", "--target", "photo.png", "-o", "room.yaml").exit_code == 0
     for command, (arguments, words) in COMMANDS.items():
         done = reslrb(command, *arguments)
@@ -201,7 +201,7 @@ def test_keys_are_the_same_from_inspect_to_the_page(folder, name):
 
 
 @pytest.mark.usefixtures("llvm")
-def test_inspect_names_each_thing_that_is_mended(folder, capsys):
+def test_inspect_names_each_repair(folder, capsys):
     with pytest.raises(SystemExit) as end:
         main.main(["inspect", "corner.xml"])
     assert end.value.code == 0
@@ -212,7 +212,7 @@ def test_inspect_names_each_thing_that_is_mended(folder, capsys):
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.long
-def test_the_other_commands_know_the_names(folder):
+def test_the_other_commands_accept_the_names(folder):
     key = "Sphere_2.emitter.radiance.value"
     (folder / "lamps.yaml").write_text(
         f"scene: {{file: lamps.xml}}\ntarget: {{render: {{spp: 8, parameters: {{{key}: [2, 3, 4]}}}}}}\n"
@@ -249,7 +249,7 @@ def errors(values: dict[str, np.ndarray]) -> dict[str, float]:
 
 
 @pytest.mark.long
-def test_walls_beside_a_lamp_that_clips(llvm, tmp_path, monkeypatch):
+def test_walls_beside_a_clipped_lamp(llvm, tmp_path, monkeypatch):
     """At exposure 1, by `l2`, with the lamp in view: the mask makes the difference between right and black walls."""
     write_photograph(tmp_path, 64, 1024)
     monkeypatch.chdir(tmp_path)
@@ -263,7 +263,7 @@ def test_walls_beside_a_lamp_that_clips(llvm, tmp_path, monkeypatch):
 
 
 @pytest.mark.long
-def test_walls_of_a_photograph_whose_exposure_is_unknown(llvm, tmp_path, monkeypatch):
+def test_walls_of_a_photograph_with_unknown_exposure(llvm, tmp_path, monkeypatch):
     """At an exposure of 0.8 that is recovered with the walls; taken for 1, the same photograph makes them darker."""
     write_photograph(tmp_path, 32, 1024, exposure=0.8)
     monkeypatch.chdir(tmp_path)
@@ -278,7 +278,7 @@ def test_walls_of_a_photograph_whose_exposure_is_unknown(llvm, tmp_path, monkeyp
 
 
 @pytest.mark.usefixtures("llvm")
-def test_texels_that_no_view_shows_are_told_from_settled_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invisible_texels_are_told_from_settled_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a truth, too. They light the lamp's face, and by it what is seen: a gradient, and no colour of theirs."""
     monkeypatch.chdir(tmp_path)
     tiny.write_experiment(tmp_path)
@@ -436,7 +436,7 @@ def test_colours_and_exposure_from_a_photograph(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.usefixtures("llvm")
-def test_the_same_in_short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_same_in_a_short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of fewer pixels and fewer, larger iterations."""
     write_room(tmp_path, 20, 1024)
     monkeypatch.chdir(tmp_path)

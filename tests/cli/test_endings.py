@@ -50,7 +50,7 @@ def test_a_signal_ends_a_run_after_the_iteration(optimize, during, number):
 
 
 @pytest.mark.parametrize(("name", "call"), [("write_image", 0), ("write_parameters", 2), ("write_image", 2)])
-def test_a_signal_while_files_are_written_leaves_none_of_them_out(optimize, monkeypatch, name, call):
+def test_a_signal_during_writing_loses_no_file(optimize, monkeypatch, name, call):
     real, calls = getattr(recording, name), []
 
     def interrupted(*args):
@@ -66,7 +66,7 @@ def test_a_signal_while_files_are_written_leaves_none_of_them_out(optimize, monk
     assert files(RUN) >= (COMPLETE if begun else COMPLETE - {"metrics.jsonl"})
 
 
-def test_a_run_that_is_ended_at_once_is_interrupted(optimize, during, monkeypatch):
+def test_a_run_that_ends_at_once_is_interrupted(optimize, during, monkeypatch):
     runs, seen = [], []
     monkeypatch.setattr("reslrb_cli.records.manifest._WRITING", mock.MagicMock())
     run = recording.Recording.run
@@ -97,7 +97,7 @@ def test_there_is_a_checkpoint_before_the_first_iteration(optimize, monkeypatch)
     assert seen == [(0, 0.5)]
 
 
-def test_a_run_in_progress_is_not_replaced(optimize, during):
+def test_a_running_run_is_not_replaced(optimize, during):
     seen = []
 
     def force(record):
@@ -128,7 +128,7 @@ PARTS = {
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_a_part_that_fails_leaves_the_others_alone(optimize, monkeypatch, part):
+def test_a_failing_part_does_not_affect_the_others(optimize, monkeypatch, part):
     name, before, absent = PARTS[part]
     failing_last(monkeypatch, name, calls=before)
     code, out, err = optimize()
@@ -144,7 +144,7 @@ def test_a_part_that_fails_leaves_the_others_alone(optimize, monkeypatch, part):
         assert int(state["iteration"]) == kept
 
 
-def test_without_its_page_a_run_is_finished(optimize, monkeypatch):
+def test_a_run_finishes_without_its_page(optimize, monkeypatch):
     monkeypatch.setattr(recording, "write_report", full)
     code, out, err = optimize()
     assert (code, faults(RUN, code, err)) == (0, [])
@@ -153,7 +153,7 @@ def test_without_its_page_a_run_is_finished(optimize, monkeypatch):
     assert out.rstrip().endswith("look at runs/tiny")
 
 
-def test_a_page_that_we_cannot_draw_is_no_reason_either(optimize, monkeypatch):
+def test_an_undrawable_page_does_not_fail_the_run(optimize, monkeypatch):
     def draw(folder, *now):
         raise KeyError("initial")
 
@@ -163,7 +163,7 @@ def test_a_page_that_we_cannot_draw_is_no_reason_either(optimize, monkeypatch):
     assert "the page was not written: KeyError: 'initial'" in err
 
 
-def test_a_failure_of_ours_is_noted_and_keeps_its_traceback(optimize, during, monkeypatch):
+def test_an_internal_error_is_logged_with_its_traceback(optimize, during, monkeypatch):
     during(lambda record: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         main.main(["optimize", "tiny.yaml"])
@@ -172,7 +172,7 @@ def test_a_failure_of_ours_is_noted_and_keeps_its_traceback(optimize, during, mo
     assert (RUN / "checkpoint" / "state.npz").exists()
 
 
-def test_memory_that_runs_out_at_the_end_keeps_what_was_found(optimize, monkeypatch):
+def test_running_out_of_memory_at_the_end_keeps_the_results(optimize, monkeypatch):
     def fail():
         raise RuntimeError("jit_malloc(): out of memory! Could not allocate 5 bytes")
 
@@ -208,7 +208,7 @@ def end(process: subprocess.Popen[str]) -> tuple[int, str, str]:
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_the_first_signal_only_leaves_a_mark(number):
+def test_the_first_signal_only_sets_a_flag(number):
     before = [signal.getsignal(other) for other in SIGNALS]
     with Interrupts() as interrupts:
         assert not interrupts.requested
@@ -219,7 +219,7 @@ def test_the_first_signal_only_leaves_a_mark(number):
     assert not [thread for thread in threading.enumerate() if thread.name == "interrupts"]
 
 
-def test_one_within_another_takes_its_place_and_gives_it_back():
+def test_nested_handlers_replace_and_restore_each_other():
     with Interrupts() as outer:
         for _ in range(2):
             with Interrupts() as inner:
@@ -232,7 +232,7 @@ def test_one_within_another_takes_its_place_and_gives_it_back():
         assert outer.requested
 
 
-def test_in_another_thread_nothing_happens():
+def test_other_threads_are_unaffected():
     seen = []
 
     def work():
@@ -245,7 +245,7 @@ def test_in_another_thread_nothing_happens():
     assert seen == [False]
 
 
-def test_a_signal_in_a_recording_does_not_break_it(llvm):
+def test_a_signal_during_a_recording_does_not_break_it(llvm):
     """Raised as an exception there, it becomes an error that looks like a call that cannot be recorded."""
     import drjit as dr
     import mitsuba as mi
@@ -265,13 +265,13 @@ FIRST = WITHIN + "with Interrupts(tolerated=0): print('ready', flush=True); time
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_where_none_is_tolerated_the_first_one_ends_the_process(number):
+def test_without_tolerance_the_first_signal_ends_the_process(number):
     process = start(FIRST)
     process.send_signal(number)
     assert end(process) == (130, "", "interrupted\n")
 
 
-def test_the_second_one_ends_it_after_a_last_act(tmp_path):
+def test_the_second_signal_ends_it_after_a_last_act(tmp_path):
     script = f"""
 from pathlib import Path
 from reslrb_cli.records.atomic import write_atomically
@@ -293,7 +293,7 @@ with Interrupts(last_act=act, notice="stopping"):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_two_that_come_while_a_kernel_runs_are_two():
+def test_two_signals_during_a_kernel_count_as_two():
     """Python's own handler would see one, when the kernel has ended."""
     script = (
         WITHIN
@@ -321,7 +321,7 @@ def test_a_last_act_that_fails_prevents_nothing():
     assert end(process) == (130, "", "interrupted\n")
 
 
-def test_what_was_ignored_from_the_start_stays_ignored():
+def test_initially_ignored_signals_stay_ignored():
     process = start(FIRST, shell="trap '' HUP INT")  # as nohup does
     for number in (signal.SIGHUP, signal.SIGINT):
         process.send_signal(number)
@@ -332,7 +332,7 @@ def test_what_was_ignored_from_the_start_stays_ignored():
 
 
 @pytest.mark.parametrize("stream", ["2>&-", "2>/dev/full"])
-def test_a_last_word_that_cannot_be_said_is_left_out(stream):
+def test_an_impossible_last_message_is_left_out(stream):
     process = start(FIRST, shell=f"exec {stream}")
     process.send_signal(signal.SIGTERM)
     assert end(process)[0] == 130
@@ -351,13 +351,13 @@ sys.argv = ["reslrb", "waiting"]
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_command_that_knows_of_no_signals_is_ended(number):
+def test_a_command_without_signal_handling_is_ended(number):
     process = start(PROGRAM + "run()")
     process.send_signal(number)
     assert end(process) == (130, "", "interrupted\n")
 
 
-def test_no_signal_changes_how_a_command_that_is_done_ends():
+def test_a_signal_does_not_change_the_end_of_a_finished_command():
     script = (
         PROGRAM
         + """
@@ -373,7 +373,7 @@ run()
     assert end(process) == (5, "", "")
 
 
-def test_while_the_program_is_loaded_ctrl_c_has_no_traceback():
+def test_ctrl_c_during_loading_has_no_traceback():
     script = """
 sys.argv = ["/usr/bin/reslrb"]
 import subprocess
@@ -405,7 +405,7 @@ except KeyboardInterrupt:
 """
 
 
-def test_mitsuba_does_not_write_of_signals_where_results_go():
+def test_mitsuba_writes_no_signal_messages_to_standard_output():
     code, out, err = end(start(RENDERS))
     assert (code, out) == (0, "interrupted\n"), err
 
@@ -413,7 +413,7 @@ def test_mitsuba_does_not_write_of_signals_where_results_go():
 # Run folders that are removed, emptied, moved or replaced while a run is at work.
 
 
-def test_a_folder_that_is_removed_ends_the_run(optimize, during):
+def test_removing_the_folder_ends_the_run(optimize, during):
     during(lambda record: shutil.rmtree(RUN) if record.iteration == 1 else None)
     code, out, err = optimize("--set", "run.iterations=50")
     assert (code, out) == (6, "")
@@ -422,7 +422,7 @@ def test_a_folder_that_is_removed_ends_the_run(optimize, during):
     assert os.listdir("runs") == []
 
 
-def test_what_is_in_a_folder_is_removed_and_what_can_be_kept_is(optimize, during):
+def test_removing_the_contents_of_a_folder_keeps_what_it_can(optimize, during):
     """As by `rm -rf` that has not come to the folder itself: what is then written is what the last line names."""
 
     def remove(record):
@@ -446,7 +446,7 @@ def test_what_is_in_a_folder_is_removed_and_what_can_be_kept_is(optimize, during
         assert np.array_equal(values[KEY], kept)
 
 
-def test_another_run_that_has_taken_the_name_is_left_alone(optimize, during):
+def test_another_run_with_the_same_name_is_left_alone(optimize, during):
     seen = []
 
     def take(record):
@@ -465,7 +465,7 @@ def test_another_run_that_has_taken_the_name_is_left_alone(optimize, during):
     assert line.endswith("runs/tiny: has gone while the run went on")
 
 
-def test_a_folder_that_was_moved_keeps_what_it_has(optimize, during):
+def test_a_moved_folder_keeps_its_contents(optimize, during):
     during(lambda record: RUN.rename("runs/moved") if record.iteration == 1 else None)
     code, _, err = optimize()
     assert code == 6

@@ -110,7 +110,7 @@ def test_debug_shows_the_traceback(
 
 
 @pytest.mark.usefixtures("raising")
-def test_a_fault_of_ours_keeps_its_traceback() -> None:
+def test_an_internal_error_keeps_its_traceback() -> None:
     failing[:] = [ZeroDivisionError("ours")]
     with pytest.raises(ZeroDivisionError, match="ours"):
         main(["failing"])
@@ -278,7 +278,7 @@ def little(monkeypatch: pytest.MonkeyPatch) -> int:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_what_needs_more_than_is_free(experiment: Path, little: int) -> None:
+def test_requirements_beyond_the_free_memory(experiment: Path, little: int) -> None:
     line = obstacle(experiment, "scene.size=[6000, 4000]")
     said = "scene.size: a film of 6000x4000 pixels takes at least 1.3 GiB, and 1 GiB are free; use at most 5181x3454"
     assert line.endswith(said)
@@ -290,7 +290,7 @@ def test_what_needs_more_than_is_free(experiment: Path, little: int) -> None:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_step_that_needs_more_than_is_free(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_beyond_the_free_memory(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By the estimate that `memory_budget` goes by, of which a step takes a part at the least."""
 
     def find(*sets: str) -> None:
@@ -327,7 +327,7 @@ def unbuilt(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_what_the_scene_says_of_its_film_is_known_before_it_is_built(
+def test_the_film_size_is_known_before_the_scene_is_built(
     experiment: Path, monkeypatch: pytest.MonkeyPatch, unbuilt: None
 ) -> None:
     monkeypatch.setattr(room, "free_bytes", lambda variant: 2**34)
@@ -351,7 +351,7 @@ def test_what_the_scene_says_of_its_film_is_known_before_it_is_built(
 
 
 @pytest.mark.usefixtures("llvm")
-def test_of_what_is_large_and_fits_a_line_is_said_before_it_is_built(
+def test_large_steps_are_reported_before_the_scene_is_built(
     experiment: Path, monkeypatch: pytest.MonkeyPatch, unbuilt: None, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(room, "free_bytes", lambda variant: 2**35)
@@ -369,7 +369,7 @@ def test_of_what_is_large_and_fits_a_line_is_said_before_it_is_built(
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_budget_chooses_passes_that_can_be(experiment: Path) -> None:
+def test_a_budget_chooses_possible_passes(experiment: Path) -> None:
     sets = ["scene.size=[256, 256]", "run.spp=1000000000", "run.memory_budget=640"]
     memory = room.fit_memory(assemble_scene(load(experiment / "tiny.yaml", sets))).memory
     assert memory is not None
@@ -377,7 +377,7 @@ def test_a_budget_chooses_passes_that_can_be(experiment: Path) -> None:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_long_run_is_told_of(experiment: Path) -> None:
+def test_a_long_run_is_announced(experiment: Path) -> None:
     config = load(experiment / "tiny.yaml", ["run.iterations=1000000", "run.spp=65536"])
     problem = assemble_scene(config)
     line = room.outlook(config, problem.scene, problem.sensors)
@@ -389,13 +389,13 @@ def test_a_long_run_is_told_of(experiment: Path) -> None:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_what_fits_is_not_refused(experiment: Path, little: int) -> None:
+def test_fitting_steps_are_not_refused(experiment: Path, little: int) -> None:
     config = load(experiment / "tiny.yaml", ["scene.size=[4000, 4000]", "parameters[0].resolution=[8000, 8000]"])
     announced.check_announced(config)  # which allocates nothing
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_record_that_no_thread_has_room_for(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_record_too_large_for_a_thread(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def find(*sets: str) -> None:
         room.fit_memory(assemble_scene(load(experiment / "tiny.yaml", sets)))
 
@@ -429,12 +429,12 @@ def test_free_memory_is_no_more_than_a_limit(monkeypatch: pytest.MonkeyPatch) ->
         ["run.iterations=2000000000", "run.final_spp=1000000"],
     ],
 )
-def test_large_is_not_refused(sets: list[str], experiment: Path) -> None:
+def test_large_but_fitting_sizes_are_accepted(sets: list[str], experiment: Path) -> None:
     assert isinstance(load(experiment / "tiny.yaml", sets), Config)
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_texture_that_is_too_large(experiment: Path) -> None:
+def test_a_too_large_texture(experiment: Path) -> None:
     """Its head says that it is large, and it takes no room on the disk."""
     import struct
 

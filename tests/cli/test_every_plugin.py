@@ -99,7 +99,7 @@ def test_it_works_or_is_refused_in_one_line(row: Row, folder: Path) -> None:
     check(row, folder, to_the_end=True)
 
 
-def test_no_plugin_is_missing() -> None:
+def test_every_plugin_is_covered() -> None:
     registered = {
         name
         for file in (package_folder() / "python").rglob("*.py")
@@ -111,12 +111,12 @@ def test_no_plugin_is_missing() -> None:
     assert len({row.name for row in ROWS}) == len(ROWS)
 
 
-def test_the_page_is_what_the_table_says() -> None:
+def test_the_page_matches_the_table() -> None:
     assert PAGE.read_text(encoding="utf-8") == page(), "`python tests/cli/every_plugin.py` writes it anew"
 
 
 @pytest.mark.parametrize("name", a_few(("homogeneous", "timed_sunsky", "linearcurve that emits"), ("homogeneous",)))
-def test_what_nobody_knows_is_refused_by_every_command_and_integrator(name: str, folder: Path) -> None:
+def test_unknown_plugins_are_refused_by_every_command_and_integrator(name: str, folder: Path) -> None:
     [row] = [row for row in ROWS if row.name == name]
     (folder / "scene.xml").write_text(row.xml())
     (folder / "c.yaml").write_text(BY_HAND)
@@ -130,7 +130,7 @@ def test_what_nobody_knows_is_refused_by_every_command_and_integrator(name: str,
     assert not (folder / "image.exr").exists()
 
 
-def test_a_run_of_before_is_not_exported(folder: Path) -> None:
+def test_an_older_run_is_not_exported(folder: Path) -> None:
     [row] = [row for row in ROWS if row.name == "diffuse"]
     (folder / "scene.xml").write_text(row.xml())
     (folder / "c.yaml").write_text(BY_HAND)

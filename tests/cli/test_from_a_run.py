@@ -57,7 +57,7 @@ def start(folder: Path, parameters: str) -> dict[str, np.ndarray]:
     return assemble_scene(load(folder / "tiny.yaml", [f"parameters={parameters}"])).values()
 
 
-def test_every_kind_of_value_begins_where_the_run_left_it(folder: Path) -> None:
+def test_every_kind_of_value_starts_at_the_result_of_the_run(folder: Path) -> None:
     warm = PARAMETERS.replace("initial: 0.5", "initial: {run: runs/tiny}").replace("[3, 4, 5]", "{run: runs/tiny}")
     warm = warm.replace("scale]}", "scale]}, initial: {run: runs/tiny}")
     left, begun = (read_parameters(folder / "runs/tiny/parameters" / place) for place in ("", "initial"))
@@ -68,7 +68,7 @@ def test_every_kind_of_value_begins_where_the_run_left_it(folder: Path) -> None:
         assert np.array_equal(value, taken[key]), key
 
 
-def test_a_texture_of_another_size_is_resampled_where_that_is_asked_for(folder: Path) -> None:
+def test_a_texture_of_another_size_is_resampled_on_request(folder: Path) -> None:
     spec = f"[{{key: {tiny.KEY}, initial: {{run: runs/tiny}}, resolution: [8, 6]}}]"
     left = read_value(folder / "runs/tiny", tiny.KEY)
     finer = start(folder, spec)[tiny.KEY]
@@ -77,7 +77,7 @@ def test_a_texture_of_another_size_is_resampled_where_that_is_asked_for(folder: 
         read_into(folder, "runs/tiny", finer)
 
 
-def test_values_of_a_run_are_held_to_the_bounds(folder: Path) -> None:
+def test_values_of_a_run_respect_the_bounds(folder: Path) -> None:
     left = read_value(folder / "runs/tiny", tiny.KEY)
     spec = f"[{{key: {tiny.KEY}, initial: {{run: runs/tiny}}, bounds: [0, {float(left.max()) - 1e-6}]}}]"
     with pytest.raises(ConfigError, match=r"parameters\[0\].bounds: exclude the initial value of `poster"):
@@ -93,7 +93,7 @@ def read_into(folder: Path, run: str, texture: np.ndarray) -> None:
     select_parameters(scene, [spec], "c.yaml")
 
 
-def test_rendering_a_run_is_rendering_what_it_recovered(folder: Path) -> None:
+def test_rendering_a_run_renders_its_recovered_values(folder: Path) -> None:
     left = read_parameters(folder / "runs/tiny/parameters")
     by_hand = (
         f"[{{key: {tiny.KEY}, initial: {{file: {folder}/runs/tiny/parameters/{tiny.KEY}.exr}}}},"
@@ -112,7 +112,7 @@ def test_rendering_a_run_is_rendering_what_it_recovered(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("exposure", ["per_channel", "0.6"])
-def test_renderings_of_a_run_have_its_exposure_and_its_exported_scene_names_it(
+def test_renderings_use_the_exposure_and_the_exported_scene_names_it(
     folder: Path, exposure: str, tmp_path: Path
 ) -> None:
     spec = "[{motion: {of: wall, free: [translation]}, learning_rate: 0.01}]"  # a colour cannot be told from it
@@ -140,7 +140,7 @@ def test_renderings_of_a_run_have_its_exposure_and_its_exported_scene_names_it(
     assert "exposure" not in reslrb("export", folder / "runs/tiny", "-o", tmp_path / "plain").output
 
 
-def test_mitsuba_renders_what_was_exported_as_the_run_does(folder: Path) -> None:
+def test_mitsuba_renders_the_export_like_the_run(folder: Path) -> None:
     result = reslrb("export", folder / "runs/tiny", "-o", folder / "exported")
     assert result.exit_code == 0, result.output
     assert "rendered by ptracer" in result.output
@@ -167,7 +167,7 @@ def test_mitsuba_renders_what_was_exported_as_the_run_does(folder: Path) -> None
         (("--run", "runs"), "has no manifest.json"),
     ],
 )
-def test_what_is_no_run_is_refused(
+def test_other_folders_are_refused(
     folder: Path, arguments: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(folder)
@@ -177,7 +177,7 @@ def test_what_is_no_run_is_refused(
     assert not (folder / "x.exr").exists()
 
 
-def test_a_run_that_lacks_a_value_or_has_a_bad_one_is_refused_in_a_line(folder: Path, tmp_path: Path) -> None:
+def test_missing_or_bad_values_of_a_run_are_refused_in_one_line(folder: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     (run / "checkpoint").mkdir(parents=True)
     for name in ("manifest.json", "config.yaml"):
@@ -204,7 +204,7 @@ def test_a_run_that_lacks_a_value_or_has_a_bad_one_is_refused_in_a_line(folder: 
     assert "is damaged, cut off, or not written by reslrb" in refusal()
 
 
-def test_an_exported_scene_is_rendered_by_path_where_ptracer_is_wrong(tmp_path: Path) -> None:
+def test_an_exported_scene_names_path_if_ptracer_is_wrong(tmp_path: Path) -> None:
     tiny.write_experiment(tmp_path)
     sky = """<emitter type="envmap"><string name="filename" value="poster.exr"/><transform name="to_world">
 <rotate y="1" angle="40"/></transform></emitter></scene>"""

@@ -69,7 +69,7 @@ def test_a_table_and_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str
     ]
 
 
-def test_what_fails_is_named(
+def test_failures_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from reslrb_cli.estimators import stack
@@ -124,7 +124,7 @@ def test_a_case_of_the_suite(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "there is no case `furnac`; did you mean furnace?" in capsys.readouterr().err
 
 
-def test_cases_that_are_done_are_not_run_again(
+def test_finished_cases_are_not_repeated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from reslrb_cli.measure import extreme
@@ -158,7 +158,7 @@ def test_cases_that_are_done_are_not_run_again(
     assert "--seeds is as the cases have it there, 5 here" in capsys.readouterr().err
 
 
-def test_ctrl_c_prints_what_is_done() -> None:
+def test_ctrl_c_prints_finished_comparisons() -> None:
     command = [sys.executable, "-c", "from reslrb_cli.cli import main; main()", "gradcheck", *SMALL, "--seeds", "80"]
     process = subprocess.Popen(
         [*command, "--estimators", "stack"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ
@@ -175,7 +175,7 @@ def test_ctrl_c_prints_what_is_done() -> None:
     assert 1 <= int(done[1]) < 5
 
 
-def test_a_budget_that_suffices_for_nothing_is_no_check_that_holds(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_budget_too_small_for_anything_is_no_success(capsys: pytest.CaptureFixture[str]) -> None:
     assert call(*SMALL, "--budget", "0", "--estimators", "stack") == 1
     lines = capsys.readouterr().out.splitlines()
     assert lines[-2] == "0 of 6 comparisons hold, 0 fail, 6 leave the question open"

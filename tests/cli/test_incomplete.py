@@ -60,7 +60,7 @@ def run(experiment: Path) -> tuple[str, Path]:
     return done("optimize", experiment, *settings(f"run.output={folder}", ACCEPT)).output, folder / "box"
 
 
-def test_a_run_refuses_a_derivative_that_lacks_more_than_half(experiment: Path):
+def test_a_derivative_that_lacks_more_than_half_is_refused(experiment: Path):
     result = reslrb("optimize", experiment)
     assert result.exit_code == 2
     *_, line = result.output.splitlines()
@@ -70,7 +70,7 @@ def test_a_run_refuses_a_derivative_that_lacks_more_than_half(experiment: Path):
     assert f"--set {ACCEPT} runs it anyway" in line
 
 
-def test_a_value_by_an_incomplete_derivative_is_never_settled(run: tuple[str, Path]):
+def test_a_value_with_an_incomplete_derivative_is_never_settled(run: tuple[str, Path]):
     output, folder = run
     manifest: dict[str, Any] = read_manifest(folder) or {}
     judged = manifest["results"]["certainty"]["parameters"]
@@ -87,7 +87,7 @@ def test_a_value_by_an_incomplete_derivative_is_never_settled(run: tuple[str, Pa
     assert "settled" not in output
 
 
-def test_a_run_that_goes_on_knows_what_is_missing(run: tuple[str, Path]):
+def test_a_continued_run_remembers_the_missing_share(run: tuple[str, Path]):
     before: dict[str, Any] = read_manifest(run[1]) or {}
     done("optimize", "--resume", run[1], *settings("run.iterations=22"))
     after: dict[str, Any] = read_manifest(run[1]) or {}
@@ -95,14 +95,14 @@ def test_a_run_that_goes_on_knows_what_is_missing(run: tuple[str, Path]):
     assert after["results"]["certainty"]["parameters"]["box.x"]["verdict"] == "derivative incomplete"
 
 
-def test_what_there_is_no_time_to_measure_is_said(experiment: Path):
+def test_an_unmeasured_share_is_reported(experiment: Path):
     """Also by a dry run."""
     result = done("optimize", experiment, "--dry-run", *settings("run.measuring=0"))
     assert "box.x: silhouettes and edges of shadows are not in the derivative; there was no time" in result.output
     assert "--set integrator.type=prb_projective includes all of it" in result.output
 
 
-def test_light_without_edges_lacks_nothing(llvm: str, tmp_path: Path):
+def test_light_without_edges_has_a_complete_derivative(llvm: str, tmp_path: Path):
     """A spot lamp whose light ends smoothly, through glass: its caustic is all in the derivative."""
     heights = "parameters=[{motion: {of: lamp, free: [translation]}}, {heightmap: {mesh: slab, resolution: [5, 4]}}, "
     heights += "{key: floor.bsdf.reflectance.value}]"
@@ -116,7 +116,7 @@ def test_light_without_edges_lacks_nothing(llvm: str, tmp_path: Path):
     assert not any(np.any(np.array(gradient)) for gradient in problem.gradients().values())
 
 
-def test_shares_have_their_errors():
+def test_shares_have_standard_errors():
     """The share of samples with known means is right on average, and scatters by its standard error."""
     random, found = np.random.default_rng(1), []
     for _ in range(400):
@@ -144,12 +144,12 @@ def record(share: float | None, error: float | None, seeds: int = 8) -> MissingR
         (record(None, None, 0), True, False),
     ],
 )
-def test_what_is_made_of_a_share(found: MissingRecord, incomplete: bool, refused: bool):
+def test_consequences_of_a_share(found: MissingRecord, incomplete: bool, refused: bool):
     assert (found.is_incomplete, found.is_for_the_most_part) == (incomplete, refused)
     assert ("nothing is missing" in found.line()) is (found.share == 0.1)
 
 
-def test_a_loss_that_rises_is_explained_by_what_is_missing():
+def test_a_rising_loss_is_explained_by_the_missing_part():
     """No lower rate is proposed, of other parameters that still move either."""
     level = {"start": {"mean": 1.0, "error": 0.01}, "end": {"mean": 2.0, "error": 0.01}, "change": "rose"}
     moving = {"verdict": "still moving", "shares": {"still moving": 1.0}, "moved": 0.1, "rate": 0.01, "reach": 10.0}

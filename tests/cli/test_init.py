@@ -45,7 +45,7 @@ def of_photograph(folder: Path, width: int, height: int) -> tuple[Config, Result
     return load(folder / "room.yaml"), result
 
 
-def test_a_scene_alone_gets_a_configuration_that_lacks_its_photograph_only(folder: Path) -> None:
+def test_a_scene_alone_gets_a_configuration_without_a_photograph(folder: Path) -> None:
     result = reslrb("init", "room/scene.xml")
     assert result.exit_code == 0, result.output
     assert "room.yaml: 1 of 3 parameters, at 8x8 pixels" in result.output
@@ -66,9 +66,7 @@ def test_a_scene_alone_gets_a_configuration_that_lacks_its_photograph_only(folde
     assert read_manifest(folder / "runs/room")["status"] == "finished"
 
 
-def test_it_is_named_after_the_folder_of_the_scene_wherever_that_is(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_experiment_is_named_after_the_folder_of_the_scene(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (folder / "room/photos").mkdir()
     for place, scene in (("room", "scene.xml"), ("room/photos", "../scene.xml")):
         monkeypatch.chdir(folder / place)
@@ -77,7 +75,7 @@ def test_it_is_named_after_the_folder_of_the_scene_wherever_that_is(
         assert load(folder / place / "room.yaml").scene.file.resolve() == folder / "room/scene.xml"
 
 
-def test_what_is_commented_out_is_accepted_once_it_is_not(folder: Path) -> None:
+def test_commented_settings_are_valid(folder: Path) -> None:
     assert reslrb("init", "room/scene.xml").exit_code == 0
     text = (folder / "room.yaml").read_text().replace("  # - {", "  - {")
     (folder / "room.yaml").write_text(text)
@@ -85,7 +83,7 @@ def test_what_is_commented_out_is_accepted_once_it_is_not(folder: Path) -> None:
     assert set(values) == {tiny.KEY, "lamp.emitter.radiance.value", "lamp.bsdf.reflectance.value"}
 
 
-def test_nothing_is_replaced_unless_that_is_asked_for(folder: Path) -> None:
+def test_nothing_is_replaced_without_force(folder: Path) -> None:
     (folder / "room.yaml").write_text("mine")
     refused = reslrb("init", "room/scene.xml")
     assert refused.exit_code == 2
@@ -102,7 +100,7 @@ def test_nothing_is_replaced_unless_that_is_asked_for(folder: Path) -> None:
     assert not (folder / "other.yaml").exists()
 
 
-def test_a_photograph_says_how_large_the_film_is(folder: Path) -> None:
+def test_a_photograph_sets_the_size_of_the_film(folder: Path) -> None:
     config, _ = of_photograph(folder, 12, 12)
     assert config.scene.size == (12, 12)
     assert config.target.file == folder / "photo.png"
@@ -110,7 +108,7 @@ def test_a_photograph_says_how_large_the_film_is(folder: Path) -> None:
     assert tuple(problem.scene.sensors()[0].film().size()) == (12, 12)
 
 
-def test_a_large_photograph_is_copied_at_a_size_that_runs_in_minutes(folder: Path) -> None:
+def test_a_large_photograph_is_reduced_for_a_short_run(folder: Path) -> None:
     config, result = of_photograph(folder, 600, 597)  # as near as a camera comes to the film's ratio
     width, height = config.scene.size or (0, 0)
     assert 0.9 * PIXELS < width * height <= 1.02 * PIXELS
@@ -119,7 +117,7 @@ def test_a_large_photograph_is_copied_at_a_size_that_runs_in_minutes(folder: Pat
     assert tuple(mi.Bitmap(str(config.target.file)).size()) == (width, height)
 
 
-def test_exposure_is_recovered_where_the_photograph_clips(folder: Path) -> None:
+def test_exposure_is_recovered_if_the_photograph_clips(folder: Path) -> None:
     of_photograph(folder, 8, 8)
     known = "exposure" in TargetConfig.model_fields
     assert ("exposure: auto" in (folder / "room.yaml").read_text()) is known
@@ -129,7 +127,7 @@ def test_exposure_is_recovered_where_the_photograph_clips(folder: Path) -> None:
     assert "exposure" not in (folder / "room.yaml").read_text()
 
 
-def test_a_texture_of_8_bits_is_offered_recovered_and_exported(folder: Path) -> None:
+def test_an_8_bit_texture_is_offered_recovered_and_exported(folder: Path) -> None:
     """As most textures are: read as floats while loading, and the scene's file stays as it is."""
     pixels = np.random.default_rng(6).integers(0, 256, (4, 4, 3), dtype=np.uint8)
     mi.Bitmap(pixels).write(str(folder / "room/poster.png"))
@@ -170,7 +168,7 @@ def test_a_texture_of_8_bits_is_offered_recovered_and_exported(folder: Path) -> 
         (("room/scene.xml", "-o", "nowhere/config.yaml"), "cannot write"),
     ],
 )
-def test_what_is_wrong_is_said_in_a_line(folder: Path, arguments: tuple[str, ...], message: str) -> None:
+def test_errors_are_one_line(folder: Path, arguments: tuple[str, ...], message: str) -> None:
     write_noise(folder / "wide.png", 16, 8)
     result = reslrb("init", *arguments)
     assert result.exit_code == 2
@@ -193,7 +191,7 @@ VIEW = """<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"
 <shape type="sphere"><point name="center" x="1.5" y="1" z="0"/><emitter type="area"/></shape></scene>"""
 
 
-def test_what_is_large_in_view_comes_first(tmp_path: Path) -> None:
+def test_large_visible_parameters_come_first(tmp_path: Path) -> None:
     (tmp_path / "scene.xml").write_text(VIEW)
     found = propose(load_scene(tmp_path / "scene.xml"), 0)
     tiles = [f"Rectangle_1.bsdf.brdf_0.reflectance.color{k}.value" for k in range(2)]
@@ -241,7 +239,7 @@ def write_bulb(folder: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", a_few(RECOVERED, ["a lamp and a wall"]))
-def test_what_it_writes_recovers_lamps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_the_generated_configuration_recovers_lamps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """Unedited, within 5 %: the lamp is to be far brighter than it is, in a unit that no learning rate can know."""
     monkeypatch.chdir(tmp_path)
     write_bulb(tmp_path, name)
@@ -261,7 +259,7 @@ def test_what_it_writes_recovers_lamps(tmp_path: Path, monkeypatch: pytest.Monke
     assert "noise and errors of targets are not in it" in done.output
 
 
-def test_a_lamp_alone_is_recovered_if_that_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lamp_is_recovered_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "bulb.xml").write_text(BULB.format(plate=PAINT.format("0.5"), radiance=WRONG))
     asked = ("--recover", "*.radiance.value", "--force")
@@ -275,7 +273,7 @@ def test_a_lamp_alone_is_recovered_if_that_is_asked_for(tmp_path: Path, monkeypa
     assert "# exposure: auto  # one factor for the whole image; the lamps below compensate for it" in text
 
 
-def test_of_a_photograph_that_clips_lamps_are_left_for_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lamps_of_a_clipped_photograph_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "bulb.xml").write_text(BULB.format(plate=METAL.format(0.3), radiance=WRONG))
     photo = write_noise(tmp_path / "photo.png", 24, 24)
@@ -285,7 +283,7 @@ def test_of_a_photograph_that_clips_lamps_are_left_for_later(tmp_path: Path, mon
     assert (config.target.exposure, config.optimizer.scale) == ("auto", "none")
 
 
-def test_a_lamp_is_in_view_from_its_front_alone(tmp_path: Path) -> None:
+def test_only_the_front_of_a_lamp_is_in_view(tmp_path: Path) -> None:
     """The back of an area light is dark, whatever it emits."""
     shares = []
     for angle in (0, 180):
@@ -323,7 +321,7 @@ def choices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_of_several_sensors_one_is_named(choices: Path) -> None:
+def test_one_of_several_sensors_is_named(choices: Path) -> None:
     first = reslrb("init", "hall.xml")
     assert "sensor 0 (floor); --sensor selects another: 1 (ball)" in first.output
     config = load(choices / "hall.yaml")
@@ -344,7 +342,7 @@ def test_of_several_sensors_one_is_named(choices: Path) -> None:
     assert "--sensor: is 2; the scene has 0 (floor), 1 (ball)" in missing.output
 
 
-def test_a_photograph_is_taken_as_a_person_sees_it(choices: Path) -> None:
+def test_a_photograph_is_oriented_as_a_person_sees_it(choices: Path) -> None:
     """A phone that was held upright writes lying pixels, and EXIF beside them."""
     from PIL import Image, ImageOps  # comes with matplotlib
 
@@ -394,7 +392,7 @@ def test_a_scene_that_hides_its_lights_keeps_hiding_them(choices: Path) -> None:
         assert load(choices / "hall.yaml").integrator.hide_emitters == (value == "true")
 
 
-def test_what_a_scene_leaves_open_is_named_and_can_be_set(choices: Path) -> None:
+def test_open_variables_of_a_scene_are_named_and_can_be_set(choices: Path) -> None:
     made = reslrb("init", "hall.xml")
     assert "at 16x16 pixels" in made.output
     assert '  # options: {side: 16, note: "a \\"b\\""}  # ' in (choices / "hall.yaml").read_text()
@@ -425,7 +423,7 @@ CHECKED = """<scene version="3.0.0"><sensor type="perspective"><film type="hdrfi
 <emitter type="area" id="lamp"><texture type="checkerboard" name="radiance"/></emitter></shape></scene>"""
 
 
-def test_light_that_cannot_be_sampled_is_left_to_camera_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_emitters_without_samples_are_left_to_camera_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "shop.xml").write_text(CHECKED)
     monkeypatch.chdir(tmp_path)
     assert reslrb("inspect", "shop.xml").exit_code == 0
@@ -439,7 +437,7 @@ def test_light_that_cannot_be_sampled_is_left_to_camera_paths(tmp_path: Path, mo
     assert "scene.file: Mitsuba cannot sample the rays of emitter lamp" in refused.output
 
 
-def test_it_says_why_paths_from_the_sensor_were_chosen(choices: Path) -> None:
+def test_the_reason_for_camera_paths_is_given(choices: Path) -> None:
     """In the file, in comments that are left whole, and where it is called."""
     (choices / "hall.xml").write_text(CHOICES.replace('"perspective" id="floor"', '"orthographic" id="the # floor"'))
     made = reslrb("init", "hall.xml")

@@ -29,7 +29,7 @@ def plan_lines(text: str) -> list[str]:
     return lines[lines.index("plan") + 1 : lines.index("parameters")]
 
 
-def test_plan_lists_what_is_needed_and_what_is_left_out():
+def test_the_plan_lists_needed_and_omitted_features():
     lines = plan_lines(inspect())
     assert any(line.split()[:3] == ["needed", "derivatives", "of"] for line in lines)
     assert any("left out" in line and "delta lobes" in line for line in lines)
@@ -42,7 +42,7 @@ def test_plan_as_json():
     assert not rows["null surfaces"]["needed"]
 
 
-def test_without_a_plan_the_reason_is_given():
+def test_a_missing_plan_has_a_reason():
     [line] = plan_lines(inspect("--set", "integrator.type=ptracer"))
     assert "none" in line
     assert "ptracer" in line
@@ -146,7 +146,7 @@ def test_everything_as_json(scene):
     assert (wall["obstacle"], wall["bits"], wall["type"]) == (None, 8, "TensorXu8")
 
 
-def test_a_texture_of_8_bits_that_is_selected_is_shown_as_it_is_read(scene):
+def test_a_selected_8_bit_texture_is_shown_as_floats(scene):
     config = scene.with_name("c.yaml")
     config.write_text('scene: {file: scene.xml}\nparameters: [{key: "wall.*"}]')
     found = lines_of("c.yaml")
@@ -164,7 +164,7 @@ def test_a_texture_of_8_bits_that_is_selected_is_shown_as_it_is_read(scene):
         ("parameters: [{key: Sphere_1.*}]\ntarget: {render: {}}", "`reslrb optimize c.yaml` runs it"),
     ],
 )
-def test_a_configuration_need_not_be_complete(scene, text, next_step):
+def test_an_incomplete_configuration_is_accepted(scene, text, next_step):
     Path("c.yaml").write_text(f"scene: {{file: scene.xml}}\n{text}\n")
     found = lines_of("c.yaml")
     assert found[-1].startswith(f"next: {next_step}")
@@ -197,7 +197,7 @@ def test_sections_can_be_given_on_the_command_line(scene):
         (["run.yaml"], "run.yaml: scene: missing; it has no default"),
     ],
 )
-def test_what_is_given_wrong(scene, capsys, arguments, said):
+def test_wrong_arguments(scene, capsys, arguments, said):
     Path("empty.yaml").write_text("")
     Path("run.yaml").write_text("run: {spp: 4}")
     with pytest.raises(SystemExit) as end:
@@ -206,7 +206,7 @@ def test_what_is_given_wrong(scene, capsys, arguments, said):
     assert said in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_a_run_folder_says_how_far_it_came(scene):
+def test_a_run_folder_shows_its_progress(scene):
     Path("c.yaml").write_text(
         "scene: {file: scene.xml}\ntarget: {render: {spp: 4}}\nparameters: [{key: Sphere_1.emitter.radiance.value}]\n"
         "integrator: {type: ptracer, max_depth: 2}\nrun: {iterations: 2, spp: 1}\n"
@@ -220,7 +220,7 @@ def test_a_run_folder_says_how_far_it_came(scene):
         assert found[-1] == "next: `reslrb optimize runs/c/config.yaml` runs it again"
 
 
-def test_keys_that_match_nothing_are_answered_with_lasting_names(scene, capsys):
+def test_unmatched_keys_get_suggestions(scene, capsys):
     Path("c.yaml").write_text(
         "scene: {file: scene.xml}\ntarget: {render: {}}\nparameters: [{key: Sphere_3.emitter.radiance}]"
     )
@@ -271,7 +271,7 @@ def test_conditioning_as_a_table_and_as_json():
     assert measured["spread"]["curvature"] == pytest.approx(measured["spread"]["change"] ** 2, rel=0.01)
 
 
-def test_a_spread_needs_two():
+def test_a_spread_needs_two_samples():
     from reslrb_cli.optimization.decisions import Sensitivity
     from reslrb_cli.optimization.sensitivity import Conditioning
 
@@ -283,7 +283,7 @@ def test_a_spread_needs_two():
     assert Conditioning(rows, 2, 1, 0).spread("gradient") == pytest.approx(2e3)
 
 
-def test_samples_belong_to_conditioning():
+def test_samples_require_conditioning():
     result = CliRunner().invoke(main, ["inspect", str(STIFF), "--samples", "4"])
     assert result.exit_code == 2
     assert "--conditioning" in result.output

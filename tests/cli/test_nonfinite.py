@@ -104,7 +104,7 @@ STOP = "run.on_nonfinite=stop"
 
 
 @pytest.mark.parametrize("film", a_few(["rgb", "rgba"], ["rgba"]))
-def test_a_texel_that_is_not_a_number(spoilt_experiment, capsys, film):
+def test_a_nan_texel(spoilt_experiment, capsys, film):
     _, err = optimize(capsys, STOP, f"scene.options={{wall: spoilt.exr, format: {film}}}")
     assert "not finite in iteration 0" in err.splitlines()[-1]
     iteration, [offender], text = inspect(capsys, err)
@@ -121,7 +121,7 @@ def test_a_texel_that_is_not_a_number(spoilt_experiment, capsys, film):
     assert f"path {at['path']} of 1024" in text
 
 
-def test_a_step_of_a_stage_is_replayed_in_its_film(spoilt_experiment, capsys):
+def test_a_step_of_a_stage_is_replayed_on_its_film(spoilt_experiment, capsys):
     stages = "run.stages=[{until: 0.5, film: 0.5}]"
     _, err = optimize(capsys, STOP, "run.spp=4", "scene.options={wall: spoilt.exr}", stages)
     iteration, [offender], text = inspect(capsys, err)
@@ -130,21 +130,21 @@ def test_a_step_of_a_stage_is_replayed_in_its_film(spoilt_experiment, capsys):
     assert f"path {offender['where']['path']} of 64" in text
 
 
-def test_a_light_that_overflows(spoilt_experiment, capsys):
+def test_an_overflowing_light(spoilt_experiment, capsys):
     _, err = optimize(capsys, STOP, "scene.options={power: 3e38}")
     _, [offender], _ = inspect(capsys, err)
     assert offender["quantity"] == "emission E"
     assert (offender["value"], offender["where"]["vertex"]) == (["inf"] * 3, 0)
 
 
-def test_a_sum_that_overflows(spoilt_experiment, capsys):
+def test_an_overflowing_sum(spoilt_experiment, capsys):
     _, err = optimize(capsys, STOP, "scene.options={power: 2e36}")
     _, [offender], _ = inspect(capsys, err)
     assert "finite" in offender["quantity"]
     assert min(offender["value"]) > 1e30
 
 
-def test_a_derivative_that_is_not_finite(spoilt_experiment, capsys):
+def test_a_non_finite_derivative(spoilt_experiment, capsys):
     """A reflectance of 0.5 + sqrt(x) at x = 0."""
     _register_root()
     Path("scene.xml").write_text(SCENE.replace("REFLECTANCE", '<texture type="root" name="reflectance"/>'))
@@ -155,7 +155,7 @@ def test_a_derivative_that_is_not_finite(spoilt_experiment, capsys):
     assert offender["where"]["surface"] == "poster_shape"
 
 
-def test_the_replay_has_the_parameters_of_then(spoilt_experiment, capsys):
+def test_the_replay_uses_the_parameters_of_that_iteration(spoilt_experiment, capsys):
     """A reflectance that is not a number once x has moved by more than 0.015, in iteration 2."""
     import drjit as dr
 
@@ -203,7 +203,7 @@ def root_of_pixel(image, target, weights=None):
 
 
 @pytest.mark.parametrize("kind", ["stop", "skip", "zero"])
-def test_a_loss_whose_derivative_is_not_finite(spoilt_experiment, capsys, monkeypatch, kind):
+def test_a_loss_with_a_non_finite_derivative(spoilt_experiment, capsys, monkeypatch, kind):
     monkeypatch.setitem(losses.LOSSES, "l2", root_of_pixel)
     _, err = optimize(capsys, f"run.on_nonfinite={kind}", code=5 if kind == "stop" else 0)
     assert "dL/dI in 1 entry, the first at pixel (5, 3), channel 1, of sensor 0" in err
@@ -216,7 +216,7 @@ def test_a_loss_whose_derivative_is_not_finite(spoilt_experiment, capsys, monkey
     assert moved.all() if kind == "zero" else not moved.any()
 
 
-def test_what_was_done_is_kept(spoilt_experiment, capsys, monkeypatch):
+def test_finished_work_is_kept(spoilt_experiment, capsys, monkeypatch):
     """A fault in the second iteration: the run folder is whole, and the parameters are those of then."""
     calls = []
 
@@ -253,7 +253,7 @@ def test_the_last_line_counts(spoilt_experiment, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("adjoint", a_few(["independent", "batched"], ["batched"]))
-def test_each_set_of_samples_is_looked_at(spoilt_experiment, capsys, adjoint):
+def test_each_set_of_samples_is_checked(spoilt_experiment, capsys, adjoint):
     _, err = optimize(
         capsys, STOP, "scene.options={wall: spoilt.exr}", f"run.adjoint={adjoint}", "run.memory_budget=64"
     )
@@ -262,14 +262,14 @@ def test_each_set_of_samples_is_looked_at(spoilt_experiment, capsys, adjoint):
     assert f"the first at pixel ({', '.join(map(str, offender['pixel']))})" in err
 
 
-def test_each_shard_is_looked_at(spoilt_experiment, capsys):
+def test_each_shard_is_checked(spoilt_experiment, capsys):
     _, err = optimize(capsys, STOP, "scene.options={wall: spoilt.exr}", "run.adjoint=others", "run.shards=2")
     _, [offender], _ = inspect(capsys, err)
     assert offender["where"]["samples"] in ("shard 1, image and gradient", "shard 2, image and gradient")
     assert f"the first at pixel ({', '.join(map(str, offender['pixel']))})" in err
 
 
-def test_there_must_be_something_to_show(spoilt_experiment, capsys):
+def test_without_a_fault_there_is_nothing_to_show(spoilt_experiment, capsys):
     code, _, err = reslrb_nonfinite(capsys, "inspect", "config.yaml", "--nonfinite")
     assert (code, len(err.splitlines())) == (2, 1)
     assert "is not in a run folder" in err
@@ -279,7 +279,7 @@ def test_there_must_be_something_to_show(spoilt_experiment, capsys):
     assert "all values of this run were finite" in err
 
 
-def test_the_run_s_own_step_is_traced_again(spoilt_experiment, capsys):
+def test_the_step_of_the_run_is_traced_again(spoilt_experiment, capsys):
     """Its files have to be those of the run, its state whole, and its settings are its own."""
     optimize(capsys, STOP, "scene.options={wall: spoilt.exr}")
     command = ("inspect", "runs/config/config.yaml", "--nonfinite")
@@ -300,7 +300,7 @@ def test_the_run_s_own_step_is_traced_again(spoilt_experiment, capsys):
 
 
 @pytest.mark.parametrize("sequence", ["independent", "low_discrepancy", "auto"])
-def test_paths_are_of_the_run_s_sequence(spoilt_experiment, capsys, sequence):
+def test_paths_use_the_sequence_of_the_run(spoilt_experiment, capsys, sequence):
     """Where it was measured, of the sequence that was measured to pay."""
     sets = ("scene.options={wall: spoilt.exr}", f"integrator.sequence={sequence}", "run.measuring=1000")
     optimize(capsys, STOP, *sets)
@@ -327,7 +327,7 @@ def test_a_clamp_reports_its_bias(spoilt_experiment, capsys):
 
 
 @pytest.mark.parametrize("paths", a_few(["camera", "both, light_share: 0.02", "auto"], ["camera", "auto"]))
-def test_camera_paths_are_looked_at(spoilt_experiment, capsys, paths):
+def test_camera_paths_are_checked(spoilt_experiment, capsys, paths):
     ours = f"integrator={{type: reslrb, max_depth: 4, estimator: stack, paths: {paths}}}"
     _, err = optimize(capsys, STOP, "scene.options={wall: spoilt.exr}", ours)
     _, [offender], _ = inspect(capsys, err)
@@ -341,7 +341,7 @@ def test_camera_paths_are_looked_at(spoilt_experiment, capsys, paths):
         assert f"the first at pixel ({', '.join(map(str, offender['pixel']))})" in err
 
 
-def test_lamps_that_camera_paths_find_are_looked_at(spoilt_experiment, capsys):
+def test_lamps_hit_by_camera_paths_are_checked(spoilt_experiment, capsys):
     ours = "integrator={type: reslrb, max_depth: 4, estimator: stack, paths: camera}"
     _, err = optimize(capsys, STOP, "scene.options={power: 3.4028236e38}", ours)
     _, [offender], _ = inspect(capsys, err)
@@ -349,7 +349,7 @@ def test_lamps_that_camera_paths_find_are_looked_at(spoilt_experiment, capsys):
     assert offender["where"]["samples"].endswith(", camera paths")
 
 
-def test_paths_from_the_sensor_are_not_looked_at(spoilt_experiment, capsys):
+def test_other_paths_from_the_sensor_are_not_checked(spoilt_experiment, capsys):
     prb = "integrator={type: prb, max_depth: 4}"
     _, err = optimize(capsys, STOP, "scene.options={wall: spoilt.exr}", prb)
     _, [offender], _ = inspect(capsys, err)
@@ -358,7 +358,7 @@ def test_paths_from_the_sensor_are_not_looked_at(spoilt_experiment, capsys):
     assert offender["where"] is None
 
 
-def test_emitters_that_are_seen_are_looked_at(spoilt_experiment, capsys):
+def test_visible_emitters_are_checked(spoilt_experiment, capsys):
     """The lamp, turned towards the camera beside the poster, at a depth of 1: there are no light paths at all."""
     at_camera = SCENE.replace('<rotate x="1" angle="180"/><translate z="5"/>', '<scale value="0.1"/>')
     Path("scene.xml").write_text(
@@ -384,7 +384,7 @@ def test_other_integrators_have_the_same_paths(spoilt_experiment, capsys, integr
     assert found[0] == found[1]
 
 
-def test_passes_that_a_budget_made_are_replayed(spoilt_experiment, capsys):
+def test_passes_of_a_memory_budget_are_replayed(spoilt_experiment, capsys):
     sets = (STOP, "scene.options={wall: spoilt.exr}", "run.spp=1024", "integrator.estimator=reservoir")
     _, err = optimize(capsys, *sets, "run.memory_budget=1e-3", code=2)
     least = int(re.search(r"allow at least (\d+) MiB", err)[1])
@@ -465,7 +465,7 @@ def test_it_is_the_step_of_the_run(spoilt_experiment, capsys, monkeypatch, way):
 
 
 @pytest.mark.parametrize("fault", ["untaught", "not learned on", "out of order"])
-def test_other_tables_are_seen(spoilt_experiment, capsys, fault, monkeypatch):
+def test_differing_tables_are_detected(spoilt_experiment, capsys, fault, monkeypatch):
     """Tables that know nothing, that do not learn between the batches of a step, or that are those of another batch."""
     if fault == "untaught":
         monkeypatch.setattr(state, "restore_tables", lambda problem, calls, learned: None)

@@ -107,7 +107,7 @@ def test_a_texture_is_recovered(experiment, capsys, type):
 
 
 @pytest.mark.parametrize("transform", a_few(["sigmoid", "log", "softplus"], ["sigmoid", "softplus"]))
-def test_a_texture_is_recovered_by_way_of_a_transform(experiment, capsys, transform):
+def test_a_texture_is_recovered_with_a_transform(experiment, capsys, transform):
     sets = ["run.iterations=40", "run.adjoint=independent", "optimizer={scale: auto, learning_rate: 0.1}"]
     sets += [f"parameters[0].transform={transform}", "integrator={type: reslrb, max_depth: 3, estimator: stack}"]
     code, _, err = reslrb(capsys, "optimize", "box.yaml", *(word for each in sets for word in ("--set", each)))
@@ -128,7 +128,7 @@ def test_a_texture_is_recovered_by_way_of_a_transform(experiment, capsys, transf
         assert f"optimizer/{KEY}/variable" in state
 
 
-def test_what_a_run_saves_agrees_with_itself(experiment, capsys):
+def test_saved_files_of_a_run_agree(experiment, capsys):
     assert reslrb(capsys, "optimize", "box.yaml", "--set", "run.iterations=3", "--set", "run.images_every=2")[0] == 0
     assert "iteration-000002.exr" in names("runs/box/images")
     with np.load("runs/box/checkpoint/state.npz") as state, np.load("runs/box/parameters/parameters.npz") as values:
@@ -268,7 +268,7 @@ def test_scenes_that_cannot_work_are_refused_before_rendering(experiment, capsys
 
 
 @pytest.mark.parametrize("name", ["orthographic", "glass alone"])
-def test_what_light_paths_cannot_render_camera_paths_do(experiment, capsys, name):
+def test_camera_paths_render_scenes_that_light_paths_cannot(experiment, capsys, name):
     """By default; `paths: auto` then is `camera`, or `both`."""
     part, other, *_ = BAD_SCENES[name]
     Path("scene.xml").write_text(SCENE.replace(part, other))
@@ -293,7 +293,7 @@ def test_a_render_is_written_and_bad_outputs_are_refused(experiment, capsys):
     assert not Path("x.exr").exists()
 
 
-def test_inspect_tells_what_can_be_recovered(experiment, capsys):
+def test_inspect_lists_recoverable_parameters(experiment, capsys):
     code, out, _ = reslrb(capsys, "inspect", "box.yaml")
     assert code == 0
     assert any(line.split()[:4] == ["*", KEY, "4x4", "texels"] for line in out.splitlines())
@@ -323,7 +323,7 @@ def optimize(config: str, *settings: str) -> dict:
 
 
 @pytest.mark.long
-def test_eight_cameras_two_held_out(llvm, tmp_path, monkeypatch):
+def test_eight_cameras_with_two_held_out(llvm, tmp_path, monkeypatch):
     """The walls from six of eight cameras, three of them an iteration: what the other two see comes closer as well."""
     (tmp_path / "scene.xml").write_text(cornell_box(24, eyes=EYES))
     true = ", ".join(f"{key}: {value}" for key, value in WALLS.items())
@@ -349,7 +349,7 @@ run: {{iterations: 120, spp: 16, views_per_iteration: 3, held_out: [2, 5]}}
     assert results["rmse"]["final"] < 0.05 < results["rmse"]["initial"]
 
 
-def test_a_run_tells_of_its_views(llvm, tmp_path, monkeypatch, capsys):
+def test_a_run_reports_its_views(llvm, tmp_path, monkeypatch, capsys):
     """Mask, exposure and shares are in the manifest, in `images/` and on the page."""
     import mitsuba as mi
 
@@ -384,7 +384,7 @@ def optimize_motion(tmp_path, *sets):
     return main.main(["optimize", str(path), "--quiet", *sets], standalone_mode=False)
 
 
-def test_what_moves_is_recorded_by_its_names(tmp_path, llvm, capsys):
+def test_moving_parameters_are_recorded_by_name(tmp_path, llvm, capsys):
     motion = "{motion: {of: lamp, free: [translation]}, learning_rate: 0.02, bounds: [-0.01, 0.01]}"
     heightmap = "{heightmap: {mesh: slab, resolution: [3, 2]}, learning_rate: 1e-3}"
     assert optimize_motion(tmp_path, f"parameters=[{motion}, {heightmap}]") == 0
@@ -404,7 +404,7 @@ def test_what_moves_is_recorded_by_its_names(tmp_path, llvm, capsys):
 
 
 @pytest.mark.long
-def test_vertices_are_a_parameter_like_others(tmp_path, llvm):
+def test_vertices_are_ordinary_parameters(tmp_path, llvm):
     key = "slab.vertex_positions"
     sets = (f"parameters=[{{key: {key}}}]", "target.render.parameters={}", "optimizer.learning_rate=1e-3")
     assert optimize_motion(tmp_path, *sets) == 0
@@ -435,7 +435,7 @@ def test_errors_are_one_located_line(tmp_path, llvm, override, line):
     assert "Traceback" not in result.output
 
 
-def test_inspect_says_whose_edges_move(tmp_path, llvm):
+def test_inspect_marks_moving_edges(tmp_path, llvm):
     path = glass.write_experiment(tmp_path)
     parameters = "parameters=[{motion: {of: [slab, lamp]}}]"
     output = CliRunner().invoke(main, ["inspect", str(path), "--set", parameters]).output

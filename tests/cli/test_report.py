@@ -37,7 +37,7 @@ def report(capsys, tmp_path, monkeypatch):
     return call
 
 
-def test_one_page_of_everything(report, tmp_path):
+def test_one_page_for_everything(report, tmp_path):
     make_run(tmp_path / "a")
     make_run(tmp_path / "b")
     write_bench(tmp_path / "bench.jsonl")
@@ -55,7 +55,7 @@ def test_one_page_of_everything(report, tmp_path):
     assert "CIEDE2000" in page
 
 
-def test_of_one_run_its_own_page_is_written_anew(report, tmp_path):
+def test_the_page_of_one_run_is_rewritten(report, tmp_path):
     folder = make_run(tmp_path / "a")
     (folder / "report.html").write_text('<meta http-equiv="refresh" content="5">')
     assert report("a") == (0, f"look at {os.path.join('a', 'report.html')}\n", "")
@@ -78,7 +78,7 @@ def test_of_one_run_its_own_page_is_written_anew(report, tmp_path):
         (["\x1b[31m"], "\\x1b[31m: no such file"),
     ],
 )
-def test_what_cannot_be_done_is_one_line(report, tmp_path, args, line):
+def test_errors_are_one_line(report, tmp_path, args, line):
     make_run(tmp_path / "a", iterations=0)
     (tmp_path / "empty").mkdir()
     (tmp_path / "note.txt").write_text("hello\n")
@@ -115,7 +115,7 @@ def optimize(llvm, tmp_path, monkeypatch, capsys):
     return call
 
 
-def test_writing_the_page_is_in_no_time_that_is_counted(optimize, monkeypatch):
+def test_writing_the_page_is_not_timed(optimize, monkeypatch):
     """A page that takes 0.2 s, before and after each iteration."""
     written = []
 
@@ -132,7 +132,7 @@ def test_writing_the_page_is_in_no_time_that_is_counted(optimize, monkeypatch):
     assert read_content(RUN)["results"]["elapsed_s"] == times[-1]
 
 
-def test_the_page_says_how_the_run_goes_and_is_whole_at_every_moment(optimize, monkeypatch):
+def test_the_page_shows_progress_and_is_always_complete(optimize, monkeypatch):
     seen, torn, over = [], [], threading.Event()
 
     def look():
@@ -173,7 +173,7 @@ def test_the_page_says_how_the_run_goes_and_is_whole_at_every_moment(optimize, m
     assert f'alt="end: {KEY}"' in last
 
 
-def test_where_the_last_page_cannot_be_written_none_says_that_the_run_is_at_work(optimize, monkeypatch):
+def test_no_page_claims_that_an_ended_run_is_running(optimize, monkeypatch):
     shown = recording.write_report
 
     def only_live(folder, *now):
@@ -188,7 +188,7 @@ def test_where_the_last_page_cannot_be_written_none_says_that_the_run_is_at_work
     assert read_content(RUN)["status"] == "finished"
 
 
-def test_pages_take_no_more_than_their_share(monkeypatch):
+def test_pages_keep_to_their_share_of_the_time(monkeypatch):
     """One that takes 1 s is written every 20 s, a quick one every 5 s; one that fails is not tried again."""
     now, cost, written = [100.0], [1.0], []
     monkeypatch.setattr(recorder.time, "monotonic", lambda: now[0])
@@ -220,7 +220,7 @@ def test_pages_take_no_more_than_their_share(monkeypatch):
     assert len(written) == before
 
 
-def test_the_manifest_has_the_plan_and_errors_as_people_see_them(optimize):
+def test_the_manifest_has_the_plan_and_perceptual_errors(optimize):
     optimize("--set", "run.iterations=1")
     manifest = read_content(RUN)
     plan = manifest["plan"]
@@ -236,7 +236,7 @@ def test_the_manifest_has_the_plan_and_errors_as_people_see_them(optimize):
         assert f"<h2>{title}</h2>" in page
 
 
-def test_errors_that_cannot_be_measured_end_no_run(optimize, monkeypatch):
+def test_unmeasurable_errors_do_not_end_a_run(optimize, monkeypatch):
     def fail(folder, results):
         raise ImportError("no colours here")
 

@@ -43,7 +43,7 @@ def read(path):
     return np.array(mi.Bitmap(str(path)), dtype=np.float64)
 
 
-def test_values_and_errors_stand_above_the_last_line(capsys):
+def test_values_and_errors_precede_the_last_line(capsys):
     both = f"parameters=[{{key: {KEY}, initial: 0.5, bounds: [0, 1]}}, {{key: {WALL}, initial: [0.2, 0.3, 0.4]}}]"
     last, out, results = optimize(capsys, both, "run.iterations=3", "run.adjoint=independent")
     head, poster, wall, *rest = out.splitlines()
@@ -67,7 +67,7 @@ def test_values_and_errors_stand_above_the_last_line(capsys):
     assert optimize(capsys, "run.iterations=1", options=["--quiet"])[1].count("\n") == 1
 
 
-def test_units_that_differ_are_told_as_relative_errors(capsys):
+def test_different_units_give_relative_errors(capsys):
     both = f"parameters=[{{key: {WALL}, initial: 0.2}}, {{key: {LAMP}, initial: 2.0, learning_rate: 0.5}}]"
     last, out, results = optimize(capsys, both, "run.iterations=3")
     for record in read_metrics("runs/box"):
@@ -84,7 +84,7 @@ def test_units_that_differ_are_told_as_relative_errors(capsys):
     assert "relative error" in out.splitlines()[0]
 
 
-def test_another_resolution_than_the_truths_has_an_error(capsys):
+def test_a_truth_of_another_resolution_has_an_error(capsys):
     last, _, results = optimize(capsys, "parameters[0].resolution=[8, 8]", "run.iterations=2")
     records = read_metrics("runs/box")
     assert all(record["parameter_rmse"] > 0 for record in records)
@@ -94,7 +94,7 @@ def test_another_resolution_than_the_truths_has_an_error(capsys):
     assert read("runs/box/parameters/true/" + KEY + ".exr").shape == (4, 4, 3)
 
 
-def test_a_loss_that_does_not_fall_is_said_plainly(capsys):
+def test_a_loss_that_does_not_fall_is_reported(capsys):
     """A learning rate of nothing: the parameters stay where they are."""
     sets = ["optimizer.learning_rate=1e-12", "run.iterations=40", "run.spp=512"]
     last, _, results = optimize(capsys, *sets)
@@ -107,7 +107,7 @@ def test_a_loss_that_does_not_fall_is_said_plainly(capsys):
     assert "the loss" in Path("runs/box/report.html").read_text().partition("<section>")[0]
 
 
-def test_a_parameter_that_got_worse_is_said_plainly(capsys):
+def test_a_worse_parameter_is_reported(capsys):
     """Far too large a learning rate, from close to the truth."""
     wall = f"parameters=[{{key: {WALL}, initial: 0.42, bounds: [0, 1]}}]"
     last, out, results = optimize(
@@ -121,7 +121,7 @@ def test_a_parameter_that_got_worse_is_said_plainly(capsys):
     assert "  at its bound" in out.splitlines()[1]
 
 
-def test_a_run_that_works_has_nothing_to_complain_of(capsys):
+def test_a_good_run_has_no_complaints(capsys):
     last, _, results = optimize(capsys, "run.adjoint=independent", "run.spp=128", "run.certainty=false")
     assert results["loss_trend"]["change"] == "fell"
     assert results["warnings"] == []
@@ -131,7 +131,7 @@ def test_a_run_that_works_has_nothing_to_complain_of(capsys):
     assert (results["loss_trend"], results["warnings"]) == (None, [])
 
 
-def test_a_short_run_that_got_worse_says_so_and_what_it_lacked(capsys):
+def test_a_short_worse_run_is_reported_with_the_reason(capsys):
     """Images of many samples, and known errors, tell it where the losses of a few iterations do not."""
     wall = f"parameters=[{{key: {WALL}, initial: 0.42, bounds: [0, 1]}}]"
     last, out, results = optimize(capsys, wall, "optimizer.learning_rate=30", "run.iterations=5")
@@ -148,7 +148,7 @@ def test_a_short_run_that_got_worse_says_so_and_what_it_lacked(capsys):
     assert "the target itself has 2 samples per pixel only: --set target.render.spp=" in few[0]
 
 
-def test_a_loss_that_is_nothing_but_noise_is_no_failure(capsys):
+def test_a_noisy_loss_is_not_a_failure(capsys):
     """The images of the iterations are too noisy to tell, those of more samples are not."""
     _, _, results = optimize(capsys, "run.adjoint=independent", "run.certainty=false")
     assert results["loss_trend"]["change"] == "flat"
@@ -156,7 +156,7 @@ def test_a_loss_that_is_nothing_but_noise_is_no_failure(capsys):
     assert results["warnings"] == []
 
 
-def test_a_run_that_is_not_done_says_so_everywhere(capsys):
+def test_an_unfinished_run_is_marked_everywhere(capsys):
     sets = ["run.adjoint=independent", "run.spp=128", "optimizer.learning_rate=0.002"]
     last, out, results = optimize(capsys, *sets)
     about = results["certainty"]["parameters"][KEY]
@@ -180,7 +180,7 @@ def test_a_run_that_is_not_done_says_so_everywhere(capsys):
 
 
 @pytest.mark.parametrize("integrator", ["ptracer", "reslrb, estimator: event, samples_per_pass: 24"])
-def test_initial_and_final_images_have_samples_of_their_own(capsys, integrator, monkeypatch):
+def test_initial_and_final_images_have_their_own_samples(capsys, integrator, monkeypatch):
     from reslrb_cli.optimization.problem import Problem
 
     samples, render = [], Problem.render
@@ -197,7 +197,7 @@ def test_initial_and_final_images_have_samples_of_their_own(capsys, integrator, 
 
 
 @pytest.mark.parametrize("views", ["[{sensor: 0}]", "[{sensor: 0}, {sensor: 1}]"])
-def test_the_error_map_is_that_of_the_final_image(capsys, views):
+def test_the_error_map_belongs_to_the_final_image(capsys, views):
     _, _, results = optimize(capsys, f"views={views}", "run.iterations=1", "run.final_spp=16")
     images = Path("runs/box/images")
     for suffix in ("",) if views == "[{sensor: 0}]" else ("-0", "-1"):
@@ -239,7 +239,7 @@ def test_an_environment_map_has_an_error_and_a_picture(capsys):
     assert 'alt="true: sky.data"' in Path("runs/box/report.html").read_text()
 
 
-def test_images_are_toned_by_what_is_in_view_but_lamps(capsys):
+def test_images_are_tone_mapped_without_lamps(capsys):
     bulb = '<shape type="sphere" id="bulb"><float name="radius" value="0.3"/><point name="center" value="0, 0, 1"/>' \
         '<emitter type="area"><rgb name="radiance" value="9000, 9000, 9000"/></emitter></shape>'  # fmt: skip
     Path("scene.xml").write_text(SCENE.replace("</scene>", f"{bulb}</scene>"))
@@ -260,7 +260,7 @@ def test_images_are_toned_by_what_is_in_view_but_lamps(capsys):
     assert re.search(r"shown \d\S* times darker; \d\S* % of the target is brighter than white, and clipped", page)
 
 
-def test_a_png_is_toned_where_that_is_asked_for(capsys):
+def test_a_png_is_tone_mapped_on_request(capsys):
     dim = re.sub(r'(name="radiance" value=")[^"]*', r"\g<1>0.01, 0.01, 0.01", SCENE)
     assert dim != SCENE
     Path("scene.xml").write_text(dim)

@@ -32,13 +32,13 @@ def name_of(path: Path) -> str:
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=name_of)
-def test_the_readme_states_its_time(config: Path) -> None:
+def test_the_readme_states_the_time(config: Path) -> None:
     assert stated_seconds(name_of(config)) > 0
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("config", CONFIGS, ids=name_of)
-def test_it_recovers_what_it_promises(config: Path, tmp_path: Path) -> None:
+def test_it_recovers_the_stated_parameters(config: Path, tmp_path: Path) -> None:
     """The time is that of the iterations, four times what is stated at most: the README's machine is not this one."""
     main.main(
         ["optimize", str(config), "--set", f"run.output={tmp_path}", "--set", "run.name=it"], standalone_mode=False

@@ -136,14 +136,14 @@ def storm(experiment: Path, number: int, count: int, times: int = 1) -> Counter[
         *(pytest.param(number, 10, marks=pytest.mark.long) for number in SIGNALS),
     ],
 )
-def test_a_storm(experiment: Path, number: int, count: int) -> None:
+def test_many_signals(experiment: Path, number: int, count: int) -> None:
     assert sum(storm(experiment, number, count).values()) == count
 
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_storm_of_two(experiment: Path, number: int) -> None:
+def test_many_pairs_of_signals(experiment: Path, number: int) -> None:
     assert {code for code, _ in storm(experiment, number, 10, times=2)} <= {0, 130, -number}
 
 
@@ -188,7 +188,7 @@ def test_a_small_disk(experiment: Path, disk: Path, kib: int) -> None:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_disk_that_is_full_before_the_run(experiment: Path, disk: Path) -> None:
+def test_a_full_disk_before_the_run(experiment: Path, disk: Path) -> None:
     mount(disk, 64)
     (disk / "other").write_bytes(bytes(64 << 10))
     process = start(experiment, "--set", f"run.output={disk}/runs", "--quiet")
@@ -210,7 +210,7 @@ def test_a_run_without_a_terminal(experiment: Path, streams: str) -> None:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_terminal_that_is_closed(experiment: Path) -> None:
+def test_a_closed_terminal(experiment: Path) -> None:
     """Its progress bar goes nowhere, and the hang-up ends the run in order."""
     fcntl, pty, termios = (pytest.importorskip(name) for name in ("fcntl", "pty", "termios"))
     ours, theirs = pty.openpty()
@@ -255,9 +255,7 @@ class Measurement:
         return ({"rows": len(self.rows)}, {"rows": self.rows}) if len(self.rows) else None
 
 
-def test_both_files_are_current_and_those_of_another_measurement_go(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_both_files_are_current_and_old_ones_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measurement_files, "PAGE_SECONDS", 0.0)
     monkeypatch.setattr(measurement_files, "PAGE_SHARE", 0.0)
     file = tmp_path / "c.jsonl"
@@ -283,7 +281,7 @@ def test_both_files_are_current_and_those_of_another_measurement_go(
     assert {path.name for path in tmp_path.iterdir()} == {"c.jsonl", "c.samples.npz"}
 
 
-def test_it_is_written_every_few_seconds_and_costs_a_twentieth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_are_written_every_few_seconds_at_low_cost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now, written = [100.0], []
     monkeypatch.setattr(recorder.time, "monotonic", lambda: now[0])
     measured = Measurement(tmp_path / "c.jsonl")
@@ -301,9 +299,7 @@ def test_it_is_written_every_few_seconds_and_costs_a_twentieth(tmp_path: Path, m
     assert np.diff(written).min() >= 20
 
 
-def test_what_cannot_be_written_on_the_way_ends_nothing_and_is_told_in_the_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_intermediate_write_is_reported_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "c.jsonl"
     measured = Measurement(file)
     measured.keeper.refresh()
@@ -317,7 +313,7 @@ def test_what_cannot_be_written_on_the_way_ends_nothing_and_is_told_in_the_end(
         measured.keeper.finish(lines("a"))
 
 
-def test_samples_that_are_too_large_are_not_kept_and_that_is_said(
+def test_too_large_samples_are_not_saved_and_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(measurement_files, "MOST_SAMPLES_BYTES", 100)
@@ -328,7 +324,7 @@ def test_samples_that_are_too_large_are_not_kept_and_that_is_said(
     assert not measurement_files.samples_file(tmp_path / "c.jsonl").exists()
 
 
-def test_a_pipe_has_each_line_once_as_it_comes(tmp_path: Path) -> None:
+def test_a_pipe_gets_each_line_once_at_once(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
     file = LineFile(tmp_path / "pipe")
@@ -341,7 +337,7 @@ def test_a_pipe_has_each_line_once_as_it_comes(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["pipe"]
 
 
-def test_what_a_link_points_to_is_written(tmp_path: Path) -> None:
+def test_the_target_of_a_link_is_written(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "c.jsonl")
     LineFile(tmp_path / "link").write(lines("here", "a"))
     assert (tmp_path / "link").is_symlink()
@@ -376,7 +372,7 @@ def repeats(file: Path) -> set[int]:
     [(BENCH, 1), pytest.param(CONVERGENCE, 2, marks=pytest.mark.long)],
     ids=["bench", "convergence"],
 )
-def test_a_killed_measurement_is_gone_on_from(
+def test_a_killed_measurement_continues(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str], steps: int
 ) -> None:
     """It is killed as soon as its first rounds are on the disk; of some thousands only a few are taken then."""

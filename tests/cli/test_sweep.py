@@ -83,7 +83,7 @@ def test_all_combinations_with_all_seeds(folder):
     assert found == {(kind, spp) for kind in ("Adam", "SGD") for spp in (4, 8, 12)}
 
 
-def test_integrators_are_varied_as_methods_that_keep_the_experiments_depth(folder):
+def test_integrators_are_varied_as_methods_with_the_depth_of_the_experiment(folder):
     values = "integrator=[prb, 'reslrb:stack(guiding=on,adjoint=independent)', {type: ptracer}]"
     plan = make_plan(Path("tiny.yaml"), [values], 1, ["integrator.max_depth=3", "integrator.rr_depth=2"])
     prb, stack, plain = plan.configs.values()
@@ -149,7 +149,7 @@ def test_names_are_short_safe_and_different(folder):
         (["-o", "."], ", but no sweep; give a new or empty folder"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_said_before_anything_runs(folder, arguments, line):
+def test_errors_are_reported_before_any_run(folder, arguments, line):
     before = tiny.files(folder)
     config = [] if "--resume" in arguments else ["tiny.yaml"]
     result = reslrb("sweep", *config, *arguments)
@@ -175,7 +175,7 @@ def test_a_folder_has_one_sweep(folder):
     assert "add only --seeds, --retry" in reslrb("sweep", "--resume", "s", "--vary", "run.spp=[4]").output
 
 
-def test_what_is_damaged_is_located(folder):
+def test_damage_is_located(folder):
     Path("s").mkdir()
     for text in ("{", "[]", '{"seeds": [0]}', "\0"):
         Path("s/sweep.json").write_text(text)
@@ -195,7 +195,7 @@ def test_what_is_damaged_is_located(folder):
 # --- runs, kills and what is left -------------------------------------------------------------------------------------
 
 
-def test_a_sweep_that_was_killed_ends_with_the_table_of_one_that_was_not(folder, monkeypatch):
+def test_a_killed_sweep_ends_with_the_same_table(folder, monkeypatch):
     """At four moments what a kill would have left is copied: in the midst of a run, before one has kept anything, over
     its final images, and between two runs."""
     show, begin, calls, moments = progress.Progress.show, recording.Recording._begin, [], []
@@ -259,7 +259,7 @@ def test_a_sweep_that_was_killed_ends_with_the_table_of_one_that_was_not(folder,
     assert len(calls) == 10  # nothing is done twice
 
 
-def test_a_run_that_fails_is_told_in_its_row(folder, monkeypatch):
+def test_a_failed_run_is_shown_in_its_row(folder, monkeypatch):
     ends = {"learning_rate=0.02-seed=1": (5, "the loss is not finite"), "learning_rate=0.2-seed=0": (-9, "killed")}
     called = []
 
@@ -289,7 +289,7 @@ def test_a_run_that_fails_is_told_in_its_row(folder, monkeypatch):
 
 
 @pytest.mark.parametrize(("code", "end"), [(6, 6), (3, 3), (130, 130)])
-def test_what_is_no_fault_of_a_run_ends_the_sweep(folder, monkeypatch, code, end):
+def test_a_fault_outside_the_run_ends_the_sweep(folder, monkeypatch, code, end):
     monkeypatch.setattr(sweep, "call", lambda *given, **options: (code, "the disk is full"))
     result = reslrb("sweep", "tiny.yaml", "--vary", RATES, "-o", "s")
     assert result.exit_code == end
@@ -297,7 +297,7 @@ def test_what_is_no_fault_of_a_run_ends_the_sweep(folder, monkeypatch, code, end
     assert read_sweep(Path("s")).failures == {}
 
 
-def test_ctrl_c_ends_it_after_the_iteration_with_folders_complete(folder, monkeypatch):
+def test_ctrl_c_ends_it_after_the_iteration_with_complete_folders(folder, monkeypatch):
     show = progress.Progress.show
 
     def interrupting(self, record):
@@ -316,7 +316,7 @@ def test_ctrl_c_ends_it_after_the_iteration_with_folders_complete(folder, monkey
     assert "finished, 2 of 2 runs done" in tiny.done(*words).output
 
 
-def test_a_sweep_has_its_folder_to_itself(folder, monkeypatch):
+def test_a_sweep_locks_its_folder(folder, monkeypatch):
     said = []
 
     def another(arguments, interrupts, verbose=False, fresh=False):
@@ -353,7 +353,7 @@ def wait_for(happened, seconds=60.0):
         time.sleep(0.02)
 
 
-def test_a_process_that_crashes_is_told_by_its_last_words(monkeypatch):
+def test_a_crashed_process_is_reported_by_its_last_message(monkeypatch):
     for end, code, said in (
         ("print('>>> no room'); print('x'); sys.stdout.flush(); os.kill(os.getpid(), 9)", -9,
          "ended by SIGKILL (often sent when memory runs out): no room"),
@@ -367,7 +367,7 @@ def test_a_process_that_crashes_is_told_by_its_last_words(monkeypatch):
         assert sweep.call(["optimize"], interrupts) == (code, said)
 
 
-def test_runs_of_equal_time_find_nothing_of_earlier_runs(folder, monkeypatch):
+def test_runs_of_equal_time_use_no_earlier_results(folder, monkeypatch):
     monkeypatch.undo()  # `call` itself
     monkeypatch.setattr(
         sweep, "_PROGRAM", "import os; print(*map(os.environ.get, ('DRJIT_CACHE_DIR', 'RESLRB_CACHE')))"
@@ -396,7 +396,7 @@ def test_only_runs_of_equal_time_are_fresh(folder, monkeypatch):
     assert "losses of different `integrator` have each one's own noise, and what its paths lack" in result.output
 
 
-def test_a_run_that_another_goes_on_with_is_waited_for(folder, monkeypatch):
+def test_a_run_in_use_is_waited_for(folder, monkeypatch):
     words = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "-o", "s"]
     tiny.done(*words)
     manifest = json.loads(Path("s/seed=0/manifest.json").read_text())
@@ -409,7 +409,7 @@ def test_a_run_that_another_goes_on_with_is_waited_for(folder, monkeypatch):
     assert "finished, 1 of 1 runs done" in tiny.done(*words).output
 
 
-def test_a_run_does_not_outlive_a_sweep_that_is_killed(llvm, tmp_path):
+def test_a_run_ends_with_its_killed_sweep(llvm, tmp_path):
     tiny.write_experiment(tmp_path)
     settings = tiny.settings(*QUICK, "run.iterations=100000")
     process = start(tmp_path, "tiny.yaml", *settings, "-o", "s")
@@ -476,7 +476,7 @@ def test_killed_five_times(llvm, tmp_path):
 OWN = "import drjit as dr\n\n\ndef own(image, target):\n    return dr.mean(dr.square(image - target), axis=None)\n"
 
 
-def test_code_of_the_users_own_is_asked_for_and_stays_the_same(folder):
+def test_users_code_needs_permission_and_stays_the_same(folder):
     Path("own.py").write_text(OWN)
     loss = "loss={type: custom, file: own.py:own}"
     words = (
@@ -513,7 +513,7 @@ def test_code_of_the_users_own_is_asked_for_and_stays_the_same(folder):
 # --- what it comes to -------------------------------------------------------------------------------------------------
 
 
-def test_pairs_tell_what_the_spread_over_seeds_hides():
+def test_pairs_reveal_differences_that_the_spread_over_seeds_hides():
     rng = np.random.default_rng(4)
     noise = np.exp(rng.normal(0, 1, 10))
     values = {"a": 1.0 * noise, "b": 1.1 * noise * np.exp(rng.normal(0, 0.01, 10)), "c": 3.0 * noise}
@@ -536,7 +536,7 @@ def pretended(losses, key="run.spp", **about):
     return sweep, runs
 
 
-def test_the_best_is_told_in_pairs_of_seeds_that_all_have():
+def test_the_best_is_judged_by_seeds_that_all_share():
     noise = np.exp(np.random.default_rng(4).normal(0, 1, 10))
     sweep, runs = pretended([1.1 * noise, noise])
     (best, equal) = best_records(sweep, runs)
@@ -625,18 +625,18 @@ def coverage(count, seeds, spread, true, levels):
 
 
 @pytest.mark.parametrize("levels", [(1.0,), (1.6, 1.0, 1.9)])
-def test_intervals_hold_the_truth_as_often_as_they_say(levels, monkeypatch):
+def test_intervals_have_their_coverage(levels, monkeypatch):
     monkeypatch.setattr(judged, "RESAMPLES", 600)
     assert coverage(300, 8, 0.2, 0.6, levels) > 0.92
 
 
-def test_an_interval_of_half_the_width_is_seen(monkeypatch):
+def test_an_interval_of_half_the_width_fails(monkeypatch):
     monkeypatch.setattr(judged, "RESAMPLES", 600)
     monkeypatch.setattr(judged, "CONFIDENCE", 0.6)
     assert coverage(300, 8, 0.2, 0.6, (1.0,)) < 0.92
 
 
-def test_what_is_no_ratio():
+def test_invalid_ratios():
     for own, base in (([[1.0] * 4], [[1.0] * 4]), ([[1.0] * 5], [[0.0] * 5]), ([[float("inf")] * 5], [[1.0] * 5]),
                       ([], [[1.0] * 5])):  # fmt: skip
         assert ratio(own, base) is None
@@ -644,7 +644,7 @@ def test_what_is_no_ratio():
     assert (found.value, found.low, found.high) == (0.25, 0.25, 0.25)
 
 
-def test_equal_settings_are_rarely_told_apart():
+def test_equal_settings_are_rarely_distinguished():
     """Of four equal ones any is told from the best with a probability of at most 5 %."""
     rng = np.random.default_rng(9)
     wrong = 0
@@ -655,7 +655,7 @@ def test_equal_settings_are_rarely_told_apart():
     assert wrong <= 20 + 3 * 4.4
 
 
-def test_curves_are_medians_with_the_least_and_the_greatest():
+def test_curves_are_medians_with_minimum_and_maximum():
     """Of runs of 1, 2 and 4 iterations; by time from where all have one, and where each ended from then on."""
     runs = []
     for number, (times, losses) in enumerate(
@@ -671,7 +671,7 @@ def test_curves_are_medians_with_the_least_and_the_greatest():
     assert [end.tolist() for end in curve.band] == [[1.0, 1.0, 2.0, 3.0], [9.0] * 4]
 
 
-def test_the_page_has_table_curves_and_pictures(folder):
+def test_the_page_has_a_table_curves_and_pictures(folder):
     words = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", "target.render.spp=[8, 16]", "--seeds", "2"]
     tiny.done(*words, "-o", "s")
     tiny.done("report", "s")
@@ -697,7 +697,7 @@ def test_the_page_has_table_curves_and_pictures(folder):
     assert "<i>k" not in text
 
 
-def test_a_dry_run_says_how_many_runs_and_what_they_take(folder):
+def test_a_dry_run_reports_the_number_and_time_of_runs(folder):
     before = tiny.files(folder)
     result = tiny.done("sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", RATES, "--seeds", "3", "--dry-run")
     assert "2 combinations with 3 seeds: 6 runs, one after the other; nothing was written" in result.output

@@ -75,7 +75,7 @@ def test_a_run_and_its_errors(experiment, capsys):
         assert "\x1b" not in out + err
 
 
-def test_a_run_whose_configuration_is_called_by_bytes_that_are_not_utf8(experiment, capsys, monkeypatch):
+def test_a_configuration_name_with_invalid_utf8(experiment, capsys, monkeypatch):
     path = experiment.parent / "c\udcff.yaml"
     monkeypatch.setattr("sys.argv", ["reslrb", "optimize", str(path), ESC])
     path.write_text((experiment / "c.yaml").read_text().replace("file: ", f"file: {experiment}/".replace(ESC, "*")))
@@ -101,7 +101,7 @@ def test_the_log(capsys):
     assert capsys.readouterr().err == "a\\x1b[31m: b\\nc\n"
 
 
-def test_long_keys_make_files(experiment, capsys):
+def test_long_keys_become_file_names(experiment, capsys):
     long = "k" * 120  # longer ids are replaced
     scene = (experiment / "scene.xml").read_text()
     (experiment / "scene.xml").write_text(scene.replace('id="wall"', f'id="{long}"'))
@@ -112,7 +112,7 @@ def test_long_keys_make_files(experiment, capsys):
     assert (Path("runs/c/parameters") / entries[f"{long}.reflectance.data"]["file"]).exists()
 
 
-def test_an_image_whose_name_is_not_utf8(experiment, capsys, monkeypatch):
+def test_an_image_name_with_invalid_utf8(experiment, capsys, monkeypatch):
     monkeypatch.chdir(experiment)
     code, out, err = reslrb(capsys, "render", "c.yaml", "-o", "\udcff.png")
     assert code == 0, err
@@ -140,7 +140,7 @@ def test_outputs_and_counts(experiment, capsys, monkeypatch, arguments, what):
     assert not Path("x.png").exists()
 
 
-def test_a_working_directory_that_is_gone(experiment, capsys, monkeypatch):
+def test_a_removed_working_directory(experiment, capsys, monkeypatch):
     gone = experiment / "gone"
     gone.mkdir()
     monkeypatch.chdir(gone)
@@ -153,7 +153,7 @@ def test_a_working_directory_that_is_gone(experiment, capsys, monkeypatch):
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_a_terminal_that_has_gone_ends_no_run(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_losing_the_terminal_does_not_end_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
     class Terminal(io.StringIO):
         there = True
 
@@ -213,7 +213,7 @@ def shown(monkeypatch, width, units, iterations=30, resize=None):
 
 @pytest.mark.parametrize("units", [1, 2])
 @pytest.mark.parametrize("width", [40, 60, 80, 120, 200])
-def test_every_width_has_a_bar_the_percentage_and_the_loss(monkeypatch, width, units):
+def test_every_width_shows_a_bar_the_percentage_and_the_loss(monkeypatch, width, units):
     frames = shown(monkeypatch, width, units)
     assert len(frames) >= 30
     assert max(map(len, frames)) <= width
@@ -228,7 +228,7 @@ def test_every_width_has_a_bar_the_percentage_and_the_loss(monkeypatch, width, u
     assert (LAMP[-14:] in words) == (units == 2 and width >= 120)
 
 
-def test_what_is_logged_stands_above_the_bar_once(monkeypatch):
+def test_log_lines_appear_once_above_the_bar(monkeypatch):
     logger = logging.Logger("lines")
     logger.addHandler(LogLines())
     master, slave = os.openpty()
@@ -243,7 +243,7 @@ def test_what_is_logged_stands_above_the_bar_once(monkeypatch):
     assert "\x1b[31m" not in text
 
 
-def test_a_terminal_that_changes_its_width(monkeypatch):
+def test_a_terminal_that_changes_width(monkeypatch):
     frames = shown(monkeypatch, 120, 2, resize=40)
     assert len(frames[3]) > 110
     for frame in frames[-8:]:
@@ -254,13 +254,13 @@ def test_a_terminal_that_changes_its_width(monkeypatch):
     assert "at worst" in frames[-1]
 
 
-def test_hardly_any_room(monkeypatch):
+def test_a_very_narrow_terminal(monkeypatch):
     frames = shown(monkeypatch, 14, 1)
     assert max(map(len, frames)) <= 14
     assert all(re.fullmatch(r" *\d+%\|.*\|", frame) for frame in frames)
 
 
-def test_an_error_is_told_where_it_is_known():
+def test_an_error_is_shown_if_it_is_known():
     meter = make_meter(2)
     assert descriptions(make_record(), meter) == ["loss 0.5"]
     long, short, loss = descriptions(record(0, 2), meter)
@@ -269,7 +269,7 @@ def test_an_error_is_told_where_it_is_known():
     assert descriptions(record(0, 1), make_meter(1))[0] == "loss 0.01235, parameter RMSE 0.2468"
 
 
-def test_keys_are_shortened_in_the_middle_and_cannot_steer_the_terminal():
+def test_keys_are_shortened_and_cannot_control_the_terminal():
     key = "\x1b[31mred" + "x" * 60 + ".value"
     meter = ErrorMeter(
         {key: np.ones(3), "b": np.ones(1)}, {key: np.ones(3, bool), "b": np.ones(1, bool)}, {"b": "radiance"}
@@ -302,7 +302,7 @@ def test_reading_a_long_file_has_a_bar(monkeypatch, tmp_path):
     assert text.endswith("drawing\r\n")
 
 
-def test_without_a_terminal_a_line_is_written_now_and_then(monkeypatch, tmp_path, capsys):
+def test_without_a_terminal_lines_are_written_from_time_to_time(monkeypatch, tmp_path, capsys):
     file = write_metrics(tmp_path)
     with Reading() as tell:
         read_lines(file, tell)

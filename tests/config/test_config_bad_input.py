@@ -348,7 +348,7 @@ def test_file_errors_are_located(case: str, tmp_path: Path) -> None:
     assert all(str(part) in line for part in parts)
 
 
-def test_the_mended_override_is_right(tmp_path: Path) -> None:
+def test_the_suggested_override_is_valid(tmp_path: Path) -> None:
     line = line_of(tmp_path, GOOD, ("parameters[0].key=*.data",))
     option, mended = shlex.split(line.partition("in quotes: ")[2])
     assert option == "--set"
@@ -356,7 +356,7 @@ def test_the_mended_override_is_right(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", REMOVED)
-def test_what_was_removed_is_refused_with_what_to_do_instead(name: str, tmp_path: Path) -> None:
+def test_removed_settings_are_refused_with_a_replacement(name: str, tmp_path: Path) -> None:
     place, _, value = name.partition(": ")
     lists = {"views.": "views[0].", "stages.": "run.stages[0].", "render.": "target.render."}
     for short, whole in lists.items():
@@ -384,7 +384,7 @@ def test_file_is_blamed_for_its_own_errors(tmp_path: Path) -> None:
     assert line_of(tmp_path, GOOD + "run: {spp: 0}\n", ("run.seed=3",)).startswith("x.yaml: run.spp")
 
 
-def test_override_can_mend_the_file(tmp_path: Path) -> None:
+def test_an_override_can_correct_the_file(tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
     path.write_text(GOOD + "run: {spp: 0}\n")
     assert load(path, ["run.spp=2"]).run.spp == 2

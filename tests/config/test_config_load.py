@@ -141,7 +141,7 @@ def test_round_trip(tmp_path: Path, text: str, overrides: tuple[str, ...], monke
     assert dump(again) == written
 
 
-def test_configs_differ_where_a_setting_does(tmp_path: Path) -> None:
+def test_configs_differ_if_a_setting_does(tmp_path: Path) -> None:
     assert load_text(tmp_path, GOOD) == load_text(tmp_path, GOOD)
     assert load_text(tmp_path, GOOD) != load_text(tmp_path, GOOD, "run.seed=1")
 
@@ -174,13 +174,13 @@ def test_overrides_are_typed_as_yaml_and_the_last_one_wins(tmp_path: Path) -> No
     assert config.run.name == "007"
 
 
-def test_overrides_alone_can_make_a_configuration(tmp_path: Path) -> None:
+def test_overrides_alone_make_a_configuration(tmp_path: Path) -> None:
     config = load_text(tmp_path, "", "scene.file=a.xml", "target.file=b.exr", "parameters[0].key=c")
     assert config.target.file == tmp_path / "b.exr"
     assert [spec.key for spec in config.parameters] == ["c"]
 
 
-def test_sections_that_are_commented_out_have_their_defaults(tmp_path: Path) -> None:
+def test_commented_sections_have_defaults(tmp_path: Path) -> None:
     assert load_text(tmp_path, GOOD + "run:\n  # spp: 3\noptimizer:\n") == load_text(tmp_path, GOOD)
 
 
@@ -195,7 +195,7 @@ def test_merge_keys_and_byte_order_mark(tmp_path: Path) -> None:
     assert load(path).integrator == Prb(rr_depth=2)
 
 
-def test_free_mappings_are_those_of_the_schema() -> None:
+def test_free_mappings_match_the_schema() -> None:
     found = []
 
     def visit(schema: dict, location: tuple[str, ...]) -> None:
@@ -228,9 +228,7 @@ def test_configuration_loads_no_mitsuba() -> None:
         (["run.adjoint=correlated"], "correlated"),
     ],
 )
-def test_adjoint_auto_takes_batches_where_they_divide_the_samples(
-    tmp_path: Path, sets: list[str], adjoint: str
-) -> None:
+def test_adjoint_auto_uses_batches_that_divide_the_samples(tmp_path: Path, sets: list[str], adjoint: str) -> None:
     config = load_text(tmp_path, GOOD, *sets)
     assert config.adjoint == config.step_options()["adjoint"] == adjoint
     assert ("batches" in config.step_options()) is (adjoint == "batched")
@@ -247,7 +245,7 @@ motion: {of: [lens, cap], free: [translation, rotation, scale]}
     learning_rate: {rotation: 0.5}"""
 
 
-def test_a_motion_has_settings_by_word(tmp_path: Path) -> None:
+def test_a_motion_has_settings_by_part(tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
     path.write_text(changed(PARAMETER, POSE))
     config = load(path)
@@ -262,19 +260,19 @@ def test_a_motion_has_settings_by_word(tmp_path: Path) -> None:
     assert load(again).parameters == config.parameters
 
 
-def test_one_learning_rate_and_transform_serve_all_words() -> None:
+def test_a_learning_rate_and_transform_apply_to_all_parts() -> None:
     spec = ParameterSpec(motion={"of": "lamp"}, learning_rate=0.1, transform="none")  # type: ignore[arg-type]
     assert spec.names == ["lamp.translation", "lamp.rotation"]
     assert spec.settings("rotation").learning_rate == spec.settings("translation").learning_rate == 0.1
 
 
-def test_one_free_word_takes_plain_settings() -> None:
+def test_a_single_free_part_accepts_plain_settings() -> None:
     spec = ParameterSpec(motion={"of": "lamp", "free": ["translation"]}, initial=[0, 1, 0], bounds=(-1, 1))  # type: ignore[arg-type]
     assert spec.settings("translation").initial == [0, 1, 0]
     assert spec.settings("translation").bounds == (-1, 1)
 
 
-def test_each_axis_has_settings_of_its_own(tmp_path: Path) -> None:
+def test_each_axis_has_its_own_settings(tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
     axes = "motion: {of: lens, free: [x, y]}\n    initial: {y: 0.1}\n    bounds: {x: [-1, 1], y: [0, 2]}"
     path.write_text(changed(PARAMETER, axes))
@@ -389,7 +387,7 @@ def test_the_table_names_every_estimator() -> None:
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
-def test_options_and_defaults_are_the_estimators_own(name: str) -> None:
+def test_options_and_defaults_match_the_estimators(name: str) -> None:
     options = Reslrb(estimator=name).options()  # type: ignore[arg-type]
     shared = {"max_depth", "rr_depth", "hide_emitters", "estimator"}
     shared |= {"attached", "filter_normalization", "attached_sampling", "guiding", "sequence", "paths", "light_share"}
@@ -400,7 +398,7 @@ def test_options_and_defaults_are_the_estimators_own(name: str) -> None:
     assert {key: value for key, value in options.items() if key not in shared} == known
 
 
-def test_paths_that_an_estimator_named_leaves_to_nobody() -> None:
+def test_paths_unsupported_by_the_named_estimator() -> None:
     assert (Reslrb().paths, Reslrb().light_share) == ("auto", "auto")
     assert Reslrb(estimator="stack").paths == "light"
     named = Reslrb(estimator="stack", paths="both")
@@ -420,12 +418,12 @@ def test_paths_that_an_estimator_named_leaves_to_nobody() -> None:
         ({"paths": "sideways"}, "'auto', 'light', 'camera' or 'both'"),
     ],
 )
-def test_paths_that_cannot_be(options: dict[str, Any], words: str) -> None:
+def test_impossible_paths(options: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         Reslrb(**options)
 
 
-def test_naive_differentiation_has_the_paths_that_it_is_told() -> None:
+def test_naive_differentiation_uses_the_given_paths() -> None:
     assert WalkAd().options()["paths"] == "light"
     with pytest.raises(ValueError, match="has no effect with paths: camera, only with both"):
         WalkAd(paths="camera", light_share=0.3)
@@ -444,7 +442,7 @@ def test_amounts_of_memory(written: int | float | str, bytes_: int) -> None:
 
 
 @pytest.mark.parametrize("written", ["", "512", "-1 MiB", "1 XiB", "0 B", 0, -3, float("nan"), float("inf"), True])
-def test_what_is_no_amount_of_memory(written: int | float | str) -> None:
+def test_invalid_amounts_of_memory(written: int | float | str) -> None:
     with pytest.raises(ValueError, match="not an amount of memory"):
         memory_bytes(written)
 
@@ -452,7 +450,7 @@ def test_what_is_no_amount_of_memory(written: int | float | str) -> None:
 @pytest.mark.parametrize(
     ("name", "off", "on"), [("guiding", "off", "on"), ("sequence", "independent", "low_discrepancy")]
 )
-def test_what_is_left_to_measurement_where_the_estimator_is(name: str, off: str, on: str) -> None:
+def test_measured_options_if_the_estimator_is_measured(name: str, off: str, on: str) -> None:
     def given(**options: Any) -> str:
         return str(getattr(Reslrb(**options), name))
 
@@ -497,7 +495,7 @@ def test_every_section_has_its_place(key: str) -> None:
     assert f"`{key}`" in markdown()
 
 
-def test_every_key_has_a_meaning() -> None:
+def test_every_key_is_described() -> None:
     schema, page = json_schema(), markdown()
     for name, section in [("Config", schema), *schema["$defs"].items()]:
         assert section["description"]

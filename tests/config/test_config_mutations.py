@@ -77,14 +77,14 @@ def test_large_input_is_refused_at_once(case: str, tmp_path: Path) -> None:
     assert len(line) < 1200
 
 
-def test_the_override_that_brings_a_problem_is_found_among_many(tmp_path: Path) -> None:
+def test_the_faulty_override_is_found_among_many(tmp_path: Path) -> None:
     good = [f"scene.options.a{i}=1" for i in range(200)]
     for place in (0, 1, 77, 199, 200):
         overrides = (*good[:place], "run.spp=0", *good[place:])
         assert line_of(tmp_path, GOOD, overrides).startswith("--set run.spp=0: run.spp: ")
 
 
-def test_an_override_leaves_what_an_alias_shares(tmp_path: Path) -> None:
+def test_an_override_does_not_change_shared_aliases(tmp_path: Path) -> None:
     text = GOOD.replace("{render: {}}", "{render: {integrator: &i {type: prb}}}") + "integrator: *i\n"
     (tmp_path / "x.yaml").write_text(text)
     config = load(tmp_path / "x.yaml", ["integrator.rr_depth=2"])
@@ -94,7 +94,7 @@ def test_an_override_leaves_what_an_alias_shares(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["pipe", "socket", "device"])
-def test_what_is_no_regular_file_is_not_read(kind: str, tmp_path: Path) -> None:
+def test_only_regular_files_are_read(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "x"
     if kind == "pipe":
         os.mkfifo(path)
@@ -107,7 +107,7 @@ def test_what_is_no_regular_file_is_not_read(kind: str, tmp_path: Path) -> None:
         load(path)
 
 
-def test_paths_that_are_not_utf8(tmp_path: Path) -> None:
+def test_paths_with_invalid_utf8(tmp_path: Path) -> None:
     folder = tmp_path / "d\udcff"
     folder.mkdir()
     for place in (folder / "x.yaml", tmp_path / "x\udcff.yaml"):

@@ -73,7 +73,7 @@ def askew(scene: Case, ours: Any, factor: float = 1.5) -> None:
 
 @pytest.mark.usefixtures("everywhere")
 @pytest.mark.parametrize("name", a_few(NAMES, FEW))
-def test_means_are_those_of_unguided_samples(name: str) -> None:
+def test_means_equal_those_of_unguided_samples(name: str) -> None:
     assert means_hold(name, 32)
 
 
@@ -87,7 +87,7 @@ def means_hold(name: str, count: int) -> Any:
 @pytest.mark.usefixtures("everywhere")
 @pytest.mark.parametrize("estimator", a_few(ESTIMATORS, ["reservoir", "gather"]))
 @pytest.mark.parametrize("adjoint", a_few(["correlated", "independent", "batched"], ["batched"]))
-def test_every_way_of_a_step_has_the_mean_of_the_unguided(estimator: str, adjoint: str) -> None:
+def test_every_kind_of_step_has_the_unguided_mean(estimator: str, adjoint: str) -> None:
     scene, ours, plain = aimed("roughplastic", estimator=estimator)
     found = [scene.gradients(each, seeds(24, block), SPP, adjoint=adjoint) for block, each in enumerate((ours, plain))]
     result = compare(*found, block=None)
@@ -96,7 +96,7 @@ def test_every_way_of_a_step_has_the_mean_of_the_unguided(estimator: str, adjoin
 
 
 @pytest.mark.usefixtures("everywhere")
-def test_sequences_of_low_discrepancy_have_the_same_means() -> None:
+def test_low_discrepancy_sequences_have_the_same_means() -> None:
     scene, ours, plain = aimed("roughplastic", sequence="low_discrepancy")
     assert compare(samples(scene, ours, 32), samples(scene, plain, 32, 1), block=None)
 
@@ -174,7 +174,7 @@ FAULTS = {
 
 @pytest.mark.usefixtures("everywhere")
 @pytest.mark.parametrize("name", a_few(FAULTS, ["without_factor", "of_even_density"]))
-def test_what_would_bias_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_planted_biases_are_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     fault, case, count = FAULTS[name]
     fault(monkeypatch)
     assert not means_hold(case, count)
@@ -183,7 +183,7 @@ def test_what_would_bias_is_found(name: str, monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.usefixtures("everywhere")
 @pytest.mark.parametrize("fault", [False, True])
 @pytest.mark.parametrize("name", a_few(["roughplastic", "plastic", "mask_texture_in_view"], ["plastic"]))
-def test_a_replay_follows_the_paths_that_were_traced(name: str, fault: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_replay_follows_the_traced_paths(name: str, fault: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if fault:
         replayed_from(monkeypatch, lambda table: replace(table, aim=replace(table.aim, slots=0 * table.aim.slots)))
     monkeypatch.setattr(guiding, "NOW", 0.0)  # what is known beforehand is compared with what is not
@@ -191,7 +191,7 @@ def test_a_replay_follows_the_paths_that_were_traced(name: str, fault: bool, mon
 
 
 @pytest.mark.usefixtures("everywhere")
-def test_a_recorded_step_is_the_step() -> None:
+def test_a_recorded_step_equals_the_step() -> None:
     """Recordings have the table that there is, not the one that they were made with."""
     (scene, ours, _), (_, frozen, _) = (guided("roughplastic", 0, freeze=freeze) for freeze in (False, True))
     for factor in (0.0, 1.0, 2.0):
@@ -204,7 +204,7 @@ def test_a_recorded_step_is_the_step() -> None:
 
 @pytest.mark.usefixtures("everywhere")
 @pytest.mark.parametrize("size", [(1, 1), (9, 7), (160, 90), (1000, 3), (1920, 1080)])
-def test_blocks_part_the_film_and_their_densities_are_those_of_their_slots(size: tuple[int, int]) -> None:
+def test_blocks_partition_the_film_with_the_densities_of_their_slots(size: tuple[int, int]) -> None:
     import mitsuba as mi
 
     film, random = Blocks.of(size), np.random.default_rng(3)
@@ -232,7 +232,7 @@ def test_blocks_part_the_film_and_their_densities_are_those_of_their_slots(size:
 
 
 @pytest.mark.usefixtures("everywhere")
-def test_paths_are_sent_where_something_was_said() -> None:
+def test_paths_are_aimed_at_recorded_contributions() -> None:
     _, ours, _ = guided("roughplastic", 2)
     tables = ours.preparation.guiding
     said = np.sqrt(tables.learned[0].film)
@@ -244,7 +244,7 @@ def test_paths_are_sent_where_something_was_said() -> None:
 
 @pytest.mark.usefixtures("everywhere")
 @pytest.mark.parametrize("purpose", Purpose)
-def test_paths_of_a_gradient_are_sent_where_its_own_dl_di_is_large(purpose: Purpose) -> None:
+def test_paths_of_a_gradient_are_aimed_at_its_dl_di(purpose: Purpose) -> None:
     import mitsuba as mi
 
     _, ours, _ = guided("roughplastic", 2)
@@ -282,7 +282,7 @@ def test_means_of_blocks(size: tuple[int, int]) -> None:
 
 
 @pytest.mark.usefixtures("everywhere")
-def test_only_scenes_with_glossy_surfaces_pay_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_scenes_with_glossy_surfaces_use_aiming(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(context, "worthwhile", aim.worthwhile)
     for name, expected in (("roughplastic", True), ("texture", False), ("thin_lens", False), ("bumpmap", False)):
         scene, ours, _ = guided(name, 1)
@@ -296,19 +296,19 @@ MOVING = {case.name: case for case in (*attached_cases.CASES, *moving_lamps.CASE
 
 
 @pytest.mark.parametrize("name", a_few(["latents", "spot", "mesh", "bounces_4"], ["spot"]))
-def test_means_of_what_moves_are_those_of_unguided_samples(name: str) -> None:
+def test_means_of_moving_scenes_equal_those_of_unguided_samples(name: str) -> None:
     means_of_motion_hold(name, "stack")
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["latents", "mesh", "bounces_4"])
-def test_means_by_reservoir_are_those_of_unguided_samples(name: str) -> None:
+def test_means_by_reservoir_equal_those_of_unguided_samples(name: str) -> None:
     means_of_motion_hold(name, "reservoir")
 
 
 @pytest.mark.parametrize("name", a_few(["latents", "mesh", "bounces_4"], ["bounces_4"]))
 @pytest.mark.parametrize("estimator", a_few(["stack", "reservoir"], ["stack"]))
-def test_means_hold_where_paths_end_by_a_table(name: str, estimator: str) -> None:
+def test_means_hold_with_learned_roulette(name: str, estimator: str) -> None:
     means_of_motion_hold(name, estimator, harsh=True)
 
 

@@ -139,7 +139,7 @@ def test_a_small_stack_equals_a_large_one(depth: int, sizes: tuple[int, ...], op
 
 
 @pytest.mark.long
-def test_normalization_of_the_filter_makes_a_difference():
+def test_normalization_of_the_filter_has_an_effect():
     """Else that it is attached or detached would not show in any of these tests."""
     case = BY_NAME["slab"]
     moving = case.moving()
@@ -158,7 +158,7 @@ def test_enough_faults():
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
-def test_it_fits_the_code(fault: AttachedFault, monkeypatch: pytest.MonkeyPatch):
+def test_the_faults_apply_to_the_code(fault: AttachedFault, monkeypatch: pytest.MonkeyPatch):
     plant(fault, monkeypatch)
 
 
@@ -225,7 +225,7 @@ FORWARD_FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FORWARD_FAULTS.values(), ids=FORWARD_FAULTS)
-def test_it_fits_the_forward_code(fault: Fault, monkeypatch: pytest.MonkeyPatch):
+def test_the_faults_apply_to_the_forward_code(fault: Fault, monkeypatch: pytest.MonkeyPatch):
     plant(fault, monkeypatch)
 
 
@@ -284,7 +284,7 @@ def test_as_a_plugin_every_pixel_is_that_of_naive_ad(normalization: str):
     assert relative(ours, naive) < ROUNDING
 
 
-def test_a_lamp_that_moves_is_refused():
+def test_a_moving_lamp_is_refused():
     case = SCENES["moved_point"].case()
     with pytest.raises(UnsupportedScene, match="forward mode has no derivatives of moving emitters"):
         case.tangent(integrator("reslrb", 2, estimator="stack"), np.array([1.0, 0, 0]), 1, 4)
@@ -361,7 +361,7 @@ QUICK_EDGES = ("meets_nothing",)
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK_EDGES else pytest.mark.long) for n in EDGES])
-def test_at_the_edge(name: str):
+def test_at_the_border(name: str):
     edge = EDGES[name]
     moving = Moving(edge.scene(), edge.start, edge.place)
     options = {"hide_emitters": True}
@@ -405,7 +405,7 @@ def test_a_flat_mesh_that_bends_has_its_shading_normals():
 
 @pytest.mark.long
 @pytest.mark.parametrize("size", [0.0, 0.5])
-def test_the_derivative_of_a_flat_mesh_knows_that_it_will_bend(size: float):
+def test_the_derivative_of_a_flat_mesh_includes_its_bending(size: float):
     moving = bending(glass(1.5))
     moving.start["size"] = np.float64(size)
     ours = moving.gradient(integrator("reslrb", 5, estimator="stack", filter_normalization="detached",

@@ -119,7 +119,7 @@ def test_no_bias_in_blocks(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.long
-def test_without_a_random_sign_there_is_bias(monkeypatch: pytest.MonkeyPatch):
+def test_without_a_random_sign_it_is_biased(monkeypatch: pytest.MonkeyPatch):
     """Else that there is none would show nothing."""
     monkeypatch.setattr(chain, "sign", lambda numbers: 1)
     found = bias(ONE, "follow", 12, jacobian_damping=0.5)
@@ -152,7 +152,7 @@ def test_bounces_with_several_connections(options: dict[str, Any]):
 
 
 @pytest.mark.parametrize("name", ["spot", pytest.param("point", marks=pytest.mark.long)])
-def test_a_lamp_alone_moves(name: str):
+def test_a_single_lamp_moves(name: str):
     """No vertex then has anything to differentiate, only the ray that leaves the lamp. Over a floor alone, at whatever
     depth, a path has one connection."""
     [lamp] = [case for case in LAMPS if case.name == name]
@@ -169,7 +169,7 @@ def test_a_lamp_alone_moves(name: str):
 
 @pytest.mark.long
 @pytest.mark.parametrize("options", [{}, {"capacity": 3}], ids=str)
-def test_a_lamp_alone_moves_within_walls(options: dict[str, Any]):
+def test_a_single_lamp_moves_within_walls(options: dict[str, Any]):
     """The same with several connections a path, of which some are selected: in expectation. (Of a point, whose light
     goes everywhere, 16 seeds leave a tenth of noise.)"""
     [lamp] = [case for case in LAMPS if case.name == "spot_bounces"]
@@ -235,7 +235,7 @@ def distance(name: str) -> float:
 
 
 @pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
-def test_it_fits_the_code(fault: Fault, monkeypatch: pytest.MonkeyPatch):
+def test_the_faults_apply_to_the_code(fault: Fault, monkeypatch: pytest.MonkeyPatch):
     plant(fault, monkeypatch)
 
 
@@ -329,7 +329,7 @@ def test_both_agree(name: str):
 
 
 @pytest.mark.long
-def test_a_corner_at_rest():
+def test_a_corner_that_does_not_move():
     """Directions that turn sweep over it, which `auto` leaves alone: finite differences hold with it, and fail
     without."""
     scene = SCENES["bounce_corner"]
@@ -343,7 +343,7 @@ def test_a_corner_at_rest():
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["bounce", "bounce_steps", "bounce_corner"])
-def test_where_auto_stays_finite_differences_agree(name: str):
+def test_finite_differences_agree_if_auto_stays(name: str):
     scene = SCENES[name]
     ways = {way: replace(scene, options=dict(scene.options) | {"attached_sampling": way}) for way in ("auto", "follow")}
     found = {way: compare_with_differences(one) for way, one in ways.items()}
@@ -366,7 +366,7 @@ def test_where_auto_stays_finite_differences_agree(name: str):
     ],
     ids=str,
 )
-def test_what_auto_takes(bsdf: dict[str, Any], sampling: str, max_depth: int, expected: tuple[bool, bool]):
+def test_the_choice_of_auto(bsdf: dict[str, Any], sampling: str, max_depth: int, expected: tuple[bool, bool]):
     import drjit as dr
     import mitsuba as mi
 

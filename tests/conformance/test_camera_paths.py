@@ -93,7 +93,7 @@ FEW = ("mirror", "mask", "gaussian", "hidden lamp", "crop", "sphere")
 
 
 @taking_turns("name", [*FEW, *(name for name in SCENES if name not in FEW)], "way", [0, 1, 2, 3], FEW)
-def test_images_are_those_of_path_in_every_pixel(name: str, way: int):
+def test_images_equal_path_in_every_pixel(name: str, way: int):
     lights, sensor, things, options = SCENES[name]()
     scene = stage(lights, sensor, **things)
     result = agreement(scene, spp=128, seeds=12, reslrb={"estimator": "stack", **WAYS[way]}, **options)
@@ -108,7 +108,7 @@ def unevenly(tracer: Any, scene: Any) -> Any:
 
 
 @pytest.mark.parametrize("paths", [7, 20, 33, 100, 1003])
-def test_paths_that_are_shared_out_are_as_many_as_each_pixel_is_said_to_have(paths: int):
+def test_distributed_paths_have_the_requested_number_per_pixel(paths: int):
     density = np.random.default_rng(paths).exponential(size=20)
     density[:3] = 0
     shares = PixelShares.of(density, paths)
@@ -133,7 +133,7 @@ UNEVEN = ["mirror", "gaussian", "crop", "sphere"]
 
 
 @taking_turns("name", UNEVEN, "way", [0, 1, 2, 3], UNEVEN)
-def test_images_are_those_of_path_however_paths_are_shared_out(name: str, way: int):
+def test_images_equal_path_for_any_distribution_of_paths(name: str, way: int):
     lights, sensor, things, _ = SCENES[name]()
     scene = stage(lights, sensor, **things)
     ours = unevenly(make_integrator("reslrb", max_depth=5, rr_depth=100, estimator="stack", **WAYS[way]), scene)
@@ -145,7 +145,7 @@ def test_images_are_those_of_path_however_paths_are_shared_out(name: str, way: i
 
 
 @pytest.mark.parametrize("paths", ["camera", "both"])
-def test_gradients_are_what_they_are_however_paths_are_shared_out(paths: str):
+def test_gradients_are_independent_of_the_distribution_of_paths(paths: str):
     case = next(case for case in CASES if case.name == "texture")
     scene = Case(case.scene(), case.keys)
     even = integrator("reslrb", **options_of(case, paths))
@@ -155,7 +155,7 @@ def test_gradients_are_what_they_are_however_paths_are_shared_out(paths: str):
         assert compare(scene.gradients(ours, seeds(16, 1), case.spp, **step), expected, block=None)
 
 
-def test_what_is_noted_finds_the_pixels_that_a_mirror_alone_shows():
+def test_the_pilot_finds_pixels_that_only_a_mirror_shows():
     """A red wall behind the camera is seen in a mirror; its colour is known from the mirror's pixels alone, and all
     else has few paths. Noted anew it is the same."""
     size = {"width": 48, "height": 48, "pixel_format": "rgb", "rfilter": {"type": "box"}}
@@ -191,7 +191,7 @@ def test_what_is_noted_finds_the_pixels_that_a_mirror_alone_shows():
 
 
 @pytest.mark.parametrize("image", ["lamp", "texture"])
-def test_edges_are_no_noise(image: str):
+def test_edges_do_not_count_as_noise(image: str):
     """Beside a bright lamp without noise the gradient has no more variance than with even shares. With a flat noisy
     half and a clean textured one it has at most 0.8 of that."""
     means, deviations, signal = np.ones((48, 48)), np.full((48, 48), 0.5), np.ones((48, 48))
@@ -207,7 +207,7 @@ def test_edges_are_no_noise(image: str):
 
 
 @pytest.mark.parametrize("left_out", [False, True])
-def test_no_path_is_shared_out_for_noise_that_the_loss_does_not_count(left_out: bool):
+def test_noise_outside_the_loss_gets_no_paths(left_out: bool):
     """A lamp's bright surroundings are noisy, and have a small curvature by relative_l2, or are left out: the gradient
     has less variance with the loss's curvature than without."""
     means, signal = np.ones((48, 48)), np.ones((48, 48))
@@ -231,7 +231,7 @@ def grid(n: int) -> mi.Point2f:
     return mi.Point2f((pixel % n + 0.5) / n, (pixel // n + 0.5) / n)
 
 
-def test_light_paths_alone_may_have_the_border_that_both_have():
+def test_light_paths_alone_can_have_the_border_of_both():
     """Where they are what `paths: auto` makes of both."""
     film = {"film": {"rfilter": {"type": "gaussian", "stddev": 1.5}}}
     scene = stage(None, looks(**film))
@@ -242,7 +242,7 @@ def test_light_paths_alone_may_have_the_border_that_both_have():
         assert bool(compare(renders, theirs, block=1)) == holds
 
 
-def test_what_camera_paths_cannot_find_is_left_to_light_paths():
+def test_light_that_camera_paths_cannot_find_is_left_to_light_paths():
     """Parallel light through a ball of glass: next event estimation is blocked, and no path meets the lamp."""
     scene = stage({"sun": {"type": "directional", "direction": [0, -1, -0.2], "irradiance": rgb(3, 3, 3)}}, looks(),
                   ball=ball({"type": "dielectric"}))  # fmt: skip
@@ -258,7 +258,7 @@ def test_what_camera_paths_cannot_find_is_left_to_light_paths():
 
 
 @pytest.mark.parametrize("paths", ["camera", "both"])
-def test_fewer_paths_than_pixels_and_the_rest_of_their_share(paths: str):
+def test_fewer_paths_than_pixels(paths: str):
     """At one sample per pixel, and where but a few paths are light paths, means are what they are."""
     scene = stage(None, looks())
     options = {"max_depth": 3, "rr_depth": 100, "estimator": "stack", "paths": paths}
@@ -308,7 +308,7 @@ def test_gradients_equal_naive_ad(case: GradientCase, paths: str):
 
 @pytest.mark.parametrize("paths", ["camera", "both"])
 @pytest.mark.parametrize("name", a_few([case.name for case in BOTH], ["texture", "mask_texture_in_view"]))
-def test_forward_mode_is_naive_ad(name: str, paths: str):
+def test_forward_mode_equals_naive_ad(name: str, paths: str):
     case = next(case for case in CASES if case.name == name)
     scene = Case(case.scene(), case.keys)
     tangent = forward(scene, plugin("reslrb", **options_of(case, paths)), 3, 16)
@@ -318,7 +318,7 @@ def test_forward_mode_is_naive_ad(name: str, paths: str):
 
 
 @pytest.mark.parametrize("case", a_few([case for case in BOTH if case.reference == "prb"], ()))
-def test_gradients_are_those_of_prb(case: GradientCase):
+def test_gradients_equal_prb(case: GradientCase):
     scene = Case(case.scene(), case.keys)
     reference = scene.gradients(integrator("prb", **case.both), seeds(16, 1), case.spp)
     for paths in ("camera", "both"):
@@ -331,7 +331,7 @@ NO_CAUSTICS = [case for case in BOTH if case.name not in ("glass", "mirror")]
 
 
 @pytest.mark.parametrize("case", a_few(NO_CAUSTICS, ["texture", "area"]))
-def test_both_is_in_expectation_what_camera_paths_are(case: GradientCase):
+def test_both_has_the_expectation_of_camera_paths(case: GradientCase):
     scene = Case(case.scene(), case.keys)
     ours, reference = (
         scene.gradients(integrator("reslrb", **options_of(case, paths)), seeds(16, at), case.spp)
@@ -341,7 +341,7 @@ def test_both_is_in_expectation_what_camera_paths_are(case: GradientCase):
 
 
 @pytest.mark.parametrize("estimator", ["gather", "event", "reservoir"])
-def test_every_estimator_takes_weighed_connections(estimator: str):
+def test_every_estimator_handles_weighted_connections(estimator: str):
     case = next(case for case in CASES if case.name == "texture")
     scene = Case(case.scene(), case.keys)
     exact = scene.gradients(integrator("reslrb", **options_of(case, "both")), seeds(16), case.spp)
@@ -365,14 +365,14 @@ def peak(depth: int, spp: int, paths: str) -> float:
 
 
 @pytest.mark.parametrize("paths", ["camera", "both"])
-def test_memory_is_that_of_light_paths_however_deep_they_go(paths: str):
+def test_memory_is_flat_in_depth(paths: str):
     light = peak(4, 16, "light")
     film = 32 * 32 * 4 * 4 / 2**20
     for depth, spp in ((4, 16), (64, 16), (4, 64)):
         assert peak(depth, spp, paths) <= max(1.03 * light, light + film), (depth, spp)
 
 
-def test_a_share_that_leaves_one_side_has_nothing_of_the_other():
+def test_a_share_of_0_or_1_compiles_only_one_side():
     for share, paths in ((0.0, "camera"), (1.0, "light")):
         made = make_integrator("reslrb", estimator="stack", paths="both", light_share=share)
         assert made.paths == paths
@@ -386,7 +386,7 @@ def test_a_share_that_leaves_one_side_has_nothing_of_the_other():
         ({"paths": "sideways"}, "must be one of light, camera, both"),
     ],
 )
-def test_options_that_cannot_be(options: dict[str, Any], words: str):
+def test_impossible_options(options: dict[str, Any], words: str):
     with pytest.raises(ValueError, match=words):
         make_integrator("reslrb", **options)
 
@@ -403,7 +403,7 @@ def test_sensors_that_light_paths_cannot_connect_to():
         images(scene, "reslrb", range(1), 4, max_depth=4, estimator="stack", paths="both")
 
 
-def test_what_moves_light_has_light_paths_in_the_image_of_its_step_too():
+def test_moving_light_uses_light_paths_in_its_image_too():
     case = next(case for case in CASES if case.name == "gaussian")
     scene = Case(case.scene(), case.keys)
     work = interface_of(integrator("reslrb", estimator="stack", paths="both", attached=True, **case.both))

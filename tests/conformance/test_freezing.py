@@ -47,14 +47,14 @@ def gradients(case: GradientCase, adjoint: str, **options: object) -> tuple[list
 
 
 @taking_turns("case", [BY_NAME[name] for name in QUICK], "estimator", ESTIMATORS, FEWEST)
-def test_a_recorded_step_is_the_step(case: GradientCase, estimator: str) -> None:
+def test_a_recorded_step_equals_the_step(case: GradientCase, estimator: str) -> None:
     recorded_step_is_the_step(case, estimator)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("name", [name for name in BY_NAME if name not in QUICK + NOT_RECORDED])
-def test_a_recorded_step_of_other_cases_is_the_step(name: str, estimator: str) -> None:
+def test_a_recorded_step_of_other_cases_equals_the_step(name: str, estimator: str) -> None:
     recorded_step_is_the_step(BY_NAME[name], estimator)
 
 
@@ -73,7 +73,7 @@ def recorded_step_is_the_step(case: GradientCase, estimator: str) -> None:
 
 
 @taking_turns("estimator", ESTIMATORS, "adjoint", list(KINDS), ("reservoir", "event", "gather"))
-def test_what_cannot_be_recorded_is_computed_all_the_same(estimator: str, adjoint: str) -> None:
+def test_unrecordable_calls_are_computed_plainly(estimator: str, adjoint: str) -> None:
     case = BY_NAME["thin_lens"]
     expected, _ = gradients(case, adjoint, estimator=estimator, freeze=False)
     found, counts = gradients(case, adjoint, estimator=estimator, freeze=True)
@@ -82,7 +82,7 @@ def test_what_cannot_be_recorded_is_computed_all_the_same(estimator: str, adjoin
     assert not KINDS[adjoint] & set(counts[-1]) & {"trace", "image", "fused"}
 
 
-def test_a_recording_that_no_longer_fits_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_outdated_recording_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     class Stale:
         """Works while it is tried, twice, and not later."""
 
@@ -101,7 +101,7 @@ def test_a_recording_that_no_longer_fits_is_an_error(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("adjoint", a_few(KINDS, ("batched",)))
-def test_sensors_have_recordings_of_their_own(adjoint: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_sensors_have_their_own_recordings(adjoint: str, capfd: pytest.CaptureFixture[str]) -> None:
     """One for all was made anew for each of three sensors in each step, and Dr.Jit warned every time."""
     case = BY_NAME["texture"]
     cameras = {f"camera_{n}": camera(sensor="thinlens" if n == 3 else "perspective") for n in range(4)}
@@ -121,7 +121,7 @@ def test_sensors_have_recordings_of_their_own(adjoint: str, capfd: pytest.Captur
     assert "frozen function" not in capfd.readouterr().err
 
 
-def test_what_is_recorded_anew_each_time_no_longer_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frequently_recorded_calls_are_no_longer_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     class Restless:
         """Is recorded anew in each call."""
 
@@ -145,7 +145,7 @@ def test_what_is_recorded_anew_each_time_no_longer_is(monkeypatch: pytest.Monkey
     assert chosen.preparation.recordings.counts() == {}
 
 
-def test_sensors_without_end_are_not_all_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unlimited_sensors_are_not_all_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(freezing, "MOST_CALLS", 2)
     case = BY_NAME["texture"]
     cameras = {f"camera_{n}": camera() for n in range(3)}
@@ -158,7 +158,7 @@ def test_sensors_without_end_are_not_all_recorded(monkeypatch: pytest.MonkeyPatc
     assert len(chosen.preparation.recordings._functions) == 2
 
 
-def test_another_scene_is_another_recording() -> None:
+def test_another_scene_has_another_recording() -> None:
     case = BY_NAME["texture"]
     chosen = integrator("reslrb", estimator="stack", freeze=True)
     plain = integrator("reslrb", estimator="stack", freeze=False)
@@ -168,7 +168,7 @@ def test_another_scene_is_another_recording() -> None:
         assert relative(scene.gradient(chosen, 3, 8), scene.gradient(plain, 3, 8)) < 1e-5
 
 
-def test_other_sample_counts_are_other_recordings() -> None:
+def test_other_sample_counts_have_other_recordings() -> None:
     case = BY_NAME["texture"]
     scene, chosen = Case(case.scene(), case.keys), integrator("reslrb", estimator="event", freeze=True)
     plain = integrator("reslrb", estimator="event", freeze=False)
@@ -186,7 +186,7 @@ def test_large_steps_are_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
         assert bool(chosen.preparation.recordings.counts()) == recorded
 
 
-def test_an_image_is_the_same_call_alone_and_in_a_step() -> None:
+def test_an_image_is_the_same_alone_and_in_a_step() -> None:
     """Of what derivatives ask of a walk, an image knows nothing: else it would carry that, and be recorded twice."""
     case = BY_NAME["texture"]
     scene, chosen = Case(case.scene(), case.keys), integrator("reslrb", estimator="stack", freeze=True)

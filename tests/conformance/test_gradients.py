@@ -85,7 +85,7 @@ def test_random_estimators_agree(case: GradientCase):
     agree(case, 16, BY_ADJOINT, "independent")
 
 
-def test_event_agrees_where_lobes_are_not_connected():
+def test_event_agrees_without_connected_lobes():
     [case] = [case for case in CASES if case.name == "glass"]
     agree(case, 16, {"event": {}}, "correlated")
 
@@ -161,7 +161,7 @@ SAME_PATHS = ("texture", "gaussian", "crop", "rgba", "thin_lens", "twosided", "m
     "name",
     a_few(SAME_PATHS, ("texture", "crop", "thin_lens", "projector")),
 )
-def test_walk_ad_is_ptracer(name: str):
+def test_walk_ad_equals_ptracer(name: str):
     case = BY_NAME[name]
     scene = Case(case.scene(), case.keys)
     options = case.both | {"hide_emitters": True}
@@ -187,7 +187,7 @@ QUICK = ("texture", "roulette", "thin_lens", "glass", "mask_texture_in_view", "t
 
 
 @pytest.mark.parametrize("name", a_few([n for n in BY_NAME if n != "texture_prb"], QUICK))
-def test_forward_mode_is_walk_ad(name: str):
+def test_forward_mode_equals_walk_ad(name: str):
     case = BY_NAME[name]
     scene, options = Case(case.scene(), case.keys), case.both | case.options
     tangent = forward(scene, plugin("reslrb", **options), 3, 32)
@@ -389,7 +389,7 @@ def test_endless_paths_are_refused() -> None:
 
 
 @pytest.mark.parametrize("name", ["ptracer", "trajectory", "walk_ad", "reservoir", "gather", "stack"])
-def test_a_known_adjoint_gives_image_and_gradient_of_a_correlated_step(name: str) -> None:
+def test_a_known_adjoint_gives_the_image_and_gradient_of_a_correlated_step(name: str) -> None:
     import drjit as dr
 
     named = BY_NAME["texture"]
@@ -485,7 +485,7 @@ def test_correlated_samples_are_measurably_biased(case_of_two: Case, reference: 
 
 @pytest.mark.long
 @pytest.mark.parametrize("estimator", ["reservoir", "gather", "event"])
-def test_batches_serve_every_estimator(case_of_two: Case, reference: tuple, estimator: str):
+def test_batches_work_for_every_estimator(case_of_two: Case, reference: tuple, estimator: str):
     result = agreement_adjoint(case_of_two, reference, "four batches", estimator)
     print(estimator, result)
     assert result
@@ -493,7 +493,7 @@ def test_batches_serve_every_estimator(case_of_two: Case, reference: tuple, esti
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["ptracer", "walk_ad", "prb"])
-def test_batches_serve_the_baselines(case_of_two: Case, reference: tuple, name: str):
+def test_batches_work_for_the_baselines(case_of_two: Case, reference: tuple, name: str):
     target, expected = reference
     tracer, objective = integrator(name), l2(target)
     ours = [case_of_two.gradient(tracer, seed, SPP, objective, **ADJOINTS["four batches"]) for seed in seeds(COUNT)]
@@ -511,7 +511,7 @@ def test_batches_that_do_not_divide_are_refused(case_of_two: Case, reference: tu
 
 
 @pytest.mark.parametrize("name", ["correlated", "independent", "four batches"])
-def test_sample_sets_are_those_of_a_step(case_of_two: Case, name: str):
+def test_sample_sets_equal_those_of_a_step(case_of_two: Case, name: str):
     tracer, results = integrator("reslrb", estimator="stack"), []
 
     def step(*args, **options):

@@ -76,7 +76,7 @@ def samples(scene: Case, ours: Any, count: int, block: int = 0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", a_few(NAMES, FEW))
-def test_means_are_those_of_unguided_samples(name: str) -> None:
+def test_means_equal_those_of_unguided_samples(name: str) -> None:
     means_hold(name, 4, 32)
 
 
@@ -106,7 +106,7 @@ def strength(ours: Any) -> float:
 
 @pytest.mark.parametrize("estimator", a_few(ESTIMATORS, ["stack"]))
 @pytest.mark.parametrize("adjoint", a_few(["correlated", "independent", "batched"], ["batched"]))
-def test_every_way_of_a_step_has_the_mean_of_the_unguided(estimator: str, adjoint: str) -> None:
+def test_every_kind_of_step_has_the_unguided_mean(estimator: str, adjoint: str) -> None:
     """The replay draws the numbers that were traced, whatever is learned in between."""
     scene, ours, plain = guided("two_emitters", 3, estimator=estimator)
     del ours.preparation.guiding.due  # as it comes: some of the steps learn
@@ -117,7 +117,7 @@ def test_every_way_of_a_step_has_the_mean_of_the_unguided(estimator: str, adjoin
 
 
 @pytest.mark.long
-def test_an_image_alone_has_the_mean_of_the_unguided() -> None:
+def test_an_image_alone_has_the_unguided_mean() -> None:
     scene, ours, plain = guided("envmap", 3)
     images = [
         np.stack([np.array(render_image(each, scene.scene, 0, seed, SPP), np.float64) for seed in seeds(24, block)])
@@ -142,7 +142,7 @@ def test_exact_estimators_agree_at_equal_seeds(name: str) -> None:
             assert relative(scene.gradient(other, 5, SPP, adjoint=adjoint), reference) < 1e-4
 
 
-def test_a_recorded_step_is_the_step() -> None:
+def test_a_recorded_step_equals_the_step() -> None:
     scene, ours, _ = guided("envmap", 2)
     _, frozen, _ = guided("envmap", 0, freeze=True)
     frozen.expect(SPP)
@@ -158,7 +158,7 @@ def test_a_recorded_step_is_the_step() -> None:
     assert frozen.preparation.recordings.counts()["fused"] > 0
 
 
-def test_a_script_s_renders_learn_from_one_to_the_next() -> None:
+def test_renders_of_a_script_learn_from_each_other() -> None:
     """`mi.render`, forward and backward: the tables live in the integrator."""
     import drjit as dr
     import mitsuba as mi
@@ -179,7 +179,7 @@ def test_a_script_s_renders_learn_from_one_to_the_next() -> None:
 
 
 @pytest.mark.parametrize("fault", [None, *FAULTS])
-def test_what_is_drawn_is_evenly_spread_by_its_weight(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samples_are_stratified_by_weight(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the table: weighted means of functions of the numbers are those of even ones. No fault passes."""
     if fault is not None:
         fault(monkeypatch)
@@ -223,7 +223,9 @@ def histogram(numbers: list[Any], weights: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("fault", [None, same_numbers, learned_in_its_midst])
-def test_tables_learn_from_other_numbers_and_change_between_steps(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tables_use_their_own_random_numbers_and_change_between_steps(
+    fault: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if fault is not None:
         fault(monkeypatch)
     assert learns_apart(monkeypatch) == (fault is None)
@@ -261,7 +263,7 @@ def learns_apart(patch: pytest.MonkeyPatch) -> bool:
 
 @pytest.mark.long
 @pytest.mark.parametrize("fault", FAULTS)
-def test_what_would_bias_is_found(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_planted_biases_are_found(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     fault(monkeypatch)
     scene, ours, plain = guided("two_emitters", 4)
     result = compare(samples(scene, ours, 32), samples(scene, plain, 32, 1), block=None)
@@ -375,22 +377,22 @@ def holds(found: tuple[tuple[float, float], ...]) -> bool:
     return not any(beyond)
 
 
-def test_a_table_that_has_gone_wrong_does_little_harm_and_is_soon_corrected() -> None:
+def test_a_wrong_table_does_little_harm_and_is_soon_corrected() -> None:
     assert holds(errors(32))
 
 
 @pytest.mark.long
-def test_many_steps_say_so_too() -> None:
+def test_many_steps_agree() -> None:
     assert holds(errors(400))
 
 
 @pytest.mark.long
-def test_tables_that_know_much_forget_it_as_soon() -> None:
+def test_confident_tables_forget_as_fast() -> None:
     assert holds(errors(100, 8 * EVERY))
 
 
 @pytest.mark.long
-def test_tables_that_do_not_look_again_in_time_are_too_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tables_that_update_too_late_are_too_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     from reslrb_cli.guiding import tables
 
     monkeypatch.setattr(tables, "EVERY", 2 * EVERY)
@@ -398,7 +400,7 @@ def test_tables_that_do_not_look_again_in_time_are_too_wrong(monkeypatch: pytest
 
 
 @pytest.mark.long
-def test_tables_that_learn_no_more_stay_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tables_that_stop_learning_stay_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     from reslrb_cli.guiding.tables import Guiding
 
     right = Guiding.due
@@ -411,7 +413,7 @@ def test_tables_that_learn_no_more_stay_wrong(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.long
-def test_tables_without_an_even_share_are_too_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tables_without_a_uniform_share_are_too_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     from reslrb_cli.transport import plan
 
     monkeypatch.setattr(plan, "GUIDE_UNIFORM", 0.02)

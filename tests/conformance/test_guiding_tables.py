@@ -35,7 +35,7 @@ GRIDS = {
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("name", GRIDS)
-def test_slots_are_all_shared_out_and_a_quarter_evenly(name: str) -> None:
+def test_all_slots_are_assigned_and_a_quarter_uniformly(name: str) -> None:
     grid = GRIDS[name]
     density = np.random.default_rng(1).gamma(0.02, size=grid.cells) * grid.measures()
     counts = apportion(grid, density)
@@ -53,7 +53,7 @@ def test_slots_are_all_shared_out_and_a_quarter_evenly(name: str) -> None:
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("name", ["one", "directions"])
-def test_who_has_learned_nothing_draws_evenly(name: str) -> None:
+def test_an_untrained_table_is_uniform(name: str) -> None:
     np.testing.assert_array_equal(np.array(even_table(GRIDS[name]).weights), 1)
 
 
@@ -67,7 +67,7 @@ def test_who_has_learned_nothing_draws_evenly(name: str) -> None:
         ("two_emitters", (5, 4, 4, 4)),
     ],
 )
-def test_numbers_that_emission_does_not_use_are_not_cut(name: str, bits: tuple[int, ...]) -> None:
+def test_numbers_unused_by_emission_are_not_cut(name: str, bits: tuple[int, ...]) -> None:
     scene = Case(SCENES[name](), [])
     ours = integrator("reslrb", guiding="on")
     grid = ours.plan(scene.scene, scene.scene.sensors()[0]).grid
@@ -77,7 +77,7 @@ def test_numbers_that_emission_does_not_use_are_not_cut(name: str, bits: tuple[i
 
 
 @pytest.mark.usefixtures("llvm")
-def test_emitters_that_nobody_draws_have_a_grid() -> None:
+def test_emitters_without_samples_have_a_grid() -> None:
     for weights in ([], [0.0, 0.0]):
         grid = make_grid([True] * 4, weights)
         assert apportion(grid, grid.measures()).sum() == grid.slots
@@ -90,7 +90,7 @@ def test_scenes_without_emitters_are_traced() -> None:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_roulette_does_not_see_the_weight(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_roulette_ignores_the_weight(monkeypatch: pytest.MonkeyPatch) -> None:
     """Paths that are drawn often would else end for being many: a hundredth of the weight leaves just that."""
     import mitsuba as mi
 
@@ -118,7 +118,7 @@ def heard(*rows: Any) -> np.ndarray:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_no_voice_drowns_another_and_none_that_is_not_finite_is_heard() -> None:
+def test_no_group_dominates_and_non_finite_values_are_dropped() -> None:
     from reslrb_cli.guiding.tables import Learned, Purpose
 
     draws, first, other = np.ones(SMALL.cells), np.zeros(SMALL.cells), np.zeros(SMALL.cells)
@@ -143,7 +143,7 @@ def test_no_voice_drowns_another_and_none_that_is_not_finite_is_heard() -> None:
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("name", GRIDS)
-def test_cells_part_the_cube_and_coarser_ones_are_made_of_them(name: str) -> None:
+def test_cells_partition_the_cube_and_merge_into_coarser_ones(name: str) -> None:
     """Each cell lies in one coarser cell, and all that do are drawn alike."""
     grid = GRIDS[name]
     values = np.random.default_rng(2).random(grid.cells)
@@ -167,7 +167,7 @@ def test_cells_part_the_cube_and_coarser_ones_are_made_of_them(name: str) -> Non
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("weights", [[1.0], [1.0, 0.0, 2.0, 0.5]])
-def test_each_cell_is_drawn_as_often_as_its_weight_says_and_numbers_lie_in_it(weights: list[float]) -> None:
+def test_cells_are_sampled_by_weight(weights: list[float]) -> None:
     """Of three lanes for each slot a cell has exactly three times its slots; p is that share, with no rounding."""
     import mitsuba as mi
 
@@ -191,7 +191,7 @@ def test_each_cell_is_drawn_as_often_as_its_weight_says_and_numbers_lie_in_it(we
 
 
 @pytest.mark.usefixtures("llvm")
-def test_cells_are_as_fine_as_there_are_paths_to_tell_them_apart() -> None:
+def test_cells_are_as_fine_as_the_paths_allow() -> None:
     """A few paths say nothing of single cells; what many say of one is not spread over others."""
     from reslrb_cli.guiding.tables import FINE, Learned
 
@@ -211,7 +211,7 @@ def test_cells_are_as_fine_as_there_are_paths_to_tell_them_apart() -> None:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_what_was_heard_long_ago_counts_for_little() -> None:
+def test_old_samples_count_little() -> None:
     from reslrb_cli.guiding.tables import Learned, Purpose
 
     draws, before, now = np.ones(SMALL.cells), np.zeros(SMALL.cells), np.zeros(SMALL.cells)
@@ -223,7 +223,7 @@ def test_what_was_heard_long_ago_counts_for_little() -> None:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_tables_of_any_number_of_sensors_take_64_mib() -> None:
+def test_tables_of_any_number_of_sensors_use_64_mib() -> None:
     from reslrb_cli.guiding.tables import Guiding, grid_for
 
     for emitters, sensors in ((1, 1), (1, 3), (2, 1), (3, 2), (3000, 1), (3, 1000)):
@@ -253,7 +253,7 @@ def taught(name: str, steps: int, **options: Any) -> Any:
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("name", ["two_emitters", "envmap"])
-def test_what_a_recorded_walk_says_is_what_a_plain_one_does(name: str) -> None:
+def test_a_recorded_walk_collects_the_same_as_a_plain_one(name: str) -> None:
     """Bit by bit with one thread, as tests have it; and tables that have changed are no reason to record anew."""
     plain, recorded = (taught(name, 7, freeze=freeze) for freeze in (False, True))
     for one, other in zip(*(each.preparation.guiding.learned.values() for each in (plain, recorded)), strict=True):
@@ -275,7 +275,7 @@ def test_walks_of_many_paths_are_not_recorded(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.usefixtures("llvm")
-def test_tables_lie_where_every_kernel_finds_them_alike() -> None:
+def test_tables_have_the_same_alignment_in_every_kernel() -> None:
     """In memory that Dr.Jit aligns, wherever NumPy has what they are made of."""
     grid, kept = make_grid([True] * 4, [1.0, 2.0], 8), []
     for number in range(20):
@@ -287,7 +287,7 @@ def test_tables_lie_where_every_kernel_finds_them_alike() -> None:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_tables_learn_often_at_first_and_soon_enough_later() -> None:
+def test_tables_learn_often_at_first_and_regularly_later() -> None:
     """What a run is told that it pays for is what it has."""
     scene, ours, _ = guided("two_emitters", 0)
     guiding = ours.preparation.guiding
@@ -300,7 +300,7 @@ def test_tables_learn_often_at_first_and_soon_enough_later() -> None:
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("worse", [0.3, 1.0, 3.0])
-def test_tables_that_do_harm_learn_as_often_as_at_first(worse: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_harmful_tables_learn_as_often_as_at_first(worse: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """But no oftener where they go on to do harm: only what learns rarely begins anew."""
     scene, ours, _ = guided("two_emitters", 0)
     guiding, right = ours.preparation.guiding, Learned.with_more
@@ -317,7 +317,7 @@ def test_tables_that_do_harm_learn_as_often_as_at_first(worse: float, monkeypatc
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("weight", [0.5, 1.0, 4.0])
-def test_what_a_table_does_to_those_who_speak_is_what_it_is_worth(weight: float) -> None:
+def test_the_worth_of_a_table_is_its_effect_on_the_second_moment(weight: float) -> None:
     """Of a voice that speaks where paths weigh so much, and beside one that speaks where they weigh nothing of note."""
     grid, paths = make_grid([True] * 4, [1.0], 8), 1e4
     rare = np.arange(grid.cells) < 8
@@ -336,7 +336,7 @@ def test_what_a_table_does_to_those_who_speak_is_what_it_is_worth(weight: float)
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("paths", [100, 4096, 20_000, 10**7])
 @pytest.mark.parametrize("weights", [[1.0], [1.0, 1e-3, 2.0]])
-def test_a_grid_is_as_fine_as_its_walks_can_ever_tell(paths: int, weights: list[float]) -> None:
+def test_a_grid_is_as_fine_as_its_walks_can_resolve(paths: int, weights: list[float]) -> None:
     finest = grid_for([True] * 4, weights, 1)
     grid = grid_for([True] * 4, weights, 1, paths)
     assert finest.coarser(grid.cells) == grid  # made of the same cuts
@@ -348,7 +348,7 @@ def test_a_grid_is_as_fine_as_its_walks_can_ever_tell(paths: int, weights: list[
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_grid_of_few_cells_says_what_the_finest_does() -> None:
+def test_a_coarse_grid_agrees_with_the_finest() -> None:
     """Of the same paths, heard by either: each of its cells is drawn as those are that it is made of."""
     finest, paths = make_grid([True] * 4, [1.0, 3.0], 14), 500
     grid = finest.coarser(most_cells(paths))
@@ -411,7 +411,7 @@ def cells_after(*calls: Any, told: int | None = None) -> list[Grid]:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_the_first_pass_settles_the_grid_and_gradients_of_more_samples_refine_it() -> None:
+def test_the_first_pass_fixes_the_grid_and_larger_gradients_refine_it() -> None:
     small, image, large, again = cells_after((1, True), (64, False), (64, True), (1, True))
     assert small == image
     assert 16 * small.cells <= large.cells <= 128 * small.cells
@@ -422,7 +422,7 @@ def test_the_first_pass_settles_the_grid_and_gradients_of_more_samples_refine_it
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_run_that_says_so_has_the_same_grid_whatever_comes_first() -> None:
+def test_a_run_with_a_sample_count_has_the_same_grid() -> None:
     grids = [*cells_after((SPP, False), (4, True), (SPP, True), told=4), *cells_after((4, True), (64, True), told=4)]
     assert len(set(grids)) == 1
     assert grids[0] == cells_after((4, True))[0]
@@ -452,7 +452,7 @@ def blank() -> Guiding:
     return guiding
 
 
-def test_what_was_learned_comes_back() -> None:
+def test_learned_state_is_restored() -> None:
     before, after = learned(), blank()
     calls, arrays = before.state()
     assert after.restore(calls, arrays.__getitem__) is None
@@ -488,7 +488,7 @@ def test_what_was_learned_comes_back() -> None:
         ("3/frame", lambda frame: -frame),
     ],
 )
-def test_what_is_of_other_cells_is_refused_and_changes_nothing(name: str, wrong: Any) -> None:
+def test_state_of_other_cells_is_refused_without_effect(name: str, wrong: Any) -> None:
     calls, arrays = learned().state()
     arrays[name] = wrong(arrays[name])
     after = learned()
@@ -501,7 +501,7 @@ def test_what_is_of_other_cells_is_refused_and_changes_nothing(name: str, wrong:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_without_a_guide_nothing_of_it_is_compiled() -> None:
+def test_without_a_guide_its_code_is_not_compiled() -> None:
     nothing_is_compiled_without("grid", *guided("two_emitters", 0))
 
 
@@ -518,7 +518,7 @@ def test_later_steps_compile_nothing() -> None:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_step_stays_recorded_whatever_its_tables_learn() -> None:
+def test_a_step_stays_recorded_while_its_tables_learn() -> None:
     """A step that is recorded anew for each new table would, after a few of them, not be recorded any more."""
     scene, ours, _ = guided("two_emitters", 0, freeze=True)
     for seed in range(2):

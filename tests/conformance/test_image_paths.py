@@ -142,7 +142,7 @@ def test_passes_are_unbiased_and_independent():
     assert in_four == pytest.approx(in_one, rel=0.1)
 
 
-def test_first_pass_is_what_ptracer_traces():
+def test_the_first_pass_equals_ptracer():
     assert difference_from_ptracer(stage(large()), spp=8, reslrb={"samples_per_pass": 8}) < SAME
 
 
@@ -294,7 +294,7 @@ def test_clip_planes(kind, planes):
 
 
 @pytest.mark.parametrize("focus", [{}, {"focus_distance": 0.9}, {"focus_distance": 30.0}, {"focus_distance": 2.0}])
-def test_a_lens_that_focuses_outside_of_its_clip_planes(focus):
+def test_a_lens_focused_outside_its_clip_planes(focus):
     # Stock light tracing has it see nothing then, or, on the far plane, where it focuses by default, a part.
     result = agreement(seen(camera(type="thinlens", aperture_radius=0.1, near_clip=1.0, far_clip=7.0, **focus)))
     assert result, result

@@ -157,7 +157,7 @@ def test_sheet(name):
 
 @pytest.mark.usefixtures("samples")
 @pytest.mark.parametrize("name", a_few(SMOOTH | HIDDEN_SMOOTH, THROWN))
-def test_what_it_throws_on_the_floor(name):
+def test_light_on_the_floor(name):
     thing = ball((SMOOTH | HIDDEN_SMOOTH)[name](), center=(0, 0.9, 0))
     light = lamp(side=1.0, position=(0, 2.2, -1.2), target=(0, 0.9, 0), radiance=rgb(4, 3, 2))
     result = agreement(stage({"lamp": light}, floor_camera(), ball=thing), spp=512)
@@ -304,7 +304,7 @@ def test_emitters_with_sampling_weights():
 
 
 @pytest.mark.usefixtures("samples")
-def test_environment_behind_nothing_but_a_floor():
+def test_an_environment_behind_a_floor_only():
     # The camera stands outside of the scene's bounding sphere, far from what it sees.
     floor = rectangle(WHITE, transform().rotate([1, 0, 0], -90) @ transform().scale(0.3))
     sensor = camera(to_world=transform().look_at(origin=[0, 3, 4], target=[0, 0, 0], up=[0, 1, 0]), fov=10)
@@ -372,7 +372,7 @@ def test_real_room(hide_emitters):
 
 
 @pytest.mark.usefixtures("samples")
-def test_a_mesh_that_its_transform_mirrors():
+def test_a_mirrored_mesh():
     """Its faces wind the other way than its normals: `ptracer` has it black."""
     import mitsuba as mi
 

@@ -57,7 +57,7 @@ def test_reservoir_is_flat(case: Case):
           for name in ("reservoir", "event", "gather", "stack")),
     ],
 )  # fmt: skip
-def test_nothing_is_kept_of_paths_whose_adjoint_is_known_before(case: Case, estimator: str, depths: tuple[int, ...]):
+def test_nothing_is_kept_of_paths_with_a_known_adjoint(case: Case, estimator: str, depths: tuple[int, ...]):
     peaks = {depth: peak(case, "reslrb", depth, estimator, adjoint="independent") for depth in depths}
     print(estimator, peaks)
     assert max(peaks.values()) < SPP * case.weights.shape[0] * case.weights.shape[1]  # a byte a path

@@ -124,7 +124,7 @@ def test_what_leaves_the_scene_stays_lit(sky: str, name: str):
     assert before.sum() < 0.9 * moved  # else nothing left the scene: the squares overlapped
 
 
-def test_a_horizon_is_not_renewed_more_than_need_be():
+def test_a_horizon_is_renewed_only_if_needed():
     scene = load(tiles(4, SKIES["constant"]))
     ours = integrator("reslrb")
     horizons = []
@@ -136,7 +136,7 @@ def test_a_horizon_is_not_renewed_more_than_need_be():
     assert horizons[0] == horizons[1] != horizons[2] == horizons[3] != horizons[4]
 
 
-def test_a_parallel_lamp_that_grows_sends_more_light():
+def test_a_growing_parallel_lamp_emits_more_light():
     lamp = surface("rectangle", "directionalarea")
     scene = load(over_floor(lamp))
     params = mi.traverse(scene)
@@ -146,7 +146,7 @@ def test_a_parallel_lamp_that_grows_sends_more_light():
     assert image(scene).sum() == pytest.approx(image(load(over_floor(larger))).sum(), rel=1e-3)
 
 
-def test_a_sphere_that_is_turned_shines_outward():
+def test_a_flipped_sphere_emits_outward():
     turned = surface("sphere") | {"to_world": transform(translate=PIVOT, rotate=([1, 0, 0], 90), scale=0.4)}
     straight = surface("sphere") | {"to_world": transform(translate=PIVOT, scale=0.4)}
     expected, found = (image(load(over_floor(lamp)), spp=1024).sum() for lamp in (straight, turned))
@@ -173,7 +173,7 @@ LAMPS = {
 
 
 @pytest.mark.parametrize("kind", a_few(LAMPS, ["sphere"]))
-def test_the_outline_of_a_lamp_that_is_seen_moves(kind: str):
+def test_the_outline_of_a_visible_lamp_moves(kind: str):
     """Differences of primary rays, which hit it or not, are noisy: large steps, many samples."""
     moving = seen(LAMPS[kind])
     ours, naive = integrator("reslrb", 1, estimator="stack"), integrator("walk_ad", 1, attached=True)
@@ -188,13 +188,13 @@ def test_the_outline_of_a_lamp_that_is_seen_moves(kind: str):
     assert (found.relative_l2 or 0.0) < 0.03
 
 
-def test_a_hidden_lamp_has_no_part():
+def test_a_hidden_lamp_has_no_effect():
     moving = seen(LAMPS["rectangle"])
     hidden = moving.gradient(integrator("reslrb", 2, estimator="stack", hide_emitters=True), 1, 16)
     assert not any(value.any() for value in hidden.values())
 
 
-def test_walk_ad_shows_a_moving_lamp_as_it_is():
+def test_walk_ad_shows_a_moving_lamp():
     """Its derivative is splatted twice, and must not show in the image."""
     moving = seen(LAMPS["rectangle"])
     results = []
@@ -206,7 +206,7 @@ def test_walk_ad_shows_a_moving_lamp_as_it_is():
 
 @pytest.mark.parametrize("kind", ["rectangle", "sphere"])
 @pytest.mark.parametrize("emitter", ["area", "directionalarea"])
-def test_one_kernel_has_it_all(kind: str, emitter: str):
+def test_one_kernel_contains_everything(kind: str, emitter: str):
     """The derivative by a number of a transformation is a sum over all paths; none is traced again for it."""
     scene = load(over_floor(surface(kind, emitter)))
     params, sensor = mi.traverse(scene), scene.sensors()[0]
@@ -225,7 +225,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", list(REFUSED))
-def test_refused_with_the_reason(name: str):
+def test_refused_with_a_reason(name: str):
     light, key, reason = REFUSED[name]
     import drjit as dr
 
@@ -255,7 +255,7 @@ FAULTS = {
 }  # fmt: skip
 QUICK = "area_of_faces_detached"
 #: What finds a fault that differences have as well.
-FOUND_BY = {"turned": test_a_sphere_that_is_turned_shines_outward}
+FOUND_BY = {"turned": test_a_flipped_sphere_emits_outward}
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n == QUICK else pytest.mark.long) for n in FAULTS])
@@ -267,7 +267,7 @@ def test_fault(name: str, monkeypatch: pytest.MonkeyPatch):
         find()
 
 
-def test_faces_of_a_mesh_are_those_that_mitsuba_draws():
+def test_faces_of_a_mesh_match_those_that_mitsuba_samples():
     from reslrb_cli.scene.graph import SceneGraph
     from reslrb_cli.transport.lamps import drawn_face, sums_of_areas
 
@@ -315,19 +315,19 @@ def share(case: Moving) -> float:
     return border_share(ours, Job(case.loaded, case.loaded.sensors()[0], dr.opaque(mi.UInt32, 3), 64, case.params))
 
 
-def test_light_that_covers_the_film_is_at_its_border_as_far_as_the_filter_reaches():
+def test_light_that_covers_the_film_counts_at_its_border():
     case = moving(3)
     tracked(case)
     assert share(case) == pytest.approx(1 - (1 - 2 * RADIUS / SIZE) ** 2, rel=0.03)
 
 
-def test_light_within_the_film_is_not():
+def test_light_within_the_film_does_not_count():
     case = moving(1)
     tracked(case)
     assert share(case) == 0
 
 
-def test_what_rests_does_not_count():
+def test_resting_objects_do_not_count():
     case = moving(1, sun={"type": "directional", "direction": [0, -1, 0]})
     tracked(case)
     assert share(case) == 0
@@ -337,7 +337,7 @@ def test_nothing_moves():
     assert share(moving(3)) == 0
 
 
-def test_a_crop_window_has_a_border_of_its_own():
+def test_a_crop_window_has_its_own_border():
     crop = {"crop_offset_x": 8, "crop_offset_y": 8, "crop_width": 16, "crop_height": 16}
     case = moving(3, crop)
     tracked(case)
@@ -345,7 +345,7 @@ def test_a_crop_window_has_a_border_of_its_own():
 
 
 @pytest.mark.parametrize(("scale", "lines"), [(3, 1), (1, 0)])
-def test_a_run_is_told_once_a_view(scale: float, lines: int):
+def test_a_run_is_warned_once_per_view(scale: float, lines: int):
     case, said = moving(scale), []
     tracked(case)
     problem: Any = types.SimpleNamespace(
@@ -357,6 +357,6 @@ def test_a_run_is_told_once_a_view(scale: float, lines: int):
     assert all(line.startswith("view 0: 2") and "% of the moving light" in line for line in said)
 
 
-def test_other_integrators_are_not_asked():
+def test_other_integrators_are_not_checked():
     problem: Any = types.SimpleNamespace(integrator=integrator("ptracer", 2))
     warn_of_border(problem, pytest.fail)

@@ -134,7 +134,7 @@ QUICK = [(shrinks or STEADY)[number % len(shrinks or STEADY)] for number, (*_, s
         for estimator in STEADY
     ],
 )
-def test_omission_changes_nothing_and_shrinks(feature, make, keys, shrinks, estimator):
+def test_an_omission_changes_nothing_and_shrinks_the_kernel(feature, make, keys, shrinks, estimator):
     (operations, image, gradient), (forced, forced_image, forced_gradient) = both_ways(make, keys, feature, estimator)
     assert differs(image, forced_image) < 1e-6
     if not (estimator == "reservoir" and feature in CANDIDATES):
@@ -153,7 +153,7 @@ ASKED = {
 
 
 @taking_turns("asked", list(ASKED), "estimator", ESTIMATORS)
-def test_only_what_is_asked_for_is_differentiated(asked: str, estimator: str):
+def test_only_requested_parameters_are_differentiated(asked: str, estimator: str):
     """What is differentiated beside a parameter does not change its derivative, and makes the kernels larger."""
     keys, more = ASKED[asked]
     results = []
@@ -173,7 +173,7 @@ def test_only_what_is_asked_for_is_differentiated(asked: str, estimator: str):
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_emitters_alone_replay_no_path(estimator: str):
+def test_emitters_alone_need_no_replay(estimator: str):
     """Beside the walk that makes the image, there is only the small kernel of emission."""
     case = Case(plain(), (RADIANCE,))
     ours = integrator("reslrb", 5, estimator=estimator)
@@ -183,7 +183,7 @@ def test_emitters_alone_replay_no_path(estimator: str):
     assert sum(others) < walk / 2
 
 
-def test_rows_say_what_is_needed() -> None:
+def test_rows_explain_needed_features() -> None:
     case, ours = Case(through_a_lens(), (FLOOR,)), integrator("reslrb", 5, estimator="stack")
     with tracking(case.params, case.keys):
         rows = plan_rows(ours.plan(case.scene, case.scene.sensors()[0], case.params))
@@ -191,7 +191,7 @@ def test_rows_say_what_is_needed() -> None:
     assert all(row.reason for row in rows)
 
 
-def test_a_step_plans_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_makes_one_plan(monkeypatch: pytest.MonkeyPatch) -> None:
     """Not once a batch: for the image of the first batch, and for all that is differentiated."""
     original, asked = Preparation.plan, []
 
@@ -231,7 +231,7 @@ def scene(llvm: str) -> dict:
     ],
 )
 @pytest.mark.parametrize("adjoint", ["independent", "correlated"])
-def test_vertices_after_the_last_to_differentiate_are_not_visited_again(
+def test_vertices_after_the_last_differentiable_one_are_not_revisited(
     scene: dict,
     monkeypatch: pytest.MonkeyPatch,
     estimator: str,
@@ -255,7 +255,7 @@ def test_vertices_after_the_last_to_differentiate_are_not_visited_again(
     assert 0 < means[0] < 0.7 * means[1]
 
 
-def test_connections_without_anything_to_differentiate_are_no_candidates(
+def test_connections_without_differentiable_vertices_are_no_candidates(
     scene: dict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     case = Case(scene, FLOOR_ALONE)
@@ -272,7 +272,7 @@ def test_connections_without_anything_to_differentiate_are_no_candidates(
     assert ours < 0.7 * of_all
 
 
-def test_without_an_image_the_others_are_not_even_connected(scene: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_an_image_other_vertices_are_not_connected(scene: dict, monkeypatch: pytest.MonkeyPatch) -> None:
     original, shares = stack.walk_back, []
 
     def noting(p: Any, form: Any, ring: Any, state: stack.StackState, *rest: Any) -> Any:

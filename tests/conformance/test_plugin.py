@@ -76,7 +76,7 @@ print(mi.load_dict({"type": "reslrb", "max_depth": 3}).max_depth)
 """
 
 
-def test_variants_that_do_not_work_are_refused_with_those_that_do():
+def test_unsupported_variants_are_refused_with_the_supported_ones():
     """None is no variant either. One that is set later is refused, too, under which nothing was ever registered."""
     run = subprocess.run([sys.executable, "-c", REGISTERED], capture_output=True, text=True, timeout=120, cwd=ROOT)
     assert run.returncode == 0, run.stderr
@@ -116,7 +116,7 @@ def _facing() -> Any:
     return transform(translate=[0.2, -0.1, 1.2], rotate=([0, 1, 0], 15), scale=0.4)
 
 
-def test_defaults_are_ptracers():
+def test_defaults_match_ptracer():
     ours, stock = plugin("reslrb", -1, 5), str(plugin("ptracer", -1, 5))
     import mitsuba as mi
 
@@ -149,14 +149,14 @@ def test_wrong_options_raise(options: dict[str, Any]):
 
 
 @pytest.mark.parametrize("name", ["estimator", "weight"])
-def test_walk_ad_knows_no_estimators(name: str):
+def test_walk_ad_has_no_estimators(name: str):
     import mitsuba as mi
 
     with pytest.raises(RuntimeError):
         mi.load_dict({"type": "walk_ad", name: "all"})
 
 
-def test_an_option_that_an_integrator_does_not_have_is_refused():
+def test_unknown_options_of_an_integrator_are_refused():
     from reslrb_cli.integrators.step import make_integrator
 
     for type in ("reslrb", "ptracer", "prb"):
@@ -187,13 +187,13 @@ def test_samples_that_passes_do_not_divide_raise(case: Case):
     ],
     ids=str,
 )
-def test_a_step_with_what_is_out_of_range_raises(case: Case, options: dict[str, Any], message: str):
+def test_a_step_with_arguments_out_of_range_raises(case: Case, options: dict[str, Any], message: str):
     given = {"sensor": 0, "seed": 1, "spp": 4} | options
     with pytest.raises(ValueError, match=message):
         step(plugin("reslrb"), case.scene, given.pop("sensor"), case.objective, params=case.params, **given)
 
 
-def test_a_step_takes_numpys_numbers(case: Case):
+def test_a_step_accepts_numpy_numbers(case: Case):
     given = {"seed": np.uint32(1), "spp": np.int64(4)}
     result = step(plugin("reslrb"), case.scene, np.int64(0), case.objective, params=case.params, **given)
     assert np.isfinite(np.array(result.image)).all()
@@ -231,7 +231,7 @@ def test_mi_render_backward_through_a_latent_variable(case: Case):
     assert compare(np.array(steps)[:, None], direct[:, None], block=None)
 
 
-def test_mi_render_adds_to_gradients_that_are_there(case: Case):
+def test_mi_render_adds_to_existing_gradients(case: Case):
     import drjit as dr
     import mitsuba as mi
 
@@ -299,7 +299,7 @@ def test_one_latent_for_several_sensors(llvm: str):
 @pytest.mark.parametrize(
     ("name", "options"), [("reslrb", {"estimator": "event"}), ("reslrb", {"estimator": "stack"}), ("walk_ad", {})]
 )
-def test_what_moves_is_refused_with_the_reason(name: str, options: dict[str, str], key: str):
+def test_moving_scenes_are_refused_with_a_reason(name: str, options: dict[str, str], key: str):
     import drjit as dr
 
     from reslrb_cli.integrators.step import gradient_step
@@ -313,7 +313,7 @@ def test_what_moves_is_refused_with_the_reason(name: str, options: dict[str, str
         gradient_step(integrator(name, **options), case.scene, 0, case.objective, seed=1, spp=4)
 
 
-def test_an_emitter_that_mitsuba_cannot_sample_is_refused():
+def test_an_emitter_without_samples_is_refused():
     scene = _textured()
     scene["spot"] = {"type": "spot", "texture": {"type": "checkerboard"}}
     case = Case(scene, (FLOOR,))
@@ -390,7 +390,7 @@ def test_samples_per_pass(case: Case):
     assert relative(one, only) < 1e-5
 
 
-def test_a_plan_is_not_taken_from_another_scene(llvm: str):
+def test_a_plan_is_not_reused_for_another_scene(llvm: str):
     """Scenes come and go, and their addresses are used again: what one needs may not be read off another."""
     import gc
 

@@ -97,7 +97,7 @@ class Rewalk(Hooks):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_replay_meets_the_same_vertices(name: str):
+def test_a_replay_visits_the_same_vertices(name: str):
     import drjit as dr
     import mitsuba as mi
     import numpy as np
@@ -130,7 +130,7 @@ def test_replay_meets_the_same_vertices(name: str):
         assert error(C, stored) < 1e-6
 
 
-def test_no_light_no_replay():
+def test_without_light_there_is_no_replay():
     """A scene whose light reaches nothing keeps nothing, and its gradient is zero."""
     from reslrb_cli.measure.scenes.small import rgb, transform
 
@@ -214,7 +214,7 @@ def check(case: Case, name: str, adjoint: str, bad: float) -> None:
 
 
 @pytest.mark.parametrize(("name", "adjoint"), REFUSED)
-def test_a_step_takes_them_for_zero_and_counts_them(case, name, adjoint):
+def test_a_step_replaces_nan_by_zero_and_counts_it(case, name, adjoint):
     check(case, name, adjoint, math.nan)
 
 
@@ -222,13 +222,13 @@ def test_infinities_are_refused_too(case):
     check(case, "stack", "correlated", -math.inf)
 
 
-def test_a_film_with_alpha_loses_none():
+def test_a_film_with_alpha_counts_all():
     alpha = Case(floor(diffuse(0.5, 0.4, 0.3), camera=camera(pixel_format="rgba")), ["floor.reflectance.value"])
     check(alpha, "stack", "correlated", math.nan)
 
 
 @pytest.mark.parametrize("name", ["stack", "ptracer"])
-def test_a_step_whose_derivative_is_known_counts_them(case, name):
+def test_a_step_with_a_known_derivative_counts_them(case, name):
     with_bad, _ = spoilt(case, math.nan)
     results = []
 
@@ -241,14 +241,14 @@ def test_a_step_whose_derivative_is_known_counts_them(case, name):
     assert np.isfinite(np.array(results[0].loss)).all()
 
 
-def test_nothing_is_refused_where_all_is_finite(case):
+def test_finite_values_are_not_refused(case):
     result, _ = step_and_gradient(case, integrator("reslrb"), linear(case.weights), adjoint="correlated")
     assert int(result.refused.count[0]) == 0
     assert result.refused.entry() is None
 
 
 @pytest.mark.parametrize("pixel_format", ["rgb", "rgba"])
-def test_light_that_is_not_finite_shows_in_the_image(pixel_format):
+def test_non_finite_light_shows_in_the_image(pixel_format):
     """On a CPU atomic sums drop a NaN that is alone at its address: it must not vanish from films with alpha."""
     data = np.full((4, 4, 3), 0.5, np.float32)
     data[1, 2, 0] = np.nan
@@ -260,7 +260,7 @@ def test_light_that_is_not_finite_shows_in_the_image(pixel_format):
 
 
 @pytest.mark.parametrize("name", [name for name in INTEGRATORS if name != "prb"])
-def test_a_contribution_that_is_not_finite_shows_in_the_gradient(name):
+def test_a_non_finite_contribution_shows_in_the_gradient(name):
     """Its weight in a reservoir is infinite: it must not be passed over."""
     scene = floor(diffuse(0.5, 0.4, 0.3), lamp=lamp(radiance=rgb(3e38, 3e38, 3e38)))
     case = Case(scene, ["floor.reflectance.value"])
@@ -269,7 +269,7 @@ def test_a_contribution_that_is_not_finite_shows_in_the_gradient(name):
 
 
 @pytest.mark.parametrize("name", ["reservoir", "gather", "event", "stack"])
-def test_a_factor_that_is_not_a_number_shows_in_the_gradient(name):
+def test_a_nan_factor_shows_in_the_gradient(name):
     data = np.full((4, 4, 3), 0.5, np.float32)
     data[1, 2] = np.nan
     scene = floor({"type": "diffuse", "reflectance": bitmap(data)})

@@ -44,7 +44,7 @@ def both(name: str, **options: Any) -> tuple[Case, Any, Any]:
 
 
 @pytest.mark.parametrize("name", a_few(NAMES, ["glass"]))
-def test_means_are_those_of_independent_numbers(name: str) -> None:
+def test_means_equal_those_of_independent_numbers(name: str) -> None:
     scene, ours, plain = both(name, freeze=True)
     result = compare(samples(scene, ours, 32), samples(scene, plain, 32, 1), block=None)
     print(name, result)
@@ -54,7 +54,7 @@ def test_means_are_those_of_independent_numbers(name: str) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("guiding", ["off", "on"])
 @pytest.mark.parametrize("name", ["texture", "two_emitters", "glass"])
-def test_means_of_many_seeds_are_those_of_others(name: str, guiding: str) -> None:
+def test_means_over_many_seeds_agree(name: str, guiding: str) -> None:
     """Of independent numbers, and of the stock integrator that is right for the case."""
     scene, ours, plain = both(name, freeze=True)
     if guiding == "on":
@@ -70,7 +70,7 @@ def test_means_of_many_seeds_are_those_of_others(name: str, guiding: str) -> Non
 
 @pytest.mark.parametrize("estimator", a_few(ESTIMATORS, ["reservoir"]))
 @pytest.mark.parametrize("adjoint", a_few(["correlated", "independent", "batched"], ["batched"]))
-def test_every_way_of_a_step_has_the_same_mean(estimator: str, adjoint: str) -> None:
+def test_every_kind_of_step_has_the_same_mean(estimator: str, adjoint: str) -> None:
     scene, ours, plain = both("texture", estimator=estimator, freeze=True)
     found = [scene.gradients(each, seeds(24, block), 16, adjoint=adjoint) for block, each in enumerate((ours, plain))]
     result = compare(*found, block=None)
@@ -80,7 +80,7 @@ def test_every_way_of_a_step_has_the_same_mean(estimator: str, adjoint: str) -> 
 
 @pytest.mark.parametrize("name", a_few(["latents", "spot", "mesh", "bounces_4"], ["spot"]))
 @pytest.mark.parametrize("estimator", a_few(["stack", "reservoir"], ["stack"]))
-def test_means_where_light_is_followed(name: str, estimator: str) -> None:
+def test_means_hold_with_followed_light(name: str, estimator: str) -> None:
     moving, found = MOVING[name].moving(), []
     for block, sequence in enumerate(("low_discrepancy", "independent")):
         ours = make_integrator("reslrb", max_depth=5, rr_depth=1000, estimator=estimator, sequence=sequence)
@@ -92,7 +92,7 @@ def test_means_where_light_is_followed(name: str, estimator: str) -> None:
     assert result
 
 
-def test_there_is_less_noise_where_these_numbers_say_where_light_goes() -> None:
+def test_noise_is_lower_if_these_numbers_determine_the_paths() -> None:
     scene, ours, plain = both("point", max_depth=2)
     variances = [samples(scene, each, 24, block).var(0, ddof=1).sum() for block, each in enumerate((ours, plain))]
     print(variances[1] / variances[0])
@@ -121,7 +121,7 @@ def test_numbers_are_evenly_distributed(guiding: str) -> None:
         sequence_faults.shared_by_passes,
     ],
 )
-def test_what_would_bias_is_found(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_planted_biases_are_found(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     fault(monkeypatch)
     result = evenly("off")
     print(fault.__name__, result)
@@ -190,7 +190,7 @@ def worst_of_replays(name: str, ways: Sequence[str] = ("correlated", "independen
     return max(relative(*(scene.gradient(each, 5, 64, adjoint=way) for each in (other, ours))) for way in ways)
 
 
-def test_a_recorded_step_is_the_step() -> None:
+def test_a_recorded_step_equals_the_step() -> None:
     scene, ours, _ = both("two_emitters")
     _, frozen, _ = both("two_emitters", freeze=True)
     for seed in (5, 6):
@@ -198,7 +198,7 @@ def test_a_recorded_step_is_the_step() -> None:
     assert frozen.preparation.recordings.counts()["fused"] > 0
 
 
-def test_with_independent_numbers_nothing_of_it_is_compiled() -> None:
+def test_with_independent_numbers_the_sequence_is_not_compiled() -> None:
     nothing_is_compiled_without("sequence", *both("two_emitters"))
 
 
@@ -234,7 +234,7 @@ def coordinates(seed: int, width: int) -> np.ndarray:
     return np.stack([np.array(points.next_1d(), np.float64) for _ in range(COORDINATES)])
 
 
-def test_points_are_sobol_s() -> None:
+def test_points_match_sobol() -> None:
     """Of 2^15 points in a row all are among SciPy's, which come in another order."""
     import drjit as dr
     import mitsuba as mi
@@ -250,7 +250,7 @@ def test_points_are_sobol_s() -> None:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("k", [3, 8])
-def test_boxes_of_the_first_two_hold_one_point_each(k: int, seed: int) -> None:
+def test_boxes_of_the_first_two_dimensions_hold_one_point_each(k: int, seed: int) -> None:
     assert fills(coordinates(seed, 7 * 2**k), k)
 
 

@@ -127,14 +127,14 @@ def differing(way: str, names: tuple[str, ...], orders: Iterator[np.random.Gener
 
 
 @pytest.mark.parametrize("way", ["both"])
-def test_what_came_before_makes_no_difference(way: str) -> None:
+def test_results_do_not_depend_on_earlier_work(way: str) -> None:
     with one_thread():
         assert differing(way, ("mirror", "zero", "moving"), map(np.random.default_rng, range(3)), 8) == []
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("way", WAYS)
-def test_what_came_before_makes_no_difference_in_200_orders(way: str) -> None:
+def test_results_do_not_depend_on_200_orders_of_earlier_work(way: str) -> None:
     with one_thread():
         orders = map(np.random.default_rng, range(200 // len(WAYS)))
         assert differing(way, tuple(SCENES), orders, 6) == []
@@ -153,7 +153,7 @@ def test_weights_of_emitters_may_change() -> None:
 
 
 @pytest.mark.parametrize("name", ["reslrb", "ptracer"])
-def test_a_scene_at_the_address_of_one_that_is_freed_is_another_one(name: str) -> None:
+def test_a_scene_at_a_reused_address_is_another_one(name: str) -> None:
     """The sphere that a sky lights is that of each scene."""
 
     def mean(tracer: Any, size: float) -> tuple[float, int]:
@@ -170,7 +170,7 @@ def test_a_scene_at_the_address_of_one_that_is_freed_is_another_one(name: str) -
 
 
 @pytest.mark.parametrize("whole", [True, False])
-def test_where_light_lands_has_the_same_derivative_however_it_is_taken(whole: bool) -> None:
+def test_the_derivative_of_film_positions_is_the_same_in_both_modes(whole: bool) -> None:
     """By splats under naive AD, by their taps, and by a look-up of dL/dI, also on a film that divides by no sum."""
     film = Film(load(room(camera=camera("gaussian"))).sensors()[0], whole)
     shape = film.block().tensor().shape

@@ -88,7 +88,7 @@ def test_forward_mode():
     assert case.tangent(tracer, direction, 3, 64) == pytest.approx(known.gradient(case.weights) @ direction, rel=0.01)
 
 
-def test_a_recorded_step_is_the_step_and_later_ones_compile_nothing():
+def test_a_recorded_step_equals_the_step_and_later_ones_compile_nothing():
     case, kernels = Case(two(), SPECKS), Kernels()
     plain, frozen = (integrator("reslrb", 3, estimator="stack", freeze=freeze) for freeze in (False, True))
     for seed in (1, 2, 3):
@@ -130,16 +130,16 @@ def behind() -> dict[str, Any]:
     ],
     ids=["a large one", "two", "behind a screen", "out of view", "parallel", "of two pixels"],
 )  # fmt: skip
-def test_which_are_small(make: Callable[[], dict[str, Any]], number: int):
+def test_classification_of_small_lamps(make: Callable[[], dict[str, Any]], number: int):
     assert len(found(make())) == number
 
 
-def test_too_many_are_left_to_primary_rays(monkeypatch: pytest.MonkeyPatch):
+def test_too_many_lamps_are_left_to_primary_rays(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(graph, "MOST", 1)
     assert found(two()) == ()
 
 
-def test_scenes_without_any_have_no_more_operations():
+def test_scenes_without_small_lamps_have_no_extra_operations():
     """And those with some have."""
     operations = {}
     for name, make in {"none": room, "some": two}.items():
@@ -171,7 +171,7 @@ def radiance_gradient(key: str, moves: bool, size: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", [0.4, 0.01])
-def test_radiance_counts_once_where_its_lamp_moves_too(size: float):
+def test_radiance_counts_once_if_its_lamp_moves_too(size: float):
     """It did twice: once by primary rays, and once by points on the lamp that show where it goes."""
     key = "light.emitter.radiance.value"
     alone, beside = (radiance_gradient(key, moves, size) for moves in (False, True))
@@ -210,5 +210,5 @@ def test_fault(fault: Fault, monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
-def test_it_fits_the_code(fault: Fault, monkeypatch: pytest.MonkeyPatch):
+def test_the_faults_apply_to_the_code(fault: Fault, monkeypatch: pytest.MonkeyPatch):
     plant(fault, monkeypatch)

@@ -48,7 +48,7 @@ def by_harsh_table(guiding: Guiding, factor: float = 1.0) -> None:
 
 
 @pytest.mark.parametrize("name", a_few(NAMES, ["two_emitters"]))
-def test_means_are_those_of_unguided_samples(name: str) -> None:
+def test_means_equal_those_of_unguided_samples(name: str) -> None:
     assert means_hold(name, 32)
 
 
@@ -61,7 +61,7 @@ def means_hold(name: str, count: int) -> Any:
 
 @pytest.mark.parametrize("estimator", a_few(ESTIMATORS, ["reservoir", "event"]))
 @pytest.mark.parametrize("adjoint", a_few(["correlated", "independent", "batched"], ["correlated"]))
-def test_every_way_of_a_step_has_the_mean_of_the_unguided(estimator: str, adjoint: str) -> None:
+def test_every_kind_of_step_has_the_unguided_mean(estimator: str, adjoint: str) -> None:
     scene, ours, plain = guided("two_emitters", 1, estimator=estimator)
     harsh(scene, ours)
     found = [scene.gradients(each, seeds(24, block), SPP, adjoint=adjoint) for block, each in enumerate((ours, plain))]
@@ -88,7 +88,7 @@ def of_another_cell(patch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("fault", [without_weight, of_another_cell])
-def test_what_would_bias_is_found(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_planted_biases_are_found(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     fault(monkeypatch)
     assert not means_hold("two_emitters", 32)
 
@@ -98,7 +98,7 @@ BOUNCES = next(case for case in MOVING if case.name == "bounces")
 
 
 @pytest.mark.parametrize("rr_depth", [2, 5])
-def test_means_stay_where_light_moves(rr_depth: int) -> None:
+def test_means_hold_with_moving_light(rr_depth: int) -> None:
     """For parameters before and behind what moves, with roulette on throughput (2) and without it (5)."""
     assert moving_means_hold("stack", "harsh", rr_depth, 8, 16)
 
@@ -107,7 +107,7 @@ def test_means_stay_where_light_moves(rr_depth: int) -> None:
 @pytest.mark.parametrize("rr_depth", [2, 5, 1000])
 @pytest.mark.parametrize("table", ["harsh", "learned"])
 @pytest.mark.parametrize("estimator", ["stack", "reservoir"])
-def test_means_stay_where_light_moves_by_many_seeds(estimator: str, table: str, rr_depth: int) -> None:
+def test_means_hold_with_moving_light_over_many_seeds(estimator: str, table: str, rr_depth: int) -> None:
     assert moving_means_hold(estimator, table, rr_depth, 24, 32)
 
 
@@ -134,7 +134,7 @@ def moving_means_hold(estimator: str, table: str, rr_depth: int, count: int, spp
     return holds
 
 
-def test_a_lost_weight_of_learned_roulette_is_found_where_light_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lost_weight_of_learned_roulette_is_found_with_moving_light(monkeypatch: pytest.MonkeyPatch) -> None:
     """The walk back asks for roulette on throughput alone, as it once did."""
     from reslrb_cli.estimators.attached import AttachedSweep
 
@@ -179,7 +179,7 @@ def replays_agree(make: Callable[[str], tuple[Case, Any]]) -> bool:
 
 @pytest.mark.parametrize("fault", [False, True])
 @pytest.mark.parametrize("name", a_few(["two_emitters", "mask_texture_in_view"], ["two_emitters"]))
-def test_a_replay_follows_the_paths_that_were_traced(name: str, fault: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_replay_follows_the_traced_paths(name: str, fault: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     def make(estimator: str) -> tuple[Case, Any]:
         scene, ours, _ = guided(name, 1, estimator=estimator)
         return scene, harsh(scene, ours)
@@ -192,7 +192,7 @@ def test_a_replay_follows_the_paths_that_were_traced(name: str, fault: bool, mon
     assert replays_agree(make) is not fault
 
 
-def test_a_recorded_step_is_the_step() -> None:
+def test_a_recorded_step_equals_the_step() -> None:
     """Recordings have the table that there is, not the one that they were made with."""
     (scene, ours, _), (_, frozen, _) = (guided("envmap", 0, freeze=freeze) for freeze in (False, True))
     for factor in (1.0, 0.3, 3.0):
@@ -204,7 +204,7 @@ def test_a_recorded_step_is_the_step() -> None:
 # What is learned of where paths go on to, and what they end by: against sums in NumPy.
 
 
-def test_cells_are_those_of_place_and_octant_and_none_is_outside() -> None:
+def test_cells_are_indexed_by_position_and_octant() -> None:
     import mitsuba as mi
 
     random = np.random.default_rng(2)
@@ -247,7 +247,7 @@ def cell_of(x: int, y: int, z: int) -> int:
     return int(np.ravel_multi_index((x, y, z, 3), SHAPE))
 
 
-def test_cells_lean_on_those_about_them_and_none_is_given_up() -> None:
+def test_cells_share_with_their_neighbours_and_none_is_zero() -> None:
     """The formula of the docstring where a cell is well known; of one that nobody has met, that of its neighbours."""
     left = np.zeros(CELLS)
     loud, near, quiet, far = (cell_of(*cube) for cube in ((10, 10, 10), (10, 10, 11), (1, 1, 1), (1, 14, 1)))
@@ -266,14 +266,14 @@ def test_cells_lean_on_those_about_them_and_none_is_given_up() -> None:
     assert 1e6 > 1e3 * LEAN
 
 
-def test_walks_in_which_nothing_was_said_teach_nothing() -> None:
+def test_walks_without_contributions_change_nothing() -> None:
     onward = Onward.nothing(BOX)
     assert np.isinf(onward.chances(1.0)).all()
     for said, light in (([0.0, 1.0], 1.0), ([1.0, 0.0], 1.0), ([np.nan, 1.0], 1.0), ([1.0, 1.0], 0.0)):
         assert onward.with_more(walked(said=np.array(said), light=light)) is onward
 
 
-def test_where_no_ray_has_left_a_vertex_all_go_on() -> None:
+def test_without_data_all_paths_survive() -> None:
     """As in a scene whose paths are not followed beyond their first surface."""
     known = Onward.nothing(BOX).with_more(walked())
     assert known.light > 0
@@ -281,7 +281,7 @@ def test_where_no_ray_has_left_a_vertex_all_go_on() -> None:
         assert np.isposinf(known.chances(share)).all()
 
 
-def test_what_is_known_does_not_depend_on_the_unit_of_light() -> None:
+def test_learned_state_does_not_depend_on_the_unit_of_light() -> None:
     """Throughputs are as bright as the light is: s is in proportion to one over that."""
     random = np.random.default_rng(3)
     squares, left = random.gamma(0.2, size=(2, CELLS)), random.integers(0, 300, CELLS).astype(float)
@@ -323,7 +323,7 @@ def certain(scene: Case, ours: Any) -> None:
 
 
 @pytest.mark.parametrize("fault", [None, "square", "length"])
-def test_what_is_heard_is_what_there_is_whatever_roulette_ends(fault: str | None, monkeypatch: Any) -> None:
+def test_collected_values_do_not_depend_on_roulette(fault: str | None, monkeypatch: Any) -> None:
     """Weights of roulette are taken out again: a table that learned its own weights would feed on itself."""
     from reslrb_cli.guiding import collect
 
@@ -336,7 +336,7 @@ def test_what_is_heard_is_what_there_is_whatever_roulette_ends(fault: str | None
     assert bool(result) == (fault is None)
 
 
-def test_what_follows_a_bounce_is_heard_where_its_ray_left() -> None:
+def test_later_contributions_are_collected_at_the_ray_of_the_bounce() -> None:
     """Against sums in NumPy over the paths of the same seed, vertex by vertex, of what they say about the image."""
     import drjit as dr
     import mitsuba as mi
@@ -379,7 +379,7 @@ def test_what_follows_a_bounce_is_heard_where_its_ray_left() -> None:
         np.testing.assert_allclose(np.bincount(cell, values, CELLS), sums, rtol=1e-3, atol=1e-6 * sums.max())
 
 
-def test_vertices_that_find_no_room_are_summed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vertices_beyond_the_capacity_are_summed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of walks of two bounces rays leave the first vertex alone: there is room for that, or for both."""
     from reslrb_cli.guiding import collect
 
@@ -393,7 +393,7 @@ def test_vertices_that_find_no_room_are_summed(monkeypatch: pytest.MonkeyPatch) 
         np.testing.assert_allclose(getattr(found[1], name), getattr(found[0], name), rtol=1e-4)
 
 
-def test_tables_that_have_learned_end_paths_that_say_little() -> None:
+def test_trained_tables_end_paths_with_small_contributions() -> None:
     """Walks of equal seeds get shorter."""
     scene, ours, _ = guided("roulette", 4, rr_depth=100)
     lengths = []

@@ -328,7 +328,7 @@ def test_a_weight_is_a_ratio_of_densities(name: str):
     assert "L" not in ways or (ways["L"].missed == set() and len(ways["L"].error) > 500)
 
 
-def test_every_pattern_of_delta_vertices_is_there():
+def test_every_pattern_of_delta_vertices_is_covered():
     met = {way: set(one.patterns) for way, one in as_it_stands("patterns").items()}
     every = {pattern for m in range(1, 6) for pattern in product((False, True), repeat=m)}
     assert met["H"] == every
@@ -343,7 +343,7 @@ def test_every_pattern_of_delta_vertices_is_there():
         ["lamps", "evened", "masks", "envmap", "only_constant"],
     ),
 )
-def test_the_density_of_rays_is_that_of_those_that_are_sampled(name: str):
+def test_the_density_of_rays_matches_the_sampled_ones(name: str):
     """Which a ray's weight tells: it is the light along it, times the cosine at a lamp, over that density."""
     import drjit as dr
     from conformance.path_densities import Densities, Emission, cosine

@@ -74,7 +74,7 @@ def drawn(shape: str, side: int) -> np.ndarray:
         ("inverse", 90, "light", 32),
     ],
 )
-def test_a_picture_of_black_and_white_becomes_a_lens(
+def test_a_black_and_white_picture_becomes_a_lens(
     shape: str, side: int, mode: str, pixels: int, tmp_path: Path, llvm: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     values = drawn(shape, side)
@@ -96,7 +96,7 @@ def test_a_picture_of_black_and_white_becomes_a_lens(
     assert seen.min() == 0
 
 
-def test_a_pattern_that_is_finer_than_the_pixels_is_named(tmp_path: Path) -> None:
+def test_a_pattern_finer_than_the_pixels_is_named(tmp_path: Path) -> None:
     Image.fromarray((255 * (np.indices((64, 64)).sum(axis=0) % 2)).astype(np.uint8)).save(tmp_path / "p.png")
     result = CliRunner().invoke(command, [str(tmp_path / "p.png"), "-o", str(tmp_path / "lens"), "--pixels", "32"])
     assert str(result.exception).startswith(f"--pixels: is 32, too few for the fine pattern of {tmp_path}/p.png")
@@ -104,7 +104,7 @@ def test_a_pattern_that_is_finer_than_the_pixels_is_named(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("kind", OPTIONS)
-def test_the_start_throws_the_picture_upright_and_as_bright_as_its_target(kind: str, tmp_path: Path) -> None:
+def test_the_start_casts_the_picture_upright_with_the_right_brightness(kind: str, tmp_path: Path) -> None:
     wanted = picture(32, 24 if kind == "portrait" else 32)
     write_file(tmp_path / "p.exr", np.repeat(wanted[:, :, None], 3, 2).astype(np.float32), linear=True)
     folder = tmp_path / "lens"
@@ -166,7 +166,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_what_cannot_be_is_refused_in_one_line_and_nothing_is_written(
+def test_invalid_input_is_refused_in_one_line_without_output(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options, line = BAD[name]
@@ -190,7 +190,7 @@ def test_what_cannot_be_is_refused_in_one_line_and_nothing_is_written(
     assert not (tmp_path / "lens").exists()
 
 
-def test_a_run_goes_on_with_its_momentum_and_its_measured_steepness(tmp_path: Path, llvm: str) -> None:
+def test_a_run_continues_with_its_momentum_and_measured_steepness(tmp_path: Path, llvm: str) -> None:
     """Both are of what the optimiser moves, which is rougher than the heights; a rate that is measured stays."""
     write_file(tmp_path / "p.exr", np.repeat(picture(16, 16)[:, :, None], 3, 2).astype(np.float32), linear=True)
     done("lens", tmp_path / "p.exr", "-o", tmp_path / "lens", "--pixels", "16")

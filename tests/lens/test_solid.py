@@ -88,7 +88,7 @@ def edge_heights(heights: Heights, outline: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_a_solid_is_closed_outward_and_of_the_heights_volume(name: str) -> None:
+def test_a_solid_is_closed_oriented_outward_and_has_the_volume_of_its_heights(name: str) -> None:
     options, both, beside = SHAPES[name]
     wanted = plan(**options)
     # Grids of different numbers of vertices: the walls between them have to meet both.
@@ -120,7 +120,7 @@ def test_stl_has_the_normals_of_its_triangles() -> None:
     assert np.sum(records["n"] * read.face_normals, axis=1) == pytest.approx(1, abs=1e-5)
 
 
-def test_the_front_is_the_mesh_as_light_met_it() -> None:
+def test_the_front_equals_the_traced_mesh() -> None:
     points, triangles = grid(ripples)
     shuffled = np.random.default_rng(3).permutation(len(points))
     inverse = np.argsort(shuffled)
@@ -142,7 +142,7 @@ def test_a_round_outline_follows_its_ellipse() -> None:
 
 @pytest.mark.parametrize("outline", ["rectangle", "round"])
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_sphere_s_radius_slope_and_relief_are_told(sign: int, outline: str) -> None:
+def test_radius_slope_and_relief_of_a_sphere_are_reported(sign: int, outline: str) -> None:
     radius = 90.0
 
     def cap(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -170,7 +170,7 @@ def test_a_sphere_s_radius_slope_and_relief_are_told(sign: int, outline: str) ->
     assert below.max() == pytest.approx(-1 / radius if sign > 0 else 1 / radius, rel=2e-3)
 
 
-def test_hollows_are_found_whichever_way_they_run() -> None:
+def test_hollows_are_found_in_every_direction() -> None:
     wanted = plan()
     for angle in (0.0, 0.5, 1.1):
 
@@ -181,7 +181,7 @@ def test_hollows_are_found_whichever_way_they_run() -> None:
         assert 1 / solids.hollows(sheet(trough), wanted, 1).max() == pytest.approx(25, rel=1e-3)
 
 
-def test_heights_in_16_bits_are_what_they_were() -> None:
+def test_heights_survive_16_bits() -> None:
     heights = sheet().z
     numbers, offset, step = solids.scaled(heights, np.ones(heights.shape, bool))
     assert numbers.dtype == np.uint16
@@ -191,7 +191,7 @@ def test_heights_in_16_bits_are_what_they_were() -> None:
     assert (flat.max(), offset, step) == (0, 2.5, 0)
 
 
-def test_what_makes_no_solid_is_refused() -> None:
+def test_invalid_solids_are_refused() -> None:
     points, triangles = grid(ripples)
     torn, scattered, holed = points.copy(), points.copy(), triangles[:-7]
     torn[5, 2] = np.nan
@@ -235,7 +235,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
     return folder / "runs/lens"
 
 
-def test_a_run_s_folder_holds_the_solid_that_its_scene_shows(run: Path, tmp_path: Path) -> None:
+def test_the_folder_of_a_run_holds_the_solid_of_its_scene(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     said = done("export", run, "-o", out, "--set", "fabrication.min_thickness=30").output
     told = json.loads((out / "fabrication.json").read_text())
@@ -282,7 +282,7 @@ def write_mesh(read: trimesh.Trimesh, path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["stl", "3mf"])
-def test_the_solid_that_is_read_back_throws_what_the_run_s_scene_shows(kind: str, run: Path, tmp_path: Path) -> None:
+def test_the_reloaded_solid_casts_the_image_of_the_scene(kind: str, run: Path, tmp_path: Path) -> None:
     said = done("export", run, "-o", tmp_path / "out").output
     assert "interpolated" not in said
     read = read_back(tmp_path / f"out/lens.{kind}")
@@ -326,7 +326,7 @@ def test_the_solid_that_is_read_back_throws_what_the_run_s_scene_shows(kind: str
     assert np.all(count == 2)
 
 
-def test_interpolated_normals_are_warned_of(run: Path, tmp_path: Path) -> None:
+def test_interpolated_normals_give_a_warning(run: Path, tmp_path: Path) -> None:
     done("export", run, "-o", tmp_path / "out")
     folder = tmp_path / "smooth"
     shutil.copytree(run.parents[1] / "lens", folder)
@@ -337,7 +337,7 @@ def test_interpolated_normals_are_warned_of(run: Path, tmp_path: Path) -> None:
     assert "`face` was shaped with interpolated normals, which a solid does not have" in said
 
 
-def test_3mf_is_read_back_in_millimetres(run: Path, tmp_path: Path) -> None:
+def test_3mf_is_reloaded_in_millimetres(run: Path, tmp_path: Path) -> None:
     pytest.importorskip("lib3mf")
     with contextlib.suppress(locale.Error):  # a machine without it
         locale.setlocale(locale.LC_CTYPE, "C.UTF-8")
@@ -359,9 +359,7 @@ def test_3mf_is_read_back_in_millimetres(run: Path, tmp_path: Path) -> None:
     assert read.bounds == pytest.approx(other.bounds, abs=1e-4)
 
 
-def test_files_that_cannot_be_are_refused_in_one_line(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_invalid_files_are_refused_in_one_line(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "there.stl").write_bytes(b"")
     monkeypatch.setattr(export, "_writes_3mf", lambda: False)
     for name, settings, line in (

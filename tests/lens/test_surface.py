@@ -38,7 +38,7 @@ FEW = {
 }  # fmt: skip
 
 
-def test_a_picture_that_needs_no_floor_is_not_solved_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_picture_that_needs_no_floor_is_solved_once(monkeypatch: pytest.MonkeyPatch) -> None:
     trials: list[tuple[object, ...]] = []
 
     def least_floor(*arguments: object) -> float:
@@ -51,7 +51,7 @@ def test_a_picture_that_needs_no_floor_is_not_solved_again(monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("name", a_few(SETTINGS, FEW))
-def test_light_through_the_face_is_the_picture(name: str) -> None:
+def test_light_through_the_face_forms_the_picture(name: str) -> None:
     cells = 96 if name == "lens, round" else 128
     picture = smooth(cells)
     made = shape_surface(picture, SETTINGS[name], cells, floor=0.05)
@@ -70,7 +70,7 @@ def test_a_face_is_half_as_deep_at_twice_the_distance() -> None:
     assert f"{near.relief:.3g} mm deep (at 400 mm {near.relief_at_twice:.3g} mm)" in near.summary()
 
 
-def test_a_point_lights_rays_thin_out_through_the_glass() -> None:
+def test_rays_of_a_point_light_thin_out_through_the_glass() -> None:
     distance, thickness, ior = 120.0, 30.0, 1.49
     rays = Rays(replace(LENS, light_distance=distance, thickness=thickness))
     r = np.linspace(0.01, 55.0, 20_001)  # where they enter
@@ -87,7 +87,7 @@ def test_a_point_lights_rays_thin_out_through_the_glass() -> None:
     np.testing.assert_allclose(found / found[0], light[at] / light[0], rtol=1e-4)
 
 
-def test_a_face_that_leans_towards_oblique_light_gets_more_of_it() -> None:
+def test_a_face_tilted_towards_oblique_light_gets_more_light() -> None:
     rays, zero = Rays(MIRROR), np.zeros(())
     level = rays.arriving(zero, zero, zero, zero, zero)
     leaning = rays.arriving(zero, zero, zero, zero + 0.2, zero)
@@ -95,9 +95,7 @@ def test_a_face_that_leans_towards_oblique_light_gets_more_of_it() -> None:
 
 
 @pytest.mark.parametrize(("kind", "ior", "factor"), [("lens", 1.49, 0.49), ("lens", 1.8, 0.8), ("mirror", 1.49, -2.0)])
-def test_far_away_heights_are_those_of_the_paraxial_formula(
-    kind: Literal["lens", "mirror"], ior: float, factor: float
-) -> None:
+def test_distant_heights_match_the_paraxial_formula(kind: Literal["lens", "mirror"], ior: float, factor: float) -> None:
     distance = 50_000.0
     setting = replace(LENS, kind=kind, ior=ior, distance=distance, incidence=0.2 if kind == "mirror" else 0.0)
     found = shape_surface(smooth(64), setting, 64, floor=0.05).heights
@@ -123,14 +121,14 @@ def test_far_away_heights_are_those_of_the_paraxial_formula(
         ({"size": (0.0, 1.0)}, "size", "above 0"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_refused(changed: dict[str, object], key: str, words: str) -> None:
+def test_impossible_designs_are_refused(changed: dict[str, object], key: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words) as raised:
         shape_surface(smooth(32), replace(LENS, **changed), 32, floor=0.1)  # type: ignore[arg-type]
     assert raised.value.key == key
 
 
 @pytest.mark.parametrize("picture", [np.ones((8, 8)), np.zeros((8, 8)), np.ones((1, 1)), np.full((8, 8), np.nan)])
-def test_pictures_of_nothing_are_refused(picture: np.ndarray) -> None:
+def test_empty_pictures_are_refused(picture: np.ndarray) -> None:
     with pytest.raises(ConfigError) as raised:
         shape_surface(picture, LENS)
     assert raised.value.key == "picture"

@@ -36,7 +36,7 @@ PTRACER = {"type": "ptracer", "max_depth": 4}
 FLAT = Fabrication(thickness=25.0)
 
 
-def test_a_ball_leaves_what_it_fits_into_and_fills_what_it_does_not() -> None:
+def test_a_ball_fits_into_wide_hollows_and_fills_narrow_ones() -> None:
     x = np.linspace(-20, 20, 81)
     wide = np.tile(30 - np.sqrt(30**2 - x**2), (5, 1))  # a trough of 30 mm in radius
     pitch = (float(x[1] - x[0]), 20.0)
@@ -51,7 +51,7 @@ def test_a_ball_leaves_what_it_fits_into_and_fills_what_it_does_not() -> None:
     assert left == pytest.approx(np.sqrt(9 - pitch[0] ** 2) - 3, abs=1e-6)  # between brims one pitch from its middle
 
 
-def test_shift_and_figures_are_those_of_what_was_done_to_a_picture() -> None:
+def test_shift_and_figures_match_a_known_change_of_a_picture() -> None:
     target = np.zeros((48, 48))
     target[8:40, 8:40] = picture(32, 32)
     moved = np.roll(target, (2, -3), axis=(0, 1))
@@ -79,7 +79,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
     return folder
 
 
-def test_tolerances_leave_the_folder_of_a_run_at_work_alone(tmp_path: Path) -> None:
+def test_tolerances_do_not_touch_the_folder_of_a_running_run(tmp_path: Path) -> None:
     run, said = make_run(tmp_path / "run"), list[str]()
     off = {"tolerances": {"as planned": {"ssim": 1.0}}, "allowed_errors": {}}
     (run / "fabrication.json").write_text('{"kind": "lens"}')
@@ -128,7 +128,7 @@ def light_of(made: OpticalBench) -> dict[str, float]:
         return where_light_goes(made.scene, made.scene.sensors()[0], made.plan, target)
 
 
-def test_light_is_told_apart_by_where_it_goes(folder: Path) -> None:
+def test_light_is_classified_by_its_destination(folder: Path) -> None:
     """A flat lens, of whose width one tenth or so sends its light aside: beside the picture, or off the film."""
     assert light_of(with_face(folder, np.zeros_like)) == {"inside": 1, "beside": 0, "beyond": 0}
     wide = 100 / 95  # of its 95 columns of triangles ten are a wedge
@@ -144,7 +144,7 @@ def test_light_is_told_apart_by_where_it_goes(folder: Path) -> None:
         assert sum(part for other, part in found.items() if other not in ("inside", name)) < 3e-3
 
 
-def test_shares_are_those_of_a_film_that_sees_all_of_the_receiver(folder: Path) -> None:
+def test_shares_match_a_film_that_sees_the_whole_receiver(folder: Path) -> None:
     """Mitsuba's light tracer with as many reflections, a receiver so dark that none comes back from it."""
     made = with_face(folder, lambda x: 0.3 * np.sin(x / 3))
     made.params["screen.bsdf.reflectance.value"] = mi.Color3f(1e-3)
@@ -166,7 +166,7 @@ def test_shares_are_those_of_a_film_that_sees_all_of_the_receiver(folder: Path) 
 
 
 @pytest.mark.parametrize("name", ["lamp", "screen", "index"])
-def test_what_is_moved_is_what_a_scene_of_its_own_shows(name: str, folder: Path) -> None:
+def test_a_displaced_part_matches_a_scene_of_its_own(name: str, folder: Path) -> None:
     made = bench(folder)
     planned = made.render(16)
     if name == "lamp":
@@ -195,7 +195,7 @@ def test_what_is_moved_is_what_a_scene_of_its_own_shows(name: str, folder: Path)
     assert np.array_equal(made.render(16), planned)  # all is back in its place
 
 
-def test_a_lens_is_turned_with_both_of_its_faces_about_the_front_s_middle(folder: Path) -> None:
+def test_a_lens_rotates_with_both_faces_about_the_middle_of_its_front(folder: Path) -> None:
     made = bench(folder)
     points = np.array(made.params["face.vertex_positions"]).reshape(-1, 3)
     values = made.turned(made.solid_parts(), (0, 1, 0), 1.0)
@@ -206,7 +206,7 @@ def test_a_lens_is_turned_with_both_of_its_faces_about_the_front_s_middle(folder
     assert turned[corner, 2] - points[corner, 2] == pytest.approx(-np.sin(np.radians(1)) * points[corner, 0], abs=0.01)
 
 
-def test_a_wide_light_is_the_mean_of_turned_ones_that_spread_as_a_disc_does(folder: Path) -> None:
+def test_a_wide_light_is_the_mean_of_rotated_ones(folder: Path) -> None:
     made, angles = bench(folder), []
     turned = made.turned
     made.turned = lambda ids, axis, degrees: (angles.append((axis, degrees)), turned(ids, axis, degrees))[1]  # type: ignore
@@ -225,7 +225,7 @@ def test_a_wide_light_is_the_mean_of_turned_ones_that_spread_as_a_disc_does(fold
     assert wide.sum() == pytest.approx(planned.sum(), rel=0.05)
 
 
-def test_meshes_are_moved_as_shapes_are(folder: Path) -> None:
+def test_meshes_move_like_shapes(folder: Path) -> None:
     made = bench(folder)
     by = mi.ScalarTransform4f().translate([1, 2, 3])
     values = made.moved(["face", "back"], by)
@@ -237,7 +237,7 @@ def test_meshes_are_moved_as_shapes_are(folder: Path) -> None:
     assert moved - there == pytest.approx([1, 2, 3], abs=1e-4)
 
 
-def test_a_tool_s_ball_is_put_on_the_face_s_own_vertices(folder: Path) -> None:
+def test_a_tool_ball_touches_the_vertices_of_the_face(folder: Path) -> None:
     made = bench(folder)
     before = np.array(made.params["face.vertex_positions"]).reshape(-1, 3)
     sheet = as_sheet("face", before, np.array(made.params["face.faces"]).reshape(-1, 3))
@@ -252,7 +252,7 @@ def test_a_tool_s_ball_is_put_on_the_face_s_own_vertices(folder: Path) -> None:
     assert np.max(rough[:, 2] - before[:, 2]) == pytest.approx(0.5, abs=0.05)
 
 
-def test_the_command_tells_all_of_them(folder: Path) -> None:
+def test_the_command_reports_all_figures(folder: Path) -> None:
     told = json.loads((folder / "out/fabrication.json").read_text())["tolerances"]
     assert list(told) == [
         "as planned", "light of 0.53 degrees", "distance +2 %", "distance -2 %", "index +0.005", "index -0.005",
@@ -271,7 +271,7 @@ def test_the_command_tells_all_of_them(folder: Path) -> None:
     assert "needs a folder as output" in f"{result.output}{result.exception}"
 
 
-def test_the_page_of_a_run_has_what_a_maker_wants_to_know(
+def test_the_page_of_a_run_has_the_figures_for_the_maker(
     tmp_path: Path, llvm: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At its end, and what `export --tolerances` finds afterwards, with what was found at the end still there."""

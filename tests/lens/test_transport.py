@@ -16,7 +16,7 @@ def even(size: tuple[float, float], target: tuple[float, float]) -> np.ndarray:
     return np.array([0, 0, 0, target[0] / size[0] / 2, 0, target[1] / size[1] / 2])
 
 
-def test_a_product_of_densities_goes_by_each_axis_own_quantiles() -> None:
+def test_a_product_of_densities_uses_the_quantiles_of_each_axis() -> None:
     shape, target = (48, 96), (3.0, 2.0)
     source = 1 + 0.5 * np.sin(2 * np.linspace(-1, 1, 96))[None] * np.ones((48, 1))
     picture = (1.2 + np.sin(4 * np.linspace(-1, 1, 400)))[None] * (1.1 - np.linspace(-1, 1, 300) ** 2)[:, None]
@@ -32,7 +32,7 @@ def test_a_product_of_densities_goes_by_each_axis_own_quantiles() -> None:
         assert np.sqrt(np.mean((found - exact)[2:-2] ** 2)) < 0.1 * target[axis] / mu.size  # of a cell
 
 
-def test_light_is_pushed_to_where_the_picture_has_it() -> None:
+def test_light_is_transported_to_the_picture() -> None:
     picture = smooth(128)
     made = solve(Gradient(np.ones((2, 2)), (1, 1)), picture, (1, 1), (1, 1), (128, 128), even((1, 1), (1, 1)))
     assert made.converged
@@ -48,7 +48,7 @@ def test_a_round_aperture_fills_the_picture() -> None:
     assert made.error < 0.03
 
 
-def test_the_derivative_of_the_equation_is_that_of_differences() -> None:
+def test_the_derivative_of_the_equation_matches_differences() -> None:
     size, target = (1.0, 1.0), (1.0, 1.0)
     x, y = grid((24, 24), size)
     h, slopes = transport._even(even(size, target), (24, 24), size)
@@ -68,7 +68,7 @@ def test_the_derivative_of_the_equation_is_that_of_differences() -> None:
     assert np.sqrt(np.mean(difference**2)) < 0.03 * np.sqrt(np.mean(expected**2))
 
 
-def test_a_floor_is_the_least_that_does_not_tear() -> None:
+def test_a_floor_is_the_smallest_without_tears() -> None:
     optics, square = Gradient(np.ones((2, 2)), (1, 1)), (1.0, 1.0)
     assert least_floor(optics, smooth(32), square, square, even(square, square)) == 0
     found = least_floor(optics, sharp(32), square, square, even(square, square))
@@ -76,14 +76,14 @@ def test_a_floor_is_the_least_that_does_not_tear() -> None:
     assert 0.02 < found <= 0.1
 
 
-def test_resizing_keeps_the_light() -> None:
+def test_resizing_preserves_the_light() -> None:
     picture = smooth(37)
     for shape in ((11, 20), (37, 37), (50, 90)):
         assert resized(picture, shape).mean() == pytest.approx(picture.mean(), rel=1e-12)
 
 
 @pytest.mark.parametrize("side", [16, 63, 400])
-def test_no_size_of_a_black_and_white_picture_has_a_value_beyond_black_and_white(side: int) -> None:
+def test_a_resized_black_and_white_picture_stays_within_black_and_white(side: int) -> None:
     at = np.arange(side)
     disc = np.hypot(*np.meshgrid(at - side / 2, at - side / 2)) < 0.4 * side
     for picture in (disc, (at[:, None] + at) % 2, np.outer(at == 5, at == 9)):
@@ -97,13 +97,13 @@ def test_no_size_of_a_black_and_white_picture_has_a_value_beyond_black_and_white
                     assert made.mean() == pytest.approx(light.mean(), rel=1e-12)
 
 
-def test_more_cells_are_interpolated_between_where_that_is_asked_for() -> None:
+def test_more_cells_are_interpolated_on_request() -> None:
     ramp = np.arange(6.0)[None, :, None] * np.ones((4, 1, 3))
     finer = resized(ramp, (9, 24), between=True)
     assert np.allclose(finer, np.clip((np.arange(24) + 0.5) / 4 - 0.5, 0, 5)[None, :, None])
 
 
-def test_what_is_splatted_evenly_is_seen_through_a_tent() -> None:
+def test_uniform_splats_appear_through_a_tent_filter() -> None:
     picture, fine = smooth(16), 32
     at = (np.arange(16 * fine) + 0.5) / fine
     column, row = np.meshgrid(at, at)

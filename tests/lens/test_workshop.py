@@ -56,7 +56,7 @@ def test_an_error_is_allowed_until_ssim_has_fallen_by_a_twentieth() -> None:
     assert (allowed["solid turned"]["value"], allowed["solid turned"]["passes"]) == (pytest.approx(0.125), False)
 
 
-def test_grey_blacks_and_dark_corners_are_warned_of() -> None:
+def test_grey_blacks_and_dark_corners_give_warnings() -> None:
     wanted = np.ones((20, 20))
     wanted[5:10, 5:10] = 0
     assert light_warnings(blacks(wanted, wanted), unlit_corners(wanted, wanted)) == []
@@ -77,7 +77,7 @@ SETUPS = {
 
 
 @pytest.mark.parametrize("name", SETUPS)
-def test_a_set_up_is_that_of_the_command(name: str, tmp_path: Path, llvm: str) -> None:
+def test_a_set_up_matches_the_options_of_the_command(name: str, tmp_path: Path, llvm: str) -> None:
     options, side, light, through, words = SETUPS[name]
     write_file(tmp_path / "p.exr", np.repeat(picture(24, 16)[:, :, None], 3, 2).astype(np.float32), linear=True)
     done("lens", tmp_path / "p.exr", "--pixels", 24, "--distance", 300, "--size", 60, "-o", tmp_path / "l", *options)

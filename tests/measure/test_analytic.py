@@ -76,7 +76,7 @@ def twice(exact: np.ndarray) -> np.ndarray:
     return np.stack([exact, exact])
 
 
-def test_furnace_goes_to_its_limit():
+def test_furnace_approaches_its_limit():
     limit = furnace(0.9, 2.0, -1, 1)
     deep = furnace(0.9, 2.0, 1024, 1)
     assert limit.image[0, 0] == pytest.approx([20.0] * 3)
@@ -107,7 +107,7 @@ def test_fresnel():
     assert fresnel(np.array(np.pi / 2), 1.5) == pytest.approx(1)
 
 
-def test_a_medium_of_index_one_is_not_there():
+def test_a_medium_of_index_one_has_no_effect():
     through = point_through_surface(0.5, 2.0, 1.0, 1.0, (0.3, 1.6, -0.2), 1.0, 0.9, 60, 4)
     alone = 2.0 * irradiance((0.3, 1.6, -0.2), 0.9, 60, 4)
     assert through.image[..., :1] == pytest.approx(alone * 0.5 / np.pi, rel=1e-9)
@@ -192,7 +192,7 @@ def test_derivatives(name: str):
 
 
 @pytest.mark.usefixtures("_quiet")
-def test_a_surface_that_does_not_turn_the_light(monkeypatch: pytest.MonkeyPatch):
+def test_a_surface_that_does_not_refract(monkeypatch: pytest.MonkeyPatch):
     right = Segment.next_ray
     monkeypatch.setattr(Segment, "next_ray", lambda self, attached=False: dr.detach(right(self, attached)))
     motion = tilted_surface()

@@ -97,13 +97,13 @@ def test_l2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_budget_that_suffices_for_nothing_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_budget_too_small_for_anything_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     assert call("--budget", "0", "--max-depth", "4", "--integrators", "reslrb:stack") == 1
     assert "not measured: depth 2, 4: the budget was spent; allow more with --budget" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("llvm")
-def test_no_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_too_little_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "bench.json"
     args = ["--max-depth", "4", "--integrators", "ptracer", "--memory-limit", "100MiB", "--json", str(file)]
     assert call(*SMALL, *args) == 4
@@ -115,7 +115,7 @@ def test_no_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_case_that_fails_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failing_case_gives_its_reason(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "bench.json"
     (tmp_path / "scene.xml").write_text(MASKED.replace("to_world", "toWorld"))
     (tmp_path / "x.yaml").write_text(
@@ -131,7 +131,7 @@ def test_a_case_that_fails_says_why(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("limit", ["200MiB", "420MiB"])
-def test_what_ends_at_a_low_limit_ended_for_want_of_memory(limit: str, tmp_path: Path) -> None:
+def test_an_end_at_a_low_limit_is_attributed_to_memory(limit: str, tmp_path: Path) -> None:
     file = tmp_path / "bench.json"
     args = ["--max-depth", "2", "--integrators", "reslrb:stack", "--memory-limit", limit, "--json", str(file)]
     assert call(*SMALL, *args) in (0, 4)  # how much a process needs depends on the number of cores
@@ -165,7 +165,7 @@ def test_wrong_calls_are_one_located_line(args: list[str], line: str, capsys: py
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.skipif(os.name != "posix", reason="sends signals")
-def test_a_second_signal_leaves_neither_processes_nor_files(tmp_path: Path) -> None:
+def test_a_second_signal_leaves_no_processes_or_files(tmp_path: Path) -> None:
     folder = tmp_path / "temporary"
     folder.mkdir()
     command = [sys.executable, "-c", "from reslrb_cli.cli import run; run()", "bench", *SMALL, "--max-depth", "1024"]
@@ -187,7 +187,7 @@ def test_a_second_signal_leaves_neither_processes_nor_files(tmp_path: Path) -> N
 
 
 @pytest.mark.usefixtures("llvm")
-def test_ctrl_c_keeps_what_is_done(tmp_path: Path) -> None:
+def test_ctrl_c_keeps_finished_measurements(tmp_path: Path) -> None:
     file = tmp_path / "bench.json"
     command = [sys.executable, "-c", "from reslrb_cli.cli import main; main()", "bench", *SMALL, "--max-depth", "1024"]
     process = subprocess.Popen(
@@ -252,7 +252,7 @@ def test_memory_of_stack_does_not_grow_with_depth():
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.long
-def test_memory_of_naive_ad_does():
+def test_memory_of_naive_ad_grows_with_depth():
     shallow, deep = peaks("ptracer")
     assert deep > 2 * shallow > 4 * peak("reslrb:stack", 4)
 
@@ -287,13 +287,13 @@ def end_of(script: str, limit: int | None = None) -> Ended:
         ("print(json.dumps({'failure': 'failed', 'reason': 'why'}), flush=True); time.sleep(9)", FAILED, "why"),
     ],
 )
-def test_ends_are_told_apart(script: str, status: BenchStatus, reason: str) -> None:
+def test_kinds_of_ends_are_distinguished(script: str, status: BenchStatus, reason: str) -> None:
     end = end_of(script)
     assert end.status is status
     assert reason in end.reason
 
 
-def test_a_crash_near_the_limit_is_one_of_memory() -> None:
+def test_a_crash_near_the_limit_is_attributed_to_memory() -> None:
     crash = "time.sleep(0.3); os.kill(os.getpid(), signal.SIGSEGV)"
     end = end_of(crash, limit=4 * 2**20)  # not set by this process, but in use many times over
     assert end.status is OUT_OF_MEMORY
@@ -301,7 +301,7 @@ def test_a_crash_near_the_limit_is_one_of_memory() -> None:
     assert end_of(crash, limit=2**50).status is FAILED
 
 
-def test_a_refusal_holds_for_all() -> None:
+def test_a_refusal_applies_to_all() -> None:
     answer = {"failure": "refused", "reason": "x.yaml: scene.file: no such file", "exit_code": 2}
     process = Process(FIRST, command=[sys.executable, "-c", f"import json; print(json.dumps({answer!r}))"])
     with pytest.raises(Refused, match=r"scene\.file: no such file") as caught:
@@ -310,7 +310,7 @@ def test_a_refusal_holds_for_all() -> None:
     process.close()
 
 
-def test_waiting_can_be_stopped() -> None:
+def test_waiting_can_be_interrupted() -> None:
     process = Process(FIRST, command=[sys.executable, "-c", "import time; time.sleep(60)"])
     with pytest.raises(Stopped):
         process.answer(lambda: True)
@@ -318,7 +318,7 @@ def test_waiting_can_be_stopped() -> None:
     process.close()
 
 
-def test_last_words() -> None:
+def test_last_messages() -> None:
     assert last_words("") == ""
     assert last_words("a\n\n b \n") == "b"
     assert last_words("a\n>>> jit_malloc(): out of memory\nmore\n") == "jit_malloc(): out of memory"

@@ -62,7 +62,7 @@ def run(what: Sweep, stop: Callable[[], bool] = lambda: False) -> list[BenchResu
 
 
 @pytest.mark.usefixtures("_clean")
-def test_steps_are_interleaved_and_the_order_turns() -> None:
+def test_steps_are_interleaved_in_rotating_order() -> None:
     run(sweep(values=[2]))
     types = ["ptracer", "reslrb", "walk_ad"]
     warm = [(2, name, 0) for name in types for _ in range(3)]  # one cold step, two until no kernel is new
@@ -90,7 +90,7 @@ def test_records() -> None:
 
 @pytest.mark.usefixtures("_clean")
 @pytest.mark.parametrize("question", [0, 1, 2, 5], ids=["loading", "cold", "warming up", "in a round"])
-def test_a_case_that_ends_is_recorded_and_the_rest_goes_on(question: int) -> None:
+def test_an_ended_case_is_recorded_and_the_rest_continues(question: int) -> None:
     Pretended.ends = {("walk_ad", 2): question}
     rows = run(sweep())
     ended = rows[2].record
@@ -110,19 +110,19 @@ def test_without_a_baseline_there_are_no_ratios() -> None:
 
 
 @pytest.mark.parametrize("cases", ["reslrb:stack,reslrb:event", "reslrb:event,ptracer"])
-def test_times_are_over_those_of_ptracer_or_of_the_first(cases: str) -> None:
+def test_times_are_relative_to_ptracer_or_the_first_case(cases: str) -> None:
     assert sweep(cases).baseline.label == ("ptracer" if "ptracer" in cases else "reslrb:stack")
 
 
 @pytest.mark.usefixtures("_clean")
-def test_all_may_end() -> None:
+def test_all_cases_may_end() -> None:
     Pretended.ends = {(name, 2): 1 for name in ("ptracer", "reslrb", "walk_ad")}
     assert {row.record.status for row in run(sweep(values=[2]))} == {BenchStatus.OUT_OF_MEMORY}
 
 
 @pytest.mark.usefixtures("_clean")
 @pytest.mark.parametrize(("after", "kept"), [(5, []), (14, [1, 1, 1]), (13, [1, 1]), (33, [3, 3, 3, 1])])
-def test_a_stop_keeps_what_is_done(after: int, kept: list[int]) -> None:
+def test_a_stop_keeps_finished_measurements(after: int, kept: list[int]) -> None:
     answers = iter(range(1000))
     rows = run(sweep(), stop=lambda: next(answers) > after)
     assert [row.record.repeats for row in rows] == kept
@@ -130,7 +130,7 @@ def test_a_stop_keeps_what_is_done(after: int, kept: list[int]) -> None:
 
 
 @pytest.mark.usefixtures("_clean")
-def test_cases_that_need_the_memory_of_each_other_release_it() -> None:
+def test_cases_that_need_shared_memory_release_it() -> None:
     asked: list[bool] = []
 
     class Noting(Pretended):
@@ -223,7 +223,7 @@ def spent(budget_s: float) -> tuple[dict[int, list[str]], list[str], float]:
 
 
 @pytest.mark.usefixtures("_clean")
-def test_what_every_process_warns_of_is_said_once() -> None:
+def test_a_warning_of_every_process_is_shown_once() -> None:
     class Warning(Pretended):
         def answer(self, stop: Callable[[], bool]) -> dict[str, Any]:
             answer = super().answer(stop)
@@ -252,7 +252,7 @@ def test_options_of_cases() -> None:
 
 
 @pytest.mark.usefixtures("_clean")
-def test_cases_may_have_an_adjoint_of_their_own() -> None:
+def test_cases_may_have_their_own_adjoint() -> None:
     case, other, third = parse_cases("reslrb:stack(adjoint=batched,batches=2),ptracer(adjoint=correlated),prb")
     config = loads(CONFIG, "x.yaml", ["run.adjoint=batched"])
     runs = [c.at(config, 9, known=False).run for c in (case, other, third)]
@@ -288,7 +288,7 @@ def test_wrong_lists_are_located(text: str, line: str) -> None:
 
 
 @pytest.mark.usefixtures("_clean")
-def test_what_nobody_named_is_left_out_where_it_refuses():
+def test_unnamed_cases_that_refuse_are_left_out():
     Pretended.refusing = {"reslrb"}
     results, lines = play(sweep(default=True))
     assert {result.record.integrator for result in results} == {"ptracer", "walk_ad"}
@@ -298,7 +298,7 @@ def test_what_nobody_named_is_left_out_where_it_refuses():
 
 @pytest.mark.usefixtures("_clean")
 @pytest.mark.parametrize(("refusing", "default"), [("reslrb", False), ("ptracer", True)])
-def test_what_somebody_named_or_divides_by_is_not_left_out(refusing: str, default: bool):
+def test_named_cases_and_baselines_are_not_left_out(refusing: str, default: bool):
     Pretended.refusing = {refusing}
     with pytest.raises(Refused, match="moving light"):
         play(sweep(default=default))
@@ -352,7 +352,7 @@ def run_swept(swept: str, values: list[int], **changes: Any) -> tuple[list[Bench
         ("texture", [(4, 5, 6, 4, 48.0), (4, 5, 6, 64, 192.0)]),
     ],
 )
-def test_one_thing_is_varied_and_all_else_is_as_it_was(swept: str, expected: list[tuple[Any, ...]]) -> None:
+def test_one_quantity_varies_and_the_rest_stays(swept: str, expected: list[tuple[Any, ...]]) -> None:
     rows, said = run_swept(swept, [2, 8])
     assert said == []
     assert [row.value for row in rows] == [2] * 3 + [8] * 3
@@ -363,7 +363,7 @@ def test_one_thing_is_varied_and_all_else_is_as_it_was(swept: str, expected: lis
 
 
 @pytest.mark.usefixtures("_clean_values")
-def test_the_table_begins_with_what_is_swept() -> None:
+def test_the_table_starts_with_the_varied_quantity() -> None:
     Pretended.ends = {("walk_ad", 5): 2}
     rows, _ = run_swept("film", [16, 128])
     labels = LIST.split(",")
@@ -376,20 +376,20 @@ def test_the_table_begins_with_what_is_swept() -> None:
 
 
 @pytest.mark.usefixtures("_clean_values")
-def test_what_there_was_no_time_for_is_named_by_what_is_swept() -> None:
+def test_unmeasured_rows_are_named_by_the_varied_quantity() -> None:
     assert run_swept("texture", [8, 64], rounds=None)[1] == [
         "not measured: texture width 8, 64: the budget was spent; allow more with --budget"
     ]
 
 
 @pytest.mark.usefixtures("_clean_values")
-def test_samples_that_cannot_be_are_located() -> None:
+def test_impossible_sample_counts_are_located() -> None:
     with pytest.raises(ConfigError, match=r"--integrators ptracer: integrator.samples_per_pass: 2 does not divide"):
         run_swept("spp", [4, 3])
 
 
 @pytest.mark.usefixtures("_clean_values")
-def test_usual_values() -> None:
+def test_default_values() -> None:
     config = loads(CONFIG, Path("x.yaml"))
     assert usual_values("spp", config) == [1, 2, 4, 8, 16]
     assert usual_values("spp", loads(CONFIG, Path("x.yaml"), ["run.spp=2"])) == [1, 2, 4, 8]
@@ -440,7 +440,7 @@ def again(made: Bench) -> Earlier:
 
 
 @pytest.mark.usefixtures("_clean")
-def test_rounds_go_on_and_the_records_are_those_of_one_session() -> None:
+def test_continued_rounds_give_the_records_of_one_session() -> None:
     """The pretended steps take longer from round to round, so that every figure shows which rounds it is of."""
     short = measure(sweep(rounds=3))
     Pretended.log.clear()
@@ -455,7 +455,7 @@ def test_rounds_go_on_and_the_records_are_those_of_one_session() -> None:
 
 @pytest.mark.usefixtures("_clean")
 @pytest.mark.parametrize("after", [5, 14, 20, 33, 40])
-def test_what_a_stop_has_left_is_measured(after: int) -> None:
+def test_unmeasured_cases_of_a_stop_are_measured(after: int) -> None:
     answers = iter(range(1000))
     stopped = measure(sweep(), stop=lambda: next(answers) > after)
     if stopped.kept() is None:
@@ -468,7 +468,7 @@ def test_what_a_stop_has_left_is_measured(after: int) -> None:
 
 
 @pytest.mark.usefixtures("_clean")
-def test_depths_that_are_done_are_not_begun_again() -> None:
+def test_finished_depths_are_not_repeated() -> None:
     Pretended.ends = {("walk_ad", 2): 4}
     first = measure(sweep(values=[2, 4], rounds=3), stop=lambda: len(Pretended.log) > 31)
     assert {result.value for result in first.results()} == {2, 4}
@@ -481,7 +481,7 @@ def test_depths_that_are_done_are_not_begun_again() -> None:
 
 
 @pytest.mark.usefixtures("_clean")
-def test_what_refused_stays_left_out() -> None:
+def test_refused_cases_stay_left_out() -> None:
     Pretended.refusing = {"reslrb"}
     first = measure(sweep(default=True))
     Pretended.log.clear()
@@ -503,14 +503,14 @@ def test_what_refused_stays_left_out() -> None:
         ({"variant": "cuda_ad_rgb"}, "variant is llvm_ad_rgb there, cuda_ad_rgb here"),
     ],
 )
-def test_only_the_same_is_gone_on_from(change: dict[str, Any], line: str) -> None:
+def test_only_the_same_measurement_is_continued(change: dict[str, Any], line: str) -> None:
     first = measure(sweep())
     with pytest.raises(ConfigError, match=re.escape(f"--json: b.jsonl belongs to another measurement: {line}")):
         session(sweep(**({"rounds": 5} | change)), again(first))
 
 
 @pytest.mark.usefixtures("_clean")
-def test_rounds_on_file_are_not_taken_again() -> None:
+def test_saved_rounds_are_not_repeated() -> None:
     first = measure(sweep())
     Pretended.log.clear()
     again_ = measure(sweep(), again(first))
@@ -519,7 +519,7 @@ def test_rounds_on_file_are_not_taken_again() -> None:
 
 
 @pytest.mark.usefixtures("_clean")
-def test_a_scene_that_has_changed_is_another_one(tmp_path: Path) -> None:
+def test_a_changed_scene_is_another_one(tmp_path: Path) -> None:
     (tmp_path / "scene.xml").write_text("<scene/>")
     what = sweep(config=loads(CONFIG, tmp_path / "x.yaml"))
     first = again(measure(what))
@@ -529,7 +529,7 @@ def test_a_scene_that_has_changed_is_another_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("_clean")
-def test_what_is_under_way_is_kept_between_rounds() -> None:
+def test_running_work_is_saved_between_rounds() -> None:
     """So that a process that is killed in the midst of a depth leaves all rounds but the last."""
     made, seen = session(sweep(values=[2])), []
     for rows in made.run():

@@ -164,7 +164,7 @@ def test_each_file_is_another_experiment(folder: Path, name: str, files: dict[st
     assert measurements(config) == before
 
 
-def test_code_that_a_command_names_counts(folder: Path) -> None:
+def test_code_named_by_a_command_counts(folder: Path) -> None:
     config = load("photo.yaml", ["loss={type: l2}"])
     named: list[tuple[tuple[str, ...], set[str]]] = [
         (("prb,own.py:A(x=1)",), {"gradcheck", "bench", "convergence"}), (("prb", "own.py:A(x=1)"), {"convergence"}),
@@ -179,7 +179,7 @@ def test_code_that_a_command_names_counts(folder: Path) -> None:
         restore()
 
 
-def test_a_run_goes_on_with_the_files_that_it_began_with(folder: Path) -> None:
+def test_a_run_continues_with_its_original_files(folder: Path) -> None:
     """But for those of its initial values, which its state has; and whoever begins with its values sees it go on."""
     list(rl.optimize("photo.yaml", folder="first", overrides={"run.measuring": 0}, allow_code=True))
     for file, place in OF_PHOTO.items():
@@ -196,7 +196,7 @@ def test_a_run_goes_on_with_the_files_that_it_began_with(folder: Path) -> None:
         assert first_difference(before[command], now) == "parameters[0].initial.run has changed", command
 
 
-def test_a_sweep_goes_on_with_the_files_that_it_began_with(folder: Path) -> None:
+def test_a_sweep_continues_with_its_original_files(folder: Path) -> None:
     def plan() -> Any:
         return make_plan(Path("photo.yaml"), ["run.spp=[4, 8]"], 1, [], allow_code=True)
 
@@ -214,7 +214,7 @@ def test_a_sweep_goes_on_with_the_files_that_it_began_with(folder: Path) -> None
 
 
 @pytest.mark.parametrize("files", [("parts/quad.obj",), pytest.param(tuple(OF_PHOTO), marks=pytest.mark.long)])
-def test_no_decision_of_another_experiment_is_taken(folder: Path, files: tuple[str, ...]) -> None:
+def test_decisions_of_another_experiment_are_not_used(folder: Path, files: tuple[str, ...]) -> None:
     sets = ["run.measuring=1000", "integrator.guiding=auto"]
     cache = PilotCache(folder / "cache")
 
@@ -237,7 +237,7 @@ def test_no_decision_of_another_experiment_is_taken(folder: Path, files: tuple[s
     ("bench", "--max-depth", "2", "--rounds", "3", "--integrators", "reslrb:stack"),
     ("convergence", "--rounds", "3", "--integrators", "reslrb:stack"),
 ])  # fmt: skip
-def test_no_measurement_of_another_experiment_is_gone_on_from(folder: Path, command: tuple[str, ...]) -> None:
+def test_measurements_of_another_experiment_are_not_continued(folder: Path, command: tuple[str, ...]) -> None:
     name, *options = command
     words = [name, "photo.yaml", *options, *settings("loss={type: l2}"), "--json"]
     result = reslrb(*words, "first.jsonl")

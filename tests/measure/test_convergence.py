@@ -25,7 +25,7 @@ from reslrb_cli.report.convergence_tables import closing_sentence, notes
 # What `convergence` makes of methods whose cost, noise and bias are known: with processes that only pretend.
 
 
-def test_cost_error_slope_and_efficiency_are_those_of_the_methods(tmp_path: Path) -> None:
+def test_cost_error_slope_and_efficiency_match_the_methods(tmp_path: Path) -> None:
     stage = Stage(case_ptracer=Pretence(0.4, 0.5), case_reslrb_stack=Pretence(0.1, 0.6),
                   case_reslrb_event=Pretence(0.05, 1.2))  # fmt: skip
     _, results, _ = play(tmp_path, stage, plan())
@@ -64,7 +64,7 @@ def test_a_planted_bias_of_three_percent_is_reported(tmp_path: Path) -> None:
     assert any(note.startswith("reslrb:event, all: biased by 0.032 of the whole") for note in notes(results.methods))
 
 
-def test_noise_whose_tails_are_too_heavy_for_intervals_is_reported(tmp_path: Path) -> None:
+def test_too_heavy_tails_for_intervals_are_reported(tmp_path: Path) -> None:
     """One step in 64 that is a hundred times as noisy as the others: it has all of the variance.
 
     A sample without it has a hundredth of the error, and an interval that says nothing of it.
@@ -84,7 +84,7 @@ def test_noise_whose_tails_are_too_heavy_for_intervals_is_reported(tmp_path: Pat
     assert closing_sentence(results.methods).startswith("Best for this scene: reslrb:event")
 
 
-def test_tails_that_are_no_worse_than_usual_are_not_reported(tmp_path: Path) -> None:
+def test_ordinary_tails_are_not_reported(tmp_path: Path) -> None:
     """Every fourth step ten times as noisy: many steps dominate the variance, and intervals hold."""
     stage = Stage(case_reslrb_stack=Pretence(0.1, 0.05, outliers=tuple(range(0, 200, 4)), outlier=10.0))
     _, results, _ = play(tmp_path, stage, plan())
@@ -94,7 +94,7 @@ def test_tails_that_are_no_worse_than_usual_are_not_reported(tmp_path: Path) -> 
     assert record.efficiency.low < truth < record.efficiency.high
 
 
-def test_what_errors_are_taken_from_is_judged_too(tmp_path: Path) -> None:
+def test_references_of_errors_are_checked_too(tmp_path: Path) -> None:
     """With a biased one, errors of unbiased methods are wrong: said, and they are not called biased."""
     stage = Stage(reference_reslrb_stack=Pretence(0.1, 0.1, bias=0.1), case_reslrb_stack=Pretence(0.1, 0.1),
                   case_ptracer=Pretence(0.1, 0.1), case_reslrb_event=Pretence(0.1, 0.1, bias=0.1))  # fmt: skip
@@ -107,7 +107,7 @@ def test_what_errors_are_taken_from_is_judged_too(tmp_path: Path) -> None:
     assert event.bias == pytest.approx(0.1, rel=0.2)  # against ptracer, not against what is as wrong
 
 
-def test_where_there_is_no_independent_reference_that_is_said(tmp_path: Path) -> None:
+def test_a_missing_independent_reference_is_reported(tmp_path: Path) -> None:
     facts = {"independent": {"a": "ptracer", "b": None}, "why": {"a": "", "b": "not ptracer: it differs"}}
     stage = Stage(facts, case_reslrb_event=Pretence(0.1, 0.1, bias=0.1), reference_reslrb_stack=Pretence(noise=0.1))
     _, results, said = play(tmp_path, stage, plan())
@@ -119,7 +119,7 @@ def test_where_there_is_no_independent_reference_that_is_said(tmp_path: Path) ->
     assert (reference.biased, reference.bias_z, reference.message) == (None, None, "there is no independent reference")
 
 
-def test_the_noise_of_one_image_is_no_bias(tmp_path: Path) -> None:
+def test_the_noise_of_one_image_is_not_a_bias(tmp_path: Path) -> None:
     """With the configuration's loss dL/dI is held at several images; their noise is in the reference's error."""
     quiet = Pretence(0.1, 0.02, image_noise=0.1)
     stage = Stage(reference_reslrb_stack=quiet, independent_ptracer=Pretence(0.1, 0.02, image_noise=0.1),
@@ -197,7 +197,7 @@ def make(
     return MethodSamples(values, turns, seconds, ReferenceMean(means))
 
 
-def test_errors_are_those_of_averages_and_the_references_own_is_subtracted() -> None:
+def test_errors_are_those_of_averages_without_that_of_the_reference() -> None:
     """Of a reference as noisy as averages of 6 steps, which unsubtracted makes averages of 32 look twice as bad."""
     made = [make(seed, steps=64, rows=6, per_row=1) for seed in range(REPETITIONS)]
     for level in range(6):
@@ -227,7 +227,7 @@ def test_the_floor_and_the_signal() -> None:
     assert ReferenceMean(np.random.default_rng(1).standard_normal((8, 5)) * 0.0).floor is None
 
 
-def test_what_is_left_out_of_a_reference() -> None:
+def test_omissions_of_a_reference() -> None:
     reference = make(1, rows=5).reference
     moved, noises, signals = reference.without
     for k in range(5):
@@ -237,7 +237,7 @@ def test_what_is_left_out_of_a_reference() -> None:
 
 
 @pytest.mark.parametrize(("steps", "rows"), [(48, 24), (16, 8), (192, 48)])
-def test_the_intervals_cover_what_they_say(steps: int, rows: int) -> None:
+def test_the_intervals_have_their_coverage(steps: int, rows: int) -> None:
     """By 200 repetitions: of efficiency, which 1 / (relative variance * seconds) is, and of the slope, -1/2."""
     truth, covered, slopes = SIGNAL / VARIANCE / SECONDS, 0, 0
     for seed in range(REPETITIONS):
@@ -253,7 +253,7 @@ def test_the_intervals_cover_what_they_say(steps: int, rows: int) -> None:
 
 
 @pytest.mark.parametrize("steps", [16, 32, 64])
-def test_the_intervals_of_a_single_colour_cover_too(steps: int) -> None:
+def test_the_intervals_of_a_single_colour_have_their_coverage(steps: int) -> None:
     """Its three channels deviate together, so that every error is the square of one normal number."""
     covered, slopes = 0, 0
     for seed in range(REPETITIONS):
@@ -271,7 +271,7 @@ def test_the_intervals_of_a_single_colour_cover_too(steps: int) -> None:
     assert LEAST <= slopes <= MOST
 
 
-def test_the_interval_of_a_biased_method_covers_too() -> None:
+def test_the_interval_of_a_biased_method_has_its_coverage() -> None:
     bias = 0.6
     truth, covered = SIGNAL / (VARIANCE + bias**2 * SIGNAL) / SECONDS, 0
     for seed in range(REPETITIONS):
@@ -291,7 +291,7 @@ def test_a_bias_flattens_the_slope() -> None:
     assert np.sqrt(make(3, steps=256, bias=0.5).squared_bias) == pytest.approx(0.5, rel=0.2)
 
 
-def test_seeds_that_repeat_flatten_the_slope() -> None:
+def test_repeated_seeds_flatten_the_slope() -> None:
     good = make(4, steps=64)
     values = np.repeat(good.deviations[::4] + good.reference.mean, 4, axis=0)
     slope = MethodSamples(values, good.turns, good.seconds, good.reference).slope()
@@ -315,7 +315,7 @@ def test_times() -> None:
     assert rough.seconds_to(0.3, False)[1]  # within the steps, but not to be told
 
 
-def test_times_that_a_bias_forbids() -> None:
+def test_times_prevented_by_a_bias() -> None:
     samples = make(6, steps=256, rows=100, bias=0.2)
     size = float(np.sqrt(samples.squared_bias))
     assert samples.seconds_to(0.9 * size, biased=True) == (None, False)
@@ -385,7 +385,7 @@ def test_unbiased_methods(tmp_path: Path, scene: str, size: tuple[int, int], spp
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.long
-def test_what_correlated_samples_do_to_the_loss(tmp_path: Path) -> None:
+def test_effect_of_correlated_samples_on_the_loss(tmp_path: Path) -> None:
     cases = ",".join(f"reslrb:stack(adjoint={adjoint})" for adjoint in ("correlated", "independent", "batched"))
     args = ["--objective", "loss", "--set=run.spp=4", "--integrators", cases, "--rounds", "32"]
     found = [line for line in methods(tmp_path, "cornell_floor", (64, 64), *args) if line["parameter"] == "all"]
@@ -398,7 +398,7 @@ def test_what_correlated_samples_do_to_the_loss(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.long
-def test_the_intervals_cover_what_they_say_on_a_scene(tmp_path: Path) -> None:
+def test_the_intervals_have_their_coverage_on_a_scene(tmp_path: Path) -> None:
     """200 repetitions with the noise of real steps; the truth is that of all steps together. No clock takes part."""
     from reslrb_cli.measure.convergence.setup import Sampler, survey
     from reslrb_cli.optimization.assemble import assemble_scene
@@ -467,7 +467,7 @@ def test_the_loss_has_several_images(tmp_path: Path) -> None:
     ("camera", "change", "masked"),
     [(True, GAUSSIAN, True), (False, GAUSSIAN, False), (True, ("box", "box"), False)],
 )
-def test_the_border_is_left_out_where_camera_paths_take_part(
+def test_the_border_is_left_out_with_camera_paths(
     tmp_path: Path, camera: bool, change: tuple[str, str], masked: bool
 ) -> None:
     facts, arrays = asked(problem(tmp_path, change), camera=camera)
@@ -483,7 +483,7 @@ def test_the_border_is_left_out_where_camera_paths_take_part(
 
 
 @pytest.mark.usefixtures("llvm")
-def test_what_is_right_for_nothing_is_told(tmp_path: Path) -> None:
+def test_a_method_that_is_never_right_is_reported(tmp_path: Path) -> None:
     facts, arrays = asked(problem(tmp_path, ("area", "directionalarea"), GAUSSIAN), camera=True, named=False)
     assert list(facts["without"]) == ["prb"]
     assert "directionalarea" in facts["without"]["prb"]
@@ -493,7 +493,7 @@ def test_what_is_right_for_nothing_is_told(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("mode", ["known", "loss", "image"])
-def test_steps_are_repeatable_and_the_border_counts_nothing(tmp_path: Path, mode: str) -> None:
+def test_steps_are_repeatable_and_the_border_does_not_count(tmp_path: Path, mode: str) -> None:
     what = problem(tmp_path, GAUSSIAN, overrides=("run.adjoint=independent",))
     _, arrays = asked(what, "image" if mode == "image" else "loss", camera=True)
     sampler = Sampler(what.config, mode, arrays)

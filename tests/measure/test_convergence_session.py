@@ -21,7 +21,7 @@ from reslrb_cli.records.measurements import BenchStatus
 from reslrb_cli.report.convergence_tables import closing_sentence, notes
 
 
-def test_steps_go_on_from_those_that_compiled_and_no_two_share_seeds(tmp_path: Path) -> None:
+def test_steps_continue_after_compilation_with_distinct_seeds(tmp_path: Path) -> None:
     stage = Stage(case_ptracer=Pretence(0.4))
     session, _, _ = play(tmp_path, stage, plan(rounds=4))
     names = ["case ptracer", "case reslrb:stack", "case reslrb:event", "reference reslrb:stack"]
@@ -35,7 +35,7 @@ def test_steps_go_on_from_those_that_compiled_and_no_two_share_seeds(tmp_path: P
     assert stage.purposes == [f"convergence, {name}" for name in names]
 
 
-def test_turns_are_interleaved_and_about_as_long(tmp_path: Path) -> None:
+def test_turns_are_interleaved_with_similar_lengths(tmp_path: Path) -> None:
     stage = Stage(case_ptracer=Pretence(0.4), case_reslrb_stack=Pretence(0.1), case_reslrb_event=Pretence(0.01))
     session, _, _ = play(tmp_path, stage, plan(rounds=None, budget_s=20.0))
     names = ["case ptracer", "case reslrb:stack", "case reslrb:event", "reference reslrb:stack"]
@@ -46,12 +46,12 @@ def test_turns_are_interleaved_and_about_as_long(tmp_path: Path) -> None:
     assert session.of(Role.REFERENCE)[0].count == min(round(together / 2 / 0.1), MOST_REFERENCE_STEPS)
 
 
-def test_what_others_did_to_the_caches_costs_nothing(tmp_path: Path) -> None:
+def test_cache_effects_of_others_are_not_timed(tmp_path: Path) -> None:
     _, results, _ = play(tmp_path, Stage(case_ptracer=Pretence(0.1, late_s=0.3)), plan(rounds=4))
     assert of(results, "ptracer").step_s == pytest.approx(0.1)
 
 
-def test_a_number_of_rounds_makes_the_steps_the_same_everywhere(tmp_path: Path) -> None:
+def test_a_number_of_rounds_fixes_the_steps_everywhere(tmp_path: Path) -> None:
     stage = Stage(case_ptracer=Pretence(0.4), independent_prb=Pretence(0.1))
     stage.facts["independent"] = {"a": "prb", "b": "prb"}
     session, _, _ = play(tmp_path, stage, plan(rounds=3))
@@ -60,7 +60,7 @@ def test_a_number_of_rounds_makes_the_steps_the_same_everywhere(tmp_path: Path) 
     ]  # fmt: skip
 
 
-def test_ptracer_among_the_methods_stands_for_itself(tmp_path: Path) -> None:
+def test_ptracer_among_the_methods_is_its_own_reference(tmp_path: Path) -> None:
     session, results, _ = play(tmp_path, Stage(), plan(rounds=8))
     assert not session.of(Role.INDEPENDENT)  # no roulette at this depth: the same integrator
     assert of(results, "ptracer").bias_reference == "reslrb:stack"
@@ -68,7 +68,7 @@ def test_ptracer_among_the_methods_stands_for_itself(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("cases", ["reslrb:stack", "ptracer,reslrb:stack"])
-def test_else_an_independent_reference_takes_turns_of_its_own(tmp_path: Path, cases: str) -> None:
+def test_otherwise_an_independent_reference_takes_turns(tmp_path: Path, cases: str) -> None:
     stage = Stage(independent_ptracer=Pretence(0.01))
     roulette = loads(CONFIG, Path("x.yaml"), ["integrator.rr_depth=3"])
     session, results, _ = play(tmp_path, stage, plan(cases, rounds=8, config=roulette))
@@ -77,7 +77,7 @@ def test_else_an_independent_reference_takes_turns_of_its_own(tmp_path: Path, ca
     assert of(results, "reslrb:stack").bias_reference == "ptracer"
 
 
-def test_a_method_that_ends_or_breaks_is_recorded_and_the_rest_goes_on(tmp_path: Path) -> None:
+def test_an_ended_method_is_recorded_and_the_rest_continues(tmp_path: Path) -> None:
     stage = Stage(case_reslrb_stack=Pretence(ends=5), case_reslrb_event=Pretence(nan_at=20))
     _, results, said = play(tmp_path, stage, plan())
     ended, broken, sound = (of(results, label) for label in ("reslrb:stack", "reslrb:event", "ptracer"))
@@ -91,14 +91,14 @@ def test_a_method_that_ends_or_breaks_is_recorded_and_the_rest_goes_on(tmp_path:
     assert said.count("old") == 1
 
 
-def test_an_end_while_it_compiles_is_said(tmp_path: Path) -> None:
+def test_an_end_during_compilation_is_reported(tmp_path: Path) -> None:
     stage = Stage(case_reslrb_stack=Pretence(ends=1))
     _, results, said = play(tmp_path, stage, plan())
     assert "reslrb:stack: out_of_memory: ended by SIGKILL" in said
     assert of(results, "reslrb:stack").status is BenchStatus.OUT_OF_MEMORY
 
 
-def test_without_what_errors_are_taken_from_there_are_none(tmp_path: Path) -> None:
+def test_without_a_reference_there_are_no_errors(tmp_path: Path) -> None:
     _, results, said = play(tmp_path, Stage(reference_reslrb_stack=Pretence(ends=1)), plan())
     assert "reslrb:stack: out_of_memory: ended by SIGKILL" in said
     assert {record.relative_rmse for record in results.methods} == {None}
@@ -106,7 +106,7 @@ def test_without_what_errors_are_taken_from_there_are_none(tmp_path: Path) -> No
     assert "Nothing can be said" in closing_sentence(results.methods)
 
 
-def test_an_independent_reference_that_ends_is_replaced(tmp_path: Path) -> None:
+def test_an_ended_independent_reference_is_replaced(tmp_path: Path) -> None:
     stage = Stage(independent_ptracer=Pretence(ends=1))
     _, results, _ = play(tmp_path, stage, plan("reslrb:event"))
     assert of(results, "reslrb:event").bias_reference == "reslrb:stack"
@@ -114,7 +114,7 @@ def test_an_independent_reference_that_ends_is_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("default", [True, False])
-def test_only_what_nobody_named_is_left_out(tmp_path: Path, default: bool) -> None:
+def test_only_unnamed_methods_are_left_out(tmp_path: Path, default: bool) -> None:
     stage = Stage({"without": {"ptracer": "it emits wrongly"}})
     session, _, said = play(tmp_path, stage, plan(default=default, rounds=4))
     assert ("left out: ptracer: it emits wrongly" in said) is default
@@ -125,7 +125,7 @@ def begin(what: Plan, earlier: Earlier) -> Session:
     return Session(what, Path(), lambda: False, print, earlier=earlier)
 
 
-def test_going_on(tmp_path: Path) -> None:
+def test_continuing(tmp_path: Path) -> None:
     """Steps of both calls count, dL/dI is made once, and no seed comes twice."""
     stage = Stage()
     session, _, _ = play(tmp_path, stage, plan(rounds=4))
@@ -146,7 +146,7 @@ def test_going_on(tmp_path: Path) -> None:
         assert len({row.tobytes() for row in member.rows}) == len(member.rows)
 
 
-def test_rounds_on_file_are_not_taken_again(tmp_path: Path) -> None:
+def test_saved_rounds_are_not_repeated(tmp_path: Path) -> None:
     _, first, _ = play(tmp_path, Stage(), plan(rounds=4))
     kept = play(tmp_path, Stage(), plan(rounds=4))[0].kept()
     assert kept is not None
@@ -158,7 +158,7 @@ def test_rounds_on_file_are_not_taken_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("after", [188, 212, 236])
-def test_a_round_that_was_broken_off_is_begun_anew(tmp_path: Path, after: int) -> None:
+def test_an_interrupted_round_is_restarted(tmp_path: Path, after: int) -> None:
     """With new seeds, and none of its steps twice: the figures are those of whole rounds."""
     answers = iter(range(10**6))
     session, _, _ = play(tmp_path, Stage(), plan(rounds=8), stop=lambda: next(answers) > after)
@@ -173,7 +173,7 @@ def test_a_round_that_was_broken_off_is_begun_anew(tmp_path: Path, after: int) -
     assert of(results, "ptracer").efficiency is not None
 
 
-def test_what_has_ended_stays_as_it_was_and_the_rest_goes_on(tmp_path: Path) -> None:
+def test_ended_methods_stay_and_the_rest_continues(tmp_path: Path) -> None:
     first, _, _ = play(tmp_path, Stage(case_reslrb_stack=Pretence(ends=5)), plan(rounds=8))
     kept = first.kept()
     assert kept is not None
@@ -184,7 +184,7 @@ def test_what_has_ended_stays_as_it_was_and_the_rest_goes_on(tmp_path: Path) -> 
     assert "case reslrb:stack" not in {question["of"] for question in stage.asked}
 
 
-def test_a_second_budget_without_room_for_a_round_says_so(tmp_path: Path) -> None:
+def test_a_second_budget_too_small_for_a_round_is_reported(tmp_path: Path) -> None:
     first, _, _ = play(tmp_path, Stage(), plan(rounds=None, budget_s=30.0))
     kept = first.kept()
     assert kept is not None
@@ -210,7 +210,7 @@ def test_a_second_budget_without_room_for_a_round_says_so(tmp_path: Path) -> Non
         ({"spps": (4, 8)}, "spp is [] there, [4, 8] here"),
     ],
 )
-def test_only_the_same_is_gone_on_from(tmp_path: Path, change: dict[str, Any], line: str) -> None:
+def test_only_the_same_measurement_is_continued(tmp_path: Path, change: dict[str, Any], line: str) -> None:
     session, _, _ = play(tmp_path, Stage(), plan(rounds=4))
     kept = session.kept()
     assert kept is not None
@@ -225,7 +225,7 @@ def test_only_the_same_is_gone_on_from(tmp_path: Path, change: dict[str, Any], l
 
 
 @pytest.mark.parametrize("after", [0, 5, 12, 40, 120])
-def test_a_stop_keeps_what_is_done(tmp_path: Path, after: int) -> None:
+def test_a_stop_keeps_finished_measurements(tmp_path: Path, after: int) -> None:
     answers = iter(range(10**6))
     stage = Stage(case_ptracer=Pretence(0.4))
     session, results, _ = play(tmp_path, stage, plan(), stop=lambda: next(answers) > after)
@@ -238,7 +238,7 @@ def test_a_stop_keeps_what_is_done(tmp_path: Path, after: int) -> None:
 @pytest.mark.parametrize(
     ("budget_s", "measured"), [(60.0, True), (14.0, False), (11.0, False), (6.0, False), (2.0, False)]
 )
-def test_the_budget_covers_compilation_and_one_too_small_says_what_it_would_take(
+def test_the_budget_covers_compilation_and_a_small_one_names_the_needed_time(
     tmp_path: Path, budget_s: float, measured: bool
 ) -> None:
     stage = Stage(case_ptracer=Pretence(0.4, cold_s=2.0))
@@ -255,7 +255,7 @@ def test_the_budget_covers_compilation_and_one_too_small_says_what_it_would_take
         assert enough > budget_s
 
 
-def test_too_few_steps_for_a_slope_say_what_it_would_take(tmp_path: Path) -> None:
+def test_too_few_steps_for_a_slope_name_the_needed_time(tmp_path: Path) -> None:
     def slow() -> Stage:
         return Stage(case_ptracer=Pretence(3.0, cold_s=3.0))
 
@@ -270,7 +270,7 @@ def test_too_few_steps_for_a_slope_say_what_it_would_take(tmp_path: Path) -> Non
     assert not any("no slope" in line for line in said)
 
 
-def test_no_budget_is_overrun(tmp_path: Path) -> None:
+def test_no_budget_is_exceeded(tmp_path: Path) -> None:
     """Steps of seconds: a round would take longer than what some of these leave after compiling."""
     for budget_s in range(8, 60, 4):
         stage = Stage(case_ptracer=Pretence(3.0, cold_s=3.0))

@@ -53,13 +53,13 @@ def test_case(name: str):
         ("nested_dielectrics", "hardly ever find"),
     ],
 )
-def test_camera_paths_alone_are_left_out_of_what_they_cannot_find(name: str, reason: str):
+def test_camera_paths_are_left_out_of_light_that_they_cannot_find(name: str, reason: str):
     [record] = run_suite([name], ["stack(paths=camera)"])
     assert (record.verdict, record.paths, record.light_share) == (Verdict.NO_REFERENCE, "camera", None)
     assert reason in record.message
 
 
-def test_along_the_border_camera_paths_are_compared_with_those_that_lose_nothing_there():
+def test_along_the_border_camera_paths_are_compared_with_a_complete_reference():
     """`ptracer` does, and is no reference of theirs: the light that it lacks there would be found missing."""
     records = list(run_suite(["film_crop"], WAYS))
     assert {record.reference.value for record in records} == {"walk_ad", "prb", "path"}
@@ -67,7 +67,7 @@ def test_along_the_border_camera_paths_are_compared_with_those_that_lose_nothing
     assert all(record.holds for record in records)
 
 
-def test_of_what_moves_there_are_light_paths_alone():
+def test_moving_cases_use_only_light_paths():
     assert not list(run_suite(["slope_0"], WAYS))
 
 
@@ -82,13 +82,13 @@ def lost(case: str, estimator: str) -> list[str]:
 
 
 @pytest.mark.long
-def test_selection_by_contribution_alone_loses_what_follows_a_heavy_one(monkeypatch: pytest.MonkeyPatch):
+def test_selection_by_contribution_loses_later_vertices_of_a_heavy_one(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("reslrb_cli.estimators.selection.SHARE", 0.0)
     records = run_suite(["connection_1e8"], ["reservoir", "event"])
     assert {record.estimator for record in records if record.holds is False} == {"reservoir", "event"}
 
 
-def test_roulette_by_throughput_alone_loses_what_follows_a_dark_surface(monkeypatch: pytest.MonkeyPatch):
+def test_roulette_by_throughput_loses_light_behind_a_dark_surface(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("reslrb_cli.transport.factors.DIM", 1e-30)
     assert lost("albedo_1e-6_roulette", "stack")
 
@@ -100,7 +100,7 @@ def test_roulette_by_power_loses_dim_lamps(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.long
-def test_sampling_by_radiance_alone_hardly_sees_the_sky_beside_a_sun(monkeypatch: pytest.MonkeyPatch):
+def test_sampling_by_radiance_undersamples_the_sky_beside_a_sun(monkeypatch: pytest.MonkeyPatch):
     def variance() -> float:
         # Half of the seeds: of eight, a variance is known to a half, and what is looked for is a factor of a hundred.
         rows = run_suite(["sun_1e6"], ["stack"], seeds=8)
@@ -113,7 +113,7 @@ def test_sampling_by_radiance_alone_hardly_sees_the_sky_beside_a_sun(monkeypatch
     assert variance() > 100 * before
 
 
-def test_a_replay_leaves_nothing_because_its_sums_are_compensated(monkeypatch: pytest.MonkeyPatch):
+def test_a_replay_leaves_no_residue_because_its_sums_are_compensated(monkeypatch: pytest.MonkeyPatch):
     def left() -> float:
         [record] = [r for r in run_suite(["furnace"], ["gather"], seeds=2) if "residual" in r.message]
         assert record.relative_l2 is not None

@@ -58,31 +58,31 @@ def judged(kinds: list[Kind]) -> dict[str, Any]:
     return json.loads(json.dumps(record, allow_nan=False))
 
 
-def test_all_holds_where_it_does() -> None:
+def test_a_correct_result_holds() -> None:
     record = judged(pretended())
     assert record["holds"], record
     assert len(record["comparisons"]) == 3
 
 
 @pytest.mark.parametrize("planted", [1.2, 0.8])
-def test_a_planted_difference_of_naive_ad_is_seen(planted: float) -> None:
+def test_a_planted_difference_from_naive_ad_is_found(planted: float) -> None:
     """In both comparisons with it, and not in that of ours with ours."""
     record = judged(pretended(naive_factor=planted))
     assert [row["verdict"] for row in record["comparisons"]] == ["fails", "fails", "holds"]
     assert not record["holds"]
 
 
-def test_noise_that_does_not_fall_is_seen() -> None:
+def test_noise_that_does_not_fall_is_found() -> None:
     record = judged(pretended(many_factor=1.3))
     assert record["noise"]["verdict"] == "fails"
     assert not record["holds"]
 
 
-def test_naive_ad_that_fits_is_seen() -> None:
+def test_naive_ad_that_fits_is_found() -> None:
     assert not judged(pretended(fits=True))["holds"]
 
 
-def test_the_interval_covers_the_ratio() -> None:
+def test_the_interval_has_its_coverage() -> None:
     """95 of 100 times or so."""
     random, inside = np.random.default_rng(3), 0
     for _ in range(200):
@@ -91,7 +91,7 @@ def test_the_interval_covers_the_ratio() -> None:
     assert 0.9 <= inside / 200 <= 0.99
 
 
-def test_a_ratio_of_few_samples_says_nothing() -> None:
+def test_a_ratio_of_few_samples_is_undecided() -> None:
     random = np.random.default_rng(4)
     assert fall(random.normal(size=(4, 5)), random.normal(size=(4, 5)), 1.0)["verdict"] is Verdict.UNRESOLVED
 
@@ -102,7 +102,7 @@ def test_relative_noise_of_known_noise() -> None:
     assert relative_noise(samples, np.full(300, 6.0)) == pytest.approx(1 / 6, rel=0.02)
 
 
-def test_what_is_written(tmp_path: Path) -> None:
+def test_written_files(tmp_path: Path) -> None:
     kinds, image = pretended(), np.random.default_rng(2).uniform(size=(16, 16, 3)).astype(np.float32)
     panels = figure1.panels({"target": image, "initial": image}, kinds, figure1.Plan.limit)
     assert [title for title, _ in panels[0]][2] == "naive AD, 1024 spp: over 2 GiB"
@@ -115,7 +115,7 @@ def test_what_is_written(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.long
-def test_what_is_compared_has_one_expectation(config: Config) -> None:
+def test_compared_methods_have_one_expectation(config: Config) -> None:
     """Whatever of ours naive AD does not have is left out."""
     from paper.gradients import comparable
 
@@ -135,7 +135,7 @@ def test_what_is_compared_has_one_expectation(config: Config) -> None:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_process_ends_by_its_limit() -> None:
+def test_a_process_ends_at_its_limit() -> None:
     """It loads the scene, and has no room for the paths of a sample count that naive AD keeps."""
     kind = Kind("naive AD", 2**16, "ptracer")
     sample(kind, 1, load(figure1.CONFIG, SMALL), np.ones((16, 16, 3), np.float32), "test", 3 << 29)
@@ -154,7 +154,7 @@ def test_a_process_ends_by_its_limit() -> None:
         ("parameters=[{key: face.vertex_positions}]", "parameters"),
     ],
 )
-def test_what_it_cannot_show_is_refused(setting: str, key: str) -> None:
+def test_unsupported_figures_are_refused(setting: str, key: str) -> None:
     with pytest.raises(ConfigError, match=key):
         figure1.measure(load(figure1.CONFIG, [setting]), figure1.Plan(), lambda line: None)
 
@@ -186,7 +186,7 @@ def pretended_room(naive_factor: float = 1.0, prb_factor: float = 1.0) -> list[K
     ]
 
 
-def test_what_agrees_holds(tmp_path: Path) -> None:
+def test_agreement_holds(tmp_path: Path) -> None:
     kinds = pretended_room()
     record = figure5.judge(kinds, [])
     assert record["holds"], record
@@ -202,14 +202,14 @@ def test_what_agrees_holds(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("of", [0, 1])
-def test_a_planted_difference_is_seen(of: int) -> None:
+def test_a_planted_difference_is_found(of: int) -> None:
     record = figure5.judge(pretended_room(*((1.1, 1.0), (1.0, 1.1))[of]), [])
     verdicts = [row["verdict"] for row in record["comparisons"]]
     assert verdicts == [Verdict.FAILS if index == of else Verdict.HOLDS for index in range(2)]
     assert not record["holds"]
 
 
-def test_what_is_not_the_same_at_equal_seeds_does_not_hold() -> None:
+def test_a_difference_at_equal_seeds_fails() -> None:
     kinds = pretended_room()
     assert kinds[0].samples is not None
     exact = Kind("reslrb:stack", 32, "stack", kinds[0].samples[:1] * (1 + 2 * figure5.CLOSE))
@@ -218,14 +218,14 @@ def test_what_is_not_the_same_at_equal_seeds_does_not_hold() -> None:
 
 @pytest.mark.long
 @pytest.mark.usefixtures("llvm")
-def test_of_a_small_box() -> None:
+def test_a_small_box() -> None:
     plan = figure5.Plan(spp=16, reference_spp=256, seeds=16)
     record, _ = figure5.measure(load(BOX, SMALL_ROOM), plan, print)
     assert [row["gradient"] for row in record["comparisons"][2:]] == ["reslrb:stack, 16 spp", "reslrb:gather, 16 spp"]
     assert record["holds"], record
 
 
-def test_what_cannot_be_compared_is_refused() -> None:
+def test_invalid_comparisons_are_refused() -> None:
     for wrong in ("integrator.estimator=auto", "integrator.max_depth=-1", "integrator.type=ptracer"):
         with pytest.raises(ConfigError, match=r"integrator\."):
             figure5.measure(load(BOX, [wrong]), figure5.Plan(), print)
@@ -233,9 +233,7 @@ def test_what_cannot_be_compared_is_refused() -> None:
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("text", [None, "<scene version='3.0.0'></scene>"])
-def test_what_is_no_room_is_said_in_one_line(
-    text: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_too_little_memory_is_one_line(text: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     if text is not None:
         (tmp_path / "scene.xml").write_text(text)
     assert main(["figure5", str(tmp_path), "-o", str(tmp_path / "out")]) == 2

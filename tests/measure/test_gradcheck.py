@@ -98,7 +98,7 @@ def test_it_holds():
     a_few(["guiding=on", "sequence=low_discrepancy", "paths=both,pixels=measured"],
           ["guiding=on", "paths=both,pixels=measured"]),
 )  # fmt: skip
-def test_paths_that_are_drawn_otherwise_agree_with_naive_ad_in_expectation(drawn: str):
+def test_differently_sampled_paths_agree_with_naive_ad_in_expectation(drawn: str):
     records = [result.record for result in check(estimators=f"stack({drawn})", seeds=16)]
     assert [(record.reference.value, record.verdict) for record in records if record.verdict is not Verdict.HOLDS] == []
     kinds = {record.kind for record in records if record.reference is Reference.WALK_AD}
@@ -129,7 +129,7 @@ def test_guided_steps_are_compared_with_unguided_ones(guiding: str, monkeypatch:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_selection_weight_that_is_wrong(monkeypatch: pytest.MonkeyPatch):
+def test_a_wrong_selection_weight(monkeypatch: pytest.MonkeyPatch):
     """The reservoir alone is wrong, by a fifth: all references of it say so, and none of the others'."""
     from reslrb_cli.estimators import reservoir
 
@@ -140,7 +140,7 @@ def test_a_selection_weight_that_is_wrong(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_derivative_that_is_wrong_by_little(monkeypatch: pytest.MonkeyPatch):
+def test_a_slightly_wrong_derivative(monkeypatch: pytest.MonkeyPatch):
     from reslrb_cli.estimators import stack
 
     right = stack.push
@@ -156,7 +156,7 @@ def test_forward_mode_without_the_weight_of_roulette(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_fault_of_the_walk_is_none_of_its_own_references(monkeypatch: pytest.MonkeyPatch):
+def test_a_fault_of_the_walk_does_not_affect_its_references(monkeypatch: pytest.MonkeyPatch):
     """Connections that are a third too strong: image and stock reference differ, naive AD and differences do not."""
     from reslrb_cli.transport import walk as segment
 
@@ -172,7 +172,7 @@ def test_a_fault_of_the_walk_is_none_of_its_own_references(monkeypatch: pytest.M
 
 
 @pytest.mark.usefixtures("llvm")
-def test_rows_come_as_they_are_measured():
+def test_rows_are_printed_as_they_are_measured():
     """The first is there before the last estimator has taken a step, and what one row measured the next one uses."""
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
     made = Gradcheck(CheckSettings(config, parse_estimators("event,stack"), 0, 3))
@@ -191,7 +191,7 @@ def test_rows_come_as_they_are_measured():
 
 
 @pytest.mark.usefixtures("llvm")
-def test_what_the_budget_does_not_suffice_for_is_named():
+def test_unmeasured_comparisons_are_named():
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
     ticks = iter(range(10_000))
     made = Gradcheck(CheckSettings(config, parse_estimators("stack,event"), 40), now=lambda: next(ticks))
@@ -207,7 +207,7 @@ def test_what_the_budget_does_not_suffice_for_is_named():
 
 
 @pytest.mark.usefixtures("llvm")
-def test_what_is_interrupted_is_compared_with_what_is_done():
+def test_an_interrupt_compares_the_finished_samples():
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
     asked = iter(range(10_000))
     made = Gradcheck(CheckSettings(config, parse_estimators("stack"), 0, 8))
@@ -241,7 +241,7 @@ def test_estimators_have_the_options_of_the_configuration():
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_references_are_those_of_the_conformance_tests(case):
+def test_references_match_the_conformance_tests(case):
     """The rules allow what each case was judged by, and refuse both stock integrators where differences alone were."""
     scene = Case(case.scene(), case.keys)
     at = Situation.of(scene.scene, scene.scene.sensors()[0], scene.params, case.both.get("max_depth", 4), False)
@@ -255,7 +255,7 @@ def test_references_are_those_of_the_conformance_tests(case):
 
 
 @pytest.mark.usefixtures("llvm")
-def test_references_refuse_what_they_cannot_do():
+def test_references_refuse_unsupported_parameters():
     scene = Case(room(floor={"type": "twosided", "bsdf": diffuse(0, 0, 0)}), ["floor.brdf_0.reflectance.value"])
     [key], sensor = scene.keys, scene.scene.sensors()[0]
 
@@ -274,7 +274,7 @@ def test_references_refuse_what_they_cannot_do():
 
 
 @pytest.mark.usefixtures("llvm")
-def test_ptracer_is_no_reference_where_clip_planes_cut():
+def test_ptracer_is_no_reference_with_cutting_clip_planes():
     lens = {"type": "thinlens", "aperture_radius": 0.05, "focus_distance": 4.0}
 
     def why(**changes: object) -> str | None:
@@ -288,7 +288,7 @@ def test_ptracer_is_no_reference_where_clip_planes_cut():
 
 
 @pytest.mark.usefixtures("llvm")
-def test_path_loses_what_masks_reflect_before_nothing():
+def test_path_loses_light_reflected_by_masks():
     """A veil of opacity 0.4 and a lamp: the stock `path` shows 0.4 of what it is to show, `prb` and ours all of it."""
     veil = {"type": "mask", "opacity": 0.4, "bsdf": {"type": "twosided", "bsdf": diffuse(0.7, 0.6, 0.3)}}
     pane = {"type": "rectangle", "to_world": transform(rotate=([1, 0, 0], -45)), "bsdf": veil}
@@ -312,7 +312,7 @@ def test_a_wide_filter_has_no_weights_along_the_border():
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("dark", [True, False])
-def test_images_are_compared_without_the_border_that_paths_from_the_lights_leave_dark(dark):
+def test_images_are_compared_without_the_border(dark):
     case = Case(room(camera=camera("gaussian")), [])
     sensor, integrators = case.scene.sensors()[0], {"walk_ad": integrator("walk_ad", 4)}
     parts = SimpleNamespace(case=case, sensor=sensor, integrators=integrators, masked=dark, spp=16)
@@ -323,7 +323,7 @@ def test_images_are_compared_without_the_border_that_paths_from_the_lights_leave
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_step_has_the_truncation_error_that_it_says():
+def test_a_step_has_the_stated_truncation_error():
     """The image is a cubic in the albedo, whose differences are wrong by h^2 times the third derivative."""
     key = "side.brdf_0.reflectance.value"
     scene, walk = Case(room(), [key]), integrator("walk_ad", 4)
@@ -340,7 +340,7 @@ def test_a_step_has_the_truncation_error_that_it_says():
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_step_that_is_lost_in_rounding_is_not_taken():
+def test_a_step_lost_in_rounding_is_not_used():
     """Rounding of the scene, the same for all seeds, is no truncation: it grows as the step shrinks."""
 
     class Rounded:
@@ -371,7 +371,7 @@ WAYS = "stack,stack(paths=both,light_share=0.25),stack(paths=camera)"
 
 
 @pytest.mark.usefixtures("llvm")
-def test_paths_are_compared_with_naive_ad_of_the_same_at_equal_seeds():
+def test_paths_are_compared_with_their_naive_ad_at_equal_seeds():
     results = check("scene.options.size=8", estimators=WAYS, seeds=4)
     records = [result.record for result in results]
     assert not [record for record in records if record.holds is False]
@@ -393,7 +393,7 @@ def test_paths_are_compared_with_naive_ad_of_the_same_at_equal_seeds():
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_weight_of_camera_paths_that_is_wrong_is_found(monkeypatch: pytest.MonkeyPatch):
+def test_a_wrong_weight_of_camera_paths_is_found(monkeypatch: pytest.MonkeyPatch):
     """Light paths count in full beside camera paths: naive AD has the same fault, `path` has not."""
     monkeypatch.setattr("reslrb_cli.transport.walk.weight_of_connection", lambda *_: mi.Float(1))
     results = check("scene.options.size=8", "run.spp=64", estimators="stack(paths=both)", seeds=4)
@@ -402,13 +402,13 @@ def test_a_weight_of_camera_paths_that_is_wrong_is_found(monkeypatch: pytest.Mon
 
 
 @pytest.mark.usefixtures("llvm")
-def test_of_camera_paths_alone_there_is_one_estimator():
+def test_camera_paths_have_one_estimator():
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, "integrator.paths=camera"])
     assert [case.label for case in all_estimators(config)] == ["reslrb:stack"]
 
 
 @pytest.mark.usefixtures("llvm")
-def test_of_what_moves_light_there_are_light_paths():
+def test_moving_light_has_only_light_paths():
     config = room_moving("lamp_over_floor.xml", "lamp.position")
     with pytest.raises(ConfigError, match="only light paths have derivatives of moving light"):
         Gradcheck(CheckSettings(config, parse_estimators("stack(paths=both)"), 0, 3))
@@ -421,7 +421,7 @@ def _lit(view: str, **more: Any) -> Situation:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_what_counts_as_a_reference_goes_by_the_paths():
+def test_references_depend_on_the_paths():
     mirror = {"wall": {"type": "twosided", "bsdf": {"type": "conductor"}}}
     assert prb_image(_lit("light", **mirror)) is not None
     assert ptracer_image(_lit("light", **mirror)) is None
@@ -444,7 +444,7 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_lamp_that_moves():
+def test_a_moving_lamp():
     records = checked(room_moving("lamp_over_floor.xml", "lamp.position"), "stack", 4)
     of = {record.reference: record for record in records if record.parameter is not None}
     assert of[Reference.WALK_AD].kind is Kind.EQUAL_SEEDS
@@ -457,7 +457,7 @@ def test_a_lamp_that_moves():
 
 
 @pytest.mark.usefixtures("llvm")
-def test_who_takes_part():
+def test_participants():
     config = room_moving("lamp_over_floor.xml", "lamp.position")
     some = Gradcheck(CheckSettings(config, all_estimators(config), 0, 3, named=False))
     assert [case.label for case in some.participants.listed] == ["reslrb:reservoir", "reslrb:stack"]
@@ -474,7 +474,7 @@ def test_who_takes_part():
 
 
 @pytest.mark.usefixtures("llvm")
-def test_ways_to_differentiate_the_film():
+def test_derivatives_of_the_film():
     """Beside differences the filter's normalisation has its derivative, beside `ptracer` none; naive AD follows."""
     parts = Gradcheck(
         CheckSettings(room_moving("wavy_glass.xml", "top.vertex_positions"), parse_estimators("stack"), 0, 3)
@@ -489,7 +489,7 @@ def test_ways_to_differentiate_the_film():
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("name", ["caustic_heightmap", pytest.param("lens_pose", marks=pytest.mark.long)])
-def test_forward_mode_of_what_is_a_function(name: str):
+def test_forward_mode_of_functions(name: str):
     """Heights and motions are not in the scene: tangents have to reach what is, as gradients come back from there."""
     small = ["scene.options={resx: 16, resy: 16}", "run.spp=4", "target.render.spp=4"]
     parts = Participants(CheckSettings(load(CONFIGS / f"{name}.yaml", small), parse_estimators("stack"), 0, 3))
@@ -503,7 +503,7 @@ def test_forward_mode_of_what_is_a_function(name: str):
 
 
 @pytest.mark.usefixtures("llvm")
-def test_references_of_what_moves():
+def test_references_of_moving_scenes():
     scene = corner(camera=camera("gaussian"), ball={"type": "sphere", "radius": 0.3, "bsdf": diffuse(0.5, 0.5, 0.5)},
                    lamp=lamp(radiance=1.0))  # fmt: skip
     case = Case(scene, [])
@@ -584,7 +584,7 @@ def test_more_seeds_are_added_to_those_of_the_file(llvm: None, tmp_path: Path, m
         ({"config": loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, ["run.seed=3"])}, "run.seed is 0 there, 3 here"),
     ],
 )
-def test_only_the_same_is_gone_on_from(change: dict[str, Any], line: str) -> None:
+def test_only_the_same_measurement_is_continued(change: dict[str, Any], line: str) -> None:
     what = CheckSettings(loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE), parse_estimators("stack"), 0, 4)
     head = {"version": VERSION, "kind": KIND, "settings": settings(what, "llvm_ad_rgb", "")}
     with pytest.raises(ConfigError) as caught:
@@ -592,7 +592,7 @@ def test_only_the_same_is_gone_on_from(change: dict[str, Any], line: str) -> Non
     assert f"--json: g.jsonl belongs to another measurement: {line}" in str(caught.value)
 
 
-def test_samples_of_other_code_are_not_gone_on_from(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samples_of_other_code_are_not_continued(monkeypatch: pytest.MonkeyPatch) -> None:
     what = CheckSettings(loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE), parse_estimators("stack"), 0, 4)
     now = settings(what, "llvm_ad_rgb", "")
     earlier = Earlier(KIND, Path("g.jsonl"), {"version": VERSION, "kind": KIND, "settings": now}, {})
@@ -642,7 +642,7 @@ def again(made: Sampling) -> Earlier:
     return Earlier(KIND, Path("g.jsonl"), *kept)
 
 
-def test_a_second_budget_adds_seeds_that_are_new_and_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_budget_adds_new_seeds_and_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sampling, "Participants", Directed)
     first, _ = sampled(60.0)
     before = {name: len(first.of(name)) for name in NAMES if len(first._samples.get(name, ())) > 0}
@@ -659,7 +659,9 @@ def test_a_second_budget_adds_seeds_that_are_new_and_is_kept(monkeypatch: pytest
 
 
 @pytest.mark.parametrize("budget_s", [12.0, 30.0])
-def test_a_budget_that_is_too_small_says_what_the_fewest_take(budget_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_too_small_budget_names_the_time_of_the_fewest_seeds(
+    budget_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sampling, "Participants", Directed)
     made, _ = sampled(budget_s)
     assert any(len(made._samples.get(name, ())) < FEWEST for name in NAMES)

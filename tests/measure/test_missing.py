@@ -102,7 +102,7 @@ def slab_share() -> float:
 
 @pytest.mark.usefixtures("_quiet")
 @pytest.mark.long
-def test_a_texture_lacks_nothing():
+def test_a_texture_has_a_complete_derivative():
     """Neither do colours: nothing moves."""
     config = room("lamp_over_floor.xml", "floor.bsdf.reflectance.value")
     check = MissingCheck(config, 0, 6, 16, 2)
@@ -133,7 +133,7 @@ def test_known_shares(scene: Callable[[], AttachedScene], known: float):
 
 
 @pytest.mark.usefixtures("_quiet")
-def test_a_fault_is_seen(monkeypatch: pytest.MonkeyPatch):
+def test_a_fault_is_found(monkeypatch: pytest.MonkeyPatch):
     """Of a gradient without what lands elsewhere, that is missing too."""
     right = AdjointImage.lookup
     monkeypatch.setattr(AdjointImage, "lookup", lambda self, u, *a, **k: right(self, dr.detach(u), *a, **k))
@@ -142,7 +142,7 @@ def test_a_fault_is_seen(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.usefixtures("_quiet")
-def test_steps_that_are_lost_in_rounding():
+def test_steps_lost_in_rounding():
     """Rounding that is the same for all seeds is seen in how the extrapolation changes."""
 
     class Rounded:
@@ -158,7 +158,7 @@ def test_steps_that_are_lost_in_rounding():
 
 
 @pytest.mark.usefixtures("_quiet")
-def test_what_is_lost_in_noise_has_no_share():
+def test_a_part_lost_in_noise_has_no_share():
     random = np.random.default_rng(0)
     found = Missing([Direction(np.ones(2), "both")] * 2)
     for _ in range(16):
@@ -170,7 +170,7 @@ def test_what_is_lost_in_noise_has_no_share():
 
 
 @pytest.mark.usefixtures("_quiet")
-def test_errors_are_right():
+def test_errors_are_correct():
     """Over many made measurements, the deviation from the known share is of the size of the stated error."""
     random, z = np.random.default_rng(1), []
     for _ in range(300):
@@ -244,9 +244,7 @@ def test_the_command_and_more_seeds(
         (["CONFIG", "--directions", "2"], "--directions: needs --missing"),
     ],
 )
-def test_what_does_not_go_together(
-    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_incompatible_options(arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     config = tmp_path / "lamp.yaml"
     config.write_text(LAMP.format(folder=Path(__file__).parent))
     assert call(*[str(config) if argument == "CONFIG" else argument for argument in arguments]) == 2
@@ -298,14 +296,14 @@ def beam(only: tuple[float, float, float], seeds: int = 2) -> Differenced:
 
 
 @pytest.mark.usefixtures("_quiet")
-def test_a_slab_whose_surface_bends():
+def test_a_bending_slab():
     found = beam((0, 1, 0), 4)
     assert found.error < ERROR, found
     assert found.standard_error < STANDARD_ERROR, found
 
 
 @pytest.mark.usefixtures("_quiet")
-def test_a_receiver_that_moves():
+def test_a_moving_receiver():
     found = compare_with_differences(replace(SCENES["moved_receiver"], spp=16), count=3)
     assert found.error < ERROR, found
     assert found.standard_error < STANDARD_ERROR, found

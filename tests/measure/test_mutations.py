@@ -33,7 +33,7 @@ def test_enough():
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
-def test_it_fits_the_code(fault: Fault, monkeypatch: pytest.MonkeyPatch):
+def test_the_faults_apply_to_the_code(fault: Fault, monkeypatch: pytest.MonkeyPatch):
     """Also those that the default suite does not run: a change of the code that one gets lost by shows at once."""
     plant(fault, monkeypatch)
 

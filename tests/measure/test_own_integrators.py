@@ -97,7 +97,7 @@ def checked(capsys: pytest.CaptureFixture[str], options: str, *more: str) -> tup
     return code, [line for line in lines if line.startswith(f"{name}:")]
 
 
-def test_one_that_is_right_holds_and_its_cost_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_correct_integrator_holds_and_its_cost_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     code, lines = checked(capsys, "", "--set", TWO, *FEW)
     assert code == 0
     assert len(lines) == 1
@@ -125,7 +125,7 @@ QUICK = {"fault=cosine": 3, "fault=roulette": 4}
 @pytest.mark.parametrize(
     "fault", [name if name in QUICK else pytest.param(name, marks=pytest.mark.long) for name in FOUND]
 )
-def test_a_fault_is_found_and_the_sentence_points_at_it(capsys: pytest.CaptureFixture[str], fault: str) -> None:
+def test_a_fault_is_found_and_explained(capsys: pytest.CaptureFixture[str], fault: str) -> None:
     more = ["--set", TWO] if fault == "fault=lobe" else []
     if fault in QUICK:
         more = [*FEW, "--set", f"integrator.max_depth={QUICK[fault]}"]
@@ -144,7 +144,7 @@ DIFFUSE = ["--set", "scene.options.size=16", "--set", "integrator.max_depth=5", 
 
 @pytest.mark.long
 @pytest.mark.parametrize("options", ["primal_fault=clamp", "fault=clamp", "primal_fault=bright", "fault=bright"])
-def test_what_is_limited_from_above_is_told_by_darker_scenes(capsys: pytest.CaptureFixture[str], options: str) -> None:
+def test_clamped_values_are_detected_in_darker_scenes(capsys: pytest.CaptureFixture[str], options: str) -> None:
     """A throughput, and light, in both passes and in that which differentiates."""
     words = DIFFUSE if options.endswith("clamp") else ["room.yaml"]
     name = f"own_replay.py:Replay({options})"
@@ -165,7 +165,7 @@ FURNACE = str(Path(__file__).parents[2] / "configs/furnace.yaml")
 
 
 @pytest.mark.long
-def test_mitsubas_own_hold_where_they_are_right(capsys: pytest.CaptureFixture[str]) -> None:
+def test_correct_integrators_of_mitsuba_hold(capsys: pytest.CaptureFixture[str]) -> None:
     Path("mine.py").write_text(MITSUBAS)
 
     def check(config: str, name: str, *settings: str) -> int:
@@ -217,7 +217,7 @@ run: {iterations: 2, spp: 64}
 
 @pytest.mark.long
 @pytest.mark.parametrize(("triangles", "projective_holds"), [(SHEET, True), (BOX, False)], ids=["sheet", "box"])
-def test_silhouettes_are_judged_by_differences(
+def test_silhouettes_are_compared_with_differences(
     capsys: pytest.CaptureFixture[str], triangles: list[str], projective_holds: bool
 ) -> None:
     """Those of a sheet `direct_projective` has, and `prb_basic` has not, which the sentence says. At the edges of a box
@@ -238,7 +238,7 @@ def test_silhouettes_are_judged_by_differences(
     assert [line.partition(":")[0] for line in pointed] == [each.partition(":")[2] for each in names if not holds[each]]
 
 
-def test_where_there_is_nothing_in_either_image_they_agree() -> None:
+def test_two_black_images_agree() -> None:
     """As of paths of one segment, where the sensor sees no lamp."""
     nothing, something = np.zeros(4), np.array([1.0, 1.1, 0.9, 1.0])
     assert not _over(nothing, nothing).wrong
@@ -265,7 +265,7 @@ def test_where_there_is_nothing_in_either_image_they_agree() -> None:
         ("reslrb:stack", "is not your own (FILE.py:CLASS)"),
     ],
 )
-def test_what_is_no_integrator_is_one_line(capsys: pytest.CaptureFixture[str], name: str, said: str) -> None:
+def test_invalid_integrators_are_one_line(capsys: pytest.CaptureFixture[str], name: str, said: str) -> None:
     allowed = [] if "would run" in said else ["--allow-code"]
     code = call(["gradcheck", "room.yaml", "--integrators", name, *allowed, "--seeds", "3", "--spp", "4"])
     error = capsys.readouterr().err
@@ -274,7 +274,7 @@ def test_what_is_no_integrator_is_one_line(capsys: pytest.CaptureFixture[str], n
     assert "Traceback" not in error
 
 
-def test_an_image_that_is_no_number_fails(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_nan_image_fails(capsys: pytest.CaptureFixture[str]) -> None:
     code = call(["gradcheck", "room.yaml", "--integrators", "own_replay.py:Replay(primal_fault=nan)", "--allow-code",
                  "--seeds", "3", "--spp", "4", "--set", "integrator.max_depth=2"])  # fmt: skip
     said = capsys.readouterr().out
@@ -282,7 +282,7 @@ def test_an_image_that_is_no_number_fails(capsys: pytest.CaptureFixture[str]) ->
     assert "image: own_replay.py:Replay(primal_fault=nan)" in said
 
 
-def test_a_run_by_one_is_that_of_prb(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_by_an_own_integrator_equals_prb(capsys: pytest.CaptureFixture[str]) -> None:
     """`integrator.type: custom` recovers parameters, needs leave again to go on, and `render` asks for it too."""
     own = "integrator={type: custom, file: own_replay.py:Replay, max_depth: 3}"
     words = ["optimize", "room.yaml", "--set", own, "--set", "run.name=own", "--set", "run.certainty=false"]
@@ -301,7 +301,7 @@ def test_a_run_by_one_is_that_of_prb(capsys: pytest.CaptureFixture[str]) -> None
     assert "integrator.file: has changed since runs/own began" in capsys.readouterr().err
 
 
-def test_bench_and_convergence_take_one(capsys: pytest.CaptureFixture[str]) -> None:
+def test_bench_and_convergence_accept_one(capsys: pytest.CaptureFixture[str]) -> None:
     name = "own_replay.py:Replay"
     code = call(
         ["bench", "room.yaml", "--integrators", f"prb,{name}", "--values", "3", "--rounds", "2", "--allow-code"]

@@ -21,7 +21,7 @@ def samples(sd, count, seed, entries=200):
 
 
 @pytest.mark.parametrize("entries", [3, 200])
-def test_the_interval_holds_the_truth_as_often_as_it_says(entries):
+def test_the_interval_has_its_coverage(entries):
     """Four times the variance at half the time; without what single times may be off, the level is the nominal one."""
     inside = 0
     for seed in range(200):
@@ -34,7 +34,7 @@ def test_the_interval_holds_the_truth_as_often_as_it_says(entries):
     assert inside >= 176
 
 
-def test_equals_are_hardly_ever_called_better():
+def test_equal_methods_are_rarely_called_better():
     better = sum(
         race.compare(samples(1.0, 8, 2 * seed), [3.0] * 8, samples(1.0, 8, 2 * seed + 1), [3.0] * 8)[1] > 1
         for seed in range(200)
@@ -42,12 +42,12 @@ def test_equals_are_hardly_ever_called_better():
     assert better <= 13  # 5 are expected on this side without what times may be off
 
 
-def test_no_noise_is_no_comparison():
+def test_zero_noise_cannot_be_compared():
     still = [{KEY: np.ones(4, np.float32)}] * 6
     assert race.compare(still, [1.0] * 6, samples(1.0, 6, 1, 4), [1.0] * 6) == (None, None, None)
 
 
-def test_gradients_of_no_light_tell_nothing():
+def test_gradients_without_light_are_undecided():
     none = [{KEY: np.zeros(3, dtype=np.float32)} for _ in range(8)]
     assert race.compare(none, [1.0] * 8, none, [1.0] * 8) == (None, None, None)
 
@@ -63,7 +63,7 @@ CAMERA_CASES = [
 
 
 @pytest.mark.parametrize(("cases", "reference", "expected"), CAMERA_CASES)
-def test_camera_paths_are_seen_wherever_they_take_part(
+def test_camera_paths_are_checked_wherever_they_are_used(
     tmp_path: Path, cases: str, reference: str, expected: tuple[bool, bool, bool]
 ) -> None:
     changes: dict[str, Any] = {"reference": parse_cases(reference)[0]}
@@ -78,9 +78,7 @@ def test_camera_paths_are_seen_wherever_they_take_part(
     [("light", "reslrb:stack", None), ("camera", "reslrb:stack(paths=camera)", None),
      ("both", "reslrb:stack(paths=both,light_share=0.5)", 0.5)],
 )  # fmt: skip
-def test_errors_are_taken_from_all_light_that_the_scene_allows_for(
-    tmp_path: Path, paths: str, label: str, share: float | None
-) -> None:
+def test_errors_refer_to_all_light_of_the_scene(tmp_path: Path, paths: str, label: str, share: float | None) -> None:
     """Of the default list, what there are no paths for is left out, and said."""
     stage = pretended_steps.Stage(facts={"paths": paths})
     usual = pretended_steps.plan(
@@ -94,7 +92,7 @@ def test_errors_are_taken_from_all_light_that_the_scene_allows_for(
     assert (left_out in said) == (paths == "light")
 
 
-def test_of_the_default_list_camera_paths_may_be_left_out(tmp_path: Path) -> None:
+def test_camera_paths_of_the_default_list_may_be_left_out(tmp_path: Path) -> None:
     stage = pretended_steps.Stage()
     pretended_steps.play(tmp_path, stage, pretended_steps.plan("prb,reslrb:stack", rounds=3, default=True))
     [ask] = [question["ask"] for question in stage.asked if "ask" in question]

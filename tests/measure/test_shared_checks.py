@@ -71,7 +71,7 @@ def check(settings: CheckSettings, workers: int) -> None:
     assert all(np.isfinite(rows).all() and rows.any() for rows in alone[1].values())
 
 
-def test_samples_of_workers_are_those_of_one_process(experiment: Path) -> None:
+def test_samples_of_workers_equal_those_of_one_process(experiment: Path) -> None:
     """With the steps of differences, which workers do not choose, and a start that is sent by itself."""
     check(checked(load(experiment / "tiny.yaml", [MOTION]), "stack"), 1)
 
@@ -92,7 +92,7 @@ def test_any_experiment_and_any_number_of_workers(experiment: Path, case: str, w
 
 
 @pytest.mark.long
-def test_workers_go_on_from_what_one_process_did(experiment: Path) -> None:
+def test_workers_continue_samples_of_one_process(experiment: Path) -> None:
     config = load(experiment / "tiny.yaml")
     few = settings_of(config, "stack", 0.0, 3, None, 0.0)
     more = settings_of(config, "stack", 0.0, 7, None, 0.0)
@@ -139,6 +139,6 @@ def test_cases_of_the_suite_are_calls(tmp_path: Path, capsys: pytest.CaptureFixt
         (["--cluster", "tls://127.0.0.1:9", "--seeds", "4"], "distributed.comm.tls.ca-file: is not set"),
     ],
 )
-def test_what_cannot_be_shared_out_is_refused(experiment: Path, capsys, words: list[str], line: str) -> None:
+def test_undistributable_checks_are_refused(experiment: Path, capsys, words: list[str], line: str) -> None:
     assert call("tiny.yaml", *words) == 2
     assert line in capsys.readouterr().err.splitlines()[-1]

@@ -51,12 +51,12 @@ def test_equal_expectations_agree():
     assert all(compare(noise(seed), noise(seed + 100)) for seed in range(20))
 
 
-def test_small_bias_everywhere_is_seen():
+def test_a_small_bias_everywhere_is_found():
     shape = (50, 32, 32, 3)
     assert not compare(noise(1, shape), noise(2, shape, mean=1.1))
 
 
-def test_bias_in_one_block_is_seen():
+def test_a_bias_in_one_block_is_found():
     a = noise(1)
     a[:, 8:16, 24:32] *= 1.6
     assert not compare(a, noise(2))
@@ -68,13 +68,13 @@ def test_entries_without_noise_are_compared_too():
     assert not compare(a, a * 1.001)
 
 
-def test_not_a_number_never_agrees():
+def test_nan_never_agrees():
     a = noise(1)
     a[3, 5, 5, 0] = np.nan
     assert not compare(a, noise(2))
 
 
-def test_blocks_keep_remainders():
+def test_blocks_include_remainders():
     parts = blocks(np.ones((2, 10, 17, 3)), 8)
     assert parts.shape == (2, 6, 3)
     assert (parts == 1).all()
@@ -101,7 +101,7 @@ def test_effective_entries():
     assert effective_entries(np.repeat(noise[:, :1], 90, axis=1)) == pytest.approx(1, rel=0.01)
 
 
-def test_correlated_entries_are_not_counted_each():
+def test_correlated_entries_do_not_count_separately():
     """Sixty entries that are five: their z rms scatters as that of five, and a bias of one of them still shows."""
     rng, failed = np.random.default_rng(3), 0
     for _ in range(200):
@@ -133,7 +133,7 @@ def test_equal_expectations_hold(paired: bool):
 
 
 @pytest.mark.parametrize("paired", [True, False])
-def test_a_deviation_of_the_size_that_is_called_detectable_is_seen(paired: bool):
+def test_a_detectable_deviation_is_found(paired: bool):
     seen = []
     for k in range(100):
         reference = noisy(k + 100)
@@ -150,26 +150,26 @@ def test_shared_noise_sharpens_a_paired_comparison():
     assert compare_expectations(close * 1.01, reference, FAMILY, paired=False).verdict is Verdict.HOLDS
 
 
-def test_exact_values_and_what_they_may_be_wrong_by():
+def test_exact_values_and_their_errors():
     assert compare_expectations(noisy(1), TRUTH, FAMILY).verdict is Verdict.HOLDS
     assert compare_expectations(noisy(1), TRUTH + 0.5, FAMILY).verdict is Verdict.FAILS
     assert compare_expectations(noisy(1), TRUTH + 0.5, FAMILY, bias=0.5).verdict is Verdict.HOLDS
     assert compare_expectations(noisy(1), TRUTH + 1.0, FAMILY, bias=0.5).verdict is Verdict.FAILS
 
 
-def test_what_noise_hides_is_unresolved():
+def test_deviations_hidden_by_noise_are_unresolved():
     result = compare_expectations(noisy(1, size=20), noisy(2, size=20), FAMILY)
     assert result.verdict is Verdict.UNRESOLVED
     assert result.detectable > 1
 
 
-def test_a_single_seed_that_carries_the_variance_is_no_pass():
+def test_a_single_dominant_seed_does_not_pass():
     ours = noisy(1)
     ours[3] += 100
     assert compare_expectations(ours, noisy(2), FAMILY).verdict is Verdict.HEAVY_TAILED
 
 
-def test_tails_of_noise_that_is_nothing_beside_the_reference_own_error_do_not_matter():
+def test_tails_of_negligible_noise_do_not_matter():
     reference = np.ones((16, 4))
     ours = reference + 1e-4
     ours[3] += 3e-2  # one seed carries the variance, of a standard error of 2e-3
@@ -181,7 +181,7 @@ def test_tails_of_noise_that_is_nothing_beside_the_reference_own_error_do_not_ma
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_what_is_not_finite_fails(value: float):
+def test_non_finite_values_fail(value: float):
     ours = noisy(1)
     ours[2, 3] = value
     for result in (compare_expectations(ours, noisy(2), FAMILY), compare_equal_seeds(ours, noisy(2))):
@@ -210,7 +210,7 @@ def test_limits_grow_with_the_table():
     assert Family(50, 1000).z_rms_limit(10) > Family(1, 10).z_rms_limit(10)
 
 
-def test_parts_of_a_texture_and_what_takes_all_of_it_in():
+def test_tiles_and_projections_of_a_texture():
     shape, rng = (20, 30, 3), np.random.default_rng(0)
     gradient = rng.normal(size=(2, 20 * 30 * 3))
     tiles, whole = parts(gradient, shape, 8), overall(gradient)
@@ -235,7 +235,7 @@ def test_entry_count(shape: tuple[int, ...], count: int, finest: int):
     assert (entry_count(shape), divisions(shape)[0]) == (count, finest)
 
 
-def test_a_texture_that_few_paths_meet_is_compared_in_larger_tiles():
+def test_a_rarely_hit_texture_is_compared_in_larger_tiles():
     """Rare, skewed samples in every texel: equal in expectation, and far from normal in single tiles."""
     shape, tiled, coarser = (16, 16, 3), [], []
     for k in range(30):
@@ -256,7 +256,7 @@ def record(**changes) -> GradcheckRecord:
     return GradcheckRecord(**values | changes)
 
 
-def test_a_record_is_a_line_and_comes_back() -> None:
+def test_a_record_survives_a_round_trip() -> None:
     found = record(verdict=Verdict.UNRESOLVED, parameter=None)
     line = json.loads(found.to_json())
     assert {"case", "parameter", "integrator", "estimator", "reference", "seeds", "relative_l2", "z_rms", "z_max",
@@ -268,7 +268,7 @@ def test_a_record_is_a_line_and_comes_back() -> None:
     assert record_of(GradcheckRecord, {"case": "a", "colour": 3}) is None
 
 
-def test_table_and_the_line_of_a_failure():
+def test_the_table_and_the_line_of_a_failure():
     table = gradcheck_columns([record()])
     assert table.head().split() == ["parameter", "integrator", "reference", "seeds", "rel.", "L2", "z", "rms", "max",
                                     "|z|", "cosine", "variance", "detectable", "verdict"]  # fmt: skip
@@ -329,7 +329,7 @@ def spent(budget_s: float, seeds: int | None = None) -> tuple[dict[Name, int], f
 
 
 @pytest.mark.usefixtures("_pretend")
-def test_a_budget_that_suffices_for_all_is_kept_and_used() -> None:
+def test_a_sufficient_budget_is_kept_and_used() -> None:
     counts, seconds, said = spent(90.0)
     assert list(counts) == NAMES
     assert 70.0 < seconds <= 90.0
@@ -340,7 +340,7 @@ def test_a_budget_that_suffices_for_all_is_kept_and_used() -> None:
 
 
 @pytest.mark.usefixtures("_pretend")
-def test_a_budget_without_end_takes_no_more_than_is_of_use() -> None:
+def test_an_unlimited_budget_stops_when_more_is_useless() -> None:
     counts, _, _ = spent(1e6)
     cheap = [name for name in NAMES if name[0] == "image" or (name[0] == "gradient" and name[1] != "walk_ad")]
     assert {name: MOST_SEEDS if name in cheap else LEAST_SEEDS for name in NAMES} == counts
@@ -348,7 +348,7 @@ def test_a_budget_without_end_takes_no_more_than_is_of_use() -> None:
 
 @pytest.mark.usefixtures("_pretend")
 @pytest.mark.parametrize("budget_s", [0.0, 1.0, 8.0, 20.0, 40.0])
-def test_a_budget_that_compiling_exceeds_is_overrun_by_one_first_sample(budget_s: float) -> None:
+def test_a_budget_exceeded_by_compilation_runs_over_by_one_sample(budget_s: float) -> None:
     counts, seconds, _ = spent(budget_s)
     assert seconds <= max(budget_s, 2.0) + 5.2 + 0.1
     assert len(counts) < len(NAMES)
@@ -357,7 +357,7 @@ def test_a_budget_that_compiling_exceeds_is_overrun_by_one_first_sample(budget_s
 
 
 @pytest.mark.usefixtures("_pretend")
-def test_a_number_of_seeds_is_kept_whatever_it_takes() -> None:
+def test_a_number_of_seeds_is_taken_at_any_cost() -> None:
     counts, seconds, _ = spent(0.0, seeds=5)
     assert counts == dict.fromkeys(NAMES, 5)
     assert seconds > 40.0

@@ -150,7 +150,7 @@ def forced(record: Callable[..., PaidRecord], on: bool) -> Callable[..., PaidRec
 
 
 @pytest.mark.parametrize("fault", ["on whatever is found", "off with a grid"])
-def test_losses_are_seen(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_losses_are_found(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a scene that guided light paths have a third of the efficiency in: it is on; and it is off, and paths start in
     cells."""
     monkeypatch.setattr(sys.modules[__name__], "AUTO", [*AUTO, "integrator.paths=light"])

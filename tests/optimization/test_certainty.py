@@ -98,7 +98,7 @@ def verdicts(toy: Toy, found: Outcome) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("toy", SHORT, ids=lambda toy: toy.name)
-def test_what_fails_is_told_for_what_it_is(folder, toy):
+def test_failures_are_reported_with_their_cause(folder, toy):
     found = run(folder, toy)
     assert verdicts(toy, found) == toy.right, told(toy, found)
     if toy is FAIL[6]:
@@ -106,7 +106,7 @@ def test_what_fails_is_told_for_what_it_is(folder, toy):
         assert found.certainty.parameters[OTHER_TWIN].partner == TWIN
 
 
-def test_a_value_that_ran_to_its_bound_and_has_no_gradient_there_is_at_its_bound(folder, monkeypatch):
+def test_a_value_at_its_bound_without_a_gradient_is_at_its_bound(folder, monkeypatch):
     """A roughness that ran to its bound, where the lobe is so narrow that no sample differs from 0."""
     monkeypatch.setattr(measuring, "sample_gradient", lambda *given: None)
     options = "initial: 0.6, bounds: [0.4, 1], learning_rate: 0.05"
@@ -144,7 +144,7 @@ HELD = Toy("a texture that is held even", {POSTER: f"{COLOR}, regularizers: [{{t
                                "optimizer={type: adam, learning_rate: 0.02, schedule: cosine}"))  # fmt: skip
 
 
-def test_what_regularizers_cost_is_in_gradients_and_curvature(folder, monkeypatch):
+def test_regularizers_are_part_of_gradients_and_curvature(folder, monkeypatch):
     """The images alone would have it move; and it is surer than they would have it be."""
     sampled, images, gradients = measuring.sample_gradient, [], []
 
@@ -171,7 +171,7 @@ def test_what_regularizers_cost_is_in_gradients_and_curvature(folder, monkeypatc
     assert spreads[0] < 0.7 * spreads[1]
 
 
-def test_what_noise_hides_is_measured_again_with_all_samples(folder, monkeypatch):
+def test_noisy_curvature_is_measured_again_with_all_samples(folder, monkeypatch):
     """Where a first look finds no curvature of a colour, a second one does."""
     asked, along = [], measuring.Curvature.along
 
@@ -205,7 +205,7 @@ def noisy(name: str, loss: str) -> Toy:
     return Toy(name, parameters, {}, settings)
 
 
-def test_noise_of_a_rendered_target_is_in_the_spread(folder):
+def test_noise_of_a_rendered_target_is_part_of_the_spread(folder):
     """By its samples: a quarter of the variance with four times as many. Without it nothing but the run's is left."""
     found = {}
     for spp in (16, 256):
@@ -223,7 +223,7 @@ def test_noise_of_a_rendered_target_is_in_the_spread(folder):
 @pytest.mark.long
 @pytest.mark.parametrize("loss", ["l2", "relative_l2"])
 @pytest.mark.parametrize("name", NOISY)
-def test_the_truth_is_within_spreads_that_have_the_targets_noise(folder, name, loss, monkeypatch):
+def test_the_truth_is_within_spreads_with_the_noise_of_the_target(folder, name, loss, monkeypatch):
     """Over many noisy targets: errors are as large as they are said to be, and most of that is the target's."""
     z, without, settled = [], [], 0
     for seed in range(12):
@@ -274,7 +274,7 @@ def plate(name: str, x: float, y: float, alpha: float) -> str:
 
 @pytest.mark.long
 @pytest.mark.parametrize("spp", [4, 64])
-def test_wrong_values_are_told_to_be(llvm, tmp_path, spp):
+def test_wrong_values_are_reported(llvm, tmp_path, spp):
     shapes = [lamp(name, x, radiance, 0.4) for name, (x, radiance) in LAMPS.items()]
     shapes += [plate(name, *place) for name, place in PLATES.items()]
     (tmp_path / "scene.xml").write_text(SCENE.replace("BODY", "\n".join(shapes)))
@@ -334,7 +334,7 @@ def folder_of_views(llvm: str, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 @pytest.mark.long
-def test_a_known_poster_in_view_tells_exposure_from_colour(folder_of_views: Path) -> None:
+def test_a_known_visible_poster_separates_exposure_from_colour(folder_of_views: Path) -> None:
     found = run(folder_of_views, Toy("seen", COLOR_OF_BACK, {}, ENOUGH))
     verdicts = {key: about.verdict for key, about in found.certainty.parameters.items()}
     assert verdicts == {WALL: "settled", EXPOSURE: "settled"}, found.certainty
@@ -343,7 +343,7 @@ def test_a_known_poster_in_view_tells_exposure_from_colour(folder_of_views: Path
         assert np.all(np.abs(np.ravel(found.errors[key])) < 4 * spread), key
 
 
-def test_where_a_mask_leaves_out_what_is_known_one_makes_up_for_the_other(folder_of_views: Path) -> None:
+def test_with_a_mask_colour_and_exposure_compensate_for_each_other(folder_of_views: Path) -> None:
     found = run(folder_of_views, Toy("masked", COLOR_OF_BACK, {}, (*SETTINGS, "target.mask=mask.exr")))
     wall, exposure = (found.certainty.parameters[key] for key in (WALL, EXPOSURE))
     assert wall.verdict == exposure.verdict == "not determined", found.certainty
@@ -353,7 +353,7 @@ def test_where_a_mask_leaves_out_what_is_known_one_makes_up_for_the_other(folder
 # When nothing is measured of how certain values are: runs that are short, and those that are told to stop.
 
 
-def test_short_runs_and_stopped_ones_go_without(tmp_path, monkeypatch):
+def test_short_and_stopped_runs_have_no_verdicts(tmp_path, monkeypatch):
     problem, asked = make_problem(tmp_path), []
 
     def sample(problem, integrator, number, purpose, spp):
@@ -369,7 +369,7 @@ def test_short_runs_and_stopped_ones_go_without(tmp_path, monkeypatch):
     np.testing.assert_array_equal(problem.values()["albedo"], before)
 
 
-def test_a_failure_leaves_no_gradient_behind(tmp_path, monkeypatch):
+def test_a_failure_leaves_no_gradient(tmp_path, monkeypatch):
     import drjit as dr
 
     problem = make_problem(tmp_path)

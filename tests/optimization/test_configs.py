@@ -19,7 +19,7 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "stiff"
 SMALL = ["scene.options={resx: 16, resy: 16}", "target.render.spp=16"]
 
 
-def test_each_is_known_here():
+def test_each_configuration_is_listed_here():
     assert {path.stem for path in CONFIGS.iterdir()} == {"lamp", "plate", "wall"}
 
 
@@ -39,7 +39,7 @@ def test_sensitivities_differ_by_a_million(name, quantity):
 
 
 @pytest.mark.long
-def test_the_mixed_room_is_recovered_where_only_the_mirror_shows_it():
+def test_the_mixed_room_is_recovered_if_only_the_mirror_shows_it():
     """Light paths alone keep the initial values there."""
     problem = assemble(load(CONFIGS.parent / "mixed_room.yaml"))
     for _ in optimize(problem):
@@ -61,7 +61,7 @@ def slopes(heights: np.ndarray) -> np.ndarray:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["lens_pose", "caustic_heightmap"])
-def test_it_is_recovered_to_a_tenth(name):
+def test_it_is_recovered_within_a_tenth(name):
     problem = assemble(load(MOVING_CONFIGS / f"{name}.yaml"))
     start = problem.values()
     problem = find_reached(problem)

@@ -63,7 +63,7 @@ def test_the_loop_does_not_grow(toy: Any) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_a_leak_is_seen(toy: Any) -> None:
+def test_a_leak_is_found(toy: Any) -> None:
     kept = []
 
     def leak(call: int) -> float:
@@ -76,7 +76,7 @@ def test_a_leak_is_seen(toy: Any) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_a_leak_beside_the_allocator_is_seen(toy: Any) -> None:
+def test_a_leak_outside_the_allocator_is_found(toy: Any) -> None:
     kept = []
 
     def leak(call: int) -> float:
@@ -89,7 +89,7 @@ def test_a_leak_beside_the_allocator_is_seen(toy: Any) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_a_slowdown_is_seen(toy: Any) -> None:
+def test_a_slowdown_is_found(toy: Any) -> None:
     def slow(call: int) -> float:
         until = time.process_time() + 1e-3 * call / FEW  # a fifth of a step or so, at the end
         while time.process_time() < until:
@@ -156,7 +156,7 @@ def _as_expected(kernel_ms: dict[int, float], wall_ms: dict[int, float]) -> bool
     )
 
 
-def test_what_python_does_in_a_step_is_no_kernel() -> None:
+def test_time_of_python_does_not_count_as_kernels() -> None:
     clock = StepClock()
     with clock.step():
         chain(TURNS)
@@ -173,9 +173,7 @@ def test_what_python_does_in_a_step_is_no_kernel() -> None:
 
 
 @pytest.mark.parametrize("what", ["MetricsWriter.write", "save_checkpoint"])
-def test_files_that_take_long_are_in_no_time_of_a_run(
-    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_writing_files_is_not_timed(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A disk that takes 0.2 s for every line, or every checkpoint, which are written after each iteration here."""
     write_experiment(tmp_path)
     monkeypatch.chdir(tmp_path)
@@ -198,7 +196,7 @@ def test_files_that_take_long_are_in_no_time_of_a_run(
     assert statistics.median(warm) < 0.5 * SLEEP_S
 
 
-def test_arrays_that_a_step_holds_are_in_the_peak_also_when_it_lets_go_of_them() -> None:
+def test_temporary_arrays_of_a_step_count_in_the_peak() -> None:
     backend = dr.backend_v(mi.Float)
     reset_peak()
     before = peak_mib(backend)

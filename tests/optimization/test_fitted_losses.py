@@ -41,7 +41,7 @@ def view_of(name, target, weights):
 @pytest.mark.parametrize("fits", [True, False, "across"])
 @pytest.mark.parametrize("masked", [True, False])
 @pytest.mark.parametrize("name", REFERENCES)
-def test_scaled_losses_and_their_gradients_are_those_of_finite_differences(name, masked, fits):
+def test_scaled_losses_and_gradients_match_finite_differences(name, masked, fits):
     image, target = images((6, 7, 3))
     image, target = 3 * image + 0.1, target + 0.1
     weights = np.ones((6, 7))
@@ -68,7 +68,7 @@ def test_scaled_losses_and_their_gradients_are_those_of_finite_differences(name,
 
 
 @pytest.mark.parametrize("name", REFERENCES)
-def test_brightness_is_no_part_of_a_fitted_loss(name):
+def test_a_fitted_loss_ignores_brightness(name):
     image, target = images((6, 7, 3))
     view = view_of(name, target, None)
     once, thrice = (view.objective(mi.TensorXf((k * image).astype(np.float32)))[0] for k in (1, 3))
@@ -107,7 +107,7 @@ def test_noise_leaves_a_fitted_gradient_unbiased(name):
 
 
 @pytest.mark.parametrize("size", [8, 32])
-def test_what_bias_the_scale_has_is_that_of_the_methods_page(size):
+def test_the_bias_of_the_scale_matches_the_docs(size):
     """s is too large by 2 to 3 v / n, v the relative variance of a half's pixels, n their number; of one image it would
     be too small by v / (2 + v)."""
     rng, noise = np.random.default_rng(5), 0.25
@@ -223,13 +223,13 @@ def test_a_run_is_resumed_to_the_same_end(folder, monkeypatch):
     (["loss.scale=fitted", "run.spp=3"], "run.spp: must be a multiple of 2"),
     (["loss.scale=fitted", "run.spp=4", "run.adjoint=batched"], "run.spp: must be a multiple of 8"),
 ])  # fmt: skip
-def test_what_cannot_be_is_refused_in_one_line(folder, sets, line):
+def test_impossible_settings_are_refused_in_one_line(folder, sets, line):
     result = reslrb("optimize", folder / "tiny.yaml", *settings(*sets))
     assert result.exit_code == 2
     assert line in result.output.splitlines()[-1]
 
 
-def test_nothing_is_written_of_what_is_not_asked_for(folder):
+def test_unused_options_are_not_written(folder):
     config = load(folder / "tiny.yaml", [])
     assert config.model_dump()["loss"] == {"type": "l2"}
     assert "halves" not in config.step_options()
@@ -241,7 +241,7 @@ def test_a_whole_image_is_the_mean_of_its_halves():
     np.testing.assert_array_equal(np.array(whole_of(to_tensor(image))), image.mean(axis=0))
 
 
-def test_each_view_has_its_own_factor_and_those_held_out_too(folder):
+def test_each_view_including_held_out_ones_has_its_own_factor(folder):
     """Light is scattered once, so that half the reflectance makes half the image, which no loss sees."""
     write_experiment(folder, scene_seen("0, 0, 4", "1, 0, 4"))
     problem = make(folder, "views=[{sensor: 0}, {sensor: 1}]", "run.held_out=[1]", "run.spp=16")
@@ -254,7 +254,7 @@ def test_each_view_has_its_own_factor_and_those_held_out_too(folder):
     np.testing.assert_allclose(np.array(found[1][1:]), 2 * np.array(found[0][1:]), rtol=1e-4)
 
 
-def test_a_run_that_measures_what_pays_does_so_in_halves(folder, monkeypatch):
+def test_a_measuring_run_uses_halves(folder, monkeypatch):
     monkeypatch.chdir(folder)
     done("optimize", "tiny.yaml", *settings(
         "loss.scale=fitted", "run.spp=16", "run.iterations=4", "run.measuring=1", "integrator.guiding=auto",
@@ -263,7 +263,7 @@ def test_a_run_that_measures_what_pays_does_so_in_halves(folder, monkeypatch):
 
 
 @pytest.mark.parametrize("adjoint", ["batched", "independent", "correlated"])
-def test_sample_sets_are_the_halves_of_a_step(folder, adjoint):
+def test_sample_sets_match_the_halves_of_a_step(folder, adjoint):
     problem = make(folder, f"run.adjoint={adjoint}", "run.spp=16")
     [view], given = problem.views, problem.config.step_options()
     problem.apply()

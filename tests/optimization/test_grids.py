@@ -83,7 +83,7 @@ def with_quad(tmp_path):
     return path
 
 
-def test_so_does_a_mesh_of_four_vertices(tmp_path, with_quad):
+def test_a_mesh_of_four_vertices_becomes_a_grid(tmp_path, with_quad):
     from reslrb_cli.optimization.assemble import assemble_scene
 
     problem = assemble_scene(configured(tmp_path, "mesh: back, resolution: [4, 4], grid: 5", with_quad))
@@ -93,7 +93,7 @@ def test_so_does_a_mesh_of_four_vertices(tmp_path, with_quad):
     assert np.allclose(z, -1)
 
 
-def test_a_flat_grid_may_have_another(tmp_path):
+def test_a_flat_grid_can_be_refined(tmp_path):
     """Over the same square, its outside where it was."""
     from reslrb_cli.optimization.assemble import assemble_scene
 
@@ -107,7 +107,7 @@ def test_a_flat_grid_may_have_another(tmp_path):
     assert np.allclose(*normals, atol=1e-5)
 
 
-def test_what_is_no_rectangle_is_refused_and_what_lacks_a_grid_told(tmp_path, with_quad):
+def test_other_shapes_are_refused_and_missing_grids_reported(tmp_path, with_quad):
     from reslrb_cli.optimization.assemble import assemble_scene
 
     (tmp_path / "quad.ply").write_text(QUAD.replace("-1 1 0 0 1", "-1 2 0 0 1"))
@@ -119,7 +119,7 @@ def test_what_is_no_rectangle_is_refused_and_what_lacks_a_grid_told(tmp_path, wi
         configured(tmp_path, "mesh: back, resolution: [4, 4], grid: 1")
 
 
-def test_a_map_finer_than_its_mesh_is_warned_of_once(tmp_path, caplog, with_quad):
+def test_a_map_finer_than_its_mesh_gives_one_warning(tmp_path, caplog, with_quad):
     from reslrb_cli.optimization.assemble import assemble_scene
 
     with caplog.at_level(logging.WARNING):
@@ -133,7 +133,7 @@ def test_a_map_finer_than_its_mesh_is_warned_of_once(tmp_path, caplog, with_quad
     assert "`grid: [7, 5]`" in found[1]
 
 
-def test_a_run_on_a_grid_is_exported_and_gone_on_with(tmp_path, monkeypatch):
+def test_a_run_on_a_grid_is_exported_and_continued(tmp_path, monkeypatch):
     import mitsuba as mi
     from click.testing import CliRunner
 

@@ -86,7 +86,7 @@ def decided(monkeypatch: pytest.MonkeyPatch, guided_ms: float, *settings: str, *
         *(pytest.param("guiding", adjoint, marks=pytest.mark.long) for adjoint in ("correlated", "independent")),
     ],
 )
-def test_on_is_on_and_off_has_nothing_of_it(
+def test_on_enables_guiding_and_off_removes_it(
     option: str, adjoint: str, experiment: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Off, a step's kernels are, operation by operation, those of who says so."""
@@ -116,7 +116,7 @@ def test_on_is_on_and_off_has_nothing_of_it(
 
 
 @pytest.mark.usefixtures("llvm")
-def test_the_sequence_is_the_same_with_guiding_and_without(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_sequence_is_independent_of_guiding(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for guided_ms in (1.0, 1000.0):
         problem = decided(monkeypatch, guided_ms, "integrator.sequence=low_discrepancy")
         plan = problem.integrator.plan(problem.scene, problem.scene.sensors()[0])
@@ -125,7 +125,7 @@ def test_the_sequence_is_the_same_with_guiding_and_without(experiment: Path, mon
 
 
 @pytest.mark.usefixtures("llvm")
-def test_images_that_guiding_does_not_pay_for_are_not_guided(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_are_not_guided_if_it_does_not_pay(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     take = StepTrial.take
 
     def slow(self: StepTrial, other: bool, round: int, spp: int) -> Step:
@@ -179,7 +179,7 @@ def seeds_of_parts(monkeypatch: pytest.MonkeyPatch, experiment: Path) -> tuple[s
 
 
 @pytest.mark.usefixtures("llvm")
-def test_no_path_that_was_learned_from_is_judged_by(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_learning_paths_are_not_used_for_the_decision(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     learned, judged = seeds_of_parts(monkeypatch, experiment)
     assert len(learned) == 2
     assert len(judged) == 8
@@ -188,7 +188,7 @@ def test_no_path_that_was_learned_from_is_judged_by(experiment: Path, monkeypatc
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("fault", ["seeds", "held"])
-def test_faults_of_that_are_seen(fault: str, experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_faults_of_the_decision_are_found(fault: str, experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps with the seeds of what was learned from; a table that goes on learning from what it is judged by."""
     if fault == "seeds":
         monkeypatch.setattr(StepTrial, "_seed", lambda self, round, view, what: round)
@@ -204,7 +204,7 @@ def test_faults_of_that_are_seen(fault: str, experiment: Path, monkeypatch: pyte
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize(("option", "part"), [("guiding", "guided emission"), ("sequence", "low-discrepancy numbers")])
-def test_a_run_says_so_once_remembers_it_and_writes_it_down(
+def test_a_run_reports_remembers_and_records_the_decision(
     option: str, part: str, experiment: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fix_times(monkeypatch, {option: 0.1})
@@ -242,7 +242,7 @@ def test_a_run_says_so_once_remembers_it_and_writes_it_down(
 
 
 @pytest.mark.usefixtures("llvm")
-def test_it_goes_on_as_it_was_decided_bit_by_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_resumed_run_keeps_the_decision_bit_by_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Guided or not, and from which sequence: decided once, and restored."""
     begin_alone(tmp_path, monkeypatch)
     fix_times(monkeypatch, {"guiding": 0.2, "sequence": 0.1, "sequence alone": 1000.0})
@@ -265,7 +265,7 @@ def test_it_goes_on_as_it_was_decided_bit_by_bit(tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_memory_budget_without_room_for_tables_leaves_it_off(
+def test_a_memory_budget_too_small_for_tables_disables_guiding(
     experiment: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     budget = "run.memory_budget={}"
@@ -284,7 +284,7 @@ def test_a_memory_budget_without_room_for_tables_leaves_it_off(
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_damaged_outcome_is_measured_anew(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_damaged_record_is_measured_again(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Damaged(PilotCache):
         def get(self, key: str) -> dict[str, Any] | None:
             return {"guided": "maybe"}
@@ -298,7 +298,7 @@ def test_a_damaged_outcome_is_measured_anew(experiment: Path, monkeypatch: pytes
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("option", ["guiding", "sequence"])
-def test_who_compares_or_writes_a_script_has_to_say(option: str) -> None:
+def test_comparisons_and_scripts_need_an_explicit_choice(option: str) -> None:
     """In measurements `auto` of the experiment is off, and is refused where somebody writes it."""
     named = ("on", "off") if option == "guiding" else WORDS[option]
     config = load(Path(__file__).parents[2] / "configs" / "furnace.yaml")
@@ -312,7 +312,7 @@ def test_who_compares_or_writes_a_script_has_to_say(option: str) -> None:
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("option", ["guiding", "sequence"])
-def test_who_says_which_has_nothing_measured(option: str, experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_explicit_choice_is_not_measured(option: str, experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(StepTrial, "take", lambda *args: pytest.fail("measured"))
     for is_on, word in enumerate(WORDS[option]):
         problem = assemble(load("tiny.yaml", [f"integrator.{option}={word}", *SMALL]))
@@ -343,7 +343,7 @@ def gain(world: World, sizes: Sizes = SIZES) -> float:
         (World(0.1, 2.2, sparse=True), True),
     ],
 )
-def test_it_is_on_where_it_pays(world: World, on: bool) -> None:
+def test_it_is_on_if_it_pays(world: World, on: bool) -> None:
     record = world.run()
     assert record.guided == record.images == on
     assert record.gain is not None
@@ -356,7 +356,7 @@ def test_it_is_on_where_it_pays(world: World, on: bool) -> None:
 
 @pytest.mark.parametrize("entries", [3, 200])
 @pytest.mark.parametrize("sparse", [False, True])
-def test_the_interval_holds_the_gain_as_often_as_it_says(entries: int, sparse: bool) -> None:
+def test_the_interval_of_the_gain_has_its_coverage(entries: int, sparse: bool) -> None:
     """Without what single times may be off, the level is the nominal one; learning is a part of the gain."""
     inside = 0
     for seed in range(100):
@@ -375,7 +375,7 @@ def on_by_accident(**world: Any) -> int:
     return sum(World(**world, seed=seed).run().guided for seed in range(100))
 
 
-def test_where_it_does_not_pay_it_is_hardly_ever_on() -> None:
+def test_it_is_rarely_on_if_it_does_not_pay() -> None:
     # What it gains, learning costs again: 0.8 * (1 + 0.1 + 0.15).
     world = {"variance": 0.8, "walk": 0.7, "python": 16.8}
     assert gain(World(**world)) == pytest.approx(1)
@@ -384,13 +384,13 @@ def test_where_it_does_not_pay_it_is_hardly_ever_on() -> None:
     assert on_by_accident(**world, entries=3) <= 9
 
 
-def test_a_fault_that_forgets_what_learning_costs_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_decision_without_the_cost_of_learning_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     """As it is seen by the tests above: the same worlds are called better then."""
     monkeypatch.setattr(GuidingPilot, "_more_ms", lambda self: 0.0)
     assert on_by_accident(variance=0.8, walk=0.7, python=16.8) > 50
 
 
-def test_a_run_pays_for_as_much_learning_as_it_has() -> None:
+def test_a_run_pays_for_its_amount_of_learning() -> None:
     """What is worth nothing where a table learns from each seventh set of samples is worse where it learns from most of
     them, as in a short run, and better where it rarely does."""
     world, gains = {"variance": 0.8, "walk": 0.7, "python": 16.8}, []
@@ -407,7 +407,7 @@ def test_a_run_pays_for_as_much_learning_as_it_has() -> None:
 @pytest.mark.parametrize("spp", [1, 4, 16, 64, 1024])
 @pytest.mark.parametrize(("overhead", "python"), [(0.0, 0.0), (0.1, 1.0), (1.0, 100.0), (1000.0, 1000.0)])
 @pytest.mark.parametrize("time", [1.0, 3.0, 10.0])
-def test_its_share_is_kept(spp: int, overhead: float, python: float, time: float) -> None:
+def test_its_share_of_the_time_is_kept(spp: int, overhead: float, python: float, time: float) -> None:
     world = World(0.1, time, overhead=overhead, python=python, walk=1.5)
     record = world.run(Sizes(spp, spp, spp, False, 8, 1 / 7, GUIDING_LONGER), GUIDING_SHARE)
     taken = [call for call in world.calls if call[0] is not False]
@@ -424,7 +424,7 @@ def test_its_share_is_kept(spp: int, overhead: float, python: float, time: float
     assert record.share * ITERATIONS * (spp + overhead) == pytest.approx(1e3 * record.measure_s, rel=1e-6)
 
 
-def test_what_a_step_takes_beside_its_kernels_counts_as_often_as_a_run_has_it() -> None:
+def test_costs_outside_kernels_count_as_often_as_in_a_run() -> None:
     """Half the variance for three times the kernels pays where these are a small part of what is waited for."""
     world = World(0.5, 3.0, overhead=160.0)
     record, trial = world.run(), SIZES.trial
@@ -438,7 +438,7 @@ def test_what_a_step_takes_beside_its_kernels_counts_as_often_as_a_run_has_it() 
 
 
 @pytest.mark.parametrize(("python", "walks"), [(10.0, 2), (30.0, 1), (60.0, 0)])
-def test_a_second_walk_is_left_out_where_there_is_no_time_for_it(python: float, walks: int) -> None:
+def test_a_second_walk_is_left_out_without_time(python: float, walks: int) -> None:
     world = World(0.1, 1.0, overhead=1.0, python=python, walk=1.5)
     record = world.run(Sizes(16, 16, 16, False, 8, 1 / 7, GUIDING_LONGER), GUIDING_SHARE)
     assert [call[0] for call in world.calls].count("learn") == max(walks, 1)  # one, to see what it takes
@@ -446,7 +446,7 @@ def test_a_second_walk_is_left_out_where_there_is_no_time_for_it(python: float, 
     assert record.share <= GUIDING_SHARE * 1.05
 
 
-def test_samples_are_no_more_than_those_of_a_pass() -> None:
+def test_samples_fit_into_a_pass() -> None:
     world = World(0.1, 2.0)
     record = world.run(replace(SIZES, step=4096, call=1024, part=8))
     assert max(call[2] for call in world.calls) == 8
@@ -458,7 +458,7 @@ def test_few_entries_are_measured_more_often() -> None:
     assert World(0.02, 2.0, entries=3).run().rounds > World(0.02, 2.0).run().rounds
 
 
-def test_images_with_samples_of_their_own_are_guided_where_that_pays() -> None:
+def test_images_with_their_own_samples_are_guided_if_it_pays() -> None:
     for image, image_time, guided in [(0.2, 2.0, True), (2.0, 1.0, False), (0.2, 10.0, False)]:
         record = World(0.05, 2.0, image=image, image_time=image_time, alone=True).run()
         assert record.guided
@@ -470,7 +470,7 @@ def test_images_with_samples_of_their_own_are_guided_where_that_pays() -> None:
         assert record.gain == pytest.approx((1 + 1) / (0.05 * (2 + own + learning)), rel=0.2)
 
 
-def test_what_is_not_clear_is_looked_at_longer() -> None:
+def test_unclear_results_are_measured_longer() -> None:
     """What is, is not; and nothing is beyond its share."""
     assert World(0.1, 2.2).run().rounds == SIZES.rounds
     assert World(3.0, 1.0).run().rounds == SIZES.rounds
@@ -480,7 +480,7 @@ def test_what_is_not_clear_is_looked_at_longer() -> None:
 
 
 @pytest.mark.parametrize("pilot", [GuidingPilot, SequencePilot])
-def test_no_noise_is_no_gain(pilot: type[Turns[Any]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_zero_noise_gives_no_gain(pilot: type[Turns[Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(World, "_noisy", lambda self, random, variance: np.ones(4))
     record = World(pilot=pilot).run()
     assert record.setting in ("off", "independent")
@@ -488,7 +488,7 @@ def test_no_noise_is_no_gain(pilot: type[Turns[Any]], monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(("kind", "pilot"), [(GuidedRecord, GuidingPilot), (SequenceRecord, SequencePilot)])
-def test_a_record_survives_json_and_nothing_else_is_one(kind: type[PaidRecord], pilot: type[Turns[Any]]) -> None:
+def test_a_record_survives_json_and_other_data_is_refused(kind: type[PaidRecord], pilot: type[Turns[Any]]) -> None:
     record = World(0.1, 2.2, pilot=pilot).run()
     data = record.to_json()
     assert kind.from_json(data) == record
@@ -500,7 +500,7 @@ def test_a_record_survives_json_and_nothing_else_is_one(kind: type[PaidRecord], 
             kind.from_json(wrong)
 
 
-def test_walks_that_are_learned_from_come_before_all_steps_that_are_guided() -> None:
+def test_learning_walks_come_before_all_guided_steps() -> None:
     world = World(0.1, 2.2)
     world.run()
     kinds = [call[0] for call in world.calls]
@@ -513,7 +513,7 @@ def test_walks_that_are_learned_from_come_before_all_steps_that_are_guided() -> 
 
 @pytest.mark.parametrize("iterations", [1, 3, 23])
 @pytest.mark.parametrize("how", [["run.adjoint=correlated"], ["run.spp=8"]], ids=str)
-def test_a_run_learns_as_often_as_is_said_of_it(
+def test_a_run_learns_as_often_as_planned(
     how: list[str], iterations: int, llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begin(tmp_path, monkeypatch)
@@ -536,7 +536,7 @@ def test_a_run_learns_as_often_as_is_said_of_it(
 
 
 @pytest.mark.parametrize("lesson", [0.0, 0.5, 3.0])
-def test_what_learning_takes_counts_as_often_as_a_run_has_it(lesson: float) -> None:
+def test_the_cost_of_learning_counts_as_often_as_in_a_run(lesson: float) -> None:
     """Learning is among the steps that are timed twice in ten times, and in two of three."""
     for learned in ([0, 0, 1, 0, 0, 0, 0, 0, 1, 0], [2, 0, 1]):
         times = [1.0 + lesson * count for count in learned]
@@ -544,6 +544,6 @@ def test_what_learning_takes_counts_as_often_as_a_run_has_it(lesson: float) -> N
             assert _with_learning(times, learned, mean) == pytest.approx(1 + lesson * mean)
 
 
-def test_where_all_of_them_learn_or_none_the_mean_is_all_that_is_known() -> None:
+def test_without_variation_of_learning_only_the_mean_is_known() -> None:
     assert _with_learning([1.0, 3.0], [1, 2], 0.5) == 2
     assert _with_learning([1.0, 3.0], [0, 0], 0.5) == 2

@@ -43,7 +43,7 @@ def test_records_follow_gradient_descent(tmp_path, steps):
     assert (first.primal_ms, first.adjoint_ms) == (None, None)
 
 
-def test_the_time_ends_a_run_and_its_schedule(tmp_path, steps, monkeypatch):
+def test_the_time_limit_ends_a_run_and_its_schedule(tmp_path, steps, monkeypatch):
     """A clock that every look at it moves by a second: iterations after the first take equally long."""
     seconds = itertools.count()
     monkeypatch.setattr("time.perf_counter", lambda: float(next(seconds)))
@@ -71,7 +71,7 @@ def test_the_time_ends_a_run_and_its_schedule(tmp_path, steps, monkeypatch):
     assert (last[1].lr, last[0].stopped) == (pytest.approx(0.02), "")
 
 
-def test_a_step_is_split_where_it_has_an_image_in_between(tmp_path, steps):
+def test_a_step_with_an_intermediate_image_is_split(tmp_path, steps):
     steps.has_image = True
     problem = steps.problem = make_problem(tmp_path, views=2)
     for record in loop.optimize(problem):
@@ -98,7 +98,7 @@ def test_each_view_and_iteration_has_its_own_seed(tmp_path, steps):
     assert {call.adjoint for call in steps.calls} == {"independent"}  # four batches do not divide 3 samples
 
 
-def test_from_equal_states_equal_ones_follow(tmp_path, steps):
+def test_equal_states_have_equal_successors(tmp_path, steps):
     """A step is a function of its state: one that was left behind is come back to, and what it was given stays."""
     sets = ["optimizer.clamp_gradient=1.1", "optimizer.type=adam"]
     problem = steps.problem = make_problem(tmp_path, sets=sets, keys=("albedo", "other"))
@@ -124,7 +124,7 @@ def test_the_loss_is_the_mean_over_the_views(tmp_path, steps):
     np.testing.assert_allclose(np.array(three.optimizer["albedo"]), np.array(one.optimizer["albedo"]), rtol=1e-5)
 
 
-def test_a_clock_knows_new_kernels():
+def test_a_clock_detects_new_kernels():
     clock, new = StepClock(), []
     for factor in (2.0, 2.0, 3.0):
         with clock.step() as times:
@@ -133,7 +133,7 @@ def test_a_clock_knows_new_kernels():
     assert new == [1, 0, 1]
 
 
-def test_counting_leaves_finite_entries_alone():
+def test_counting_does_not_change_finite_entries():
     value = mi.TensorXf(np.array([3.0, np.nan, 4.0, np.inf], dtype=np.float32))
     assert int(count_nonfinite(value)[0]) == 2
     assert float(finite_square_norm(value)[0]) == pytest.approx(25.0)
@@ -146,7 +146,7 @@ def test_counting_leaves_finite_entries_alone():
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_a_gradient_that_is_not_finite_reaches_no_parameter(tmp_path, steps, bad):
+def test_a_non_finite_gradient_reaches_no_parameter(tmp_path, steps, bad):
     problem = steps.problem = make_problem(tmp_path, sets=["run.iterations=6"], keys=("albedo", "other"))
     steps.spoil = lambda call, key: bad if key == "other" and call in (1, 2) else 1.0
     seen = {key: [] for key in problem.selection.keys}
@@ -162,7 +162,7 @@ def test_a_gradient_that_is_not_finite_reaches_no_parameter(tmp_path, steps, bad
     assert seen["albedo"][0] != seen["albedo"][1]
 
 
-def test_a_loss_that_is_not_finite_stops_every_update(tmp_path, steps):
+def test_a_non_finite_loss_stops_every_update(tmp_path, steps):
     problem = steps.problem = make_problem(tmp_path, sets=["run.iterations=3"])
     problem.views[0].made = dr.full(mi.TensorXf, np.nan, (2, 2, 3))
     records = list(loop.optimize(problem))
@@ -170,7 +170,7 @@ def test_a_loss_that_is_not_finite_stops_every_update(tmp_path, steps):
     np.testing.assert_array_equal(np.array(problem.optimizer["albedo"]), 0.5)
 
 
-def test_it_gives_up_when_nothing_is_finite_any_more(tmp_path, steps):
+def test_it_gives_up_if_everything_is_non_finite(tmp_path, steps):
     problem = steps.problem = make_problem(tmp_path)
     steps.spoil = lambda call, key: float("nan") if call >= 2 else 1.0
     records = []
@@ -219,7 +219,7 @@ def test_each_parameter_has_its_own_count(tmp_path, steps):
     assert [record.nonfinite for record in records] == [0, 2, 1, 0]
 
 
-def test_stop_ends_at_the_first_and_updates_nothing(tmp_path, steps):
+def test_stop_ends_at_the_first_fault_without_an_update(tmp_path, steps):
     problem = make_problem(tmp_path, sets=["run.on_nonfinite=stop"], keys=("albedo", "other"))
     steps.spoil = lambda call, key: one_entry(np.inf) if call == 2 and key == "other" else 1.0
     records, values, error = run(problem)
@@ -243,7 +243,7 @@ def test_zero_updates_the_rest(tmp_path, steps):
     assert [record.nonfinite for record in records] == [1, 1, 1]
 
 
-def test_zero_leaves_a_parameter_alone_when_nothing_is_left(tmp_path, steps):
+def test_zero_does_not_update_a_parameter_without_finite_entries(tmp_path, steps):
     sets = ["run.on_nonfinite=zero", "optimizer.momentum=0.9", "optimizer.learning_rate=0.02"]
     problem = make_problem(tmp_path, sets=sets, keys=("albedo", "other"))
     steps.spoil = lambda call, key: np.nan if call >= 3 and key == "other" else 1.0
@@ -254,7 +254,7 @@ def test_zero_leaves_a_parameter_alone_when_nothing_is_left(tmp_path, steps):
     assert len(set(values["albedo"])) == len(records)
 
 
-def test_zero_goes_on_as_long_as_something_moves(tmp_path, steps):
+def test_zero_continues_while_something_moves(tmp_path, steps):
     problem = make_problem(tmp_path, sets=["run.on_nonfinite=zero", f"run.iterations={PATIENCE + 5}"])
     steps.spoil = lambda call, key: one_entry(np.nan)
     records, _, error = run(problem)
@@ -279,7 +279,7 @@ def test_a_derivative_of_the_loss_is_refused_by_each_policy(tmp_path, steps, kin
 
 
 @pytest.mark.parametrize("kind", ["skip", "zero"])
-def test_a_run_that_stands_still_ends(tmp_path, steps, kind):
+def test_a_run_without_updates_ends(tmp_path, steps, kind):
     problem = make_problem(tmp_path, sets=[f"run.on_nonfinite={kind}"])
     problem.views[0].made = dr.full(mi.TensorXf, np.nan, (2, 2, 3))
     records, values, error = run(problem)
@@ -288,7 +288,7 @@ def test_a_run_that_stands_still_ends(tmp_path, steps, kind):
     assert set(values["albedo"]) == {0.5}
 
 
-def test_it_is_told_of_before_the_update(tmp_path, steps):
+def test_a_fault_is_reported_before_the_update(tmp_path, steps):
     problem = make_problem(tmp_path, sets=["run.iterations=4"], keys=("albedo", "other"))
     steps.spoil = lambda call, key: np.nan if call == 2 and key == "other" else 1.0
     seen = []
@@ -301,7 +301,7 @@ def test_it_is_told_of_before_the_update(tmp_path, steps):
     assert seen == [(2, pytest.approx(values["albedo"][1]))]
 
 
-def test_an_update_that_overflows_is_counted_and_taken_back(tmp_path, steps):
+def test_an_overflowing_update_is_counted_and_undone(tmp_path, steps):
     problem = make_problem(tmp_path, sets=["run.iterations=2", "optimizer.learning_rate=1e30"])
     problem.optimizer._bounds = {"albedo": None}
     steps.spoil = lambda call, key: 1e30
@@ -311,7 +311,7 @@ def test_an_update_that_overflows_is_counted_and_taken_back(tmp_path, steps):
 
 
 @pytest.mark.parametrize("kind", ["skip", "zero"])
-def test_after_a_loss_nothing_moves_even_if_its_gradient_is_finite(tmp_path, steps, kind):
+def test_after_a_non_finite_loss_nothing_moves(tmp_path, steps, kind):
     problem = make_problem(tmp_path, sets=[f"run.on_nonfinite={kind}", "run.iterations=3"])
     steps.loss = lambda call: np.inf if call == 1 else 0.0
     records, values, _ = run(problem)
@@ -362,7 +362,7 @@ def heavy_tailed():
     return gradients.astype(np.float32)
 
 
-def test_it_is_what_its_docstring_says(heavy_tailed):
+def test_the_clamp_matches_its_docstring(heavy_tailed):
     clamped, said = clamp_all(4.0, heavy_tailed)
     expected = reference(heavy_tailed.astype(np.float64), 4.0)
     np.testing.assert_allclose(clamped, expected, rtol=1e-4)
@@ -376,7 +376,7 @@ def test_it_is_what_its_docstring_says(heavy_tailed):
         assert said[t].bias["x"] == pytest.approx(bias, rel=1e-3)
 
 
-def test_what_cancels_is_no_bias():
+def test_symmetric_outliers_are_no_bias():
     """Outliers of both signs in turn: each takes a share of its gradient, and together they take nothing."""
     gradients = np.ones((41, 1, 1, 3), np.float32)
     gradients[1::2, 0, 0, 1] = np.where(np.arange(20) % 2, 1000, -1000)
@@ -448,7 +448,7 @@ def test_a_run_clamps_and_says_so(tmp_path, steps):
     assert '"bias": {"albedo": ' in records[2].to_json()
 
 
-def test_it_is_off_unless_asked_for(tmp_path, steps):
+def test_the_clamp_is_off_by_default(tmp_path, steps):
     problem = make_problem(tmp_path, sets=["run.iterations=5"])
     steps.spoil = outlier
     tally = ClampTally()
@@ -458,7 +458,7 @@ def test_it_is_off_unless_asked_for(tmp_path, steps):
     assert str(tally) == ""
 
 
-def test_a_parameter_that_sits_out_is_not_clamped(tmp_path, steps):
+def test_a_skipped_parameter_is_not_clamped(tmp_path, steps):
     problem = make_problem(tmp_path, sets=["optimizer.clamp_gradient=3", "run.iterations=4"], keys=("albedo", "other"))
     steps.spoil = lambda call, key: np.nan if call == 1 and key == "other" else outlier(call, key)
     records = list(loop.optimize(problem))

@@ -95,7 +95,7 @@ def textured(shape=(17, 14, 3), seed=5):
     return (0.8 * base + rng.uniform(0, 0.3, shape)).astype(np.float32), base.astype(np.float32)
 
 
-def test_ssim_is_that_of_scikit_image():
+def test_ssim_equals_scikit_image():
     image, target = textured()
     expected = structural_similarity(
         image.astype(np.float64), target.astype(np.float64), channel_axis=2, gaussian_weights=True, sigma=1.5,
@@ -163,7 +163,7 @@ def test_gradients_of_new_losses_against_finite_differences(name, masked):
 
 
 @pytest.mark.parametrize(("name", "biased"), [("l2", False), ("ssim", True)])
-def test_which_gradients_noise_of_the_image_biases(name, biased):
+def test_gradients_that_image_noise_biases(name, biased):
     """As with `independent` and `batched`, where dL/dI comes from samples of its own: its mean over noisy images."""
     rng = np.random.default_rng(11)
     image, target = textured((16, 16, 1))
@@ -176,7 +176,7 @@ def test_which_gradients_noise_of_the_image_biases(name, biased):
     assert (abs(z) > 6) if biased else (abs(z) < 3), (z, shares.mean())
 
 
-def test_what_ssim_leaves_out_is_as_the_target_and_windows_about_it_do_not_count():
+def test_pixels_excluded_from_ssim_equal_the_target():
     image, target = textured((24, 24, 1))
     spoilt = image.copy()
     spoilt[3:6, 3:6] = np.nan
@@ -201,7 +201,7 @@ def read(tmp_path, loss, **more):
     return load(tmp_path / "tiny.yaml", [f"loss={loss}", *sets])
 
 
-def test_a_list_of_one_is_the_loss_itself_and_weights_multiply(tmp_path):
+def test_a_list_of_one_equals_the_loss_and_weights_multiply(tmp_path):
     image, target = textured()
     scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective", "film": {
         "type": "hdrfilm", "width": 14, "height": 17}}})  # fmt: skip
@@ -221,7 +221,7 @@ def test_a_list_of_one_is_the_loss_itself_and_weights_multiply(tmp_path):
     assert found[3] == pytest.approx(found[0] + 0.5 * found[4], rel=1e-6)
 
 
-def test_a_single_loss_is_written_as_ever_and_a_list_is_read_back(tmp_path):
+def test_a_single_loss_is_written_unchanged_and_a_list_is_read_back(tmp_path):
     assert read(tmp_path, "{type: l1}").model_dump()["loss"] == {"type": "l1"}
     listed = read(tmp_path, "[{type: l2}, {type: ssim, weight: 0.1}]")
     assert listed.model_dump()["loss"] == [{"type": "l2"}, {"type": "ssim", "weight": 0.1}]
@@ -240,14 +240,14 @@ def test_a_single_loss_is_written_as_ever_and_a_list_is_read_back(tmp_path):
         ("l2", "loss", "must be a mapping"),
     ],
 )
-def test_lists_that_are_none(tmp_path, loss, key, words):
+def test_invalid_lists(tmp_path, loss, key, words):
     with pytest.raises(ConfigError) as error:
         read(tmp_path, loss)
     assert error.value.key == key
     assert words in error.value.message
 
 
-def test_ssim_of_an_image_that_is_too_small(tmp_path):
+def test_ssim_of_a_too_small_image(tmp_path):
     scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective", "film": {
         "type": "hdrfilm", "width": 21, "height": 10}}})  # fmt: skip
     with pytest.raises(ConfigError, match=r"loss\[1\].type: ssim needs 11x11 pixels, but the image has 21x10"):
@@ -282,7 +282,7 @@ def set_exposure(problem, values):
 
 @pytest.mark.parametrize("kind", AT)
 @pytest.mark.parametrize("adjoint", ["batched", "independent", "correlated"])
-def test_the_gradient_is_that_of_the_mean_image(folder, kind, adjoint):
+def test_the_gradient_equals_that_of_the_mean_image(folder, kind, adjoint):
     """dL/dE of `l2` is the sum of 2 (E I - T) I over all entries, over their number; I is the mean image.
 
     With the samples of dL/dI the noise of I would add its variance, which `correlated` shows.
@@ -302,7 +302,7 @@ def test_the_gradient_is_that_of_the_mean_image(folder, kind, adjoint):
 
 
 @pytest.mark.parametrize("exposure", ["target.exposure=auto", "views=[{sensor: 0, exposure: auto}]"])
-def test_what_the_images_cannot_tell_apart_is_refused(folder, exposure):
+def test_indistinguishable_parameters_are_refused(folder, exposure):
     """All light, or all that it falls on directly, scales the image as the exposure does."""
     wall = make(folder, exposure, "integrator.max_depth=2")
     with pytest.raises(ConfigError, match=f"cannot distinguish `exposure.*` from `{KEY}`") as error:
@@ -377,7 +377,7 @@ def left_out(problem):
 
 
 @pytest.mark.parametrize("name", POINTWISE)
-def test_a_masked_loss_is_that_of_what_is_left(name):
+def test_a_masked_loss_equals_that_of_the_remaining_pixels(name):
     rng = np.random.default_rng(2)
     image, target = (rng.uniform(0.1, 2, (4, 5, 3)).astype(np.float32) for _ in range(2))
     weights = np.where(rng.uniform(size=(4, 5)) > 0.4, rng.uniform(0.5, 3, (4, 5)), 0)
@@ -412,7 +412,7 @@ def test_kinds_of_a_file(masked_folder):
     assert (left_out(problem), lines) == ([], [])
 
 
-def test_what_the_filter_mixes_with_a_clipped_pixel_is_left_out_with_it(masked_folder):
+def test_pixels_mixed_with_clipped_ones_are_excluded(masked_folder):
     scene = masked_folder / "scene.xml"
     scene.write_text(scene.read_text().replace('rfilter type="box"', 'rfilter type="gaussian"'))  # of radius 2
     problem, lines = make_masked(masked_folder, "target.file=photo.png", "target.mask={border: false}")
@@ -424,7 +424,7 @@ def test_what_the_filter_mixes_with_a_clipped_pixel_is_left_out_with_it(masked_f
     assert left_out(make_masked(masked_folder, "target.file=photo.png", off)[0]) == [CLEAR]
 
 
-def test_a_file_may_show_the_values_of_the_scene(masked_folder):
+def test_a_file_can_show_the_values_of_the_scene(masked_folder):
     """As pictures of other renderers do; the parameters' errors are then those from the scene's own values."""
     assert not make_masked(masked_folder, "target.file=photo.png")[0].truth
     problem, _ = make_masked(masked_folder, "target.file=photo.png", "target.truth=true")
@@ -435,7 +435,7 @@ def test_a_file_may_show_the_values_of_the_scene(masked_folder):
         assert not np.array_equal(value, problem.selection.array(key))  # where the run begins
 
 
-def test_photograph_and_weights_are_turned_each_by_its_own_exif(masked_folder):
+def test_photograph_and_weights_are_rotated_by_their_own_exif(masked_folder):
     """The same picture upright, and upside down with an EXIF that says so, make the same target and mask."""
     from PIL import Image  # comes with matplotlib
 
@@ -459,7 +459,7 @@ def test_photograph_and_weights_are_turned_each_by_its_own_exif(masked_folder):
     assert f"{masked_folder}/photo-down.png: turned by 180 degrees, as its EXIF orientation says" in said
 
 
-def test_values_that_are_not_finite(masked_folder):
+def test_non_finite_values(masked_folder):
     problem, _ = make_masked(masked_folder, "target.file=photo.exr")
     assert left_out(problem) == [BROKEN]
     assert np.isfinite(np.array(problem.views[0].target)).all()
@@ -484,7 +484,7 @@ def test_weights_of_a_file(masked_folder):
 
 
 @pytest.mark.parametrize(("maker", "count"), [("prb", 48), ("reslrb, paths: light", 0)])
-def test_the_border_is_left_out_where_one_is_not_light_traced(masked_folder, maker, count):
+def test_the_border_is_excluded_unless_both_are_light_traced(masked_folder, maker, count):
     scene = masked_folder / "scene.xml"
     scene.write_text(scene.read_text().replace('rfilter type="box"', 'rfilter type="gaussian"'))
     render = f"target.render={{spp: 4, integrator: {{type: {maker}, max_depth: 3}}}}"
@@ -497,7 +497,7 @@ def test_the_border_is_left_out_where_one_is_not_light_traced(masked_folder, mak
 
 
 @pytest.mark.parametrize(("bsdf", "kind"), [("conductor", "specular"), ("plastic", "mixed")])
-def test_what_light_tracing_cannot_see(masked_folder, bsdf, kind):
+def test_pixels_invisible_to_light_tracing(masked_folder, bsdf, kind):
     scene = masked_folder / "scene.xml"
     scene.write_text(scene.read_text().replace("</scene>", GLASS.format(bsdf)))
     problem, lines = make_masked(masked_folder, "target.file=photo.png")
@@ -518,7 +518,7 @@ def test_an_empty_mask_is_refused(masked_folder):
     assert error.value.key == "target.mask"
 
 
-def test_nothing_of_what_is_left_out_counts(masked_folder):
+def test_excluded_pixels_do_not_count(masked_folder):
     """Neither gradients, as the pilot takes them, nor sensitivities see what an alpha of 0 hides."""
     found = []
     for value in (60, 200):

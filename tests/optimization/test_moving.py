@@ -62,7 +62,7 @@ def differences(problem: Any, key: str, directions: list[np.ndarray]) -> list[fl
     return found
 
 
-def test_gradients_are_finite_differences(tmp_path):
+def test_gradients_match_finite_differences(tmp_path):
     problem = glass.assemble(tmp_path, MOTIONS, NO_TRUTH)
     # The slab stays flat: where it is bent, correction for shading normals steps from triangle to triangle, which
     # differences see and derivatives do not.
@@ -90,7 +90,7 @@ def glass_at(problem: Any, values: dict[str, np.ndarray]) -> Any:
     return problem
 
 
-def test_a_recorded_step_follows_what_moves(tmp_path):
+def test_a_recorded_step_follows_moving_parameters(tmp_path):
     frozen = glass.assemble(tmp_path, MOTIONS, NO_TRUTH)
     plain = glass.assemble(tmp_path, MOTIONS, NO_TRUTH)
     plain = replace(plain, integrator=plain.integrator.with_options(samples_per_pass=None, freeze=False))
@@ -150,7 +150,7 @@ def test_a_lamp_is_found(tmp_path):
     assert records[-1].parameter_rmse < 0.4 * records[0].parameter_rmse
 
 
-def test_roughness_alone_stays_detached_unless_asked(tmp_path):
+def test_roughness_stays_detached_by_default(tmp_path):
     path = glass.write_experiment(tmp_path)
     scene = (tmp_path / "scene.xml").read_text()
     rough = '<bsdf type="roughdielectric" id="glass"><float name="alpha" value="0.1"/></bsdf>'
@@ -181,7 +181,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_follow_is_refused(case, tmp_path):
+def test_unsupported_attached_parameters_are_refused(case, tmp_path):
     sets, key, what = REFUSED[case]
     with pytest.raises(ConfigError) as error:
         glass.assemble(tmp_path, *sets)

@@ -62,7 +62,7 @@ def seen_by(problem: Problem) -> np.ndarray:
     return sees_specular(problem.scene, problem.scene.sensors()[0]).alone
 
 
-def test_the_mask_is_where_the_glass_is(llvm: str, tmp_path: Path) -> None:
+def test_the_mask_follows_the_glass(llvm: str, tmp_path: Path) -> None:
     """In the whole film, in that of a stage, and on a worker; and the loss of the true place has noise alone."""
     problem = make(tmp_path)
     coarse, [view] = at_stage(problem, 0), problem.views

@@ -81,7 +81,7 @@ def test_adam_as_configured_soon_forgets_a_large_first_gradient():
     assert abs(float(np.array(optimizer["p"])[0]) - 0.2) < 0.01
 
 
-def test_a_parameter_has_its_own_rate_and_the_schedule_scales_it():
+def test_a_parameter_has_its_own_rate_scaled_by_the_schedule():
     optimizer = make(rate=0.5)
     descend(optimizer, lambda p: np.ones_like(p))
     optimizer.step(0.1)
@@ -102,7 +102,7 @@ def test_values_are_clamped_after_the_update(bounds):
 
 
 @pytest.mark.parametrize("type", OPTIMIZERS)
-def test_a_parameter_that_sits_out_keeps_value_and_state(type):
+def test_a_skipped_parameter_keeps_value_and_state(type):
     one, other = make(type), make(type)
     for step in range(6):
         descend(one)
@@ -115,7 +115,7 @@ def test_a_parameter_that_sits_out_keeps_value_and_state(type):
     np.testing.assert_array_equal(np.array(one["p"]), np.array(other["p"]))
 
 
-def test_an_update_that_overflows_is_taken_back():
+def test_an_overflowing_update_is_undone():
     optimizer = make(value=[1.0, 1.0])
     descend(optimizer, lambda p: np.array([3e38, 1.0]))
     assert optimizer.step(1e10) == {"p": 1}
@@ -127,7 +127,7 @@ def test_an_update_that_overflows_is_taken_back():
 
 @pytest.mark.parametrize("type", OPTIMIZERS)
 @pytest.mark.parametrize("kind", ["texture", "colour", "number"])
-def test_a_rate_that_changes_compiles_nothing(type, kind):
+def test_a_changing_rate_compiles_nothing(type, kind):
     value = {
         "texture": lambda: dr.full(mi.TensorXf, 0.5, (4, 4, 3)),
         "colour": lambda: mi.Color3f(0.5, 0.4, 0.3),
@@ -167,7 +167,7 @@ def test_schedules_at_half_time():
     assert learning_rate_factor("exponential", 5, 11, 0.01) == pytest.approx(0.1)
 
 
-def test_how_far_a_step_goes_where_a_value_is():
+def test_step_lengths_at_given_values():
     """In the scene's unit, by way of what is moved; with plain gradient descent that depends on the gradient."""
     start = mi.Float(2.0)
     for kind, transform, bounds, step in (
@@ -203,7 +203,7 @@ def numbers(values):
 
 @pytest.mark.parametrize(("name", "bounds", "values"), TRANSFORMS)
 @pytest.mark.parametrize("length", [1.0, 37.0])
-def test_there_and_back(name, bounds, values, length):
+def test_a_transform_is_inverted(name, bounds, values, length):
     variable = Variable(make_transform(name, bounds), bounds, length)
     v = variable.from_scene(numbers(values))
     np.testing.assert_allclose(np.array(variable.to_scene(v)), values, rtol=2e-5)
@@ -212,7 +212,7 @@ def test_there_and_back(name, bounds, values, length):
 
 
 @pytest.mark.parametrize(("name", "bounds", "values"), TRANSFORMS)
-def test_the_chain_rule_against_finite_differences(name, bounds, values):
+def test_the_chain_rule_matches_finite_differences(name, bounds, values):
     """L = sum of x², so that dL/dx = 2 x; the difference is taken in double precision."""
     variable = Variable(make_transform(name, bounds), bounds, length=0.5, gain=3.0)
     v = variable.from_scene(numbers(values))
@@ -244,7 +244,7 @@ def test_without_a_transform_a_variable_is_a_unit(length):
         ("softplus", None, 1e-36, 1e36),
     ],
 )
-def test_values_end_at_the_bounds_and_come_back(name, bounds, low, high):
+def test_values_reach_the_bounds_and_return(name, bounds, low, high):
     optimizer = Optimizer("sgd", 1.0, {}, {"p": numbers([0.5, 0.5])}, {"p": None}, {"p": bounds},
                           {"p": make_transform(name, bounds)})  # fmt: skip
     for gradient, end in ((-1e30, high), (1e30, low)):
@@ -298,7 +298,7 @@ def test_the_optimiser_moves_the_variable(name, kind):
 
 
 @pytest.mark.parametrize("type", OPTIMIZERS)
-def test_a_transformed_parameter_that_sits_out_keeps_value_and_state(type):
+def test_a_skipped_transformed_parameter_keeps_value_and_state(type):
     def make():
         return Optimizer(
             type, 0.05, {}, {"p": numbers([0.5])}, {"p": None}, {"p": None}, {"p": make_transform("log", None)}
@@ -319,7 +319,7 @@ def test_a_transformed_parameter_that_sits_out_keeps_value_and_state(type):
     np.testing.assert_array_equal(np.array(one["p"]), np.array(other["p"]))
 
 
-def test_an_update_of_a_transformed_parameter_that_overflows_is_taken_back():
+def test_an_overflowing_update_of_a_transformed_parameter_is_undone():
     optimizer = Optimizer("sgd", 1e30, {}, {"p": numbers([1.0])}, {"p": None}, {"p": None},
                           {"p": make_transform("softplus", None)})  # fmt: skip
     dr.backward(dr.sum(optimizer["p"] * -3e30, axis=None))
@@ -365,7 +365,7 @@ def smoothers():
 
 
 @pytest.mark.parametrize("kind", ["map", "mesh"])
-def test_smooth_and_back_and_the_gradient_between(kind):
+def test_smoothing_its_inverse_and_the_gradient_between(kind):
     smoother, value = smoothers()[kind]
     operator, rng = smoother.operator, np.random.default_rng(4)
     np.testing.assert_allclose(operator.smooth(operator.roughen(value)), value, rtol=1e-9, atol=1e-9)
@@ -376,7 +376,7 @@ def test_smooth_and_back_and_the_gradient_between(kind):
     np.testing.assert_allclose(operator.smooth(np.ones_like(value)), 1, rtol=1e-9)  # a constant has nothing to smooth
 
 
-def test_a_length_means_the_same_on_a_finer_map():
+def test_a_length_is_independent_of_the_resolution():
     """A cosine of wavelength w is damped by 1 / (1 + (2 pi l / w)^2), however fine the map."""
     damped = []
     for size in (32, 128):
@@ -403,7 +403,7 @@ def test_a_preconditioned_step_is_smooth_and_within_bounds(type, bounds):
         assert (moved.min(), moved.max()) == pytest.approx(bounds)
 
 
-def test_its_response_is_what_one_entry_alone_gets():
+def test_the_response_equals_that_of_a_single_entry():
     size, rate = 64, 0.1
     value = mi.TensorXf(np.zeros((size, size, 1), np.float32))
     smoother = make_smoother(np.array(value), None, 0.03)

@@ -101,7 +101,7 @@ def values(name: str) -> dict[str, np.ndarray]:
         return {key: found[key] for key in found.files}
 
 
-def test_the_formula_of_l2_gives_what_l2_gives_bit_by_bit(experiment: Path) -> None:
+def test_an_own_l2_equals_the_built_in_one_bit_by_bit(experiment: Path) -> None:
     assert run("{type: l2}", name="l2") == 0
     for name in ("own", "with_weights"):
         assert run(own(name), "--allow-code", name=name) == 0
@@ -113,7 +113,7 @@ def test_the_formula_of_l2_gives_what_l2_gives_bit_by_bit(experiment: Path) -> N
     assert (values("l2")[KEY] != 0.5).any(), "it moved"
 
 
-def test_nothing_is_run_without_being_allowed(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_code_needs_permission_to_run(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(own("own")) == 2
     out, err = capsys.readouterr()
     assert "the code was run" not in out
@@ -123,7 +123,7 @@ def test_nothing_is_run_without_being_allowed(experiment: Path, capsys: pytest.C
     assert not Path("runs").exists()
 
 
-def test_a_run_is_read_without_its_code_and_goes_on_only_with_the_same(
+def test_a_run_is_read_without_its_code_and_continues_only_with_the_same(
     experiment: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(own("own"), "--allow-code") == 0
@@ -147,7 +147,7 @@ def test_a_run_is_read_without_its_code_and_goes_on_only_with_the_same(
     assert len(read_metrics("runs/a")) == 4
 
 
-def test_yaml_cannot_allow_it(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_yaml_cannot_give_permission(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for setting in ("allow_code=true", "run.allow_code=true", "loss.allow_code=true"):
         assert run(own("own"), setting) == 2
         assert "unknown key" in capsys.readouterr().err
@@ -169,7 +169,7 @@ def test_yaml_cannot_allow_it(experiment: Path, capsys: pytest.CaptureFixture[st
         ("none", "has nothing of the name `none`"),
     ],
 )
-def test_what_is_no_loss_is_one_located_line(
+def test_an_invalid_loss_is_one_located_line(
     experiment: Path, capsys: pytest.CaptureFixture[str], name: str, words: str
 ) -> None:
     assert run(own(name), "--allow-code") == 2
@@ -188,7 +188,7 @@ def test_what_is_no_loss_is_one_located_line(
         ("1 / 0", "ZeroDivision"),
     ],
 )
-def test_a_file_that_cannot_be_run(experiment: Path, capsys: pytest.CaptureFixture[str], text: str, words: str) -> None:
+def test_a_file_that_fails(experiment: Path, capsys: pytest.CaptureFixture[str], text: str, words: str) -> None:
     (experiment / "own.py").write_text(text)
     assert run(own("own"), "--allow-code") == 2
     assert words in capsys.readouterr().err
@@ -199,14 +199,14 @@ def test_a_file_that_cannot_be_run(experiment: Path, capsys: pytest.CaptureFixtu
     [("own.py", "must be FILE.py:NAME"), ("own.txt:own", "must be FILE.py:NAME"),
      ("'own.py:a b'", "must be FILE.py:NAME"), ("gone.py:own", "no such file"), ("null", "missing; give FILE.py:NAME")],
 )  # fmt: skip
-def test_a_name_that_is_none(experiment: Path, capsys: pytest.CaptureFixture[str], file: str, words: str) -> None:
+def test_a_missing_name(experiment: Path, capsys: pytest.CaptureFixture[str], file: str, words: str) -> None:
     assert run(f"{{type: custom, file: {file}}}", "--allow-code") == 2
     err = capsys.readouterr().err
     assert "loss.file: " in err
     assert words in err
 
 
-def test_it_can_import_what_lies_beside_it_and_paths_are_the_files(experiment: Path) -> None:
+def test_it_imports_neighbouring_modules_relative_to_the_file(experiment: Path) -> None:
     (experiment / "below").mkdir()
     (experiment / "below/helping_the_loss.py").write_text("from drjit import mean\n")
     (experiment / "below/far.py").write_text(
@@ -217,7 +217,7 @@ def test_it_can_import_what_lies_beside_it_and_paths_are_the_files(experiment: P
     assert f"file: {experiment}/below/far.py:own" in Path("runs/a/config.yaml").read_text()
 
 
-def test_a_later_nan_is_a_run_s_own_affair(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_later_nan_is_handled_by_the_policy(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (experiment / "own.py").write_text(
         "import drjit as dr\ncalls = []\n\n\ndef own(image, target):\n    calls.append(1)\n"
         "    value = dr.mean(dr.square(image - target), axis=None)\n"
@@ -234,7 +234,7 @@ def test_a_later_nan_is_a_run_s_own_affair(experiment: Path, capsys: pytest.Capt
     assert "--nonfinite: does not run your own code, which loss.file names" in capsys.readouterr().err
 
 
-def test_a_later_nan_of_a_function_names_it_and_leaves_the_folder_whole(experiment: Path) -> None:
+def test_a_later_nan_of_a_function_names_it_and_keeps_the_folder_complete(experiment: Path) -> None:
     calls: list[int] = []
 
     def later(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
@@ -253,7 +253,7 @@ def test_a_later_nan_of_a_function_names_it_and_leaves_the_folder_whole(experime
     assert json.loads(Path("mine/manifest.json").read_text())["status"] == "failed"
 
 
-def test_a_function_that_is_handed_over(experiment: Path) -> None:
+def test_a_function_object(experiment: Path) -> None:
     seen: list[tuple[int, ...]] = []
 
     def loss(image: mi.TensorXf, target: mi.TensorXf) -> mi.Float:
@@ -270,7 +270,7 @@ def test_a_function_that_is_handed_over(experiment: Path) -> None:
     assert float(view.compare(mi.TensorXf(image))[0]) == float(by_name.compare(mi.TensorXf(image))[0])
 
 
-def test_what_is_wrong_with_a_function_is_located_by_its_name_and_line(experiment: Path) -> None:
+def test_faults_of_a_function_are_located_by_name_and_line(experiment: Path) -> None:
     def nan(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
         return dr.mean(dr.sqrt(image - image - 1), axis=None)
 
@@ -298,7 +298,7 @@ def test_what_is_wrong_with_a_function_is_located_by_its_name_and_line(experimen
 
 
 @pytest.mark.parametrize("adjoint", ["batched", "independent", "correlated"])
-def test_what_a_function_changes_in_place_is_its_own(experiment: Path, adjoint: str) -> None:
+def test_in_place_changes_of_a_function_stay_local(experiment: Path, adjoint: str) -> None:
     def plain(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
         return dr.mean(dr.square(2 * image - 3 * target), axis=None)
 
@@ -313,7 +313,7 @@ def test_what_a_function_changes_in_place_is_its_own(experiment: Path, adjoint: 
     assert found[0] == found[1]
 
 
-def test_weights_are_handed_to_a_function_that_takes_them(experiment: Path) -> None:
+def test_weights_are_passed_to_a_function_that_accepts_them(experiment: Path) -> None:
     rng = np.random.default_rng(1)
     image, target = rng.uniform(0, 1, (2, 8, 8, 3)).astype(np.float32)
     even, uneven = np.ones((8, 8)), rng.uniform(1, 2, (8, 8))
@@ -333,7 +333,7 @@ def test_weights_are_handed_to_a_function_that_takes_them(experiment: Path) -> N
         view("own", uneven).judge(mi.TensorXf(image))
 
 
-def test_processes_that_measure_are_told_whether_it_is_allowed(experiment: Path) -> None:
+def test_measuring_processes_know_the_permission(experiment: Path) -> None:
     call = ["--set", f"loss={own('own')}"]
     result = reslrb("convergence", "tiny.yaml", *call, "--objective", "loss", "--rounds", "2", "--spp", "4,8")
     assert (result.exit_code, "--allow-code" in result.output) == (2, True)
@@ -345,7 +345,7 @@ def test_processes_that_measure_are_told_whether_it_is_allowed(experiment: Path)
         assert told(json.loads(json.dumps(first))).allows_code is allowed
 
 
-def test_what_is_handed_over_and_allowed_stays_with_other_integrators(experiment: Path) -> None:
+def test_functions_and_permission_survive_a_change_of_integrator(experiment: Path) -> None:
     handed = load("tiny.yaml").with_loss(np.mean).with_code()
     other = with_integrator(handed, {"type": "prb"}, "--integrators", {})
     assert (other.own_loss, other.allows_code) == (np.mean, True)
@@ -353,7 +353,7 @@ def test_what_is_handed_over_and_allowed_stays_with_other_integrators(experiment
 
 
 @pytest.mark.long
-def test_convergence_runs_it_in_its_processes(experiment: Path) -> None:
+def test_convergence_runs_an_own_loss_in_its_processes(experiment: Path) -> None:
     call = ["convergence", "tiny.yaml", "--set", f"loss={own('own')}", "--rounds", "2", "--spp", "4,8"]
     result = reslrb(*call, "--objective", "loss", "--allow-code", "--integrators", "reslrb")
     assert "reslrb, 8 spp: first step" in result.output

@@ -70,7 +70,7 @@ def share_of(problem: Problem) -> tuple[str, float]:
     return problem.integrator.paths, problem.integrator.light_share
 
 
-def test_camera_paths_alone_are_tried_first_where_they_find_all(monkeypatch: pytest.MonkeyPatch):
+def test_camera_paths_are_tried_first_if_they_find_all_light(monkeypatch: pytest.MonkeyPatch):
     """All surfaces are diffuse."""
     problem = decided(monkeypatch, 100.0, apart={0.0: 0.01})
     assert problem.sides is not None
@@ -79,7 +79,7 @@ def test_camera_paths_alone_are_tried_first_where_they_find_all(monkeypatch: pyt
     assert problem.sides.low > 1
 
 
-def test_what_is_faster_is_taken_as_far_as_it_goes(monkeypatch: pytest.MonkeyPatch):
+def test_a_faster_share_is_pursued_to_the_end(monkeypatch: pytest.MonkeyPatch):
     """A few light paths after all, and then more; and from a half on fewer, where there have to be some."""
     assert share_of(decided(monkeypatch, 0.01)) == ("both", FEWER[0])
     assert share_of(decided(monkeypatch, 0.01, apart={FEWER[0]: 100.0})) == ("both", FEWER[1])
@@ -88,13 +88,13 @@ def test_what_is_faster_is_taken_as_far_as_it_goes(monkeypatch: pytest.MonkeyPat
     assert share_of(decided(monkeypatch, 0.01)) == ("both", FEWER[1])
 
 
-def test_what_is_slower_is_left(monkeypatch: pytest.MonkeyPatch):
+def test_a_slower_share_is_dropped(monkeypatch: pytest.MonkeyPatch):
     problem = decided(monkeypatch, 100.0)
     assert share_of(problem) == ("both", FIRST_SHARE)
     assert problem.sides.gain < 1
 
 
-def test_a_share_alone_is_measured_too(monkeypatch: pytest.MonkeyPatch):
+def test_a_share_is_measured_with_fixed_paths(monkeypatch: pytest.MonkeyPatch):
     problem = decided(monkeypatch, 100.0, "integrator.paths=both", "integrator.light_share=auto")
     assert share_of(problem) == ("both", FIRST_SHARE)
     assert problem.sides is not None
@@ -109,7 +109,7 @@ def test_without_time_half_of_the_paths_are_light_paths(monkeypatch: pytest.Monk
     assert "not measured" in problem.sides.note
 
 
-def test_it_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_the_decision_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     cache = PilotCache(tmp_path / "kept")
     first, second = (decided(monkeypatch, 0.01, cache=cache) for _ in range(2))
     assert not first.sides.cached
@@ -117,7 +117,7 @@ def test_it_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     assert share_of(first) == share_of(second)
 
 
-def test_light_paths_alone_are_what_is_guided_where_they_find_all(monkeypatch: pytest.MonkeyPatch):
+def test_only_light_paths_that_find_everything_are_guided(monkeypatch: pytest.MonkeyPatch):
     """With the border of both, which the target has; and that is what goes on from a checkpoint."""
     fix_times(monkeypatch, {f"paths {share:g}": 100.0 for share in OTHERS} | {"guiding": 1e-6})
     problem = assemble(load("tiny.yaml", [*AUTO, "integrator.guiding=auto"]))
@@ -130,7 +130,7 @@ def test_light_paths_alone_are_what_is_guided_where_they_find_all(monkeypatch: p
     assert with_sides(problem.integrator, problem.sides).preparation.whole
 
 
-def test_light_paths_find_all_but_mirrors_and_what_hidden_lamps_cover():
+def test_light_paths_find_all_except_mirrors_and_light_hidden_by_lamps():
     room: dict[str, Any] = {
         "type": "scene", "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 16, "height": 16}},
         "wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 3]).scale(4)},
@@ -144,7 +144,7 @@ def test_light_paths_find_all_but_mirrors_and_what_hidden_lamps_cover():
     assert not light_finds_all(scene, scene.sensors(), False)
 
 
-def test_camera_paths_find_all_but_what_gloss_and_glass_throw():
+def test_camera_paths_find_all_except_light_from_gloss_and_glass():
     """Unless all light comes straight from the lamps."""
     room: dict[str, Any] = {
         "type": "scene", "wall": {"type": "rectangle", "bsdf": {"type": "roughconductor"}},
@@ -158,7 +158,7 @@ def test_camera_paths_find_all_but_what_gloss_and_glass_throw():
     assert not camera_finds_all(mi.load_dict(room), 2)
 
 
-def test_a_run_of_a_second_has_camera_paths_where_they_find_all():
+def test_a_short_run_uses_camera_paths_if_they_find_all_light():
     """In the furnace they have a thousand times the efficiency, and more."""
     problem = assemble(load(ROOT / "configs" / "furnace.yaml", ["target.render.spp=64"]))
     assert problem.config.run.measuring == 0.1
@@ -167,7 +167,7 @@ def test_a_run_of_a_second_has_camera_paths_where_they_find_all():
 
 
 @pytest.mark.parametrize("paths", ["auto", "camera"])
-def test_camera_paths_of_a_guided_run_are_traced_as_they_are(paths: str, monkeypatch: pytest.MonkeyPatch):
+def test_camera_paths_of_a_guided_run_are_unchanged(paths: str, monkeypatch: pytest.MonkeyPatch):
     """Whether they were found to pay or asked for: no table says where they begin."""
     fix_times(monkeypatch, {f"paths {share:g}": 0.01 if share == 0 else 100.0 for share in OTHERS})
     words = [*SMALL, "integrator.guiding=on", "integrator.estimator=stack", f"integrator.paths={paths}"]
@@ -178,7 +178,7 @@ def test_camera_paths_of_a_guided_run_are_traced_as_they_are(paths: str, monkeyp
     assert optimize("--resume", str(RUN), "--set", "run.iterations=3") == 0
 
 
-def test_a_run_of_a_second_keeps_its_caustic():
+def test_a_short_run_keeps_its_caustic():
     """Which no camera path finds, so that they seem to have hardly any noise."""
     _put_glass()
     problem = assemble(load("tiny.yaml", [*SHORT, "integrator.max_depth=6"]))
@@ -187,7 +187,7 @@ def test_a_run_of_a_second_keeps_its_caustic():
 
 
 @pytest.mark.parametrize(("spp", "rounds"), [(1, race.LEAST_ROUNDS), (8, 8), (16, 16), (1024, 16)])
-def test_camera_paths_alone_are_judged_by_all_rounds_whatever_python_takes(spp: int, rounds: int):
+def test_the_decision_for_camera_paths_uses_all_rounds_without_python_time(spp: int, rounds: int):
     """In three iterations' worth of samples, or as near to that as the least that says anything comes."""
     taken: list[race.Step] = []
 
@@ -203,7 +203,7 @@ def test_camera_paths_alone_are_judged_by_all_rounds_whatever_python_takes(spp: 
     assert found.paths == "other"
 
 
-def test_beams_alone_and_scaled_ones_are_left_to_light_paths():
+def test_beams_and_scaled_emitters_are_left_to_light_paths():
     def paths(**lights: Any) -> str:
         wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 3])}
         scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}, "wall": wall, **lights})
@@ -219,7 +219,7 @@ def test_beams_alone_and_scaled_ones_are_left_to_light_paths():
     assert paths(sun=sun(2)) == "light"
 
 
-def test_what_moves_light_has_light_paths():
+def test_moving_light_uses_light_paths():
     problem = assemble_scene(load(ROOT / "configs" / "lens_pose.yaml", ["integrator.paths=both"]))
     assert (problem.paths, problem.moves, problem.integrator.paths) == ("light", True, "light")
     naive = assemble_scene(load(ROOT / "configs" / "lens_pose.yaml", ["integrator={type: walk_ad, paths: both}"]))
@@ -227,7 +227,7 @@ def test_what_moves_light_has_light_paths():
 
 
 @pytest.mark.parametrize("settings", [AUTO, SHORT], ids=["measured at length", "short"])
-def test_a_run_goes_on_with_the_paths_that_it_had(settings: list[str], monkeypatch: pytest.MonkeyPatch):
+def test_a_resumed_run_keeps_its_paths(settings: list[str], monkeypatch: pytest.MonkeyPatch):
     words = tiny.settings(*settings)
     assert optimize("tiny.yaml", *words) == 0
     found = read_manifest(RUN)
@@ -262,7 +262,7 @@ def test_targets_and_images_have_the_same_light(integrator: str):
     assert not view.masked.left_out
 
 
-def test_auto_shares_paths_out_by_l2_alone(monkeypatch: pytest.MonkeyPatch):
+def test_auto_distributes_paths_only_for_l2(monkeypatch: pytest.MonkeyPatch):
     """Also with a mask; the pixels that are left out have no extra paths, nor by a loss for which the user asks."""
     monkeypatch.setattr(sampling, "noted_part", lambda paths, spp: 0.01)
     weights = np.ones((32, 32, 3), np.float32)
@@ -284,7 +284,7 @@ def test_auto_shares_paths_out_by_l2_alone(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize("epsilon", [0.01, 0.3])
-def test_the_curvature_of_relative_l2_is_one_over_the_square_of_the_target(epsilon: float):
+def test_the_curvature_of_relative_l2_is_the_inverse_squared_target(epsilon: float):
     """In a grey target; in coloured ones the bright channels count, which have most of the noise."""
     view = View(0, make_loss("relative_l2", epsilon=epsilon))
     target, weights = np.geomspace(0.01, 1e8, 24).reshape(4, 6, 1).repeat(3, 2), np.ones((4, 6))
@@ -295,7 +295,7 @@ def test_the_curvature_of_relative_l2_is_one_over_the_square_of_the_target(epsil
     np.testing.assert_allclose(view.curvature(False), weights / weights.mean(), rtol=1e-4)
 
 
-def test_a_memory_budget_knows_of_pixels_that_are_shared_out():
+def test_a_memory_budget_includes_the_distribution_of_paths():
     """Of a film on which what else is allocated counts little."""
 
     def expected(pixels: str) -> int:
@@ -310,6 +310,6 @@ def test_a_memory_budget_knows_of_pixels_that_are_shared_out():
     assert more == pytest.approx(PixelShares.bytes(256 * 256), rel=0.1)
 
 
-def test_paths_that_cannot_be_are_located():
+def test_impossible_paths_are_located():
     with pytest.raises(ConfigError, match=r"integrator.estimator: `gather` needs the connections"):
         load("tiny.yaml", ["integrator.paths=camera", "integrator.estimator=gather"])

@@ -83,7 +83,7 @@ def test_a_box_moves_to_its_place(tmp_path: Path) -> None:
     assert np.sqrt(np.mean(np.square(errors[1]))) < 0.8 * errors[0]
 
 
-def test_parts_have_their_own_samples_and_steps_no_memory(tmp_path: Path) -> None:
+def test_parts_have_their_own_samples_and_steps_keep_no_memory(tmp_path: Path) -> None:
     path = write_experiment(tmp_path)
 
     def found(*sets: str, spp: int = 4, threshold: float = 0.0) -> np.ndarray:
@@ -114,7 +114,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_mitsuba_gets_wrong_is_refused(case: str, tmp_path: Path) -> None:
+def test_wrong_cases_of_mitsuba_are_refused(case: str, tmp_path: Path) -> None:
     sets, spot, key, what = REFUSED[case]
     with pytest.raises(ConfigError) as error:
         assemble_scene(load(write_experiment(tmp_path, spot), sets))
@@ -125,12 +125,12 @@ def test_what_mitsuba_gets_wrong_is_refused(case: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("spot", "sets"), [(True, []), (False, ["scene.options.sensor=orthographic", "integrator.sppp=0"])]
 )
-def test_what_mitsuba_gets_right_is_not_refused(spot: bool, sets: list[str], tmp_path: Path) -> None:
+def test_correct_cases_of_mitsuba_are_accepted(spot: bool, sets: list[str], tmp_path: Path) -> None:
     config = load(write_experiment(tmp_path, spot), sets)
     assert type(assemble_scene(config).integrator) is Projective
 
 
-def test_measurements_take_it_as_they_take_prb(tmp_path: Path) -> None:
+def test_measurements_accept_it_like_prb(tmp_path: Path) -> None:
     config, kind = load(write_experiment(tmp_path), ["integrator.sppp=3"]), "prb_projective"
     [case] = parse_cases(f"{kind}(sppi=2)")
     made = case.at(config, 2, known=False)
@@ -139,7 +139,7 @@ def test_measurements_take_it_as_they_take_prb(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_commands_take_it_as_they_take_prb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_accept_it_like_prb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a colour, which has no silhouettes. The few samples may fail a check."""
     kind = "prb_projective"
     write_experiment(tmp_path)

@@ -38,7 +38,7 @@ def waves(n, depth=0.3):
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_derivatives_are_those_of_finite_differences(name):
+def test_derivatives_match_finite_differences(name):
     rng = np.random.default_rng(3)
     cost = make_cost(ALL[name], (Span(10, 0.02, 0.97), Span(7)))
     heights = rng.normal(size=(9, 11, 3 if name in ("total_variation", "laplacian") else 1))
@@ -51,13 +51,13 @@ def test_derivatives_are_those_of_finite_differences(name):
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_refining_a_map_leaves_its_cost(name):
+def test_refining_a_map_keeps_its_cost(name):
     cost = make_cost(ALL[name], WHOLE)
     coarse, fine = (cost(waves(n))[0] for n in (32, 128))
     assert coarse == pytest.approx(fine, rel=0.02)
 
 
-def test_lengths_are_the_scene_s():
+def test_lengths_are_in_scene_units():
     """A ball of radius 5 seen from below is a hollow of curvature 1/5; a ramp is as steep as it is."""
     n = 64
     x, y = np.meshgrid(*[((np.arange(n) + 0.5) / n - 0.5) * 2] * 2)
@@ -88,7 +88,7 @@ def sheet(n, depth=0.3):
     return np.stack([x, y, z], axis=-1).reshape(-1, 3), faces, uv
 
 
-def test_a_mesh_costs_what_a_map_of_it_does():
+def test_a_mesh_costs_the_same_as_its_map():
     flat, faces, uv = sheet(97, depth=0)
     bent = sheet(97)[0]
     found = mesh_cost(1, flat, faces)(bent.ravel())[0]
@@ -131,7 +131,7 @@ def regularized(tmp_path, listed, head=HEAD, sets=()):
     return assemble_scene(load(path, [spec, *sets]))
 
 
-def test_cost_and_gradient_are_added_once_a_step(tmp_path):
+def test_cost_and_gradient_are_added_once_per_step(tmp_path):
     listed = "[{type: laplacian, weight: 3}, {type: thickness, thickness: 0.05, least: 0.1}]"
     problem = regularized(tmp_path, listed)
     key = problem.selection.keys[0]
@@ -238,7 +238,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_has_no_meaning_is_refused_in_one_line(case, tmp_path):
+def test_meaningless_settings_are_refused_in_one_line(case, tmp_path):
     head, listed, expected = REFUSED[case]
     with pytest.raises(ConfigError) as error:
         regularized(tmp_path, listed, head)
@@ -257,7 +257,7 @@ def facing(high=9, wide=11, there=(6, 7), **settings):
     return make_plate(Thickness(thickness=0.5, least=0.4, opposite="back", **settings), own, other, "back.heightmap")
 
 
-def test_a_plate_of_two_free_faces_has_the_thickness_between_them():
+def test_a_plate_of_two_free_faces_measures_their_distance():
     plate = facing(32, 48, (24, 40))
     (y, x), (v, u) = (np.mgrid[:n, :m] for n, m in ((32, 48), (24, 40)))
 
@@ -274,7 +274,7 @@ def test_a_plate_of_two_free_faces_has_the_thickness_between_them():
     assert plate.thickness(own[:, :, None], 0 * there[:, :, None])[:, :, 0] == pytest.approx(0.5 + own)
 
 
-def test_both_derivatives_of_a_plate_are_those_of_finite_differences():
+def test_both_derivatives_of_a_plate_match_finite_differences():
     rng = np.random.default_rng(3)
     plate = facing(weight=3.0)
     h, g = rng.normal(0, 0.2, (9, 11, 1)), rng.normal(0, 0.2, (6, 7, 1))
@@ -292,7 +292,7 @@ def test_both_derivatives_of_a_plate_are_those_of_finite_differences():
     assert plate.cost(h, 0 * g)[1] == pytest.approx(flat[1])
 
 
-def test_free_faces_give_way_alike_and_are_held_apart_at_the_texels_of_both():
+def test_free_faces_move_equally_and_stay_apart_at_the_texels_of_both():
     plate, rng = facing(), np.random.default_rng(5)
     h, g = rng.normal(-0.1, 0.3, (9, 11, 1)), rng.normal(-0.1, 0.3, (6, 7, 1))
     assert plate.thickness(h, g).min() < 0
@@ -319,7 +319,7 @@ def lens_with_two_faces(tmp_path, sets=()):
     return assemble(load(tmp_path / "l/lens.yaml", ["run.measuring=1000", *sets]), to_run=True)
 
 
-def test_a_step_that_would_have_both_faces_of_a_lens_cross_is_held_back(llvm, tmp_path):
+def test_a_step_that_would_cross_both_faces_is_limited(llvm, tmp_path):
     import drjit as dr
 
     from reslrb_cli.optimization import loop
@@ -354,7 +354,7 @@ def test_a_step_that_would_have_both_faces_of_a_lens_cross_is_held_back(llvm, tm
     assert np.array(problem.optimizer["face.heightmap"]).ravel() == pytest.approx(face.ravel(), abs=1e-6)
 
 
-def test_faces_that_begin_crossed_or_have_no_opposite_are_refused(llvm, tmp_path):
+def test_faces_that_start_crossed_or_lack_an_opposite_are_refused(llvm, tmp_path):
     for number, (setting, line) in enumerate((
         ("parameters[1].initial=-24.9", "parameters[0].regularizers: `face.heightmap` and `back.heightmap` start"),
         ("parameters[0].regularizers[0].opposite=lid",

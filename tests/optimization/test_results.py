@@ -23,13 +23,13 @@ from reslrb_cli.scene.values import resample
 # Parameters in a few numbers, and results that are there whenever a run ends.
 
 
-def test_small_parameters_are_told_by_all_their_numbers():
+def test_small_parameters_are_reported_in_full():
     assert summary(np.array(0.25)) == {"value": 0.25}
     assert summary(np.array([0.5, 1.0, 0.25])) == {"value": [0.5, 1.0, 0.25]}
     assert summary(np.arange(8.0)) == {"mean": [3.5], "min": 0.0, "max": 7.0}
 
 
-def test_textures_are_told_by_mean_and_range_of_what_is_reached():
+def test_textures_are_reported_by_mean_and_range_of_reached_texels():
     value = np.zeros((2, 2, 3))
     value[0, 0], value[0, 1], value[1] = (1, 2, 3), (3, 4, 5), 100
     mask = np.array([[True, True], [False, False]])
@@ -63,7 +63,7 @@ def test_results_of_a_run(tmp_path, steps):
 
 
 @pytest.mark.parametrize(("iterations", "worse"), [(3, ["albedo"]), (4, [])])
-def test_a_short_run_is_called_worse_once_it_is_over(tmp_path, iterations, worse):
+def test_a_short_run_is_called_worse_only_at_its_end(tmp_path, iterations, worse):
     """Pages of a run that goes on ask from its first iterations on."""
     problem = make_problem(tmp_path, sets=[f"run.iterations={iterations}"])
     results = Results(problem)
@@ -73,7 +73,7 @@ def test_a_short_run_is_called_worse_once_it_is_over(tmp_path, iterations, worse
     assert results.to_json()["worse"] == worse
 
 
-def test_a_truth_that_is_not_finite_is_null(tmp_path):
+def test_a_non_finite_truth_is_null(tmp_path):
     """The manifest is JSON, which has no such numbers."""
     problem = make_problem(tmp_path)
     problem.truth["albedo"][0, 0, 0] = np.nan
@@ -83,7 +83,7 @@ def test_a_truth_that_is_not_finite_is_null(tmp_path):
     assert found["parameter_rmse"]["albedo"] == {"initial": None, "final": None}
 
 
-def test_an_image_of_each_sensor_is_asked_for(tmp_path):
+def test_an_image_of_each_sensor_is_requested(tmp_path):
     problem = make_problem(tmp_path, views=2)
     results = Results(problem)
     image = np.full((2, 2, 3), 0.6, dtype=np.float32)
@@ -108,7 +108,7 @@ def meter_of(truth, quantities=None):
     return ErrorMeter(truth, {key: everything(value) for key, value in truth.items()}, quantities)
 
 
-def test_errors_are_taken_over_the_mask(tmp_path):
+def test_errors_are_measured_within_the_mask(tmp_path):
     problem = make_problem(tmp_path)
     problem.truth["albedo"] = np.array(problem.optimizer["albedo"]) + np.array([[[1.0], [50.0]], [[2.0], [3.0]]])
     meter = problem.meter
@@ -130,7 +130,7 @@ def test_the_error_of_several_parameters_counts_their_entries():
     assert meter.total(errors) == pytest.approx(np.sqrt((3 * 1 + 9) / 4))
 
 
-def test_units_that_differ_are_not_added_up():
+def test_different_units_are_not_added():
     truth = {"wall": np.full(3, 0.5), "lamp": np.full(3, 2e6)}
     values = {"wall": np.full(3, 0.6), "lamp": np.full(3, 1e6)}
     meter = meter_of(truth, {"wall": "", "lamp": "intensity"})
@@ -143,7 +143,7 @@ def test_units_that_differ_are_not_added_up():
     assert same.total(errors) == pytest.approx(1e6 / np.sqrt(2), rel=1e-6)
 
 
-def test_units_of_what_has_no_error_do_not_matter():
+def test_units_of_parameters_without_errors_do_not_matter():
     """A lamp that nothing reaches has no error that could be added."""
     masks = {"wall": np.ones(3, bool), "lamp": np.zeros(3, bool)}
     meter = ErrorMeter({"wall": np.ones(3), "lamp": np.ones(3)}, masks, {"wall": "", "lamp": "intensity"})
@@ -169,7 +169,7 @@ def test_another_resolution_is_compared_on_the_finer_grid(own, true):
     assert flat["t"] == pytest.approx(0.2, rel=1e-5)
 
 
-def test_the_truth_at_its_own_resolution_is_resampled_by_nothing():
+def test_the_truth_at_its_own_resolution_is_not_resampled():
     value, truth = texture(4, 4, seed=1), texture(4, 4, seed=2)
     error = meter_of({"t": truth}).errors(lambda key: value)["t"]
     assert error == pytest.approx(np.sqrt(np.mean(np.square(value - truth, dtype=np.float64))), rel=1e-6)
@@ -224,7 +224,7 @@ def seen(losses, held_out=None):
     return best
 
 
-def test_noise_is_not_taken_for_the_best():
+def test_noise_does_not_make_values_the_best():
     """One lucky loss at the start, and less of it on the average later."""
     losses = [0.01] + [1.0] * 20 + [0.5] * 15 + [0.9] * 20
     best = seen(losses)
@@ -234,25 +234,25 @@ def test_noise_is_not_taken_for_the_best():
     assert best.least.loss == pytest.approx(0.5)
 
 
-def test_there_is_none_before_the_window_is_full():
+def test_there_is_no_best_before_the_window_is_full():
     assert seen([1.0] * (WINDOW - 1)).to_json() is None
     assert seen([1.0] * WINDOW).to_json()["iteration"] == WINDOW - 1
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_what_is_not_finite_is_never_the_best(bad):
+def test_non_finite_values_are_never_the_best(bad):
     assert seen([bad] * 30).least is None
     assert seen([*[bad] * 5, *[2.0] * 30]).least.iteration == 5 + WINDOW - 1
 
 
-def test_views_that_are_held_out_decide():
+def test_held_out_views_decide():
     held_out = [3.0, None, 1.0, None, 2.0]
     best = seen([5.0, 4.0, 3.0, 2.0, 1.0], held_out)
     assert (best.least.iteration, best.least.loss, best.values) == (2, 1.0, {"a": 2})
 
 
 @pytest.mark.parametrize("at", [3, 12, 25])
-def test_it_goes_on_from_what_it_was(at):
+def test_the_best_values_survive_a_resume(at):
     losses = list(np.random.default_rng(3).uniform(size=40))
     whole, part = seen(losses), seen(losses[:at])
     again = Best(False)
@@ -291,7 +291,7 @@ def test_passes_of_a_large_image_are_not_recorded(monkeypatch):
     assert not problem.integrator.preparation.recordings.counts()
 
 
-def test_a_run_with_ptracer_says_where_a_lens_is_not_clipped(tmp_path, caplog):
+def test_a_ptracer_run_warns_of_an_unclipped_lens(tmp_path, caplog):
     lens = '<float name="aperture_radius" value="0.1"/><float name="focus_distance" value="3"/>'
     (tmp_path / "scene.xml").write_text(
         f'<scene version="3.0.0"><sensor type="thinlens" id="eye"><float name="far_clip" value="4"/>{lens}</sensor>'

@@ -57,7 +57,7 @@ def test_a_planted_ratio_is_found():
     assert after[FLOOR].length == pytest.approx(before[FLOOR].length, rel=1e-3)
 
 
-def test_a_lamp_alone_has_its_own_intensity_as_its_length():
+def test_the_length_of_a_single_lamp_is_its_intensity():
     found = measured("parameters[1].initial=1e7", f"target.render.parameters.{LAMP}=1e7",
                      f"target.render.parameters.{FLOOR}=0.5", "run.spp=512")  # fmt: skip
     assert found[LAMP].length == pytest.approx(1e7, rel=0.05)
@@ -69,19 +69,19 @@ def test_a_lamp_alone_has_its_own_intensity_as_its_length():
 
 
 @pytest.mark.parametrize("start", [1e6, 4e7])
-def test_a_length_reaches_to_the_brighter_of_image_and_target(start):
+def test_a_length_uses_the_brighter_of_image_and_target(start):
     found = measured(f"parameters[1].initial={start:g}", f"target.render.parameters.{LAMP}=1e7",
                      f"target.render.parameters.{FLOOR}=0.5", "run.spp=512")  # fmt: skip
     assert found[LAMP].length == pytest.approx(max(start, 1e7), rel=0.05)
 
 
-def test_noise_is_that_of_one_step():
+def test_noise_belongs_to_one_step():
     few, many = measured(samples=16), measured("run.spp=512", samples=16)
     for key in (FLOOR, LAMP):
         assert few[key].noise / many[key].noise == pytest.approx(4, rel=0.5)
 
 
-def test_measuring_leaves_everything_as_it_was():
+def test_measuring_changes_nothing():
     problem = assemble(load(CONFIG, TINY))
     before = problem.values()
     measure_sensitivities(problem, 2)
@@ -90,7 +90,7 @@ def test_measuring_leaves_everything_as_it_was():
         assert not np.array(problem.optimizer.gradient(key)).any()
 
 
-def test_what_has_no_effect_is_not_scaled():
+def test_parameters_without_effect_are_not_scaled():
     """At depth 1 nothing but emitters is seen, and a point has no size."""
     problem = assemble(load(CONFIG, [*TINY, "integrator={estimator: gather, max_depth: 1}", "run.iterations=1"]))
     problem = replace(problem, truth={})
@@ -113,7 +113,7 @@ def test_own_lengths():
 
 
 @pytest.mark.parametrize("type", ["adam", "sgd"])
-def test_in_units_of_its_own_no_scale_is_left(type):
+def test_in_its_own_units_no_scale_remains(type):
     """The same problem in units of 1e6 and 1, and its loss times 1e-12: equal steps, epsilon too."""
 
     def descend(unit, loss):
@@ -163,7 +163,7 @@ def test_the_optimiser_gets_gradients_of_order_one(transforms):
 
 
 @pytest.mark.parametrize("transform", a_few(["none", "sigmoid", "log", "softplus"], ["none", "log"]))
-def test_the_first_step_is_what_the_line_says(transform):
+def test_the_first_step_matches_the_printed_line(transform):
     """Adam's first step is one learning rate in what it moves."""
     sets = [f"parameters[1].transform={transform}", "parameters[1].bounds=[0, 1e8]", "run.iterations=1"]
     problem = assemble(load(CONFIG, [*TINY, *sets]))
@@ -190,7 +190,7 @@ def test_the_first_step_is_what_the_line_says(transform):
         assert (row.own_length, step) == (row.length, pytest.approx(rate * row.length, rel=0.01))
 
 
-def test_the_line_of_what_is_not_scaled_says_why():
+def test_the_line_of_an_unscaled_parameter_gives_the_reason():
     row = Scaled("lamp.intensity.value", 3, 1.0, 0.0, 0.0)
     assert (
         step_line(row, "log", 0.1) == "lamp.intensity.value has no effect on the image at its start; it is not scaled"
@@ -205,7 +205,7 @@ LAMP_ALONE = ["parameters=[{key: lamp.intensity.value, initial: [2e6, 4e6, 1e6]}
               "optimizer={type: sgd, scale: curvature}"]  # fmt: skip
 
 
-def test_the_curvature_of_a_lamp_is_that_of_the_image_it_makes():
+def test_the_curvature_of_a_lamp_matches_its_image():
     """The image I_c = x_c a, so that the mean of (I - T)^2 has the curvature 2 mean(a_c^2) / 3 along channel c."""
     problem = assemble(load(CONFIG, [*TINY, *LAMP_ALONE]))
     x = problem.selection.array(LAMP).astype(np.float64)
@@ -218,7 +218,7 @@ def test_the_curvature_of_a_lamp_is_that_of_the_image_it_makes():
 
 
 @pytest.mark.parametrize(("rate", "ends"), [(1.0, "below"), (3.0, "above")])
-def test_a_rate_of_one_ends_at_the_bottom_and_three_leaves_it(rate, ends):
+def test_a_rate_of_one_converges_and_a_rate_of_three_diverges(rate, ends):
     sets = [*TINY, *LAMP_ALONE, "run.iterations=12", f"optimizer.learning_rate={rate}"]
     problem = assemble(load(CONFIG, sets))
     problem = find_reached(problem)
@@ -226,13 +226,13 @@ def test_a_rate_of_one_ends_at_the_bottom_and_three_leaves_it(rate, ends):
     assert losses[-1] < 0.2 * losses[0] if ends == "below" else losses[-1] > losses[0]
 
 
-def test_curvature_is_for_gradient_descent_alone():
+def test_only_gradient_descent_uses_curvature():
     with pytest.raises(ConfigError, match=r"optimizer\.scale: curvature needs type: sgd"):
         load(CONFIG, ["optimizer={type: adam, scale: curvature}"])
     assert load(CONFIG, ["optimizer={type: sgd, scale: curvature}"]).optimizer.learning_rate == 0.5
 
 
-def test_what_cannot_be_smoothed_is_refused_where_it_stands():
+def test_parameters_that_cannot_be_smoothed_are_refused_with_a_location():
     config = load(CONFIG, [*TINY, "parameters=[{key: lamp.intensity.value, precondition: {laplacian: 0.1}}]"])
     with pytest.raises(ConfigError, match=r"parameters\[0\].precondition: smooths textures, heightmaps and vertices"):
         assemble(config)

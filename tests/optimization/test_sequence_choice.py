@@ -91,7 +91,7 @@ def spied(monkeypatch: pytest.MonkeyPatch, settings: list[str], guided_ms: float
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("guiding", a_few(["auto, on", "auto, off", "on", "off"], ["auto, on", "on"]))
-def test_it_is_measured_with_guiding_as_that_was_decided(
+def test_it_is_measured_with_the_decision_on_guiding(
     guiding: str, experiment: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Both kinds of steps draw from the table that guiding was decided with, held; without that, from one of theirs."""
@@ -118,9 +118,7 @@ def test_it_is_measured_with_guiding_as_that_was_decided(
 
 
 @pytest.mark.usefixtures("llvm")
-def test_alone_it_takes_the_place_of_guiding_where_that_is_better(
-    experiment: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_guiding_it_replaces_guiding_if_it_is_better(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Then nothing of guiding is left, neither in kernels nor in what memory is planned for."""
     take_times(monkeypatch, 0.1, 0.1, alone_ms=0.001)
     budget = "run.memory_budget=64"
@@ -153,7 +151,7 @@ def test_alone_it_takes_the_place_of_guiding_where_that_is_better(
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_table_of_its_own_for_either_is_seen(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_separate_tables_for_both_are_found(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from reslrb_cli.integrators.context import Preparation
 
     monkeypatch.setattr(Preparation, "draw_from", lambda self, guiding, scene: None)
@@ -174,7 +172,7 @@ def test_a_dry_run_measures_it_for_the_run(
 
 
 @pytest.mark.usefixtures("llvm")
-def test_what_is_compared_is_named() -> None:
+def test_compared_options_are_named() -> None:
     config = load(Path(__file__).parents[2] / "configs" / "furnace.yaml")
     [even, left] = parse_cases("reslrb:stack(sequence=low_discrepancy),reslrb:auto(sequence=auto)")
     assert even.estimator == "stack(sequence=low_discrepancy)"
@@ -209,7 +207,7 @@ def sizes(share: float, step: int = 64) -> Sizes:
         ({"variance": 0.05, "time": 1.1, "sparse": True}, True),
     ],
 )
-def test_it_is_on_where_it_pays(options: dict[str, Any], on: bool) -> None:
+def test_it_is_on_if_it_pays(options: dict[str, Any], on: bool) -> None:
     one = world(**options)
     record = one.run(sizes(0.02), 0.02)
     assert record.low_discrepancy == on
@@ -225,7 +223,7 @@ def on_by_accident(**options: Any) -> int:
     return sum(world(**options, seed=seed).run(sizes(0.05), 0.05).low_discrepancy for seed in range(100))
 
 
-def test_where_it_gains_nothing_it_is_hardly_ever_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_is_rarely_on_without_a_gain(monkeypatch: pytest.MonkeyPatch) -> None:
     # 2.5 are expected on this side, were times not allowed to be off, and one more for the looks before the last.
     assert on_by_accident(variance=0.9, time=1 / 0.9) <= 9
     # A fault that takes the gain itself for what it is at least is seen by that.
@@ -234,7 +232,7 @@ def test_where_it_gains_nothing_it_is_hardly_ever_on(monkeypatch: pytest.MonkeyP
     assert on_by_accident(variance=0.9, time=1 / 0.9) > 30
 
 
-def test_a_table_that_has_yet_to_learn_does_so_before_all_steps_that_count() -> None:
+def test_an_untrained_table_learns_before_all_counted_steps() -> None:
     one = world(0.1, 1.1, learns=True)
     record = one.run(sizes(0.05), 0.05)
     assert record.low_discrepancy
@@ -250,7 +248,7 @@ def test_a_table_that_has_yet_to_learn_does_so_before_all_steps_that_count() -> 
 @pytest.mark.parametrize("step", [8, 64, 1024])
 @pytest.mark.parametrize("overhead", [0.0, 0.1, 10.0])
 @pytest.mark.parametrize("time", [0.9, 1.1, 3.0])
-def test_its_share_is_kept(share: float, step: int, overhead: float, time: float) -> None:
+def test_its_share_of_the_time_is_kept(share: float, step: int, overhead: float, time: float) -> None:
     one = world(0.1, time, overhead=overhead)
     used = sizes(share, step)
     record = one.run(used, share)
@@ -267,7 +265,7 @@ def test_its_share_is_kept(share: float, step: int, overhead: float, time: float
         assert record.share <= share * 1.3
 
 
-def test_the_more_is_left_the_longer_steps_are() -> None:
+def test_more_remaining_time_gives_longer_steps() -> None:
     trials = [sizes(share, 1024).trial for share in (0.0, SEQUENCE_SHARE, 0.01, 0.02, 0.05)]
     assert trials == sorted(trials)
     assert trials[0] == 1
@@ -285,7 +283,7 @@ class Spent:
 
 
 @pytest.mark.parametrize("paths", [None, 0.02, SHARE - GUIDING_SHARE])
-def test_all_that_is_measured_takes_one_share(paths: float | None) -> None:
+def test_all_measurements_share_one_limit(paths: float | None) -> None:
     """Guiding leaves the sequence its part, and both keep within the share of all decisions."""
     ample = Allowance(1.0, 1e9, 0.0, 1.0)
     for_guiding = share_left(Spent(paths, None), ample, SEQUENCE_SHARE)  # type: ignore[arg-type]

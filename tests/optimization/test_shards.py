@@ -83,7 +83,7 @@ def test_gradients_are_unbiased(folder, way):
     assert found, found
 
 
-def test_one_set_of_samples_would_be_seen(folder):
+def test_a_single_set_of_samples_would_be_found(folder):
     """That test has the power to tell: the bias of one set shows in it."""
     reference = independent(make(folder, "run.adjoint=independent"), 16, 1024)
     found = compare(rows(make(folder, "run.spp=2", "run.shards=2", "run.adjoint=correlated"), 400), reference, None)
@@ -97,7 +97,7 @@ def test_views_and_exposures_are_unbiased(folder):
     assert found, found
 
 
-def test_halves_are_unbiased_but_for_the_quotient(folder):
+def test_halves_are_unbiased_except_for_the_quotient(folder):
     """`loss.scale: fitted` in shards of two halves each, of many samples: what bias there is, is that of a quotient."""
     sets = ["loss.scale=fitted", "run.spp=64"]
     reference = independent(make(folder, *sets, "run.adjoint=independent"), 16, 1024)
@@ -125,7 +125,7 @@ def shuffled(problem: Problem, function: Callable[..., Any], work: Any) -> Itera
         ["run.spp=8", "run.shards=4", OTHERS, "loss.scale=fitted", TWO_VIEWS.replace("auto", "2")],
     ],
 )
-def test_the_order_of_evaluation_is_nothing(folder, sets):
+def test_the_order_of_evaluation_does_not_matter(folder, sets):
     """Bit by bit, over iterations in which tables learn."""
     sets, results = [*sets, "run.iterations=3"], []
     for engine in (None, shuffled):
@@ -149,7 +149,7 @@ def unmeasured(problem: Problem) -> Problem:
     return problem
 
 
-def test_shards_of_whole_views_add_up(folder):
+def test_shards_of_whole_views_sum_up(folder):
     """The same samples as steps of each view by itself, in one sum."""
     problem = make(folder, "views=[{sensor: 0, weight: 2}, {sensor: 1}, {sensor: 2}]", "run.spp=8", "run.shards=2")
     tasks = shards.make_tasks(problem, 3)
@@ -169,7 +169,7 @@ def test_shards_of_whole_views_add_up(folder):
     np.testing.assert_allclose(take_gradient(problem)[KEY], expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
 
 
-def test_shares_add_up_to_a_gradient_at_their_mean(folder):
+def test_shares_sum_up_to_a_gradient_at_their_mean(folder):
     """In one round: the mean of the shards' gradients, and the loss of their mean image."""
     problem = make(folder, "run.spp=8", "run.shards=4", "run.adjoint=independent")
     found = [shards.shard_gradient(problem, task) for task in shards.make_tasks(problem, 0)]
@@ -190,7 +190,7 @@ def test_no_two_shards_share_a_seed(folder):
     assert len({image.tobytes() for image in images}) == 4
 
 
-def test_a_subset_of_the_views_is_in_shards(folder):
+def test_a_subset_of_the_views_is_sharded(folder):
     """Each shard has dL/dI at the mean image of the others, of a view that counts for all three."""
     views = "views=[{sensor: 0}, {sensor: 1}, {sensor: 2}]"
     problem = make(folder, views, "run.views_per_iteration=1", "run.spp=8", "run.shards=4", OTHERS)
@@ -218,7 +218,7 @@ def test_sums_are_in_double_precision():
     assert list(shards.in_order([(2, "c"), (0, "a"), (1, "b")])) == ["a", "b", "c"]
 
 
-def test_without_shards_nothing_is_new(folder, monkeypatch):
+def test_without_shards_nothing_changes(folder, monkeypatch):
     """The loop that was there, whose seeds and options are those of always."""
     monkeypatch.setattr(loop, "add_gradient", lambda *args: pytest.fail("shards"))
     given, step = [], loop.gradient_step
@@ -260,7 +260,7 @@ def test_passes_divide_a_shard(folder):
 
 
 @pytest.mark.parametrize("adjoint", ["others", "independent"])
-def test_what_is_not_finite_is_counted_in_each_shard(folder, adjoint):
+def test_non_finite_values_are_counted_in_each_shard(folder, adjoint):
     problem = make(folder, "run.spp=8", "run.shards=4", f"run.adjoint={adjoint}")
     target = np.array(problem.views[0].target)
     target[2, 5, 1] = np.nan
@@ -314,7 +314,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("sets", "message"), BAD)
-def test_what_are_no_shards_is_refused(folder, sets, message):
+def test_invalid_shards_are_refused(folder, sets, message):
     if message is None:
         make(folder, *sets)
         return

@@ -54,7 +54,7 @@ def test_each_iteration_has_the_resolution_of_its_stage(experiment: Path) -> Non
     assert now.scene is problem.scene  # the run as it is configured works on its own problem
 
 
-def test_what_is_too_fine_for_a_stage_stays_as_it_was(experiment: Path) -> None:
+def test_parameters_too_fine_for_a_stage_stay_unchanged(experiment: Path) -> None:
     """The texture begins rough, and a stage of 2x2 texels moves nothing: no roughness is lost by it."""
     stages = "run.stages=[{until: 0.5, resolution: 0.5, film: 0.5}]"
     still = ["parameters[0].initial=scene", "optimizer.learning_rate=1e-12"]
@@ -71,7 +71,7 @@ def test_what_is_too_fine_for_a_stage_stays_as_it_was(experiment: Path) -> None:
             break
 
 
-def test_values_go_along_within_their_bounds(experiment: Path) -> None:
+def test_values_are_carried_over_within_their_bounds(experiment: Path) -> None:
     """Steps of a coarse stage arrive in the fine texture, and none leaves its bounds."""
     sets = [*PLAIN, "run.stages=[{until: 0.9, resolution: 0.5}]", "optimizer.learning_rate=5"]
     problem = assemble(
@@ -87,7 +87,7 @@ def test_values_go_along_within_their_bounds(experiment: Path) -> None:
     assert errors[9] == pytest.approx(errors[8], rel=0.1)  # what the coarse stage found is there in the fine one
 
 
-def test_a_smaller_film_sees_the_mean_of_the_target_by_its_weights(experiment: Path) -> None:
+def test_a_smaller_film_sees_the_weighted_mean_of_the_target(experiment: Path) -> None:
     """And an image whose expectation is the mean of the whole one's, with a box filter."""
     problem = assemble(load(experiment, [*PLAIN, "run.stages=[{until: 0.5, film: 0.5}]"]), to_run=True)
     rng = np.random.default_rng(3)
@@ -108,7 +108,7 @@ def test_a_smaller_film_sees_the_mean_of_the_target_by_its_weights(experiment: P
     assert np.abs(z).max() < 5  # 16 pixels: once in 30,000 times, by a t distribution
 
 
-def test_scale_is_measured_anew_where_the_problem_changes_and_only_there(experiment: Path) -> None:
+def test_scale_is_measured_again_only_if_the_problem_changes(experiment: Path) -> None:
     sets = [*PLAIN, "optimizer={type: sgd, scale: curvature, learning_rate: 1}"]
     stages = "run.stages=[{until: 0.3, resolution: 0.5}, {until: 0.6, resolution: 0.5}]"
     problem = assemble(load(experiment, [*sets, stages]), to_run=True)
@@ -118,7 +118,7 @@ def test_scale_is_measured_anew_where_the_problem_changes_and_only_there(experim
     assert found[0][0] != found[6][0]
 
 
-def test_a_run_that_is_to_have_more_iterations_does_not_go_back(experiment: Path) -> None:
+def test_a_run_with_more_iterations_does_not_go_back(experiment: Path) -> None:
     sets = [*PLAIN, "run.stages=[{until: 0.5, resolution: 0.5}]"]
     problem = assemble(load(experiment, sets), to_run=True)
     stages = Stages(problem)
@@ -143,19 +143,19 @@ def test_a_run_that_is_to_have_more_iterations_does_not_go_back(experiment: Path
         ),
     ],
 )
-def test_stages_that_cannot_be_are_refused(experiment: Path, stages: str, message: str) -> None:
+def test_impossible_stages_are_refused(experiment: Path, stages: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         assemble_scene(load(experiment, [*PLAIN, f"run.stages={stages}"]))
 
 
-def test_a_stage_that_makes_nothing_coarser_is_refused(experiment: Path) -> None:
+def test_a_stage_without_coarsening_is_refused(experiment: Path) -> None:
     lamp = "parameters=[{key: lamp.emitter.radiance.value, initial: 1}]"
     with pytest.raises(ConfigError, match=r"run.stages\[0\].resolution: makes nothing coarser"):
         assemble_scene(load(experiment, [lamp, "run.stages=[{until: 0.5, resolution: 0.5}]"]))
 
 
 @pytest.mark.parametrize("face", a_few(["face", "back"], ["back"]))
-def test_a_lens_and_its_mesh_are_coarser_together(llvm: str, tmp_path: Path, face: str) -> None:
+def test_a_lens_and_its_mesh_are_coarsened_together(llvm: str, tmp_path: Path, face: str) -> None:
     """From edge to edge, its outside where it was, a plane as flat and a slope as steep as before."""
     tones = np.kron(0.3 + 0.7 * np.random.default_rng(1).uniform(size=(4, 4)), np.ones((4, 4)))
     write_file(tmp_path / "p.exr", np.repeat(tones[:, :, None], 3, 2).astype(np.float32), linear=True)

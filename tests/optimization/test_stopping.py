@@ -60,7 +60,7 @@ def test_a_loss_that_halves_every_100_iterations_is_not_stopped(tmp_path: Path) 
     assert max(stopped) < 400, "one that stands is"
 
 
-def test_a_small_fall_is_none_even_without_noise(tmp_path: Path) -> None:
+def test_a_small_fall_does_not_count_even_without_noise(tmp_path: Path) -> None:
     losses = 1 - 1e-4 * np.arange(400)
     [*_, last] = follow(config(tmp_path, STOP), losses)
     assert last.iteration == 60
@@ -68,14 +68,14 @@ def test_a_small_fall_is_none_even_without_noise(tmp_path: Path) -> None:
     assert len(follow(config(tmp_path, "run.stop={relative: 0}"), losses)) == 400
 
 
-def test_what_is_not_finite_is_left_out(tmp_path: Path) -> None:
+def test_non_finite_losses_are_left_out(tmp_path: Path) -> None:
     losses = 0.98 ** np.arange(400)
     losses[::7] = np.nan
     assert len(follow(config(tmp_path, STOP), losses)) == 400
     assert len(follow(config(tmp_path, STOP), np.full(400, np.nan))) == 400
 
 
-def test_held_out_views_decide_where_there_are_any(tmp_path: Path) -> None:
+def test_held_out_views_decide_if_there_are_any(tmp_path: Path) -> None:
     given = config(tmp_path, STOP, "run.held_out=[0]")
     falling = 0.98 ** np.arange(400)
     standing = {number: 1.0 + 0.001 * (number // 10 % 2) for number in range(0, 400, 10)}
@@ -83,12 +83,12 @@ def test_held_out_views_decide_where_there_are_any(tmp_path: Path) -> None:
     assert len(follow(given, np.ones(400), {number: falling[number] for number in standing})) == 400
 
 
-def test_a_run_in_stages_is_looked_at_once_it_is_as_configured(tmp_path: Path) -> None:
+def test_a_run_in_stages_is_judged_in_the_last_stage(tmp_path: Path) -> None:
     given = config(tmp_path, STOP, "run.stages=[{until: 0.25, film: 0.5}]")
     assert len(follow(given, np.ones(400))) == 161
 
 
-def test_a_plateau_lowers_the_rate_and_only_then_a_run_stops(tmp_path: Path) -> None:
+def test_a_plateau_lowers_the_rate_before_a_run_stops(tmp_path: Path) -> None:
     plateau = "optimizer={schedule: plateau, final_fraction: 0.2}"
     states = follow(config(tmp_path, plateau, "run.stop={patience: 10}"), np.ones(400))
     drops = [state.drops for state in states]
@@ -108,19 +108,19 @@ def test_a_plateau_lowers_the_rate_and_only_then_a_run_stops(tmp_path: Path) -> 
         ("run.stop={relative: 1}", "run.stop.relative", "below 1"),
     ],
 )
-def test_settings_that_are_none(tmp_path: Path, setting: str, key: str, words: str) -> None:
+def test_invalid_settings(tmp_path: Path, setting: str, key: str, words: str) -> None:
     with pytest.raises(ConfigError) as error:
         config(tmp_path, setting)
     assert error.value.key == key
     assert words in error.value.message
 
 
-def test_settings_that_do_not_go_together(tmp_path: Path) -> None:
+def test_incompatible_settings(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"run\.stop\.patience: must be at least 20, not 10"):
         config(tmp_path, "run.stop={patience: 10}", "run.held_out=[0]")
 
 
-def test_what_is_not_asked_for_is_not_written(tmp_path: Path) -> None:
+def test_unused_options_are_not_written(tmp_path: Path) -> None:
     written = config(tmp_path).model_dump()
     assert "stop" not in written["run"]
     asked = config(tmp_path, STOP, "optimizer={schedule: plateau}")
@@ -139,9 +139,7 @@ def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 
 @pytest.mark.parametrize("at", [18, 19, 20])
-def test_a_run_that_stops_does_so_after_a_kill_as_well(
-    experiment: Path, monkeypatch: pytest.MonkeyPatch, at: int
-) -> None:
+def test_a_run_stops_after_a_kill_as_well(experiment: Path, monkeypatch: pytest.MonkeyPatch, at: int) -> None:
     """Killed before, and after, the last iteration, when its state is kept already."""
     stop = ["--set", "run.stop={patience: 5, relative: 0.9}", "--set", "run.iterations=40"]
     every = ["--set", f"run.checkpoint_every={{iterations: {5 if at == 20 else 3}}}"]
@@ -153,7 +151,7 @@ def test_a_run_that_stops_does_so_after_a_kill_as_well(
     assert differences(whole, left) == []
 
 
-def test_a_run_that_stopped_goes_on_where_it_is_asked_to(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_stopped_run_continues_on_request(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
     stop = ["--set", "run.stop={patience: 5, relative: 0.9}", "--set", "run.iterations=24"]
     assert optimize("tiny.yaml", "--quiet", *SETS, *stop) == 0
     assert optimize("--resume", "runs/tiny", "--quiet") == 0
@@ -168,7 +166,7 @@ def test_a_run_that_stopped_goes_on_where_it_is_asked_to(experiment: Path, capsy
         assert one[KEY].tobytes() == other[KEY].tobytes()
 
 
-def test_a_run_whose_time_was_up_goes_on_with_more(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_at_its_time_limit_continues_with_more_time(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
     more = ["--set", "run.iterations=1000000", "--set", "run.max_seconds=0.001"]
     assert optimize("tiny.yaml", "--quiet", *SETS, *more) == 0
     results = manifest("runs/tiny")["results"]
@@ -187,12 +185,12 @@ def test_a_run_whose_time_was_up_goes_on_with_more(experiment: Path, capsys: pyt
     ("more", "line"),
     [("run.stages=[{until: 0.5, film: 0.5}]", "run.max_seconds: cannot be combined with run.stages")],
 )  # fmt: skip
-def test_what_counts_iterations_does_not_go_with_a_time(tmp_path: Path, more: str, line: str) -> None:
+def test_iteration_counts_are_incompatible_with_a_time_limit(tmp_path: Path, more: str, line: str) -> None:
     with pytest.raises(ConfigError, match=line):
         config(tmp_path, "run.max_seconds=5", more)
 
 
-def test_measuring_before_the_first_iteration_is_part_of_the_time(tmp_path: Path) -> None:
+def test_measuring_before_the_first_iteration_counts_in_the_time(tmp_path: Path) -> None:
     problem = make_problem(tmp_path, sets=["run.max_seconds=10"])
     record = GuidedRecord(guided=True, measure_s=2.0, compile_s=1.5)
     assert problem.limit_s == 10

@@ -78,20 +78,20 @@ def check_stops(kind: str, runs: int, iterations: int) -> None:
 
 
 @pytest.mark.parametrize("kind", NOISE)
-def test_runs_whose_loss_still_falls_are_not_stopped(kind: str) -> None:
+def test_runs_with_a_falling_loss_are_not_stopped(kind: str) -> None:
     check_stops(kind, 300, 600)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", NOISE)
-def test_runs_whose_loss_still_falls_are_not_stopped_however_long_they_are(kind: str) -> None:
+def test_long_runs_with_a_falling_loss_are_not_stopped(kind: str) -> None:
     check_stops(kind, 2000, 3000)
 
 
 @pytest.mark.parametrize(("kind", "longest"), [
     ("normal, 10 %", 300), ("normal, 30 %", 600), ("t of 3 degrees", 360), ("fireflies", 360), ("grey_room", 700),
 ])  # fmt: skip
-def test_what_a_stop_costs(kind: str, longest: int) -> None:
+def test_the_cost_of_a_stop(kind: str, longest: int) -> None:
     """Medians over runs that stand from their first iteration on; docs/steps.md has the figures."""
     random = np.random.default_rng(5)
     assert np.median(ends(NOISE[kind](random, (300, 1000)))) <= longest
@@ -100,7 +100,7 @@ def test_what_a_stop_costs(kind: str, longest: int) -> None:
 
 @pytest.mark.parametrize("kind", NOISE)
 @pytest.mark.parametrize("iterations", [20, 100, 400])
-def test_flat_losses_hardly_ever_fall_or_rise(kind: str, iterations: int) -> None:
+def test_flat_losses_rarely_fall_or_rise(kind: str, iterations: int) -> None:
     flat = NOISE[kind](np.random.default_rng(6), (300, iterations))
     found = [found.change for series in flat if (found := find_trend(series)) is not None]
     tolerance = 3 * np.sqrt(0.05 * 0.95 / len(flat)) if (kind, iterations) == ("wandering", 20) else 0
@@ -109,7 +109,7 @@ def test_flat_losses_hardly_ever_fall_or_rise(kind: str, iterations: int) -> Non
     assert iterations < 400 or found.count(Change.FLAT) > 0.6 * len(flat)
 
 
-def test_the_second_half_of_a_run_is_judged_by_itself() -> None:
+def test_the_second_half_of_a_run_is_judged_separately() -> None:
     fading = (0.3 + 26 * 0.5 ** (np.arange(200) / 10)) * NOISE["normal, 10 %"](np.random.default_rng(7), (1, 200))[0]
     found = [find_trend(series) for series in (fading, 0.5 ** (np.arange(200) / 50), fading[:30])]
     assert [(each.change, each.late) for each in found if each is not None] == [

@@ -85,7 +85,7 @@ def test_entries_are_judged_one_by_one():
     ("uuuuuuuus", Verdict.SETTLED),
     ("uuuunnssm", Verdict.STILL_MOVING),
 ])  # fmt: skip
-def test_a_parameter_is_what_its_entries_are(entries, verdict):
+def test_a_parameter_combines_its_entries(entries, verdict):
     kinds = {"s": Verdict.SETTLED, "m": Verdict.STILL_MOVING, "b": Verdict.AT_BOUND, "n": Verdict.NO_EFFECT,
              "u": Verdict.NOT_SEEN}  # fmt: skip
     found = shares([kinds[entry] for entry in entries])
@@ -109,7 +109,7 @@ def simulate(H, response, scale, noise, samples, rates, runs, random, fixed=None
 
 @pytest.mark.parametrize("target", [0.0, 0.7, 5.0])
 @pytest.mark.parametrize("iterations", [5, 60, 600])
-def test_offsets_of_the_model_are_as_wide_as_they_are_said_to_be(iterations, target):
+def test_offsets_of_the_model_are_as_wide_as_stated(iterations, target):
     """Coverage: over many runs the way to go is right on the average, and its error is what is stated.
 
     With noise of a target, which all gradients of a run share, too: it is in what is left.
@@ -136,7 +136,7 @@ def test_offsets_of_the_model_are_as_wide_as_they_are_said_to_be(iterations, tar
 
 
 @pytest.mark.parametrize("last", [1, 30])
-def test_the_last_steps_measure_where_values_are(last):
+def test_the_last_steps_locate_the_values(last):
     """Coverage, where the last steps of a run are what is known of its end beside a few gradients there."""
     random, runs = np.random.default_rng(8), 500
     H, sd = np.array([[2.0, 1.2], [1.2, 1.0]]), np.array([0.5, 0.8])
@@ -159,7 +159,7 @@ def test_the_last_steps_measure_where_values_are(last):
     assert np.abs(np.std(z, axis=0) - 1).max() * np.sqrt(2 * runs) < 4, np.std(z, axis=0)
 
 
-def test_gradients_that_the_model_has_not_foreseen_are_believed():
+def test_unforeseen_gradients_are_believed():
     """By the model nothing of the start is left; a pull of ten standard errors says otherwise."""
     H, few = np.diag([2.0, 3.0]), 4
     given = np.full(2, 0.2), np.ones(2), np.diag([0.01, 0.01])
@@ -173,7 +173,7 @@ def test_gradients_that_the_model_has_not_foreseen_are_believed():
     assert far.to_go[0] < 26
 
 
-def test_alone_is_joint_where_nothing_is_shared():
+def test_marginal_equals_joint_without_shared_parts():
     H, rates = np.array([0.5, 2.0]), [1.0] * 40
     given = np.array([0.03, 0.05]), np.array([2.0, 0.3])
     noise, gradient = np.array([0.2, 0.5]), np.array([0.1, -0.4])
@@ -184,7 +184,7 @@ def test_alone_is_joint_where_nothing_is_shared():
             np.testing.assert_allclose(getattr(each, name), getattr(both, name), rtol=1e-5)
 
 
-def test_noise_of_the_target_is_left_where_the_run_has_converged():
+def test_noise_of_the_target_remains_after_convergence():
     """H^-1 b: whatever gradients at the end say, all of them have it."""
     found = joint(np.array([[4.0]]), np.array([0.1]), np.ones(1), np.array([[1e-8]]), np.zeros(1), 9, [1.0] * 300,
                   np.array([[0.04]]))  # fmt: skip
@@ -192,7 +192,7 @@ def test_noise_of_the_target_is_left_where_the_run_has_converged():
     assert found.of_target == pytest.approx([0.2 / 4], rel=1e-3)
 
 
-def test_what_the_view_does_not_tell_stays_as_it_was():
+def test_a_value_unknown_to_the_view_stays():
     """Two lamps that light the view alike: their sum is known, their difference is as open as at the start."""
     H = np.full((2, 2), 5.0)
     found = joint(H, np.full(2, 0.1), np.ones(2), np.eye(2) * 1e-4, np.zeros(2), 5, [1.0] * 200)
@@ -204,7 +204,7 @@ def test_what_the_view_does_not_tell_stays_as_it_was():
     assert known.error[0] < 0.02
 
 
-def test_an_entry_that_no_step_moves_is_as_far_as_it_was():
+def test_an_entry_that_no_step_moves_stays():
     found = joint(
         np.diag([2.0, 0.0]), np.array([0.1, 0.0]), np.array([1.0, 7.0]), np.eye(2), np.zeros(2), 5, [1.0] * 50
     )
@@ -259,7 +259,7 @@ def told_of(measured):
             weigh(measured, directions, ROOM, {}, {}, np.zeros((2, 2)), {}).items()}  # fmt: skip
 
 
-def test_what_depends_on_a_value_that_still_moves_is_not_settled():
+def test_a_value_that_depends_on_a_moving_one_is_not_settled():
     """An exposure and a colour make up for each other: the exposure is not known before the colour is."""
     H, random = np.array([[1.0, 0.3], [0.3, 0.1]]), np.random.default_rng(1)
 
@@ -279,7 +279,7 @@ def test_what_depends_on_a_value_that_still_moves_is_not_settled():
     assert told(5.0, 0.0) == {"exposure": "settled", "colour": "still moving"}
 
 
-def test_what_creeps_under_noise_of_heavy_tails_is_not_settled(monkeypatch):
+def test_a_creeping_value_under_heavy_tailed_noise_is_not_settled(monkeypatch):
     """The wall, off at first, drives the ceiling the wrong way, and large gradients then make steps short; by the steps
     of the end nothing would be left of it."""
     random, off, told, before = np.random.default_rng(11), 0, [], 0
@@ -300,7 +300,7 @@ def test_what_creeps_under_noise_of_heavy_tails_is_not_settled(monkeypatch):
 
 
 @pytest.mark.parametrize("iterations", [100, 400])
-def test_what_has_come_to_rest_under_noise_of_heavy_tails_is_settled(iterations):
+def test_a_resting_value_under_heavy_tailed_noise_is_settled(iterations):
     random, found, right = np.random.default_rng(12), collections.Counter(), 0
     for _ in range(50):
         x, measured = recover(random, iterations, np.array([0.01, -0.02]))
@@ -310,7 +310,7 @@ def test_what_has_come_to_rest_under_noise_of_heavy_tails_is_settled(iterations)
     assert found["settled"] > 47
 
 
-def test_noise_takes_its_correlations_from_the_curvature():
+def test_noise_has_the_correlations_of_the_curvature():
     random, H = np.random.default_rng(5), np.array([[4.0, 1.8], [1.8, 1.0]])
     root = np.linalg.cholesky(H)
     found = noise_covariance(root @ random.normal(size=(2, 400)), np.diag(H), H)
@@ -320,7 +320,7 @@ def test_noise_takes_its_correlations_from_the_curvature():
     np.testing.assert_array_equal(np.diag(apart), 1)
 
 
-def test_curvature_is_averaged_over_entries_of_alike_noise():
+def test_curvature_is_averaged_over_entries_of_similar_noise():
     random = np.random.default_rng(6)
     noise = np.concatenate([np.full(320, 1.0), np.full(320, 9.0)]) * random.uniform(0.9, 1.1, 640)
     order = random.permutation(640)
@@ -333,7 +333,7 @@ def test_curvature_is_averaged_over_entries_of_alike_noise():
     assert smooth(few, np.ones(4), 1.0) == pytest.approx(0.5 + few.std() / 2)
 
 
-def test_entries_of_a_motion_have_noise_of_their_own():
+def test_entries_of_a_motion_have_their_own_noise():
     """Across the light and along it a lens differs by orders of magnitude: a run's mean squares say so."""
     sizes = np.array([1.0, 0.01, 0.3])
     gradients = np.random.default_rng(0).normal(size=(3, 3)) * sizes
@@ -370,7 +370,7 @@ def fireflies(curve):
 
 
 @pytest.mark.parametrize("iterations", [20, 100, 1000])
-def test_nothing_but_noise_is_flat(iterations):
+def test_pure_noise_is_flat(iterations):
     found = shares_of_verdicts(noisy(lambda i: np.ones(len(i))), iterations)
     assert found[Change.FLAT] > (0.75 if iterations == 20 else 0.95)
     assert max(found[Change.FELL], found[Change.ROSE]) < 0.04
@@ -378,7 +378,7 @@ def test_nothing_but_noise_is_flat(iterations):
 
 @pytest.mark.parametrize("iterations", [20, 100, 1000])
 @pytest.mark.parametrize("decay", [1, 3, 8])
-def test_a_fall_within_a_few_iterations_is_seen(iterations, decay):
+def test_a_fall_within_a_few_iterations_is_found(iterations, decay):
     """Nine tenths of the first tenth may be as low as the end."""
     found = shares_of_verdicts(noisy(lambda i: 1 + 5 * np.exp(-i / decay)), iterations)
     assert found[Change.FELL] > 0.95
@@ -386,13 +386,13 @@ def test_a_fall_within_a_few_iterations_is_seen(iterations, decay):
 
 
 @pytest.mark.parametrize("iterations", [50, 200])
-def test_fireflies_do_not_turn_a_fall_into_a_failure(iterations):
+def test_fireflies_do_not_hide_a_fall(iterations):
     found = shares_of_verdicts(fireflies(lambda i: 1 + 5 * np.exp(-8 * i / len(i))), iterations)
     assert found[Change.FELL] > 0.8
     assert found[Change.FLAT] + found[Change.ROSE] < 0.01
 
 
-def test_a_firefly_among_the_last_does_not_hide_a_fall():
+def test_a_firefly_near_the_end_does_not_hide_a_fall():
     random = np.random.default_rng(4)
     values = np.concatenate([1 + 0.05 * random.normal(size=60), 0.2 + 0.02 * random.normal(size=40)])
     values[-4] = 30.0
@@ -400,16 +400,16 @@ def test_a_firefly_among_the_last_does_not_hide_a_fall():
 
 
 @pytest.mark.parametrize("iterations", [50, 200, 1000])
-def test_fireflies_are_no_rise(iterations):
+def test_fireflies_do_not_count_as_a_rise(iterations):
     assert shares_of_verdicts(fireflies(lambda i: np.ones(len(i))), iterations)[Change.ROSE] < 0.04
 
 
-def test_a_slow_rise_is_seen():
+def test_a_slow_rise_is_found():
     found = shares_of_verdicts(noisy(lambda i: 1 + 0.5 * i / len(i)), 100)
     assert found[Change.ROSE] > 0.95
 
 
-def test_a_slow_fall_is_hardly_ever_denied():
+def test_a_slow_fall_is_rarely_missed():
     """A fifth over the run, where a single iteration has a tenth of noise."""
     for iterations in (50, 100, 200):
         found = shares_of_verdicts(noisy(lambda i: 1 - 0.2 * i / len(i)), iterations)
@@ -417,13 +417,13 @@ def test_a_slow_fall_is_hardly_ever_denied():
         assert found[Change.ROSE] < 0.01
 
 
-def test_what_leaps_up_and_comes_down_again_rose():
+def test_a_jump_that_declines_counts_as_a_rise():
     """Adam with a rate far too large: up at once, and slowly back to a level above the start."""
     found = shares_of_verdicts(noisy(lambda i: np.where(i == 0, 0.3, 1 + 20 * np.exp(-i / 10))), 100)
     assert found[Change.ROSE] > 0.95
 
 
-def test_the_levels_are_those_of_the_first_and_the_last_tenth():
+def test_the_levels_are_the_first_and_the_last_tenth():
     values = np.concatenate([np.tile([1.0, 3.0], 10), np.full(160, 9.0), np.tile([0.4, 0.6], 10)])
     trend = find_trend(values)
     assert (trend.start.mean, trend.end.mean) == (pytest.approx(2.0), pytest.approx(0.5))
@@ -433,12 +433,12 @@ def test_the_levels_are_those_of_the_first_and_the_last_tenth():
     assert window(200) == 20
 
 
-def test_a_run_in_which_nothing_moves_at_all():
+def test_a_run_without_any_change():
     trend = find_trend(np.full(30, 0.7))
     assert (trend.change, trend.start.error) == (Change.FLAT, 0.0)
 
 
-def test_short_runs_and_values_that_are_not_finite():
+def test_short_runs_and_non_finite_values():
     assert find_trend(np.linspace(0, 1, 19)) is None
     values = np.linspace(2, 1, 40)
     values[[3, 17]] = np.nan, np.inf
@@ -446,7 +446,7 @@ def test_short_runs_and_values_that_are_not_finite():
     assert find_trend(np.full(100, np.nan)) is None
 
 
-def test_what_got_worse():
+def test_worse_parameters():
     rising, random = np.linspace(0.2, 0.3, 50), np.random.default_rng(1)
     assert got_worse(list(rising), 0.3)
     assert not got_worse(list(rising[::-1]), 0.2)

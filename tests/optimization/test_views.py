@@ -40,7 +40,7 @@ def test_a_weight_is_a_share_of_the_loss(folder):
     np.testing.assert_allclose(both, 0.75 * alone[0] + 0.25 * alone[1], rtol=1e-4, atol=1e-7)
 
 
-def test_what_a_view_says_stands_in_place_of_what_all_have(folder):
+def test_settings_of_a_view_replace_common_ones(folder):
     write = np.full((8, 8, 3), 0.5, np.float32)
     mi.Bitmap(write).write(str(folder / "half.exr"))
     views = "views=[{sensor: 1, target: half.exr, exposure: auto}, {sensor: 0, mask: none, exposure: 2}]"
@@ -72,14 +72,14 @@ BAD = [
 
 
 @pytest.mark.parametrize(("setting", "key", "words"), BAD)
-def test_what_is_wrong_is_located(folder, setting, key, words):
+def test_errors_are_located(folder, setting, key, words):
     with pytest.raises(ConfigError) as error:
         make(folder, setting)
     assert words in str(error.value)
     assert key in str(error.value)
 
 
-def test_views_of_their_own_need_no_target_section(folder):
+def test_separate_views_need_no_target_section(folder):
     text = (folder / "tiny.yaml").read_text().replace("target: {render: {spp: 16}}\n", "")
     mi.Bitmap(np.full((8, 8, 3), 0.5, np.float32)).write(str(folder / "half.exr"))
     config = loads(text + "views: [{sensor: 0, target: half.exr}]\n", str(folder / "tiny.yaml"))
@@ -105,7 +105,7 @@ def test_a_subset_of_the_views_is_unbiased(tmp_path):
     assert [problem.drawn(i)[0][0].sensor for i in range(20)] != [other.drawn(i)[0][0].sensor for i in range(20)]
 
 
-def test_an_iteration_takes_the_views_that_were_drawn(tmp_path, steps):
+def test_an_iteration_uses_the_drawn_views(tmp_path, steps):
     problem = make_problem(tmp_path, views=3, sets=["run.views_per_iteration=1", "run.iterations=6"])
     losses = [record.loss for record in optimize(problem)]
     assert [call.sensor for call in steps.calls] == [problem.drawn(iteration)[0][0].sensor for iteration in range(6)]

@@ -26,7 +26,7 @@ def names(folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("durable", [False, True])
-def test_a_file_is_there_once_it_is_whole(tmp_path: Path, durable: bool) -> None:
+def test_a_file_appears_when_it_is_complete(tmp_path: Path, durable: bool) -> None:
     path, seen = tmp_path / "file", []
 
     def write(file):
@@ -41,7 +41,7 @@ def test_a_file_is_there_once_it_is_whole(tmp_path: Path, durable: bool) -> None
     assert names(tmp_path) == ["file"]
 
 
-def test_a_failure_leaves_what_was_there_and_names_the_file(tmp_path: Path) -> None:
+def test_a_failure_keeps_the_old_file_and_names_it(tmp_path: Path) -> None:
     def fail(file):
         file.write(b"half")
         raise OSError(28, "No space left on device")
@@ -57,7 +57,7 @@ def test_a_failure_leaves_what_was_there_and_names_the_file(tmp_path: Path) -> N
     assert str(gone.value) == f"[Errno 2] No such file or directory: '{tmp_path / 'nowhere' / 'file'}'"
 
 
-def test_a_process_that_ends_at_once_can_tidy_up(tmp_path: Path) -> None:
+def test_a_process_that_exits_at_once_can_tidy_up(tmp_path: Path) -> None:
     def leave(file):
         file.write(b"half")
         with unfinished_folder(tmp_path) as folder:
@@ -79,7 +79,7 @@ def test_an_unfinished_folder_stays_if_it_gets_a_name(tmp_path: Path) -> None:
     assert names(tmp_path) == ["name"]
 
 
-def test_what_killed_processes_left_is_removed(tmp_path: Path) -> None:
+def test_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     (tmp_path / "elsewhere").mkdir()
     left = [tmp_path / ".manifest.json.123.part", tmp_path / "images" / ".final.exr.99.part"]
@@ -108,7 +108,7 @@ def iteration_of(path: Path) -> int:
     return int(values["iteration"])
 
 
-def test_a_kill_at_any_moment_leaves_a_whole_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kill_at_any_moment_leaves_a_complete_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Copied before and after every call by which the writing of the fourth state changes the disk."""
     folder, left = tmp_path / "checkpoint", []
     folder.mkdir()
@@ -154,7 +154,7 @@ def test_on_a_full_disk_both_states_stay(tmp_path: Path, monkeypatch: pytest.Mon
     assert (iteration_of(tmp_path / "state.npz"), iteration_of(tmp_path / "previous.npz")) == (2, 1)
 
 
-def test_what_cannot_be_opened_is_located(tmp_path: Path) -> None:
+def test_unopenable_files_are_located(tmp_path: Path) -> None:
     np.savez(tmp_path / "state.npz", a=np.ones(3))
     with pytest.raises(ConfigError, match="holds values alone, not the state of a run"):
         read_state(tmp_path / "state.npz")
@@ -165,11 +165,11 @@ def test_what_cannot_be_opened_is_located(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("key", ["wall.reflectance.data", "Sphere_3.emitter.radiance.value", "Wände.alpha-2"])
-def test_what_can_be_a_name_is_one(key: str) -> None:
+def test_valid_names(key: str) -> None:
     assert file_stem(key) == key
 
 
-def test_keys_that_look_alike_have_names_of_their_own() -> None:
+def test_similar_keys_have_distinct_file_names() -> None:
     long = "a" * 300
     keys = ["a b", "a_b", "a/b", "a__b", "a  b", "a\x1bb", long, long + "b", f"{long} b", f"{long}_b", "é" * 200 + "/"]
     names = [file_stem(key) for key in keys]

@@ -37,7 +37,7 @@ def test_every_format_can_be_read_back(tmp_path, suffix):
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("suffix", [".exr", ".png"])
-def test_an_image_that_does_not_fit_is_not_there(tmp_path, file_size_limit, suffix):
+def test_an_incomplete_image_is_removed(tmp_path, file_size_limit, suffix):
     from reslrb_cli.records.images import write_file
 
     path = tmp_path / f"final{suffix}"
@@ -51,7 +51,7 @@ def test_an_image_that_does_not_fit_is_not_there(tmp_path, file_size_limit, suff
 
 
 @pytest.mark.usefixtures("llvm")
-def test_parameters_and_masks_are_written_like_that(tmp_path, file_size_limit):
+def test_parameters_and_masks_are_written_likewise(tmp_path, file_size_limit):
     from reslrb_cli.records.images import write_mask, write_parameters
 
     with file_size_limit(300), pytest.raises(OSError, match=r"wall\.data\.exr"):
@@ -63,7 +63,7 @@ def test_parameters_and_masks_are_written_like_that(tmp_path, file_size_limit):
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_heightmap_is_seen_from_its_lowest_point_to_its_highest(tmp_path):
+def test_a_heightmap_is_shown_from_lowest_to_highest(tmp_path):
     from matplotlib.image import imread
 
     from reslrb_cli.records.images import load_image, write_parameters
@@ -78,7 +78,7 @@ def test_a_heightmap_is_seen_from_its_lowest_point_to_its_highest(tmp_path):
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_checkpoint_that_does_not_fit_leaves_the_one_before(tmp_path, file_size_limit, monkeypatch):
+def test_an_incomplete_checkpoint_keeps_the_previous_one(tmp_path, file_size_limit, monkeypatch):
     from reslrb_cli.records.checkpoint import save_checkpoint
 
     said = []  # by archives that are thrown away
@@ -102,7 +102,7 @@ def layers():
     return {name: generator.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
 
 
-def test_layers_are_read_as_they_were_written(tmp_path):
+def test_layers_survive_a_round_trip(tmp_path):
     written = layers()
     write_layers(tmp_path / "a.exr", written)
     read = read_layers(tmp_path / "a.exr")
@@ -124,7 +124,7 @@ def test_other_programs_find_the_channels(tmp_path):
     np.testing.assert_array_equal(np.array(bitmap)[:, :, fields["image.G"]], written["image"][:, :, 1])
 
 
-def test_an_image_without_layers_is_one_without_a_name(tmp_path, llvm):
+def test_an_image_without_layers_has_no_name(tmp_path, llvm):
     from reslrb_cli.records.images import write_image
 
     image = np.abs(layers()["image"])
@@ -132,13 +132,13 @@ def test_an_image_without_layers_is_one_without_a_name(tmp_path, llvm):
     np.testing.assert_array_equal(read_layers(tmp_path / "a.exr")[""], image)
 
 
-def test_one_that_does_not_fit_is_not_there(tmp_path, file_size_limit):
+def test_an_incomplete_layered_image_is_removed(tmp_path, file_size_limit):
     with file_size_limit(300), pytest.raises(OSError, match=r"a\.exr"):
         write_layers(tmp_path / "a.exr", layers())
     assert list(tmp_path.iterdir()) == []
 
 
-def test_damaged_files_are_said_to_be(tmp_path):
+def test_damaged_files_are_reported(tmp_path):
     write_layers(tmp_path / "a.exr", layers())
     whole = (tmp_path / "a.exr").read_bytes()
     for damaged in (b"", b"no image", whole[:60], whole[: len(whole) // 2]):

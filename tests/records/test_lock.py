@@ -39,14 +39,14 @@ def test_one_at_a_time(tmp_path: Path) -> None:
     FolderLock(tmp_path, wait_s=0).release()
 
 
-def test_readers_do_not_disturb_each_other_and_nobody_gives_up_over_one(tmp_path: Path) -> None:
+def test_readers_do_not_disturb_each_other_and_nobody_gives_up(tmp_path: Path) -> None:
     reader = FolderLock(tmp_path, wait_s=0, shared=True)
     FolderLock(tmp_path, wait_s=0, shared=True).release()
     threading.Timer(0.2, reader.release).start()
     FolderLock(tmp_path).release()
 
 
-def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
+def test_a_killed_process_holds_no_lock(tmp_path: Path) -> None:
     command = [sys.executable, "-c", HOLD, str(tmp_path)]
     holder = subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": search_path(ROOT)})
     assert holder.stdout is not None
@@ -58,7 +58,7 @@ def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
     FolderLock(tmp_path, wait_s=0).release()
 
 
-def test_the_lock_goes_with_the_folder(tmp_path: Path) -> None:
+def test_the_lock_moves_with_the_folder(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     with FolderLock(tmp_path / "a") as lock:
         (tmp_path / "a").rename(tmp_path / "b")
@@ -97,7 +97,7 @@ def ended_pid() -> int:
     return process.pid
 
 
-def test_who_is_gone_where_there_are_locks(tmp_path: Path) -> None:
+def test_dead_holders_with_locks(tmp_path: Path) -> None:
     here = Holder.here(locked=True)
     with FolderLock(tmp_path):
         for holder in (here, replace(here, pid=ended_pid()), replace(here, boot="earlier")):
@@ -109,7 +109,7 @@ def test_who_is_gone_where_there_are_locks(tmp_path: Path) -> None:
     assert replace(here, host="elsewhere").is_gone(tmp_path)
 
 
-def test_a_process_does_not_wait_for_what_it_has_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_does_not_wait_for_its_own_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run draws its own page; by another process's lock it is told apart from an instant's."""
     here = Holder.here(locked=True)
     with monkeypatch.context() as patch, FolderLock(tmp_path):
@@ -123,14 +123,14 @@ def test_a_process_does_not_wait_for_what_it_has_itself(tmp_path: Path, monkeypa
         assert here.is_gone(tmp_path), "who reads is no run"
 
 
-def test_another_machine_may_have_a_lock_that_is_not_seen_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_machine_may_hold_an_invisible_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     elsewhere = Holder("elsewhere", 1, "its own boot", locked=True)
     assert elsewhere.is_gone(tmp_path) == (os.major(os.stat(tmp_path).st_dev) != 0)
     monkeypatch.setattr(os, "major", lambda device: 0)  # as on a network disk
     assert not elsewhere.is_gone(tmp_path)
 
 
-def test_who_is_gone_where_there_are_none(tmp_path: Path) -> None:
+def test_dead_holders_without_locks(tmp_path: Path) -> None:
     here = Holder.here(locked=False)
     assert not here.is_gone(tmp_path)
     assert not replace(here, pid=1).is_gone(tmp_path)
@@ -139,7 +139,7 @@ def test_who_is_gone_where_there_are_none(tmp_path: Path) -> None:
     assert not replace(here, host="elsewhere", pid=ended_pid()).is_gone(tmp_path)
 
 
-def test_a_holder_can_be_read_back() -> None:
+def test_a_holder_is_read_back() -> None:
     here = Holder.here(locked=True)
     assert Holder.from_json(asdict(here)) == here
     assert str(here) == f"process {os.getpid()} on {here.host}"

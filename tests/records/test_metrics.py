@@ -54,7 +54,7 @@ def test_each_line_is_on_disk_at_once(tmp_path):
             assert [record["iteration"] for record in read_metrics(tmp_path)] == list(range(iteration + 1))
 
 
-def test_a_torn_last_line_is_mended_before_another_follows(tmp_path):
+def test_a_torn_last_line_is_repaired_before_the_next_one(tmp_path):
     with MetricsWriter(tmp_path) as writer:
         writer.write(make_record())
     with (tmp_path / "metrics.jsonl").open("a") as file:
@@ -65,12 +65,12 @@ def test_a_torn_last_line_is_mended_before_another_follows(tmp_path):
     assert [record["iteration"] for record in read_metrics(tmp_path)] == [0, 1]
 
 
-def test_no_file_is_no_records(tmp_path):
+def test_a_missing_file_has_no_records(tmp_path):
     with MetricsWriter(tmp_path):
         assert list(tmp_path.iterdir()) == []  # nor is one ever seen empty
 
 
-def test_a_line_that_does_not_fit_leaves_whole_ones(tmp_path, file_size_limit):
+def test_an_incomplete_line_leaves_complete_ones(tmp_path, file_size_limit):
     line = len(make_record().to_json()) + 1
     with MetricsWriter(tmp_path) as writer:
         writer.write(make_record())
@@ -82,7 +82,7 @@ def test_a_line_that_does_not_fit_leaves_whole_ones(tmp_path, file_size_limit):
     assert [record["iteration"] for record in read_metrics(tmp_path)] == [0, 1]
 
 
-def test_a_file_that_was_removed_is_missed(tmp_path):
+def test_a_removed_file_is_detected(tmp_path):
     with MetricsWriter(tmp_path) as writer:
         writer.write(make_record())
         (tmp_path / "metrics.jsonl").unlink()
@@ -102,7 +102,7 @@ def test_a_checkpoint_can_be_read_by_numpy(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["previous.npz", "state.npz"]
 
 
-def test_what_is_not_finite_or_no_line_is_told_when_a_file_is_read(tmp_path):
+def test_non_finite_values_and_bad_lines_are_reported_on_reading(tmp_path):
     file = tmp_path / "metrics.jsonl"
     lines = (
         '{"a": 1e999, "b": [-1e999, NaN, {"c": Infinity}], "d": 1.5, "e": 7}', "", "[1]", '{"a": ', "\xe9"
@@ -137,7 +137,7 @@ def text(record: Record) -> str:
     return json.dumps(finite(asdict(record)))
 
 
-def test_records_are_what_they_were(tmp_path: Path) -> None:
+def test_records_survive_a_round_trip(tmp_path: Path) -> None:
     records = written(tmp_path, 5)
     found, size = read_records(tmp_path, 3, None)
     assert list(map(text, found)) == list(map(text, records[:3]))
@@ -148,7 +148,7 @@ def test_records_are_what_they_were(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kept", [0, 2])
-def test_the_last_line_is_put_back(tmp_path: Path, kept: int) -> None:
+def test_the_last_line_is_restored(tmp_path: Path, kept: int) -> None:
     records = written(tmp_path, kept)
     last = replace(RECORD, iteration=kept)
     found, size = read_records(tmp_path, kept + 1, last)
@@ -176,13 +176,13 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_no_run_wrote_is_located(tmp_path: Path, case: str) -> None:
+def test_foreign_files_are_located(tmp_path: Path, case: str) -> None:
     (tmp_path / "metrics.jsonl").write_text(BAD[case] + "\n")
     with pytest.raises(ConfigError, match=r"metrics\.jsonl: line 1: is not what a run writes"):
         read_records(tmp_path, 1, None)
 
 
-def test_lines_that_are_missing_are_told(tmp_path: Path) -> None:
+def test_missing_lines_are_reported(tmp_path: Path) -> None:
     written(tmp_path, 2)
     with pytest.raises(ConfigError, match="holds 2 of the 4 iterations of the checkpoint"):
         read_records(tmp_path, 4, replace(RECORD, iteration=3))
@@ -193,7 +193,7 @@ def test_lines_that_are_missing_are_told(tmp_path: Path) -> None:
 EMPTY = Origin(device="", variant="", command=[], versions={}, platform="", written="")
 
 
-def test_it_names_the_command_and_the_versions_of_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_file_names_the_command_and_versions(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["/home/me/.venv/bin/reslrb", "bench", "a b.yaml", "\x1b[31m", "--rounds", "3"])
     entry = json.loads(Origin("a machine", "llvm_ad_rgb").to_json())
     assert entry["command"][:3] == ["reslrb", "bench", "a b.yaml"]
@@ -205,13 +205,13 @@ def test_it_names_the_command_and_the_versions_of_this_process(monkeypatch: pyte
     assert entry["written"].endswith("+00:00")
 
 
-def test_what_was_written_is_read_again() -> None:
+def test_written_lines_are_read_again() -> None:
     origin = Origin("a machine", "llvm_ad_rgb", ["reslrb", "bench"])
     assert read_origin(json.loads(origin.to_json())) == origin
 
 
 @pytest.mark.parametrize("entry", [{}, {"kind": "point"}, {"kind": ["origin"]}, {"versions": {}}])
-def test_other_lines_are_none(entry: dict) -> None:
+def test_other_lines_are_skipped(entry: dict) -> None:
     assert read_origin(entry) is None
 
 

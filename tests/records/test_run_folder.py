@@ -45,7 +45,7 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_new_folder_is_whole(tmp_path):
+def test_a_new_folder_is_complete(tmp_path):
     folder = create(tmp_path / "deep" / "runs")
     assert folder.path == tmp_path / "deep" / "runs" / "run"
     assert names(folder.path) == ["checkpoint", "config.yaml", "images", "manifest.json", "parameters"]
@@ -74,7 +74,7 @@ def test_an_empty_folder_of_that_name_is_not_taken_over(tmp_path):
     assert names(tmp_path / "run") == []
 
 
-def test_force_replaces_a_run_and_leaves_what_is_not_its_own(tmp_path):
+def test_force_replaces_a_run_and_keeps_other_files(tmp_path):
     first = create(tmp_path).path
     (first / "notes.txt").write_text("mine")
     (first / "report.html").write_text("old")
@@ -100,7 +100,7 @@ def test_force_does_not_follow_links(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["folder", "foreign manifest", "file", "link"])
-def test_force_refuses_what_is_no_run_folder(tmp_path, kind):
+def test_force_refuses_other_folders(tmp_path, kind):
     path = tmp_path / "run"
     if kind == "file":
         path.write_text("precious")
@@ -128,17 +128,17 @@ def test_an_output_that_is_a_file_is_refused(tmp_path):
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs /proc")
-def test_an_unwritable_output_is_refused_for_root_too(tmp_path):
+def test_an_unwritable_output_is_refused_even_for_root(tmp_path):
     with pytest.raises(ConfigError, match=r"run\.output: cannot write to"):
         check_output("c.yaml", Path("/proc/runs"), "run", False)
 
 
-def test_checking_leaves_nothing_behind(tmp_path):
+def test_checking_leaves_no_files(tmp_path):
     check_output("c.yaml", tmp_path / "new" / "runs", "run", False)
     assert names(tmp_path) == []
 
 
-def test_a_failed_start_leaves_nothing(tmp_path, monkeypatch):
+def test_a_failed_start_leaves_no_files(tmp_path, monkeypatch):
     monkeypatch.setattr(Manifest, "write", lambda self, folder: (_ for _ in ()).throw(OSError(28, "No space left")))
     with pytest.raises(MachineError, match="No space left"):
         create(tmp_path / "runs")
@@ -146,14 +146,14 @@ def test_a_failed_start_leaves_nothing(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["x" * 300, "ü" * 130, "x" * 254])
-def test_names_that_no_file_can_have_are_refused_at_once(tmp_path, name):
+def test_impossible_file_names_are_refused_at_once(tmp_path, name):
     with pytest.raises(ConfigError, match=r"^c\.yaml: run\.name: ") as error:
         check_output("c.yaml", tmp_path, name, False)
     assert len(str(error.value)) < 200
     assert names(tmp_path) == []
 
 
-def test_a_full_disk_is_no_fault_of_the_configuration(tmp_path, monkeypatch):
+def test_a_full_disk_is_not_blamed_on_the_configuration(tmp_path, monkeypatch):
     def fail(*args, **options):
         raise OSError(28, "No space left on device")
 
@@ -180,14 +180,14 @@ def test_a_folder_in_use_is_not_replaced(tmp_path):
     assert create(tmp_path, force=True).path == folder.path
 
 
-def test_who_replaces_a_folder_holds_it(tmp_path):
+def test_replacing_a_folder_locks_it(tmp_path):
     create(tmp_path)
     for _ in range(2):
         with RunFolder.create("c.yaml", tmp_path, "run", True, "", make_manifest()), pytest.raises(ConfigError):
             create(tmp_path, force=True)
 
 
-def test_without_locks_runs_go_on_as_they_can(tmp_path, monkeypatch):
+def test_without_locks_runs_still_work(tmp_path, monkeypatch):
     fcntl = pytest.importorskip("fcntl")
 
     def fail(descriptor, operation):
@@ -200,7 +200,7 @@ def test_without_locks_runs_go_on_as_they_can(tmp_path, monkeypatch):
             assert (content["status"], content["process"]["locked"]) == ("running", False)
 
 
-def test_a_folder_that_a_killed_process_did_not_finish_is_removed_in_time(tmp_path):
+def test_an_unfinished_folder_of_a_killed_process_is_removed_later(tmp_path):
     old, new, locked = (tmp_path / f".reslrb-{name}" for name in ("old", "new", "locked"))
     for folder in (old, new, locked):
         (folder / "images").mkdir(parents=True)
@@ -211,7 +211,7 @@ def test_a_folder_that_a_killed_process_did_not_finish_is_removed_in_time(tmp_pa
         assert names(tmp_path) == [".reslrb-locked", ".reslrb-new", "run"]
 
 
-def test_a_folder_that_takes_long_to_write_is_not_removed(tmp_path):
+def test_a_slowly_written_folder_is_not_removed(tmp_path):
     """An export into a folder of runs takes minutes; a run that begins there meanwhile leaves it alone."""
     with unfinished_folder(tmp_path) as part:
         (part / "scene.xml").write_text("half")
@@ -224,7 +224,7 @@ def test_a_folder_that_takes_long_to_write_is_not_removed(tmp_path):
         pass
 
 
-def test_a_replacement_that_fails_halfway_says_so(tmp_path, monkeypatch):
+def test_a_half_failed_replacement_is_reported(tmp_path, monkeypatch):
     create(tmp_path)
     rmtree = shutil.rmtree
 
@@ -266,7 +266,7 @@ for number in range(count):
 
 
 @pytest.mark.parametrize(("count", "each"), [(4, 6), pytest.param(8, 40, marks=pytest.mark.long)])
-def test_many_at_once_either_replace_or_are_refused(tmp_path, count, each):
+def test_concurrent_runs_either_replace_or_are_refused(tmp_path, count, each):
     environment = {**os.environ, "PYTHONPATH": search_path(ROOT)}
     command = [sys.executable, "-c", CONTEND, str(tmp_path), str(each)]
     runs = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
@@ -307,7 +307,7 @@ def stored(folder: Path):
     return json.loads((folder / MANIFEST_FILE).read_text())
 
 
-def test_a_run_that_was_killed_is_interrupted(tmp_path):
+def test_a_killed_run_is_interrupted(tmp_path):
     abandoned(tmp_path)
     (tmp_path / "metrics.jsonl").write_text('{"iteration": 0}\n{"itera')
     (tmp_path / ".report.html.77.part").write_text("half")
@@ -322,14 +322,14 @@ def test_a_run_that_was_killed_is_interrupted(tmp_path):
     assert sorted(os.listdir(tmp_path)) == [MANIFEST_FILE, "metrics.jsonl"]
 
 
-def test_a_run_that_goes_on_is_running(tmp_path):
+def test_a_continued_run_is_running(tmp_path):
     abandoned(tmp_path)
     with FolderLock(tmp_path):
         assert read_manifest(tmp_path)["status"] == "running"
     assert stored(tmp_path)["status"] == "running"
 
 
-def test_a_reader_who_may_not_write_is_told_the_same(tmp_path, monkeypatch):
+def test_a_reader_without_write_permission_sees_the_same(tmp_path, monkeypatch):
     abandoned(tmp_path)
 
     def fail(*args, **options):
@@ -378,7 +378,7 @@ def test_a_damaged_manifest_is_one_located_line(tmp_path):
 
 
 @pytest.mark.parametrize("status", [Status.FINISHED, Status.INTERRUPTED, Status.FAILED])
-def test_what_has_ended_stays_as_it_ended(tmp_path, status):
+def test_an_ended_run_keeps_its_status(tmp_path, status):
     abandoned(tmp_path).end(tmp_path, status, "a line")
     before = stored(tmp_path)
     assert read_manifest(tmp_path) == before
@@ -386,13 +386,13 @@ def test_what_has_ended_stays_as_it_ended(tmp_path, status):
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"program": "other"}', "[" * 100_000, "\udcff"])
-def test_what_is_no_manifest_of_ours(tmp_path, text):
+def test_foreign_manifests(tmp_path, text):
     (tmp_path / MANIFEST_FILE).write_bytes(text.encode(errors="surrogateescape"))
     assert read_manifest(tmp_path) is None
     assert read_manifest(tmp_path / "nowhere") is None
 
 
-def test_the_last_word_of_a_process_that_ends_at_once_stays(tmp_path, monkeypatch):
+def test_the_last_status_of_an_exiting_process_stays(tmp_path, monkeypatch):
     monkeypatch.setattr(manifests, "_WRITING", threading.Lock())
     manifest = make_manifest()
     manifest.write(tmp_path)
@@ -419,7 +419,7 @@ def test_entries_are_kept(tmp_path: Path) -> None:
     assert cache.get("c") is None
 
 
-def test_the_oldest_go(tmp_path: Path) -> None:
+def test_the_oldest_entries_are_dropped(tmp_path: Path) -> None:
     cache = PilotCache(tmp_path)
     (tmp_path / "pilot.json").write_text(json.dumps({str(k): {"x": k} for k in range(MOST)}))
     cache.put("new", {"x": -1})
@@ -429,7 +429,7 @@ def test_the_oldest_go(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", ["", "{", "[1]", '{"a": 3}', "\xff"])
-def test_a_broken_file_is_empty_and_mended(tmp_path: Path, content: str) -> None:
+def test_a_broken_file_counts_as_empty_and_is_repaired(tmp_path: Path, content: str) -> None:
     (tmp_path / "pilot.json").write_bytes(content.encode("latin-1"))
     cache = PilotCache(tmp_path)
     assert cache.get("a") is None
@@ -437,13 +437,13 @@ def test_a_broken_file_is_empty_and_mended(tmp_path: Path, content: str) -> None
     assert cache.get("a") == {"x": 1}
 
 
-def test_no_place_to_write_is_no_error(tmp_path: Path) -> None:
+def test_an_unwritable_place_is_no_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     PilotCache(tmp_path / "file" / "deeper").put("a", {})
     assert PilotCache(tmp_path / "file" / "deeper").get("a") is None
 
 
-def test_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_location(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RESLRB_CACHE", "/own")
     assert cache_folder() == Path("/own")
     monkeypatch.delenv("RESLRB_CACHE")
@@ -453,6 +453,6 @@ def test_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     assert cache_folder() == Path.home() / ".cache" / "reslrb"
 
 
-def test_keys_tell_apart_what_differs() -> None:
+def test_keys_distinguish_different_entries() -> None:
     assert key_of({"a": 1, "b": [2]}) == key_of({"b": [2], "a": 1})
     assert key_of({"a": 1}) != key_of({"a": 2})

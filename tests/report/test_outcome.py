@@ -20,7 +20,7 @@ def outcome(found: dict[str, Any], **manifest: Any) -> Outcome:
     return outcome_of({"status": "finished", "config": "a room.yaml"} | manifest, found, "runs/room")
 
 
-def test_only_a_run_whose_loss_fell_and_whose_parameters_settled_is_good() -> None:
+def test_only_a_falling_loss_and_settled_parameters_are_good() -> None:
     assert outcome(results("settled", "settled")) == Outcome(
         "good", "The loss fell, and all 2 parameters are settled.", "Write the recovered scene:",
         "reslrb export runs/room -o recovered",

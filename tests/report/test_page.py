@@ -112,7 +112,7 @@ def test_values_and_errors_of_every_parameter(tmp_path):
     assert f"relative error 0.5 to 0.1 at worst ({FLOOR})" in page.sections[""]
 
 
-def test_without_a_truth_there_are_values_all_the_same(tmp_path):
+def test_without_a_truth_there_are_still_values(tmp_path):
     page = page_of(make_run(tmp_path / "lamp", truth=False))
     assert page.cells["Parameters"][0] == ["parameter", "start", "end"]
     assert page.row("Parameters", LAMP)[1:] == ["2 1 0.5", "3.6 1.8 0.9"]
@@ -120,7 +120,7 @@ def test_without_a_truth_there_are_values_all_the_same(tmp_path):
     assert "RMSE" not in page.sections["Parameters"] + page.sections["Convergence"]
 
 
-def test_textures_stand_beside_each_other(tmp_path):
+def test_textures_are_shown_side_by_side(tmp_path):
     page = page_of(make_run(tmp_path / "lamp"))
     shown = {alt: pixels(uri) for alt, uri in page.pictures if FLOOR in alt}
     assert list(shown) == [f"{name}: {FLOOR}" for name in ("start", "end", "true", "reached")]
@@ -132,7 +132,7 @@ def test_textures_stand_beside_each_other(tmp_path):
     np.testing.assert_allclose(shown[f"true: {FLOOR}"], expected, atol=0.01)
 
 
-def test_heights_are_shown_from_the_lowest_to_the_highest(tmp_path):
+def test_heights_are_shown_from_lowest_to_highest(tmp_path):
     """They may be negative, and far below what a picture shows."""
     heights = np.array([[-1e-3, 0, 3e-3]], np.float32)[:, :, None]
     (tmp_path / "parameters" / "true").mkdir(parents=True)
@@ -148,7 +148,7 @@ def test_heights_are_shown_from_the_lowest_to_the_highest(tmp_path):
     assert "black is -0.001, white is 0.003" in page.sections[""]
 
 
-def test_a_place_has_no_colour():
+def test_a_position_has_no_colour():
     values = {"value": [0.1, 0.2, 0.3]}
     results = {"parameters": {"lamp.translation": {"quantity": "length", "shape": [3], "final": values}}}
     assert "swatch" not in parameter_table(results)
@@ -166,7 +166,7 @@ def test_every_sensor_has_its_images_and_error_map(tmp_path, sensors):
     assert ("Sensor 2" in page.sections["Images"]) == (sensors == 3)
 
 
-def test_the_colours_of_an_error_map_end_where_it_says(tmp_path):
+def test_the_colours_of_an_error_map_end_at_the_stated_value(tmp_path):
     folder = make_run(tmp_path / "lamp")
     page = page_of(folder)
     [(alt, uri)] = [(alt, uri) for alt, uri in page.pictures if "error map" in alt]
@@ -226,7 +226,7 @@ SHARED = SharedTime(("local:2",), 4.0, 2.5, 0.5, {"worker 0 (here)": WorkerTime(
 )
 
 
-def test_what_workers_took_is_told_by_part_and_by_worker(tmp_path):
+def test_times_of_workers_are_reported_by_part_and_worker(tmp_path):
     page = page_of(make_run(tmp_path / "lamp", shared=asdict(SHARED)))
     elapsed = json.loads((tmp_path / "lamp" / "metrics.jsonl").read_text().splitlines()[-1])["elapsed_s"]
     assert "Workers: local:2, tls://there:1." in page.sections["Workers"]
@@ -239,7 +239,7 @@ def test_what_workers_took_is_told_by_part_and_by_worker(tmp_path):
     assert "cannot be shown" in damaged.sections["Workers"]
 
 
-def test_paths_and_how_they_are_drawn_are_told(tmp_path):
+def test_paths_and_their_sampling_are_reported(tmp_path):
     """In the order in which they are decided, each where it was left to measurement."""
     paths = PathsRecord(paths="both", light_share=0.125, gain=1.5, low=1.2, high=1.9, measure_s=2.0, compile_s=3.0)
     guided, sequence = GuidedRecord(guided=False, note="<b>"), SequenceRecord(low_discrepancy=False, note="alike")
@@ -256,7 +256,7 @@ def test_paths_and_how_they_are_drawn_are_told(tmp_path):
     assert sorted(lines, key=told.index) == lines
 
 
-def test_paths_alone_are_told(tmp_path):
+def test_paths_alone_are_reported(tmp_path):
     """Where the estimator is given."""
     camera = PathsRecord(paths="camera", light_share=0.0, note="all is diffuse").to_json()
     title = "Choice of the samples"
@@ -266,7 +266,7 @@ def test_paths_alone_are_told(tmp_path):
         assert title not in page_of(make_run(tmp_path / f"{number}", iterations=0, paths=unread)).sections
 
 
-def test_what_went_wrong_stands_first(tmp_path):
+def test_faults_come_first(tmp_path):
     trend = {"start": {"mean": 0.0131, "error": 0.0004}, "end": {"mean": 0.0133, "error": 0.0004}, "change": "flat"}
     page = page_of(make_run(tmp_path / "lamp", results={"loss_trend": trend, "worse": [LAMP]}))
     assert "the loss did not fall (0.0131 ± 0.0004 at the start, 0.0133 ± 0.0004 at the end)" in page.sections[""]
@@ -293,7 +293,7 @@ def test_names_stay_text(tmp_path):
     assert "<script>alert(1)</script>" in page.sections["Configuration"]
 
 
-def test_nothing_is_loaded(tmp_path):
+def test_nothing_is_loaded_from_elsewhere(tmp_path):
     markup = render_run(make_run(tmp_path / "lamp"))
     assert re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', markup) == []
     assert "url(http" not in markup
@@ -301,7 +301,7 @@ def test_nothing_is_loaded(tmp_path):
     assert '<meta name="viewport" content="width=device-width, initial-scale=1">' in markup
 
 
-def test_a_folder_with_hardly_anything_in_it_has_a_page(tmp_path):
+def test_an_almost_empty_folder_has_a_page(tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     assert "No iteration was completed" in page_of(empty).sections["Convergence"]
@@ -315,7 +315,7 @@ def test_a_folder_with_hardly_anything_in_it_has_a_page(tmp_path):
     assert "end" not in [alt for alt, _ in page.pictures]
 
 
-def test_what_is_there_is_shown_without_what_is_missing(tmp_path):
+def test_existing_parts_are_shown_without_missing_ones(tmp_path):
     folder = make_run(tmp_path / "interrupted")
     for name in ("final", "target", "comparison"):
         (folder / "images" / f"{name}.exr").unlink()
@@ -331,7 +331,7 @@ def test_a_page_of_a_long_run_with_large_pictures_is_small(tmp_path):
     assert "Each point is the mean of 9 iterations" in parsed.sections["Convergence"]
 
 
-def test_many_parameters_have_their_worst_drawn(tmp_path):
+def test_the_worst_of_many_parameters_are_drawn(tmp_path):
     keys = tuple(f"part{number}.reflectance.value" for number in range(12))
     page = page_of(make_run(tmp_path / "many", keys=keys))
     assert len(page.cells["Parameters"]) == 13
@@ -342,7 +342,7 @@ def grey(shape=(64, 64), value=0.02):
     return np.full((*shape, 3), value, np.float32)
 
 
-def test_a_lamp_in_view_does_not_darken_all_else():
+def test_a_visible_lamp_does_not_darken_the_rest():
     room = np.random.default_rng(0).uniform(0.01, 0.02, (64, 64, 3)).astype(np.float32)
     lamps = np.zeros((64, 64), bool)
     lamps[:8, :8] = True
@@ -370,7 +370,7 @@ def test_a_small_caustic_is_not_blown_out():
     assert exposure_for(few) == 0.02
 
 
-def test_what_can_be_seen_is_shown_as_it_is():
+def test_an_ordinary_image_is_shown_unchanged():
     assert exposure_for(None) == exposure_for(grey(value=0.0)) == exposure_for(grey(value=0.5)) == 1
     assert exposure_for(grey(value=np.nan)) == exposure_for(np.zeros((0, 4, 3))) == 1
     assert exposure_for(grey(value=3.2)) == 0.25
@@ -378,7 +378,7 @@ def test_what_can_be_seen_is_shown_as_it_is():
     assert exposure_for(alpha) == 800
 
 
-def test_what_is_clipped_is_said():
+def test_clipping_is_mentioned():
     image = grey(value=0.5)
     image[:16] = 2.0
     assert exposure_words(1.0, image) == "25 % of the target is brighter than white, and clipped"
@@ -386,7 +386,7 @@ def test_what_is_clipped_is_said():
     assert exposure_words(1.0) == exposure_words(1.0, grey(value=0.5)) == ""
 
 
-def test_images_have_the_exposure_that_the_manifest_says(tmp_path):
+def test_images_have_the_exposure_of_the_manifest(tmp_path):
     folder = make_run(tmp_path / "lamp", sensors=2, views=[{"sensor": 0, "shown": 0.1}, {"sensor": 1}])
     assert re.findall(r"shown .*? times \w{6}", page_of(folder).sections["Images"]) == ["shown 10 times darker"]
     assert shown_exposures([{"sensor": 0, "shown": "x"}]) == shown_exposures(None) == {}
@@ -445,7 +445,7 @@ def test_nothing_scrolls_sideways(chromium, pages, name, width):
 
 
 @pytest.mark.parametrize("width", [400, 750, 1400])
-def test_no_number_is_broken(chromium, pages, width):
+def test_no_number_is_wrapped(chromium, pages, width):
     """Each is on one line of its own table cell."""
     broken = """[...document.querySelectorAll('.rows td, thead th')].filter(cell => {
         const walker = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT), range = document.createRange();
@@ -460,7 +460,7 @@ def test_no_number_is_broken(chromium, pages, width):
         assert chromium.evaluate(broken) == []
 
 
-def test_pictures_and_curves_are_there_without_script_and_network(chromium, pages):
+def test_pictures_and_curves_work_without_script_and_network(chromium, pages):
     page = pages["textures and colours"]
     chromium.open(page, 400, scripts=False)
     assert chromium.requests()[0] == page.absolute().as_uri()
@@ -513,7 +513,7 @@ def test_only_a_reliable_result_is_green(chromium, pages, tmp_path):
     assert colors == ["rgb(23, 112, 58)", "rgb(138, 75, 0)"]
 
 
-def test_a_page_of_everything_is_complete_in_itself(chromium, pages):
+def test_a_page_of_everything_is_self_contained(chromium, pages):
     chromium.open(pages[EVERYTHING], 1400)
     assert all(address.startswith("data:") for address in chromium.requests()[1:])
     assert chromium.evaluate("[...document.images].filter(i => !i.complete || i.naturalWidth == 0).length") == 0
@@ -522,7 +522,7 @@ def test_a_page_of_everything_is_complete_in_itself(chromium, pages):
     assert [event for event in chromium.events if event["method"] == "Log.entryAdded"] == []
 
 
-def test_the_page_of_a_run_at_work_loads_itself_again_until_it_is_over(chromium, pages, tmp_path, monkeypatch):
+def test_the_page_of_a_running_run_reloads_until_the_end(chromium, pages, tmp_path, monkeypatch):
     monkeypatch.setattr(page_module, "REFRESH_SECONDS", 1)
     folder = make_run(tmp_path / "run", iterations=3, truth=False)
     path = write_report(folder, read_manifest(folder) | {"status": "running"}, {})
@@ -535,7 +535,7 @@ def test_the_page_of_a_run_at_work_loads_itself_again_until_it_is_over(chromium,
     assert chromium.requests() == []
 
 
-def test_markup_in_names_does_nothing(chromium, pages):
+def test_markup_in_names_has_no_effect(chromium, pages):
     name = "long-" * 40 + "name"
     chromium.open(pages[name], 1400)
     assert chromium.evaluate("document.title") == name
@@ -543,7 +543,7 @@ def test_markup_in_names_does_nothing(chromium, pages):
 
 
 @pytest.mark.parametrize("dark", [False, True])
-def test_text_stands_out_from_what_is_behind_it(chromium, pages, dark):
+def test_text_has_contrast_with_its_background(chromium, pages, dark):
     """WCAG's contrast of 4.5, of every element that has text of its own, in light and in dark."""
     contrast = """(() => {
         const level = c => c / 255 <= 0.04045 ? c / 255 / 12.92 : ((c / 255 + 0.055) / 1.055) ** 2.4;

@@ -31,7 +31,7 @@ def test_colours_are_linear_srgb():
     assert ciede2000(np.full(3, 5.0), np.ones(3)) == pytest.approx(0, abs=1e-9)
 
 
-def test_images_that_are_the_same():
+def test_identical_images():
     image = texture(20, 24)
     found = image_errors(image, image, 1.0)
     assert (found["psnr_db"], found["ssim"]) == (None, pytest.approx(1, abs=1e-12))
@@ -39,12 +39,12 @@ def test_images_that_are_the_same():
     assert "not_finite" not in found
 
 
-def test_the_ratio_of_signal_to_noise():
+def test_the_signal_to_noise_ratio():
     """An offset of 0.1 everywhere is 20 dB."""
     assert psnr(np.full((4, 4, 3), 0.5), np.full((4, 4, 3), 0.6)) == pytest.approx(20)
 
 
-def test_images_are_compared_as_a_screen_shows_them():
+def test_images_are_compared_as_displayed():
     """In sRGB, where a linear 0.5 is 0.735357 and 0.214041 is 0.5, and where nothing is brighter than 1."""
     half, dark = np.full((4, 4, 3), 0.5), np.full((4, 4, 3), 0.214041)
     assert image_errors(half, dark, 1.0)["psnr_db"] == pytest.approx(-20 * np.log10(0.735357 - 0.5), rel=1e-4)
@@ -67,7 +67,7 @@ def test_errors_depend_on_the_exposure():
     assert dark["ciede2000"]["mean"] < 0.2 < 10 < bright["ciede2000"]["mean"]
 
 
-def test_what_is_not_finite_is_counted_and_black():
+def test_non_finite_pixels_are_counted_and_black():
     image, target = texture(16, 16), texture(16, 16)
     image[0, :2], image[1, 1, 0], target[0, :2], target[1, 1] = np.nan, np.inf, 0, (0, *target[1, 1, 1:])
     found = image_errors(image, target, 1.0)
@@ -102,7 +102,7 @@ def test_recovered_colours():
     assert not is_color("lens.translation", "length")
 
 
-def test_what_is_found_in_a_run_folder(tmp_path):
+def test_files_of_a_run_folder(tmp_path):
     folder = make_run(tmp_path / "lamp", sensors=2)
     about = {FLOOR: {"quantity": ""}, LAMP: {"quantity": "intensity"}, "gone": {}}
     found = seen_errors(folder, {"parameters": about})

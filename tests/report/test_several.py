@@ -72,7 +72,7 @@ def test_the_errors_of_runs_with_different_units_are_relative(tmp_path):
     assert "0.1 of the truth at worst" in page.row("Runs", "a")[6]
 
 
-def test_every_record_of_each_run_is_there(tmp_path):
+def test_every_record_of_each_run_is_shown(tmp_path):
     guided = GuidedRecord(guided=False, note="not measured").to_json()
     records = {"guided": guided, "memory": MEMORY, "scaling": SCALING, "plan": PLAN}
     page = page_of(
@@ -88,7 +88,7 @@ def test_every_record_of_each_run_is_there(tmp_path):
     assert page.row("Runs", "a")[2] == PLAN["estimator"]
 
 
-def test_the_plan_stands_on_the_page_of_one_run(tmp_path):
+def test_the_plan_is_on_the_page_of_one_run(tmp_path):
     page = page_of(make_run(tmp_path / "a", plan=PLAN, iterations=0))
     assert page.cells["Plan"][1:] == [
         ["masks", "yes", "the scene has masks"],
@@ -96,7 +96,7 @@ def test_the_plan_stands_on_the_page_of_one_run(tmp_path):
     ]
 
 
-def test_errors_as_people_see_them(tmp_path):
+def test_perceptual_errors(tmp_path):
     told = {"mean": 2.5, "max": 9.0}
     errors = {"psnr_db": 31.25, "ssim": 0.9, "ciede2000": told}
     same = errors | {"psnr_db": None, "ssim": None, "not_finite": 3}
@@ -114,7 +114,7 @@ def test_errors_as_people_see_them(tmp_path):
     assert [row[0] for row in both.cells[title][1:3]] == ["b start", "b end3 pixels not finite"]
 
 
-def test_measurements_are_known_by_what_is_in_them(tmp_path):
+def test_measurements_are_recognised_by_their_contents(tmp_path):
     write_bench(tmp_path / "x.jsonl")
     write_gradcheck(tmp_path / "y.txt")
     write_convergence(tmp_path / "z")
@@ -222,7 +222,7 @@ def test_names_stay_text(tmp_path):
     assert re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', markup) == []
 
 
-def test_the_same_name_twice_is_told_apart(tmp_path):
+def test_equal_names_are_distinguished(tmp_path):
     runs = [make_run(tmp_path / parent / "lamp") for parent in ("a", "b")]
     names = [source.name for source in read_sources(runs)]
     assert names == [str(run) for run in runs]
@@ -239,7 +239,7 @@ def test_the_same_name_twice_is_told_apart(tmp_path):
         (b'{"kind": "bench"}\n', "holds no line"),
     ],
 )
-def test_what_is_nothing_of_the_kind_is_one_located_line(tmp_path, content, line):
+def test_other_files_are_one_located_line(tmp_path, content, line):
     path = tmp_path / "x.jsonl"
     if content is not None:
         path.write_bytes(content)
@@ -249,7 +249,7 @@ def test_what_is_nothing_of_the_kind_is_one_located_line(tmp_path, content, line
     assert "\n" not in str(caught.value)
 
 
-def test_a_folder_that_is_nothing_of_the_kind(tmp_path):
+def test_other_folders(tmp_path):
     (tmp_path / "picture.exr").write_bytes(b"no image")
     with pytest.raises(ConfigError, match="is no run folder, no sweep and no folder of maps"):
         read_sources([tmp_path])
@@ -311,7 +311,7 @@ def test_damaged_metrics_are_named_and_the_rest_is_drawn(tmp_path):
     assert "svg" in page.tags
 
 
-def test_runs_that_have_hardly_begun(tmp_path):
+def test_runs_that_have_just_started(tmp_path):
     begun = make_run(tmp_path / "begun", iterations=0, status=Status.RUNNING, results={"parameters": {}})
     for path in begun.glob("images/*"):
         path.unlink()
@@ -340,7 +340,7 @@ KINDS = {
 
 
 @pytest.mark.parametrize("heading", KINDS)
-def test_the_page_says_what_does_it_again(tmp_path: Path, heading: str) -> None:
+def test_the_page_gives_the_command_to_repeat_it(tmp_path: Path, heading: str) -> None:
     file = tmp_path / "a.jsonl"
     KINDS[heading](file)
     title = f"{heading}: a.jsonl"

@@ -51,11 +51,11 @@ def test_numbers():
     assert (number(None), number(0.123456), number(1e6), number(0.5, 3)) == ("", "0.1235", "1e+06", "0.5")
 
 
-def test_one_of_a_thing_is_singular():
+def test_one_item_is_singular():
     assert [count(amount, "iteration") for amount in (0, 1, 2)] == ["0 iterations", "1 iteration", "2 iterations"]
 
 
-def test_keys_lose_their_middle():
+def test_keys_are_shortened_in_the_middle():
     assert shorten("floor.reflectance.data", 40) == "floor.reflectance.data"
     short = shorten("a_very_long_name.brdf_0.reflectance.data", 20)
     assert (len(short), short[:8], short[-8:]) == (20, "a_very_l", "nce.data")
@@ -71,7 +71,7 @@ def results(**changes):
     } | changes  # fmt: skip
 
 
-def test_without_a_truth_the_table_has_values_alone():
+def test_without_a_truth_the_table_has_only_values():
     assert parameter_lines(results(), 80) == [
         "parameter               start        end",
         "wall.reflectance.value  0.5 0.5 0.5  0.123 0.2 0.3",
@@ -100,7 +100,7 @@ def test_many_parameters_are_a_few_lines():
     assert lines[-1] == "and 28 more parameters, on the page"
 
 
-def test_a_run_that_ended_before_it_began_has_no_table():
+def test_a_run_without_iterations_has_no_table():
     assert parameter_lines({}, 80) == []
     assert parameter_lines(results(parameters={"a": {"initial": None}}), 80) == []
 
@@ -119,7 +119,7 @@ def trend(change, start=0.0131, end=0.0133):
     return {"start": {"mean": start, "error": 0.0004}, "end": {"mean": end, "error": 0.0004}, "change": change}
 
 
-def test_what_is_said_of_the_loss():
+def test_statements_about_the_loss():
     assert warnings(results(loss_trend=trend("fell"))) == warnings(results(loss_trend=trend("unclear"))) == []
     flat = "the loss did not fall (0.0131 +- 0.0004 at the start, 0.0133 +- 0.0004 at the end)"
     assert warnings(results(loss_trend=trend("flat"))) == [flat]
@@ -131,7 +131,7 @@ def test_what_is_said_of_the_loss():
     assert warnings(results(loss_trend=trend("flat"), image_loss={"initial": 0.01, "final": None})) == [flat]
 
 
-def test_the_worst_are_named():
+def test_the_worst_parameters_are_named():
     pairs = {f"part{n}": {"initial": 0.1, "final": 0.1 + 0.1 * n} for n in range(1, 7)}
     lines = warnings(results(worse=list(pairs), parameter_rmse=pairs))
     assert lines[0] == "part6 got worse (RMSE 0.1 to 0.7)"
@@ -171,12 +171,12 @@ def judged(about, **measured):
      "more iterations", "--set run.iterations=680"),
     (judged({}, trend=trend("fell", 26.0, 0.3) | {"late": "flat"}), "scale: auto", "--set optimizer.scale=auto"),
 ])  # fmt: skip
-def test_a_value_that_still_moves_is_told_what_helps(found, words, setting):
+def test_a_moving_value_gets_a_remedy(found, words, setting):
     assert parameter_lines(found, 120)[1].endswith(f"still moving: {words}")
     assert f"not converged, still moving: lamp.radiance.value ({words}: {setting})" in warnings(found)
 
 
-def test_noise_of_the_target_is_told_from_that_of_the_run():
+def test_noise_of_the_target_is_told_from_noise_of_the_run():
     noisy = {"verdict": "below the noise", "shares": {"below the noise": 1.0}, "spread": [3.0], "of_target": [2.9]}
     found = judged(noisy)
     assert parameter_lines(found, 120)[1].endswith("below the noise of the target: more samples for it")
@@ -188,14 +188,14 @@ def test_noise_of_the_target_is_told_from_that_of_the_run():
     assert len(parameter_lines(found, 120)) == 2
 
 
-def test_a_spread_that_leaves_out_the_targets_noise_says_so():
+def test_a_spread_without_the_noise_of_the_target_is_marked():
     found = judged({}, target_noise="left out")
     assert parameter_lines(found, 120)[-1] == (
         "spread: by the noise of the run; noise and errors of targets are not in it"
     )
 
 
-def test_what_no_view_shows_is_told_beside_what_is_settled():
+def test_invisible_parts_are_reported_beside_settled_ones():
     shares = {"settled": 0.58, "still moving": 0.02, "not seen": 0.4}
     found = judged({"verdict": "settled", "shares": shares})
     assert parameter_lines(found, 120)[1].endswith("settled (58 %), 40 % not seen")

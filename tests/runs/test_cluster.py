@@ -75,14 +75,14 @@ def end(course: RunProgress, after: Callable[[int], object] = lambda iteration: 
         return course.problem.values() | ({} if guiding is None else guiding.state()[1])
 
 
-def test_workers_come_to_the_numbers_of_one_process(experiment: Path) -> None:
+def test_workers_give_the_results_of_one_process(experiment: Path) -> None:
     check(experiment, "guided, scaled", 2)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("workers", [1, 2, 3, 5])
 @pytest.mark.parametrize("case", CASES)
-def test_any_number_of_workers_comes_to_the_same(experiment: Path, case: str, workers: int) -> None:
+def test_any_number_of_workers_gives_the_same(experiment: Path, case: str, workers: int) -> None:
     check(experiment, case, workers)
 
 
@@ -99,7 +99,7 @@ OWN_SETS = ["run.shards=3", "run.adjoint=batched", "loss={type: custom, file: ow
             "integrator={type: custom, file: own.py:BasicPRBIntegrator, max_depth: 3}"]  # fmt: skip
 
 
-def test_workers_run_a_users_code_where_the_run_may(experiment: Path) -> None:
+def test_workers_run_users_code_with_permission(experiment: Path) -> None:
     (experiment / "own.py").write_text(OWN)
     compare(experiment, OWN_SETS, 1)
     course = make(experiment, *OWN_SETS)
@@ -146,7 +146,9 @@ SCENE = """\
 QUAD = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
 
 
-def test_a_bundle_has_all_that_an_experiment_reads(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bundle_contains_all_files_of_an_experiment(
+    llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Includes, folders of <path>, variables, meshes, textures, initial values and cameras, wherever they are; in the
     end nothing of the experiment's own folder is read."""
     rng, where = np.random.default_rng(1), made(tmp_path / "here")
@@ -197,7 +199,7 @@ def reads(folder: Path, threads: int) -> tuple[str, dict[str, float]]:
     return (folder / "a").read_text(), {"reads": 0.5}
 
 
-def test_a_worker_says_what_it_lacks(as_worker: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_reports_missing_requirements(as_worker: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another version and code that is not asked for stand against it for good; files are sent once."""
     opening = worker.Opening("1", reads)
     other = worker.Opening("1", reads, versions={"mitsuba": "0.1"})
@@ -220,7 +222,7 @@ def test_a_worker_says_what_it_lacks(as_worker: None, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(("shown", "seen"), [("3,5", "5"), ("7", "7"), ("0,1,2", "1")])
-def test_workers_see_a_gpu_each(as_worker: None, monkeypatch: pytest.MonkeyPatch, shown: str, seen: str) -> None:
+def test_each_worker_sees_one_gpu(as_worker: None, monkeypatch: pytest.MonkeyPatch, shown: str, seen: str) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", shown)
     worker.open_state(worker.Opening("1", reads), {"a": b""}, 1)
     assert os.environ["CUDA_VISIBLE_DEVICES"] == seen
@@ -281,7 +283,7 @@ def spoil(act: Callable[[], object]) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("workers", [1, 2])
 @pytest.mark.parametrize("fault", [hang, run_full, take_memory])
-def test_workers_that_fail_are_started_anew(
+def test_failing_workers_are_restarted(
     experiment: Path, monkeypatch: pytest.MonkeyPatch, fault: Callable[[], None], workers: int
 ) -> None:
     """One of them, in the midst of a run, which ends the same, and is never held up for longer than a minute."""
@@ -300,7 +302,7 @@ def test_workers_that_fail_are_started_anew(
 
 
 @pytest.mark.long
-def test_who_takes_twenty_times_as_long_is_not_waited_for(experiment: Path) -> None:
+def test_a_very_slow_worker_is_not_waited_for(experiment: Path) -> None:
     """A worker that has a twentieth of its time, from the second iteration on."""
     stopped = threading.Event()
 
@@ -409,7 +411,7 @@ def said(net, process) -> str:
 
 
 @pytest.mark.long
-def test_hosts_without_another_way_come_to_the_same(net, tmp_path: Path) -> None:
+def test_isolated_hosts_give_the_same(net, tmp_path: Path) -> None:
     """One is cut off for 20 seconds in the midst; who has no certificate is refused."""
     more = tiny.settings("run.iterations=40", "run.spp=64")
     local = reslrb(net, 2, *RUN, *more, "--cluster", "local:2", "--set", "run.name=local")
@@ -434,7 +436,7 @@ def test_hosts_without_another_way_come_to_the_same(net, tmp_path: Path) -> None
 
 @pytest.mark.long
 @pytest.mark.parametrize("whom", ["scheduler", "coordinator"])
-def test_five_kills_of_who_is_alone_are_gone_on_with(net, tmp_path: Path, whom: str) -> None:
+def test_a_single_worker_survives_five_kills(net, tmp_path: Path, whom: str) -> None:
     """One line within a minute, and the same parameters by --resume."""
     more = tiny.settings("run.iterations=60", "run.spp=64", "run.checkpoint_every={iterations: 5}")
     local = reslrb(net, 2, *RUN, *more, "--cluster", "local:2", "--set", "run.name=local")
@@ -496,12 +498,12 @@ BAD = [
 
 
 @pytest.mark.parametrize(("arguments", "message"), BAD)
-def test_what_cannot_be_shared_out_is_refused(experiment: Path, capsys, arguments, message) -> None:
+def test_undistributable_work_is_refused(experiment: Path, capsys, arguments, message) -> None:
     assert optimize("tiny.yaml", *arguments) == 2
     assert message in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_without_dask_it_says_what_to_install(experiment: Path, capsys, monkeypatch) -> None:
+def test_without_dask_the_installation_is_explained(experiment: Path, capsys, monkeypatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert optimize("tiny.yaml", "--cluster", "local:2", "--set", "run.shards=4") == 2
     assert "pip install reslrb[cluster]" in capsys.readouterr().err

@@ -44,7 +44,7 @@ class Counting:
         return SharedTime((self.where,), 1.25 * self.calls, self.calls, 0.0, workers)
 
 
-def test_a_run_that_goes_on_elsewhere_adds_up(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_times_of_a_resumed_run_add_up(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two rounds of four shards an iteration; also where only the state knows, as after a kill."""
 
     @contextmanager
@@ -66,13 +66,13 @@ def test_a_run_that_goes_on_elsewhere_adds_up(experiment: Path, monkeypatch: pyt
     assert "calls also sent to others" in Path("runs/tiny/report.html").read_text()
 
 
-def test_a_run_by_itself_has_none(experiment: Path) -> None:
+def test_a_local_run_has_no_cluster_time(experiment: Path) -> None:
     assert optimize("tiny.yaml", *QUICK, "--set", "run.iterations=1") == 0
     assert shared() is None
 
 
 @pytest.mark.long
-def test_what_workers_did_is_all_there(experiment: Path) -> None:
+def test_all_work_of_workers_is_counted(experiment: Path) -> None:
     """Of each worker its calls, and of the iterations no more than they took."""
     run = ["tiny.yaml", *QUICK, "--cluster", "local:2"]
     assert optimize(*run, "--set", "run.iterations=4") == 0

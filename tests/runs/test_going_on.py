@@ -132,9 +132,7 @@ def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 
 @pytest.mark.parametrize("case", a_few(CASES, FEW))
-def test_a_killed_run_goes_on_as_if_nothing_had_been(
-    case: str, experiment: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_killed_run_resumes_to_the_same_end(case: str, experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It was killed three iterations after its newest state, which are done again."""
     sets = [word for setting in CASES[case] for word in ("--set", setting)]
     at, newest = KILLED.get(case, (15, 12))
@@ -151,9 +149,7 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(
     assert (resumed["iteration"], resumed["changed"]) == (newest, {})
 
 
-def test_killed_in_each_of_five_stages_it_ends_as_if_nothing_had_been(
-    experiment: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_killed_in_five_stages_resumes_to_the_same_end(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the midst of a stage, and at the moment at which the next one begins; from each state a life goes on."""
     settings = ["run.checkpoint_every={iterations: 1}", "run.certainty=false", FIVE_STAGES]
     sets = [word for setting in settings for word in ("--set", setting)]
@@ -175,7 +171,7 @@ def test_killed_in_each_of_five_stages_it_ends_as_if_nothing_had_been(
     assert differences(whole, left) == []
 
 
-def test_a_run_goes_on_whose_tables_were_just_found_wrong(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_with_wrong_tables_resumes(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its newest state is that of a moment at which gradients are counted anew."""
     right = Learned.with_more
 
@@ -191,7 +187,7 @@ def test_a_run_goes_on_whose_tables_were_just_found_wrong(experiment: Path, monk
     assert differences(whole, left) == []
 
 
-def test_a_run_that_went_on_can_go_on_again(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_resumed_run_can_be_resumed_again(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And a finished one has more iterations, as many as it would have had at once."""
     assert optimize("tiny.yaml", "--quiet", *ITERATIONS, *SIMPLE, "--set", "run.name=whole") == 0
     assert optimize("tiny.yaml", "--quiet", *ITERATIONS, "--set", "run.iterations=7", *SIMPLE) == 0
@@ -222,7 +218,7 @@ def _another_seed(run_seed, iteration, view, purpose):
         ["no moments"],
     ),
 )
-def test_what_is_not_taken_up_is_missed(fault: str, experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lost_state_is_detected(fault: str, experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Planted: each part of the state is left out in turn."""
     from reslrb_cli.runs import prepare, resume
 
@@ -254,7 +250,7 @@ def test_what_is_not_taken_up_is_missed(fault: str, experiment: Path, monkeypatc
     assert differences(whole, left) != []
 
 
-def test_a_state_is_what_it_was_when_it_was_taken(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_state_survives_a_round_trip(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A failure in the midst of an update leaves the state of the last whole iteration to be kept."""
     step, calls = optimizers.Optimizer.step, []
 
@@ -275,7 +271,7 @@ def test_a_state_is_what_it_was_when_it_was_taken(experiment: Path, monkeypatch:
     assert differences(Path("runs/whole"), RUN) == []
 
 
-def test_the_best_values_are_those_of_the_least_mean(experiment: Path) -> None:
+def test_the_best_values_have_the_lowest_mean(experiment: Path) -> None:
     assert optimize("tiny.yaml", "--quiet", *ITERATIONS, *SIMPLE) == 0
     losses = [record["loss"] for record in records_of(RUN)]
     means = [np.mean(losses[end - 10 : end]) for end in range(10, 19)]
@@ -334,9 +330,7 @@ def kill_at_random(process: subprocess.Popen[str], run: Path, chance: random.Ran
 @pytest.mark.parametrize(
     ("kills", "iterations"), [(1, 30), pytest.param(50, 1200, marks=pytest.mark.long)], ids=["one", "fifty"]
 )
-def test_a_run_that_is_killed_again_and_again_ends_where_the_other_does(
-    tmp_path: Path, kills: int, iterations: int
-) -> None:
+def test_a_repeatedly_killed_run_reaches_the_same_end(tmp_path: Path, kills: int, iterations: int) -> None:
     tiny.write_experiment(tmp_path)
     length = ["--set", f"run.iterations={iterations}"]
     with pytest.MonkeyPatch.context() as patch:
@@ -375,7 +369,7 @@ def test_a_run_that_is_killed_again_and_again_ends_where_the_other_does(
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="sends SIGKILL")
 @pytest.mark.long
-def test_a_run_that_is_killed_in_each_of_its_five_stages_ends_where_the_other_does(tmp_path: Path) -> None:
+def test_a_run_killed_in_each_stage_reaches_the_same_end(tmp_path: Path) -> None:
     tiny.write_experiment(tmp_path)
     of_each, chance = 80, random.Random(7)
     sets = [*SETS, "--set", f"run.iterations={5 * of_each}", "--set", FIVE_STAGES]
@@ -407,7 +401,7 @@ SIZES = [8, 48, 96, 128, 160, 256, 512]
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="sends SIGKILL")
 @pytest.mark.long
 @pytest.mark.parametrize("kib", SIZES)
-def test_a_run_whose_disk_was_full_goes_on_when_there_is_room(tmp_path: Path, disk: Path, kib: int) -> None:
+def test_a_run_with_a_full_disk_resumes_when_there_is_room(tmp_path: Path, disk: Path, kib: int) -> None:
     tiny.write_experiment(tmp_path)
     mount(disk, kib)
     output = ["--set", f"run.output={disk}/runs"]
@@ -435,7 +429,7 @@ def test_a_run_whose_disk_was_full_goes_on_when_there_is_room(tmp_path: Path, di
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="sends SIGKILL")
 @pytest.mark.long
-def test_with_several_threads_it_is_no_farther_off_than_runs_are_from_each_other(tmp_path: Path) -> None:
+def test_with_several_threads_it_differs_no_more_than_repeated_runs(tmp_path: Path) -> None:
     """Twice the largest distance among five whole runs, as large as sums in another order make it."""
     tiny.write_experiment(tmp_path)
     script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"

@@ -73,7 +73,7 @@ WRONG: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_a_state_that_does_not_fit_is_told_in_a_line(case: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unfitting_state_is_one_line(case: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arrays, values, message = WRONG[case]
     rewritten(run, arrays, values)
     if case == "no state":
@@ -93,7 +93,7 @@ DAMAGED: dict[str, Callable[[bytes], bytes]] = {
 
 
 @pytest.mark.parametrize("case", DAMAGED)
-def test_a_damaged_state_is_told(case: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_damaged_state_is_reported(case: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in (STATE, PREVIOUS):
         (run / name).write_bytes(DAMAGED[case]((run / name).read_bytes()))
     line = told(capsys, run)
@@ -101,7 +101,7 @@ def test_a_damaged_state_is_told(case: str, run: Path, capsys: pytest.CaptureFix
     assert "is damaged, cut off, or not written by reslrb" in line
 
 
-def test_the_state_before_is_taken_and_that_is_said(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_previous_state_is_used_and_reported(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (run / STATE).write_bytes((run / STATE).read_bytes()[:-40])
     assert optimize("--resume", str(run)) == 0
     err = capsys.readouterr().err
@@ -113,7 +113,7 @@ def test_the_state_before_is_taken_and_that_is_said(run: Path, capsys: pytest.Ca
         assert int(previous["iteration"]) == 5
 
 
-def test_what_differs_is_shown(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_differences_are_shown(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert told(capsys, run, "--set", "run.spp=8").startswith("--set: run.spp: is 8, 4 in the run; ")
     line = told(capsys, run, *(word for each in ("run.seed=1", "run.spp=8", "loss.type=l1", "run.final_spp=9")
                                for word in ("--set", each)))  # fmt: skip
@@ -123,7 +123,7 @@ def test_what_differs_is_shown(run: Path, capsys: pytest.CaptureFixture[str]) ->
     assert told(capsys, run).startswith("config.yaml: integrator.max_depth: is 4, 3 in the run; ")
 
 
-def test_who_changed_it_is_named(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_source_of_a_change_is_named(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Not an override that may change what it does, beside a file in which something else was changed."""
     text = (run / "config.yaml").read_text()
     (run / "config.yaml").write_text(text.replace("max_depth: 3", "max_depth: 4"))
@@ -131,7 +131,7 @@ def test_who_changed_it_is_named(run: Path, capsys: pytest.CaptureFixture[str]) 
     assert line.startswith("config.yaml: integrator.max_depth: is 4, 3 in the run; ")
 
 
-def test_a_scene_that_changed_is_another_experiment(
+def test_a_changed_scene_is_another_experiment(
     run: Path, interrupted: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene = interrupted.parents[1] / "scene.xml"
@@ -143,7 +143,7 @@ def test_a_scene_that_changed_is_another_experiment(
         scene.write_text(text)
 
 
-def test_what_may_change_is_said_in_the_manifest(run: Path, tmp_path: Path) -> None:
+def test_changeable_settings_are_in_the_manifest(run: Path, tmp_path: Path) -> None:
     """Iterations, learning rates, and the folder, in which case the first one stays as it was."""
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     sets = ["run.iterations=7", "optimizer.learning_rate=0.1", f"run.output={tmp_path}/other"]
@@ -156,7 +156,7 @@ def test_what_may_change_is_said_in_the_manifest(run: Path, tmp_path: Path) -> N
     assert {path.name for path in run.iterdir()} == {path.name for path in (tmp_path / "other/tiny").iterdir()}
 
 
-def test_a_run_that_is_done_says_so(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_finished_run_is_reported(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert optimize("--resume", str(run), "--quiet") == 0
     before = (run / "manifest.json").read_bytes()
     capsys.readouterr()
@@ -166,7 +166,7 @@ def test_a_run_that_is_done_says_so(run: Path, capsys: pytest.CaptureFixture[str
     assert "run.iterations: is 5; the run has done 6 already" in told(capsys, run, "--set", "run.iterations=5")
 
 
-def test_no_run_is_told(tmp_path: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_run_is_reported(tmp_path: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert told(capsys, tmp_path / "nothing") == f"{tmp_path}/nothing: no such folder"
     (tmp_path / "empty").mkdir()
     assert "is no run's folder" in told(capsys, tmp_path / "empty")
@@ -175,12 +175,12 @@ def test_no_run_is_told(tmp_path: Path, run: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.skipif(os.name != "posix", reason="no locks")
-def test_a_run_at_work_is_left_alone(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_running_run_is_left_alone(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with FolderLock(run):
         assert "is in use by a run (process" in told(capsys, run)
 
 
-def test_lines_that_were_lost_are_told(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_lost_lines_are_reported(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lines = (run / "metrics.jsonl").read_bytes().splitlines(keepends=True)
     (run / "metrics.jsonl").write_bytes(b"".join(lines[:2]))
     assert told(capsys, run).startswith("metrics.jsonl: holds 2 of the 4 iterations of the checkpoint; put it back")
@@ -191,9 +191,7 @@ def test_lines_that_were_lost_are_told(run: Path, capsys: pytest.CaptureFixture[
     assert [record["iteration"] for record in records_of(run)] == list(range(6))
 
 
-def test_a_folder_that_cannot_be_written_to_is_told(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unwritable_folder_is_reported(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """And the run can go on in another."""
     place = tmp_path / "disk"
     place.mkdir()

@@ -79,7 +79,7 @@ def directions(scene, number):
 
 
 @pytest.mark.parametrize("write", [write_nerf, write_colmap])
-def test_a_point_is_seen_where_the_camera_has_it(folder, write):
+def test_a_point_projects_to_its_pixel(folder, write):
     scene = load_scene(folder / "scene.xml", cameras=write(folder))
     assert [sensor.id() for sensor in scene.sensors()] == ["a", "b"]
     film = scene.sensors()[1].film()
@@ -96,7 +96,7 @@ def make(folder, cameras, run="", say=None):
     return assemble(loads(text, str(folder / "tiny.yaml")), *([] if say is None else [say]))
 
 
-def test_the_cameras_images_are_the_targets(folder):
+def test_images_of_the_cameras_are_the_targets(folder):
     assert write_nerf(folder).name == "transforms.json"
     problem = make(folder, "transforms.json")
     assert [view.wanted.file.name for view in problem.views] == ["a.exr", "b.exr"]
@@ -108,7 +108,7 @@ def test_the_cameras_images_are_the_targets(folder):
         make(folder, "transforms.json")
 
 
-def test_the_cameras_images_are_not_turned(folder):
+def test_images_of_the_cameras_are_not_rotated(folder):
     """COLMAP looks for cameras that see pixels as they lie in the file."""
     from PIL import Image  # comes with matplotlib
 
@@ -123,7 +123,7 @@ def test_the_cameras_images_are_not_turned(folder):
     assert any(line.startswith(f"{folder}/a.png: not turned by 90 degrees clockwise") for line in said), said
 
 
-def test_a_size_that_is_not_said_is_the_images(folder):
+def test_a_missing_size_is_taken_from_the_images(folder):
     path = write_nerf(folder, w=None, h=None, fl_x=None, fl_y=None, camera_angle_x=1.2)
     [camera, _] = read_cameras(path)
     assert camera.size == (WIDTH, HEIGHT)
@@ -143,7 +143,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("changes", "message"), BAD)
-def test_what_is_wrong_in_a_transforms_json(folder, changes, message):
+def test_errors_in_a_transforms_json(folder, changes, message):
     with pytest.raises(ConfigError, match=message):
         read_cameras(write_nerf(folder, **changes))
 
@@ -157,7 +157,7 @@ def test_what_is_wrong_in_a_transforms_json(folder, changes, message):
         ("PINHOLE 40 24 50 51 20 12", "cameras.txt:2: has focal lengths 50 and 51"),
     ],
 )
-def test_what_is_wrong_in_a_cameras_txt(folder, model, message):
+def test_errors_in_a_cameras_txt(folder, model, message):
     with pytest.raises(ConfigError, match=message):
         read_cameras(write_colmap(folder, model))
     assert len(read_cameras(write_colmap(folder, "SIMPLE_RADIAL 40 24 50 20 12 0"))) == 2

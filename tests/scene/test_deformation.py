@@ -78,7 +78,7 @@ def turn(degrees: Any) -> np.ndarray:
 POSE = {"translation": [0.1, -0.2, 0.3], "rotation": [20, -30, 40], "scale": 1.5}
 
 
-def test_a_mesh_is_scaled_then_turned_then_moved(scene):
+def test_a_mesh_is_scaled_rotated_and_translated_in_this_order(scene):
     before = positions(select(scene, motion("box")))
     selection = select(scene, motion("box", pivot=[1, 2, 3], initial=POSE))
     assert selection.keys == ["box.translation", "box.rotation", "box.scale"]
@@ -106,7 +106,7 @@ def test_axes_move_alone(scene):
     assert [float(dr.grad(leaf)[0]) / len(before) for leaf in leaves.values()] == pytest.approx([1, 10])
 
 
-def test_all_turn_about_the_centre_of_their_box(scene):
+def test_all_parts_rotate_about_the_centre_of_their_box(scene):
     before = {key: positions(select(scene, motion("box")), key) for key in (MESH, "other.vertex_positions")}
     together = np.concatenate(list(before.values()))
     centre = (together.min(0) + together.max(0)) / 2
@@ -144,7 +144,7 @@ def test_a_heightmap_displaces_along_the_initial_normals(scene):
     assert np.allclose(positions(selection), before + 0.25 * normals, atol=1e-5)
 
 
-def test_a_heightmap_is_bilinear_between_texels_and_clamped_beyond(scene):
+def test_a_heightmap_is_bilinear_and_clamped_outside(scene):
     import mitsuba as mi
 
     from reslrb_cli.scene.deformation import _corners
@@ -156,14 +156,14 @@ def test_a_heightmap_is_bilinear_between_texels_and_clamped_beyond(scene):
     assert np.allclose(found, [0, 0, 1, (0.3 * 0 + 0.7 * 1 + 0.3 * 10 + 0.7 * 20) / 2, 40, 40, 1], atol=1e-4)
 
 
-def test_flipped_normals_point_the_other_way(make_scene):
+def test_flipped_normals_reverse_the_displacement(make_scene):
     scene = make_scene(box={"type": "cube", "flip_normals": True})
     assert np.abs(positions(select(scene, heightmap("box", initial=0.25)))).max() == pytest.approx(1.0)
     scene = make_scene(box={"type": "cube"})
     assert np.abs(positions(select(scene, heightmap("box", initial=0.25)))).max() == pytest.approx(1.25)
 
 
-def test_a_heightmap_moves_with_its_mesh_and_one_map_serves_several(scene):
+def test_a_heightmap_moves_with_its_mesh_and_can_serve_several(scene):
     plain = select(scene, motion("box"))
     before, normals = positions(plain), np.array(plain.params["box.vertex_normals"]).reshape(-1, 3)
     other = positions(plain, "other.vertex_positions")
@@ -184,7 +184,7 @@ def test_interpolated_normals_follow(scene):
     assert not np.allclose(normals[0], [0, -1, 0], atol=0.1)
 
 
-def test_gradients_come_back_to_what_moves(scene):
+def test_gradients_reach_the_moving_parameters(scene):
     """Central differences of where the vertices are, weighted as a step would."""
     import drjit as dr
     import mitsuba as mi
@@ -221,7 +221,7 @@ def test_gradients_come_back_to_what_moves(scene):
             assert gradient[entry] == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=2e-3, abs=2e-3), key
 
 
-def test_a_gradient_that_is_not_finite_is_not_lost(llvm):
+def test_a_non_finite_gradient_is_not_lost(llvm):
     """Where no other vertex shares its texels, atomic sums would drop it."""
     import drjit as dr
     import mitsuba as mi
@@ -313,14 +313,14 @@ def test_refused(scene, parameters, where, what):
         ({MESH: 0.0}, "depends on `box.translation`"),
     ],
 )
-def test_true_values_are_refused_where_they_stand(scene, values, what):
+def test_refused_true_values_are_located(scene, values, what):
     with pytest.raises(ConfigError) as error:
         set_values(scene, specs(motion("box", "translation")), values, "c.yaml", "target.render.parameters")
     assert error.value.key == f"target.render.parameters.{next(iter(values))}"
     assert what in error.value.message
 
 
-def test_a_mesh_that_emits_moves(scene):
+def test_an_emitting_mesh_moves(scene):
     before = positions(select(scene, motion("box", "translation")))
     selection = select(scene, motion("glow", "translation"))
     assert selection.keys == ["glow.translation"]

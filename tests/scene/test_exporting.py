@@ -182,7 +182,7 @@ def images(scene: mi.Scene, seeds: range, spp: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("names", [TOGETHER, *([name] for name in KINDS if name not in TOGETHER)], ids="/".join)
-def test_mitsuba_reads_back_what_was_recovered(names: list[str], file: Path, tmp_path: Path) -> None:
+def test_mitsuba_reads_back_the_recovered_values(names: list[str], file: Path, tmp_path: Path) -> None:
     before = mi.traverse(described(file, ["floor.*"])[0])
     _, description, selection = changed(file, names)
     export(description, selection, tmp_path / "out")
@@ -194,7 +194,7 @@ def test_mitsuba_reads_back_what_was_recovered(names: list[str], file: Path, tmp
         assert own.shape != old.shape or not np.allclose(own, old, rtol=1e-3), f"{key} was not changed"
 
 
-def test_the_image_of_all_together_is_that_of_the_scene(file: Path, tmp_path: Path) -> None:
+def test_the_image_of_all_parameters_equals_that_of_the_scene(file: Path, tmp_path: Path) -> None:
     scene, description, selection = changed(file, TOGETHER)
     export(description, selection, tmp_path / "out")
     ours, theirs = (
@@ -208,7 +208,7 @@ def test_the_image_of_all_together_is_that_of_the_scene(file: Path, tmp_path: Pa
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", KINDS)
-def test_the_image_is_that_of_the_scene(name: str, file: Path, tmp_path: Path) -> None:
+def test_the_image_equals_that_of_the_scene(name: str, file: Path, tmp_path: Path) -> None:
     scene, description, selection = changed(file, [name])
     export(description, selection, tmp_path / "out")
     theirs = images(mi.load_file(str(tmp_path / "out/scene.xml")), range(100, 112), 64)
@@ -216,7 +216,7 @@ def test_the_image_is_that_of_the_scene(name: str, file: Path, tmp_path: Path) -
     assert result, result
 
 
-def test_it_is_loaded_without_us_from_wherever_it_lies(file: Path, tmp_path: Path) -> None:
+def test_it_is_loaded_by_mitsuba_alone_from_any_folder(file: Path, tmp_path: Path) -> None:
     _, description, selection = changed(file, TOGETHER)
     export(description, selection, tmp_path / "out")
     moved = (tmp_path / "out").rename(tmp_path / "moved")
@@ -244,7 +244,7 @@ print(mi.load_file({str(moved / "scene.xml")!r}))"""
         ("Cylinder_1.bsdf.brdf_0.clearcoat.value", "no such lobe .* had no effect"),
     ],
 )
-def test_what_cannot_be_said_is_refused_and_nothing_is_left(key: str, reason: str, file: Path, tmp_path: Path) -> None:
+def test_inexpressible_values_are_refused_without_output(key: str, reason: str, file: Path, tmp_path: Path) -> None:
     scene, description = described(file)
     selection = select_parameters(scene, [ParameterSpec(key=key, initial=0.5)], "c.yaml")
     with pytest.raises(ConfigError, match=rf"{key}: cannot be exported: .*{reason}"):
@@ -252,7 +252,7 @@ def test_what_cannot_be_said_is_refused_and_nothing_is_left(key: str, reason: st
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_mitsuba_reads_otherwise_is_refused_and_nothing_is_left(
+def test_values_that_mitsuba_reads_differently_are_refused_without_output(
     file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from reslrb_cli.scene import export as replacing

@@ -79,7 +79,7 @@ SIMILAR = ("lens_pose", "caustic_slab", "caustic_heightmap")
         for file in SHIPPED
     ],
 )  # fmt: skip
-def test_what_is_loaded_is_what_mitsuba_loads(file):
+def test_loaded_scenes_equal_those_of_mitsuba(file):
     import mitsuba as mi
 
     size = {"resx": 24, "resy": 24} if 'name="resx"' in file.read_text() else {}
@@ -109,7 +109,7 @@ OLD = """<scene version="0.6.0">
 </scene>"""
 
 
-def test_variables_includes_and_folders_are_mitsubas(tmp_path):
+def test_variables_includes_and_folders_work_as_in_mitsuba(tmp_path):
     import mitsuba as mi
 
     (tmp_path / "parts").mkdir()
@@ -207,7 +207,7 @@ MENDED = [
 
 
 @pytest.mark.parametrize(("part", "text", "said"), MENDED, ids=[said.partition(":")[0][:40] for _, _, said in MENDED])
-def test_what_is_mended_is_said_with_its_line(tmp_path, caplog, part, text, said):
+def test_repairs_are_reported_with_their_line(tmp_path, caplog, part, text, said):
     expected = values(load_scene(write(tmp_path)))
     assert not caplog.records
     file = write(tmp_path, **{part: text})
@@ -220,14 +220,14 @@ def test_what_is_mended_is_said_with_its_line(tmp_path, caplog, part, text, said
     assert file.read_bytes() == before
 
 
-def test_what_is_left_out_is_named_as_the_file_has_it(tmp_path, caplog):
+def test_omissions_are_named_as_in_the_file(tmp_path, caplog):
     file = write(tmp_path, film=PARTS["film"] + '<boolean name="highQualityEdges" value="true"/>')
     load_scene(file)
     [record] = caplog.records
     assert record.getMessage() == f"{file}:6: hdrfilm has no parameter `highQualityEdges` in Mitsuba 3: left out"
 
 
-def test_one_line_for_one_kind_of_thing(tmp_path, caplog):
+def test_similar_repairs_are_one_line(tmp_path, caplog):
     shape = PARTS["shape"].replace("<ref", '<float name="weight" value="3"/><ref')
     file = write(tmp_path, shape="\n".join([shape] * 9))
     load_scene(file)
@@ -258,7 +258,7 @@ def test_the_scenes_own_integrator_is_not_loaded(tmp_path, caplog):
     assert not caplog.records
 
 
-def test_references_to_what_is_left_out_are_left_out(tmp_path, caplog):
+def test_references_to_omitted_objects_are_omitted(tmp_path, caplog):
     points, own = (
         '<sampler type="halton" id="points"/>',
         '<integrator type="x"><sampler type="stratified" id="own"/></integrator>',
@@ -268,13 +268,13 @@ def test_references_to_what_is_left_out_are_left_out(tmp_path, caplog):
     assert len(caplog.records) == 1
 
 
-def test_objects_of_one_name_are_all_there(tmp_path):
+def test_objects_with_one_name_are_all_kept(tmp_path):
     # Mitsuba drops the first: a name is that of a parameter
     shape = PARTS["shape"].replace("<shape", '<shape name="mesh"')
     assert len(load_scene(write(tmp_path, shape=shape + shape)).shapes()) == 2
 
 
-def test_files_are_found_where_backslashes_part_folders(tmp_path, caplog):
+def test_paths_with_backslashes_are_found(tmp_path, caplog):
     import mitsuba as mi
 
     (tmp_path / "textures").mkdir()
@@ -285,7 +285,7 @@ def test_files_are_found_where_backslashes_part_folders(tmp_path, caplog):
 
 
 @pytest.mark.parametrize("text", ["<!-- - -- what a -- rule -->", "<!-- \n -->", "Tom & Jerry", "<!DOCTYPE scene>"])
-def test_what_mitsubas_parser_lets_pass(tmp_path, text, caplog):
+def test_input_tolerated_by_the_parser_of_mitsuba(tmp_path, text, caplog):
     head = text + PARTS["head"] if "DOCTYPE" in text else PARTS["head"] + text
     load_scene(write(tmp_path, head=head))
     assert not caplog.records
@@ -311,7 +311,7 @@ def test_encodings(tmp_path, encoding):
         ("light", '<path value="none"/>', "<path>: folder `none` not found"),
     ],
 )
-def test_what_cannot_be_mended_is_refused(tmp_path, part, text, said):
+def test_irreparable_scenes_are_refused(tmp_path, part, text, said):
     file = write(tmp_path, **{part: text})
     with pytest.raises(ConfigError) as error:
         load_scene(file)
@@ -404,7 +404,7 @@ def test_a_material_has_the_colour_of_the_same_spectrum_written_inline(tmp_path:
     np.testing.assert_array_equal(found, inline)
 
 
-def test_a_mended_spectrum_is_named_with_its_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_repaired_spectrum_is_named_with_its_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     file = write_spectrum(tmp_path, IRREGULAR.format('name="reflectance"'))
     with caplog.at_level(logging.WARNING):
         load_scene(file)
@@ -428,13 +428,13 @@ def test_a_mended_spectrum_is_named_with_its_line(tmp_path: Path, caplog: pytest
          "only emitters can have a blackbody; a bsdf can have <rgb>"),
     ],
 )  # fmt: skip
-def test_what_is_no_spectrum_is_one_located_line(tmp_path: Path, xml: str, reason: str) -> None:
+def test_an_invalid_spectrum_is_one_located_line(tmp_path: Path, xml: str, reason: str) -> None:
     with pytest.raises(ConfigError, match=reason):
         load_scene(write_spectrum(tmp_path, xml.format('name="reflectance"')))
 
 
 @pytest.mark.parametrize("temperature", ["0", "-3", "warm", "3000 4000"])
-def test_no_temperature_is_one_located_line(tmp_path: Path, temperature: str) -> None:
+def test_a_missing_temperature_is_one_located_line(tmp_path: Path, temperature: str) -> None:
     light = f'<spectrum type="blackbody" name="radiance"><float name="temperature" value="{temperature}"/></spectrum>'
     with pytest.raises(ConfigError, match=r"scene\.xml:4: temperature: must be"):
         load_scene(write_spectrum(tmp_path, light=light))
@@ -455,7 +455,7 @@ def test_constants_of_spectra_are_no_parameters() -> None:
     assert all(info.obstacle == "is a constant of a spectrum; give the colour as <rgb>" for info in constants)
 
 
-def test_what_a_hair_is_not_given_is_no_parameter() -> None:
+def test_missing_options_of_a_hair_are_no_parameters() -> None:
     scene = mi.load_dict({"type": "scene", "a": {"type": "sphere", "bsdf": {"type": "hair"}}}, optimize=False)
     infos = {info.key.rpartition(".")[2]: info for info in list_parameters(mi.traverse(scene), values=True)}
     assert (infos["sigma_a"].obstacle, infos["sigma_a"].value) == ("is not in the scene file", None)

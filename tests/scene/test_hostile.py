@@ -71,7 +71,7 @@ OPENED = {
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("kind", OPENED)
-def test_no_pipe_is_opened_however_a_scene_names_it(kind: str, tmp_path: Path) -> None:
+def test_no_pipe_is_opened(kind: str, tmp_path: Path) -> None:
     (tmp_path / "data" / "ior").mkdir(parents=True)
     pipes = [tmp_path / "pipe", *(tmp_path / "data" / "ior" / f"{name}.spd" for name in ("mine.eta", "Cu.k"))]
     for pipe in pipes:
@@ -105,7 +105,7 @@ def test_no_pipe_is_opened_however_a_scene_names_it(kind: str, tmp_path: Path) -
         ),
     ],
 )
-def test_what_mitsuba_would_crash_on_or_not_locate(tmp_path, objects, said):
+def test_input_that_crashes_mitsuba_or_lacks_a_location(tmp_path, objects, said):
     file = write(tmp_path, HEAD + objects + "</scene>")
     with pytest.raises(ConfigError) as error:
         load_scene(file)
@@ -151,7 +151,7 @@ def test_a_mesh_with_faces_of_missing_vertices_is_refused(tmp_path, vertices, la
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_texture_that_is_damaged_is_refused_where_it_is_named(tmp_path):
+def test_a_damaged_texture_is_refused_with_a_location(tmp_path):
     lines = bytes((2, 2, 0, 8)) + bytes((136, 1)) * 4
     image = b"#?RGBE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 8\n" + lines + b"\xff" * 12
     (tmp_path / "a.hdr").write_bytes(image)
@@ -166,7 +166,7 @@ def test_a_texture_that_is_damaged_is_refused_where_it_is_named(tmp_path):
 
 
 @pytest.mark.usefixtures("llvm")
-def test_what_is_no_regular_file(tmp_path):
+def test_irregular_files(tmp_path):
     os.mkfifo(tmp_path / "pipe.xml")
     for file in (tmp_path / "pipe.xml", Path("/dev/zero")):
         with pytest.raises(ConfigError, match=f"{file}: is a pipe, a socket or a device, not a regular file"):
@@ -174,7 +174,7 @@ def test_what_is_no_regular_file(tmp_path):
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_name_that_no_file_can_have(tmp_path):
+def test_an_impossible_file_name(tmp_path):
     file = write(tmp_path, HEAD + f'<shape type="ply"><string name="filename" value="{"a" * 5000}"/></shape></scene>')
     with pytest.raises(ConfigError) as error:
         load_scene(file)

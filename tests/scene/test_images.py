@@ -60,7 +60,7 @@ def refused(path, **options):
     return line.removeprefix(f"{path}: ")
 
 
-def test_a_whole_file_is_read(image, capfd):
+def test_a_complete_file_is_read(image, capfd):
     assert read_image(image, size=(128, 96)).shape == (96, 128, 3)
     image.write_bytes(image.read_bytes() + b"\0" * 500)  # what cameras and copies put behind the image
     assert read_image(image).shape == (96, 128, 3)
@@ -68,7 +68,7 @@ def test_a_whole_file_is_read(image, capfd):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.25, 0.5, 0.75, 0.9, 0.99, 1.0])
-def test_a_file_that_is_cut_off_is_refused(image, share, capfd):
+def test_a_truncated_file_is_refused(image, share, capfd):
     data = image.read_bytes()
     image.write_bytes(data[: min(int(share * len(data)), len(data) - 1)])
     assert refused(image).startswith(("is truncated", "is damaged or truncated", "is not a readable image"))
@@ -81,7 +81,7 @@ PADDED = [(name, share) for name in NAMES[:-3] for share in (0.25, 0.5, 0.9) if 
 
 @pytest.mark.parametrize(("image", "share"), PADDED, indirect=["image"])
 @pytest.mark.parametrize("padding", ["zeros", "the end"])
-def test_a_file_that_is_cut_off_and_padded_is_refused(image, share, padding, capfd):
+def test_a_truncated_and_padded_file_is_refused(image, share, padding, capfd):
     data = image.read_bytes()
     begin, end = data[: int(share * len(data))], data[-12:] if padding == "the end" else b""
     if image.suffix == ".jpg":
@@ -92,7 +92,7 @@ def test_a_file_that_is_cut_off_and_padded_is_refused(image, share, padding, cap
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_hole_in_the_midst_of_a_jpeg_is_refused(tmp_path):
+def test_a_hole_within_a_jpeg_is_refused(tmp_path):
     import mitsuba as mi
 
     path = tmp_path / "a.jpg"
@@ -103,7 +103,7 @@ def test_a_hole_in_the_midst_of_a_jpeg_is_refused(tmp_path):
     assert "is damaged or truncated (Corrupt JPEG data" in refused(path)
 
 
-def test_what_libjpeg_says_is_heard_where_standard_error_is_closed(tmp_path, monkeypatch):
+def test_messages_of_libjpeg_are_read_without_standard_error(tmp_path, monkeypatch):
     import mitsuba as mi
 
     path = tmp_path / "a.jpg"
@@ -148,7 +148,7 @@ def exr(right, bottom):
         ("a.bmp", b"BM" + bytes(16) + struct.pack("<ii", 60_000, -60_000) + bytes(100)),
     ],
 )
-def test_what_says_that_it_is_huge_is_not_decoded(tmp_path, monkeypatch, name, data):
+def test_a_file_with_a_huge_size_is_not_decoded(tmp_path, monkeypatch, name, data):
     path = tmp_path / name
     path.write_bytes(data)
     monkeypatch.setattr(images, "mi", None)  # so that nothing can be
@@ -171,13 +171,13 @@ def test_what_says_that_it_is_huge_is_not_decoded(tmp_path, monkeypatch, name, d
         b"BM",
     ],
 )
-def test_heads_that_say_nothing(tmp_path, data):
+def test_empty_headers(tmp_path, data):
     path = tmp_path / "a.png"
     path.write_bytes(data)
     assert refused(path).startswith("is not a readable image (EXR, PNG")
 
 
-def test_a_jpeg_of_empty_parts_takes_no_time(tmp_path, monkeypatch):
+def test_a_jpeg_of_empty_parts_is_read_fast(tmp_path, monkeypatch):
     monkeypatch.setattr(images, "_MOST_PARTS", 1000)
     path = tmp_path / "a.jpg"
     path.write_bytes(b"\xff\xd8" + b"\xff\xe0\0\x02" * 2000)
@@ -185,7 +185,7 @@ def test_a_jpeg_of_empty_parts_takes_no_time(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "sparse"])
-def test_what_is_no_regular_file_is_not_read(tmp_path, kind):
+def test_only_regular_files_are_read(tmp_path, kind):
     path = tmp_path / "a.png"
     if kind == "pipe":
         os.mkfifo(path)
@@ -199,7 +199,7 @@ def test_what_is_no_regular_file_is_not_read(tmp_path, kind):
     )
 
 
-def test_an_allocation_that_fails_is_no_damage(tmp_path, monkeypatch):
+def test_a_failed_allocation_is_no_damage(tmp_path, monkeypatch):
     class Full:
         def Bitmap(self, _path):
             raise MemoryError("std::bad_alloc")
@@ -213,7 +213,7 @@ def test_an_allocation_that_fails_is_no_damage(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("width", [7, 8, 40, 300])
-def test_the_lines_of_a_radiance_image_are_looked_at_before_they_are_decoded(width, tmp_path):
+def test_lines_of_a_radiance_image_are_checked_before_decoding(width, tmp_path):
     """Mitsuba writes past its memory where one of them is no runs, which the first ones are."""
     import mitsuba as mi
 
@@ -252,7 +252,7 @@ def with_orientation(path, orientation, channels=3):
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize(("name", "channels"), [("a.jpg", 3), ("a.jpg", 1), ("a.png", 4), ("a.png", 3)])
-def test_what_is_seen_upright_is_what_pillow_makes_of_it(name, channels, orientation, tmp_path):
+def test_orientation_matches_pillow(name, channels, orientation, tmp_path):
     from PIL import Image, ImageOps
 
     path = with_orientation(tmp_path / name, orientation, channels)
@@ -291,7 +291,7 @@ SIX = (0x0112, 3, 1, 6)
 
 
 @pytest.mark.parametrize("order", "<>")
-def test_entries_before_the_orientation_and_other_segments_are_passed_over(order, tmp_path):
+def test_other_entries_and_segments_are_skipped(order, tmp_path):
     entries = [(0x010F, 2, 4, 0x4142), (0x0110, 2, 4, 0x4142), SIX, (0x0112, 3, 1, 3)]
     data = b"Exif\0\0" + exif(entries, order)
     path = jpeg_with(tmp_path / "a.jpg", b"http://ns.adobe.com/xap/1.0/\0<x/>", data, b"Exif\0\0" + exif([]))
@@ -317,7 +317,7 @@ def test_entries_before_the_orientation_and_other_segments_are_passed_over(order
         exif([(0x8769, 4, 1, 0), (0x014A, 4, 1, 0)] * 1000),  # directories within directories, all of them this one
     ],
 )
-def test_exif_that_says_nothing_turns_nothing(data, tmp_path):
+def test_exif_without_orientation_rotates_nothing(data, tmp_path):
     start = time.monotonic()
     for path in (
         jpeg_with(tmp_path / "a.jpg", b"Exif\0\0" + data),
@@ -339,7 +339,7 @@ def png_with(path, data):
     return path
 
 
-def test_a_png_whose_exif_is_longer_than_its_file_is_cut_off(tmp_path):
+def test_a_png_with_too_long_exif_is_truncated(tmp_path):
     path = png_with(tmp_path / "a.png", exif([SIX]))
     assert orientation_of(path) == 6
     data = bytearray(path.read_bytes())
@@ -348,7 +348,7 @@ def test_a_png_whose_exif_is_longer_than_its_file_is_cut_off(tmp_path):
     assert refused(path).startswith("is truncated")
 
 
-def test_a_texture_is_read_as_it_lies_and_that_is_said(tmp_path, caplog):
+def test_a_texture_is_read_unrotated_with_a_message(tmp_path, caplog):
     path = with_orientation(tmp_path / "a.png", 8)
     assert read_image(path).shape == (5, 7, 3)
     assert f"{path}: the stored orientation is used, not turned by 90 degrees counter" in caplog.text
@@ -463,21 +463,21 @@ def test_pixels_are_means_of_light(tmp_path: Path) -> None:
     assert np.allclose(found, expected, atol=2e-5)  # of 16 bits
 
 
-def test_pixels_take_their_share_of_those_between_them(tmp_path: Path) -> None:
+def test_partly_covered_pixels_are_weighted(tmp_path: Path) -> None:
     values = np.random.default_rng(0).uniform(0, 5, (5, 7, 3)).astype(np.float32)
     found = read_image(smaller(tmp_path, values, (3, 2)))
     fine = np.repeat(np.repeat(values, 2, axis=0), 3, axis=1)  # by which both sizes divide
     assert np.allclose(found, fine.reshape(2, 5, 3, 7, 3).mean(axis=(1, 3)), rtol=1e-5)
 
 
-def test_what_is_clipped_in_part_stays_clipped(tmp_path: Path) -> None:
+def test_partly_clipped_pixels_stay_clipped(tmp_path: Path) -> None:
     values = np.full((8, 8, 3), 100, dtype=np.uint8)
     values[2, 6, 1] = 255
     pixels = np.array(mi.Bitmap(str(smaller(tmp_path, values, (2, 2)))))
     assert np.argwhere(pixels == 65535).tolist() == [[0, 1, 1]]
 
 
-def test_what_is_transparent_in_part_stays_transparent(tmp_path: Path) -> None:
+def test_partly_transparent_pixels_stay_transparent(tmp_path: Path) -> None:
     values = np.full((8, 8, 4), 100, dtype=np.uint8)
     values[5, 1, 3] = 0
     pixels = np.array(mi.Bitmap(str(smaller(tmp_path, values, (2, 2)))))
@@ -485,7 +485,7 @@ def test_what_is_transparent_in_part_stays_transparent(tmp_path: Path) -> None:
     assert (np.delete(pixels[:, :, 3].ravel(), 2) == 65535).all()
 
 
-def test_what_is_not_finite_stays_so_and_reaches_no_other(tmp_path: Path) -> None:
+def test_non_finite_pixels_stay_isolated(tmp_path: Path) -> None:
     values = np.ones((6, 6, 3), dtype=np.float32)
     values[0, 5, 2] = np.inf
     pixels = np.array(mi.Bitmap(str(smaller(tmp_path, values, (3, 3)))))

@@ -105,7 +105,7 @@ def test_errors_are_located(tmp_path, text, options, where, what):
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "the mesh has no faces"),
     ],
 )
-def test_meshes_that_are_not_there(tmp_path, text, what):
+def test_missing_meshes(tmp_path, text, what):
     if text is not None:
         (tmp_path / "mesh.obj").write_text(text)
     mesh = '<shape type="obj"><string name="filename" value="mesh.obj"/></shape>'
@@ -148,7 +148,7 @@ ROOM = (
         (1e-4, 0, "scale it to about 1"),
     ],
 )
-def test_light_that_ray_offsets_lose_is_warned_of(tmp_path, caplog, scale: float, x: float, advice: str | None):
+def test_light_lost_by_ray_offsets_gives_a_warning(tmp_path, caplog, scale: float, x: float, advice: str | None):
     load(tmp_path, ROOM, scale=scale, x=x)
     if advice is None:
         assert not caplog.records
@@ -222,7 +222,7 @@ def walls(tmp_path, request):
 
 
 @pytest.mark.parametrize("walls", TEXTURES, indirect=True)
-def test_what_is_selected_of_few_bits_has_mitsubas_own_values_as_floats(walls):
+def test_a_selected_8_bit_texture_has_the_values_of_mitsuba_as_floats(walls):
     own = load_scene(walls)
     before = {info.key: info for info in list_parameters(mi.traverse(own), values=True) if info.bits is not None}
     [key, other] = sorted(before, key=lambda key: key.startswith("ball"))
@@ -251,7 +251,7 @@ def _numbers(value):
 
 
 @pytest.mark.parametrize("walls", ["RGB"], indirect=True)
-def test_nothing_is_built_anew_where_nothing_of_few_bits_is_selected(walls):
+def test_nothing_is_rebuilt_without_selected_8_bit_textures(walls):
     types = [type(mi.traverse(load_scene(walls, keys=keys))["ball.bsdf.reflectance.data"]).__name__
              for keys in ([], ["Constant_1.*"], ["wall.bsdf.reflectance.data"], ["*.data"])]  # fmt: skip
     assert types == ["TensorXu8"] * 3 + ["TensorXf"]
@@ -310,7 +310,7 @@ def moved(z: float, scale: float = 1) -> str:
         (WHITE, obj("a", "one") + obj("b", "other") + f'<shape type="cube">{moved(z=0, scale=3)}</shape>', None),
     ],
 )
-def test_faces_at_the_same_place_are_warned_of(tmp_path, caplog, bsdf, shapes, names):
+def test_coincident_faces_give_a_warning(tmp_path, caplog, bsdf, shapes, names):
     for name, faces in (("one", ONE), ("other", OTHER), ("twice", TWICE), ("both", ONE + OTHER)):
         (tmp_path / f"{name}.obj").write_text(TRIANGLE + faces)
     view = '<transform name="to_world"><lookat origin="0,1,6" target="0,0,0" up="0,1,0"/></transform>'
@@ -369,7 +369,7 @@ def lit(objects: str) -> str:
     return f'<scene version="3.0.0">\n{SENSOR}\n<emitter type="constant" id="sky"/>\n{objects}\n</scene>'
 
 
-def test_names_say_kind_and_number(tmp_path):
+def test_names_have_kind_and_number(tmp_path):
     found = keys(write(tmp_path, HOUSE))
     assert names(found) == [
         *("Perspective_1", "Thinlens_1", "Twosided_1", "Diffuse_2", "Checkerboard_2"),
@@ -385,7 +385,7 @@ def test_names_say_kind_and_number(tmp_path):
     } <= set(found)
 
 
-def test_a_script_has_the_names_of_the_command_line(tmp_path):
+def test_a_script_sees_the_names_of_the_command_line(tmp_path):
     """Of an older version's file, too, which `mi.load_file` refuses, with textures of 8 bits that are asked for."""
     import mitsuba as mi
     import numpy as np
@@ -433,12 +433,12 @@ def test_an_id_renames_no_other_object(tmp_path):
     assert [key.replace("Sphere_1.", "first.") for key in before] == after
 
 
-def test_a_name_that_is_taken_is_not_given_again(tmp_path):
+def test_a_taken_name_is_not_reused(tmp_path):
     shapes = '<shape type="sphere" id="Sphere_2"/><shape type="sphere"/><shape type="sphere" id="Sphere_2_2"/>'
     assert names(keys(write(tmp_path, lit(shapes))))[2:] == ["Sphere_2", "Sphere_2_3", "Sphere_2_2"]
 
 
-def test_numbers_go_on_through_includes(tmp_path):
+def test_numbers_continue_through_includes(tmp_path):
     (tmp_path / "parts").mkdir()
     write(tmp_path / "parts", f'<scene version="3.0.0">{LAMP}<include filename="more.xml"/>{LAMP}</scene>', "lamps.xml")
     write(tmp_path / "parts", '<scene version="3.0.0"><shape type="cube"/></scene>', "more.xml")
@@ -452,13 +452,13 @@ def test_numbers_go_on_through_includes(tmp_path):
     assert "Sphere_4.bsdf.diffuse_reflectance.value" in found
 
 
-def test_shapes_in_groups_keep_mitsubas_names(tmp_path):
+def test_shapes_in_groups_keep_the_names_of_mitsuba(tmp_path):
     group = '<shape type="shapegroup" id="g"><shape type="sphere"/><shape type="cube"/></shape>'
     found = keys(write(tmp_path, lit(group + '<shape type="instance"><ref id="g"/></shape><shape type="sphere"/>')))
     assert {"g.shape.to_world", "g.shape_1.faces", "Instance_1.to_world", "Sphere_2.to_world"} <= set(found)
 
 
-def test_ids_that_mitsuba_takes_for_none(tmp_path, caplog):
+def test_ids_that_mitsuba_ignores(tmp_path, caplog):
     # as `mi.parser.write_file` writes them
     shapes = (
         '<bsdf type="diffuse" id="_unnamed_3"/><shape type="sphere" id="_unnamed_4"><ref id="_unnamed_3"/></shape>'
@@ -468,7 +468,7 @@ def test_ids_that_mitsuba_takes_for_none(tmp_path, caplog):
     assert not caplog.records
 
 
-def test_odd_ids_stay_where_they_can(tmp_path, caplog):
+def test_unusual_ids_are_kept_if_possible(tmp_path, caplog):
     odd = ["a.b", "two words", "wall [1]*", "lampe-é", "../x"]
     balls = [(name, f'<float name="radius" value="{k + 1}"/>') for k, name in enumerate(odd)]  # none where another is
     shapes = "".join(f'<shape type="sphere" id="{name}">{radius}</shape>' for name, radius in balls)
@@ -479,7 +479,7 @@ def test_odd_ids_stay_where_they_can(tmp_path, caplog):
 
 
 @pytest.mark.parametrize("own", ["a&#10;b", "&#x200b;", "x" * 200])
-def test_an_id_that_no_key_can_hold_is_replaced(tmp_path, caplog, own):
+def test_an_id_that_keys_cannot_contain_is_replaced(tmp_path, caplog, own):
     shapes = f'<bsdf type="diffuse" id="{own}"/><shape type="sphere"><ref id="{own}"/></shape>'
     file = write(tmp_path, lit(shapes))
     assert "Diffuse_1.reflectance.value" in keys(file)
@@ -490,7 +490,7 @@ def test_an_id_that_no_key_can_hold_is_replaced(tmp_path, caplog, own):
     assert len(record.getMessage()) < 200 + len(str(file))
 
 
-def test_an_id_of_two_objects_is_kept_by_the_first(tmp_path, caplog):
+def test_a_duplicate_id_belongs_to_the_first_object(tmp_path, caplog):
     file = write(tmp_path, lit('<shape type="sphere" id="ball"/>\n<shape type="cube" id="ball"/>'))
     assert names(keys(file))[2:] == ["ball", "Cube_1"]
     [record] = caplog.records

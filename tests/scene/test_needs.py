@@ -149,7 +149,7 @@ def test_refused(make_scene, changes, hide_emitters, reason):
 
 @pytest.mark.usefixtures("_without_scenes_of_before")
 @pytest.mark.parametrize("plugin", ["directional", "projector"])
-def test_scaled_emitters_are_refused_from_both_sides(make_scene, plugin):
+def test_scaled_emitters_are_refused_for_both_kinds_of_paths(make_scene, plugin):
     def scene(scale):
         turned = mi.ScalarTransform4f().look_at([0, 0, 3], [1, 0, 0], [0, 1, 0])
         return make_scene(beam={"type": plugin, "to_world": turned @ mi.ScalarTransform4f().scale(scale)})
@@ -185,14 +185,14 @@ def test_summary(make_scene):
 
 
 @pytest.mark.usefixtures("_without_scenes_of_before")
-def test_summary_of_what_cannot_be_rendered(make_scene):
+def test_summary_of_an_unrenderable_scene(make_scene):
     sensor = summarise(make_scene(camera={"type": "orthographic"})).sensors[0]
     assert sensor.view is None
     assert "OrthographicCamera" in sensor.obstacle
 
 
 @pytest.mark.usefixtures("_without_scenes_of_before")
-def test_fractions_are_of_the_crop_window(make_scene):
+def test_fractions_refer_to_the_crop_window(make_scene):
     import mitsuba as mi
 
     film = {"type": "hdrfilm", "width": 16, "height": 12, "crop_offset_x": 7, "crop_offset_y": 5, "crop_width": 2,
@@ -231,7 +231,7 @@ REF = {"type": "ref", "id": "group"}
         ({"ball": {"type": "sphere", "bsdf": WARM}}, "Mitsuba cannot evaluate bsdf bsdf: .*not implemented"),
     ],
 )  # fmt: skip
-def test_what_no_integrator_knows_is_refused_alike(make_scene, changes, reason):
+def test_scenes_unknown_to_every_integrator_are_refused_alike(make_scene, changes, reason):
     scene = make_scene(**changes)
     said = []
     for paths in ("light", "prb"):
@@ -243,7 +243,7 @@ def test_what_no_integrator_knows_is_refused_alike(make_scene, changes, reason):
 
 
 @pytest.mark.usefixtures("_without_scenes_of_before")
-def test_a_medium_that_rays_cannot_meet_is_nobodys(make_scene):
+def test_an_unreachable_medium_is_ignored(make_scene):
     scene = make_scene(group={"type": "shapegroup", "fog": FOG})
     check_paths(scene, scene.sensors()[0], "light")
     check_paths(scene, scene.sensors()[0], "prb")
@@ -265,7 +265,7 @@ def test_a_medium_that_rays_cannot_meet_is_nobodys(make_scene):
         ),
     ],
 )
-def test_the_way_out_is_named_where_there_is_one(make_scene, changes, way):
+def test_an_existing_remedy_is_named(make_scene, changes, way):
     scene = make_scene(**changes)
     with pytest.raises(UnsupportedScene, match=f"{way}[^;]*$"):
         check_paths(scene, scene.sensors()[0], "light")
@@ -273,7 +273,7 @@ def test_the_way_out_is_named_where_there_is_one(make_scene, changes, way):
 
 @pytest.mark.usefixtures("_without_scenes_of_before")
 @pytest.mark.parametrize("paths", ["camera", "both"])
-def test_no_way_out_is_named_that_is_blocked(make_scene, paths):
+def test_a_blocked_remedy_is_not_named(make_scene, paths):
     scene = make_scene(camera={"type": "orthographic"}, lamp=BEAM)
     with pytest.raises(UnsupportedScene, match="other paths cannot render it either") as error:
         check_paths(scene, scene.sensors()[0], paths)
@@ -282,7 +282,7 @@ def test_no_way_out_is_named_that_is_blocked(make_scene, paths):
 
 @pytest.mark.usefixtures("_without_scenes_of_before")
 @pytest.mark.parametrize(("bsdf", "same"), [("hair", False), ("pplastic", True), ("principled", True)])
-def test_a_material_is_refused_to_light_paths_that_differs_with_light_and_view_exchanged(make_scene, bsdf, same):
+def test_asymmetric_materials_are_refused_for_light_paths(make_scene, bsdf, same):
     import mitsuba as mi
 
     scene = make_scene(plane={"type": "rectangle", "bsdf": {"type": bsdf}})
@@ -318,7 +318,7 @@ def inside(albedo: float) -> mi.Scene:
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize(("albedo", "segments"), [(0.5, 8), (0.7, 16), (0.85, 32), (0.97, 64)])
-def test_what_is_missing_is_what_longer_paths_would_add(albedo: float, segments: int) -> None:
+def test_missing_light_is_that_of_longer_paths(albedo: float, segments: int) -> None:
     found = find_depth(inside(albedo), 0)
     assert found.segments == segments
     if segments == DEPTHS[-1]:
@@ -334,14 +334,14 @@ def test_what_is_missing_is_what_longer_paths_would_add(albedo: float, segments:
 KEY = "floor.reflectance.data"
 
 
-def test_all_of_an_open_floor(make_scene):
+def test_an_open_floor_in_full(make_scene):
     scene = make_scene()
     mask = visible_texels(scene, scene.sensors(), KEY)
     assert mask.shape == (4, 6)
     assert mask.all()
 
 
-def test_texels_are_seen_through_as_many_surfaces_as_pixels_are(make_scene):
+def test_texels_are_visible_through_as_many_surfaces_as_pixels(make_scene):
     import mitsuba as mi
 
     place = mi.ScalarTransform4f()
@@ -384,7 +384,7 @@ def mirrored(make_scene, bsdf):
                       pane={"type": "rectangle", "bsdf": bsdf, "to_world": pane})  # fmt: skip
 
 
-def test_what_glass_shows_is_seen_by_camera_paths(make_scene):
+def test_camera_paths_see_through_glass(make_scene):
     scene = mirrored(make_scene, {"type": "dielectric"})
     seen, all_of_it = (visible_texels(scene, scene.sensors(), KEY, (), each) for each in (False, True))
     assert not seen.any()
@@ -393,7 +393,7 @@ def test_what_glass_shows_is_seen_by_camera_paths(make_scene):
     assert not visible_texels(scene, scene.sensors(), KEY, (), True).any()
 
 
-def test_pixels_that_are_left_out_show_nothing(make_scene):
+def test_excluded_pixels_show_nothing(make_scene):
     """As a mask has them: those of the film's left half, (H, W)."""
     scene = make_scene()
     height, width = (int(n) for n in reversed(scene.sensors()[0].film().crop_size()))
@@ -405,7 +405,7 @@ def test_pixels_that_are_left_out_show_nothing(make_scene):
     assert visible_texels(scene, scene.sensors(), KEY, [None]).all()
 
 
-def test_hidden_texels_and_what_hides(make_scene):
+def test_hidden_texels_and_occluders(make_scene):
     import mitsuba as mi
 
     half = mi.ScalarTransform4f().translate([0.5, 0, 0.01]).scale([0.5, 1, 1])
@@ -428,7 +428,7 @@ def test_nested_shared_and_repeated(make_scene):
     assert visible_texels(scene, scene.sensors(), "floor.brdf_0.reflectance.data").all()
 
 
-def test_emission_is_not_a_matter_of_sight(make_scene):
+def test_emission_does_not_affect_visibility(make_scene):
     import mitsuba as mi
 
     sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32))}
@@ -493,7 +493,7 @@ def pixels(margin: int = 0) -> np.ndarray:
     ],
     ids=lambda value: value["type"] if isinstance(value, dict) else "",
 )
-def test_which_surfaces_count(bsdf: dict, kind: str | None) -> None:
+def test_counted_surfaces(bsdf: dict, kind: str | None) -> None:
     found = seen(bsdf)
     for name in ("alone", "mixed"):
         expected = pixels() if name == kind else np.zeros((8, 16), dtype=bool)
@@ -501,7 +501,7 @@ def test_which_surfaces_count(bsdf: dict, kind: str | None) -> None:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_glass_is_seen_through_what_lets_light_pass() -> None:
+def test_glass_is_visible_through_transparent_surfaces() -> None:
     veil = {"type": "mask", "opacity": 0.5, "bsdf": DIFFUSE}
     found = seen(MIRROR, in_front=veil)
     assert np.array_equal(found.alone, pixels())
@@ -510,7 +510,7 @@ def test_glass_is_seen_through_what_lets_light_pass() -> None:
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize(("filter", "margin"), [("tent", 1), ("gaussian", 2)])
-def test_the_filter_spreads_it(filter: str, margin: int) -> None:
+def test_the_filter_spreads_visibility(filter: str, margin: int) -> None:
     assert np.array_equal(seen(MIRROR, filter).alone, pixels(margin))
 
 
@@ -593,6 +593,6 @@ def test_thick(thickness: float, tmp_path: Path, caplog: pytest.LogCaptureFixtur
     assert warnings(tmp_path, caplog, thickness) == []
 
 
-def test_a_ball_is_thin_at_its_rim_alone(tmp_path: Path, caplog: pytest.LogCaptureFixture, llvm: str) -> None:
+def test_a_ball_is_thin_only_at_its_rim(tmp_path: Path, caplog: pytest.LogCaptureFixture, llvm: str) -> None:
     place = '<float name="radius" value="0.5"/><point name="center" value="0, 1, 0"/>'
     assert warnings(tmp_path, caplog, 0.3, f'<shape type="sphere">{place}<ref id="glass"/></shape>') == []

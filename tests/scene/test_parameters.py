@@ -77,7 +77,7 @@ def test_file_fills_a_texture(make_scene, tmp_path):
     assert np.array_equal(selection.array(TEXTURE), values)
 
 
-def test_globs_take_what_can_be_recovered(make_scene):
+def test_globs_match_recoverable_parameters(make_scene):
     selection = select(make_scene(), {"key": "floor.*"})  # not `to_uv`
     assert selection.keys == [TEXTURE]
 
@@ -208,7 +208,7 @@ def test_textures_with_few_bits(make_scene, type_, bits):
         select(scene, {"key": TEXTURE})
 
 
-def test_what_shapes_a_beam_is_refused(make_scene):
+def test_parameters_that_shape_a_beam_are_refused(make_scene):
     scene = make_scene(lamp={"type": "spot"})
     for name in ("cutoff_angle", "beam_width"):
         with pytest.raises(ConfigError, match="shapes the beam"):

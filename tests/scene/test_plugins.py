@@ -100,7 +100,7 @@ def test_the_trap_works(trap):
         '<shape type="evil.so"/>',
     ],
 )
-def test_a_plugin_of_the_scenes_own_is_refused(trap, objects):
+def test_a_plugin_from_the_folder_of_the_scene_is_refused(trap, objects):
     (trap.folder / "scene" / "part.xml").write_text('<scene version="3.0.0"><bsdf type="evil"/></scene>')
     file = trap.write(objects.format(folder=trap.folder))
     options = {"kind": "evil"} if "$kind" in objects else {}
@@ -112,7 +112,7 @@ def test_a_plugin_of_the_scenes_own_is_refused(trap, objects):
     assert not trap.is_sprung
 
 
-def test_mitsubas_own_plugin_is_taken_where_the_scene_has_one_of_its_name(trap):
+def test_the_plugin_of_mitsuba_wins_over_one_of_the_scene(trap):
     kinds = [
         '<shape type="ellipsoids"/>',
         '<sampler type="evil"/>',
@@ -160,7 +160,7 @@ CONFIG_FILE = "../c.yaml"
         ),
     ],
 )
-def test_no_command_runs_what_lies_in_its_folders(trap, commands):
+def test_no_command_runs_code_from_its_folders(trap, commands):
     trap.write("").write_text(SCENE.format("").replace('perspective"/>', f'perspective">{SMALL}</sensor>'))
     (trap.folder / "c.yaml").write_text(CONFIG)
     script = (
@@ -183,7 +183,7 @@ def test_modules_of_the_working_folder_are_not_imported(trap):
     assert trap.is_sprung, "what Python does by itself"
 
 
-def test_what_this_process_has_registered_is_known():
+def test_registered_plugins_are_known():
     import mitsuba as mi
 
     assert installation.is_known("prb")

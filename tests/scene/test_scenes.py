@@ -32,7 +32,7 @@ def small(name: str):
     return load_scene(ROOT / "scenes" / name / "scene.xml", {"resx": 32, "resy": 32, "spp": 4})
 
 
-def test_images_are_what_the_script_makes():
+def test_images_match_the_script():
     import mitsuba as mi
 
     for name, expected in make_scenes().images().items():
@@ -41,14 +41,14 @@ def test_images_are_what_the_script_makes():
         assert np.allclose(found, expected, atol=1 / 256 if "sky" in name else 1 / 4096, rtol=1e-5), name
 
 
-def test_the_stiff_wall_is_what_the_script_makes():
+def test_the_stiff_wall_matches_the_script():
     import mitsuba as mi
 
     found = np.array(mi.Bitmap(str(ROOT / "scenes" / "stiff" / "wall.png")))
     assert np.abs(np.squeeze(found).astype(int) - make_scenes().mottled_wall(192, 384)).max() <= 1
 
 
-def test_meshes_are_what_the_script_makes():
+def test_meshes_match_the_script():
     import mitsuba as mi
 
     for name, (positions, normals, *texcoords, faces) in make_scenes().meshes().items():
@@ -63,7 +63,7 @@ def test_meshes_are_what_the_script_makes():
 
 
 @pytest.mark.parametrize("name", a_few(["lens_pose", "caustic_heightmap"], ["caustic_heightmap"]))
-def test_light_that_is_to_be_moved_stays_off_the_border(name):
+def test_moving_light_stays_off_the_border(name):
     """Where it crosses that, derivatives of what moves it are cut off."""
     import mitsuba as mi
 
@@ -105,14 +105,14 @@ def test_config_fits_the_scene(name):
     assert select_parameters(scene, config.parameters, config.source).keys
 
 
-def test_cornell_floor_is_well_seen():
+def test_cornell_floor_is_visible():
     scene = load_scene(ROOT / "scenes" / "cornell_floor" / "scene.xml")
     mask = visible_texels(scene, scene.sensors(), "floor.reflectance.data")
     assert mask.mean() > 0.7  # a ninth of the floor is under the boxes
     assert look(scene, scene.sensors()[0]).nothing < 0.1
 
 
-def test_grey_room_is_lit_by_a_turned_sky_alone():
+def test_grey_room_is_lit_only_by_a_rotated_sky():
     import mitsuba as mi
 
     scene = small("grey_room")
@@ -131,7 +131,7 @@ def test_caustic_is_not_seen_through_the_glass():
     assert needs.has_shading_normals
 
 
-def test_mixed_room_has_light_that_either_side_lacks():
+def test_mixed_room_has_light_that_each_side_misses():
     """Light paths do not see the mirror; of what both see, connections to the lamp find less than half on the wall."""
     import mitsuba as mi
 
