@@ -10,10 +10,10 @@ Array = np.ndarray[Any, Any]
 
 
 def jackknife_variance(without: Array) -> Array:
-    """Return the jackknife variance (...) of an estimate; its square root is the standard error.
+    """Return the jackknife variance (...) of an estimate. Its square root is the standard error.
 
-    `without` (N, ...) holds the estimates with each of N independent samples left out in turn.
-    Source: Efron, The Jackknife, the Bootstrap and Other Resampling Plans, 1982.
+    `without` (N, ...) holds the estimates with each of N independent samples left out in turn. Source: Efron, The
+    Jackknife, the Bootstrap and Other Resampling Plans, 1982.
     """
     count = len(without)
     return np.asarray((count - 1) / count * np.sum(np.square(without - without.mean(axis=0)), axis=0))

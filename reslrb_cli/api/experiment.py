@@ -98,19 +98,19 @@ def load(
 ) -> Config:
     """Load and check an experiment, and fill in the defaults.
 
-    `experiment` is one of:
+    `experiment` can be given in four forms.
 
-    - a YAML file;
-    - a mapping with the same content as a YAML file (paths, tuples and NumPy numbers and arrays are allowed);
-    - a run folder: the parameters then start from the values that the run has reached;
-    - a `Config`.
+    - A YAML file.
+    - A mapping with the same content as a YAML file. Paths, tuples and NumPy numbers and arrays are allowed.
+    - A run folder. The parameters then start from the values that the run has reached.
+    - A `Config`.
 
     `overrides` maps keys to values, with the keys of `--set`: `{"run.iterations": 5, "parameters[0].bounds": [0, 1]}`.
     Paths in a file are relative to the file. Paths in a mapping are relative to `base`, by default the working
-    directory. The files that the experiment names are not opened, and no Mitsuba variant is set.
+    directory. `load` does not open the files that the experiment names, and sets no Mitsuba variant.
 
-    Raises ConfigError, located by file and key, if a key is unknown or missing or a value has a wrong type. Errors in
-    an override are located by `overrides`.
+    Raises ConfigError if a key is unknown or missing or a value has a wrong type. The error names the file and the key,
+    or `overrides`.
     """
     return load_with(experiment, loader.overrides_of(overrides), base)
 
@@ -174,11 +174,11 @@ def gradient(
 ) -> tuple[float, dict[str, Array]]:
     """Return the loss of an experiment and its gradients by key.
 
-    Each gradient is float32 and has the shape of its parameter, per unit of the parameter. The result equals that of
-    the first iteration of a run, including the images that `run.adjoint` selects. The parameters have their initial
-    values, or `values` as for `render`.
+    Each gradient is a float32 array with the shape of its parameter. Its unit is the loss per unit of the parameter.
+    The result equals that of the first iteration of a run, including the images that `run.adjoint` selects. The
+    parameters have their initial values, or `values` as for `render`.
 
-    `spp` replaces `run.spp`. `seed` replaces `run.seed` for the samples only: the target and the measurements before
+    `spp` replaces `run.spp`. `seed` replaces `run.seed` for the samples only. The target and the measurements before
     the first iteration (`guiding: auto`, ...) still use the experiment's seed. Regularizers contribute to the gradient
     but not to the loss. Entries that are not finite are returned unchanged.
 
@@ -220,10 +220,12 @@ def gradcheck(
     - `budget`: total time in seconds.
     - `seeds`: number of seeds, at least 3, regardless of `budget`.
     - `spp`: samples per pixel of one gradient.
-    - `integrators`: your own Mitsuba integrators, `FILE.py:CLASS[(OPTION=VALUE,...)]`, which are checked instead of
-      those of `reslrb` (docs/your_integrator.md). The log (`logging.INFO`) reports their noise and cost, and hints for
-      an integrator that is wrong.
+    - `integrators`: your own Mitsuba integrators, `FILE.py:CLASS[(OPTION=VALUE,...)]`. They are checked instead of the
+        estimators of `reslrb` (docs/your_integrator.md).
     - `allow_code`: permit running the code of these files.
+
+    For your own integrators, the log (`logging.INFO`) reports noise and cost. It also gives hints if an integrator is
+    wrong.
 
     An interrupt stops the check after the current gradient and raises KeyboardInterrupt. Sets the experiment's Mitsuba
     variant if none is set. Raises ConfigError and UnsupportedScene.
@@ -264,7 +266,7 @@ def convergence(
     """Measure how fast the error of each method falls, as `reslrb convergence` does (docs/convergence.md).
 
     Returns the records that `--json` writes: points, methods, references and a summary sentence. The arguments are the
-    options of the command:
+    options of the command.
 
     - `integrators`, `reference`: as for `--integrators` and `--reference`.
     - `budget`: total time in seconds.
@@ -272,8 +274,8 @@ def convergence(
     - `spps`: sample counts per pixel to compare.
     - `allow_code`: permit running the files of your own integrators.
 
-    Each method runs in its own process with the experiment's variant; this process sets none. An interrupt stops the
-    measurement soon and raises KeyboardInterrupt. Raises ConfigError.
+    Each method runs in its own process with the experiment's variant. The calling process sets no variant. An interrupt
+    stops the measurement soon and raises KeyboardInterrupt. Raises ConfigError.
     """
     began = time.monotonic()
     with called() as stop:

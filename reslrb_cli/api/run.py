@@ -153,10 +153,10 @@ class Run:
         return watched(iter(self), total, self.iteration, problem.meter, draw if figure else None)
 
     def close(self) -> None:
-        """Stop the run and complete its folder; do nothing if no loop is active.
+        """Stop the run and complete its folder. Does nothing if no loop is active.
 
-        Raises the error if the folder could not be completed, now or when an earlier loop was left. It is a
-        MachineError if the folder could not be written to.
+        If the folder cannot be completed, the error is raised here. This includes an error from leaving an earlier
+        loop. It is a MachineError if the folder cannot be written to.
         """
         loop = None if self._loop is None else self._loop()
         if loop is not None:
@@ -226,11 +226,11 @@ class Run:
 
     @property
     def images(self) -> dict[int, Array]:
-        """The current image of each view, by sensor index: (height, width, channels) float32, exposed as its target.
+        """The current image of each view, by sensor index.
 
-        Each access renders the images, with the sample count of the images saved between iterations (at least 64 per
-        pixel) and with separate seeds, so it does not change the run. Raises the same errors as a run, such as
-        ConfigError.
+        Images are float32 arrays (height, width, channels) with the exposure of the target. Each access renders the
+        images with separate seeds, so it does not change the run. The sample count is that of the images saved between
+        iterations, at least 64 per pixel. Raises the same errors as a run, such as ConfigError.
         """
         course = self._begun.course
         problem = course.problem
@@ -244,7 +244,7 @@ class Run:
 
     @property
     def targets(self) -> dict[int, Array]:
-        """The target of each view, by sensor index: (height, width, channels) float32, without alpha."""
+        """The target of each view, by sensor index: float32 arrays (height, width, channels) without alpha."""
         return {view.sensor: np.array(view.target) for view in self._begun.course.problem.views}
 
     @property

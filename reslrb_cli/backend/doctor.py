@@ -1,6 +1,6 @@
 """Examination for `reslrb doctor`: versions, libraries, device, and a trial of each backend.
 
-Also facts of the devices that kernels run on: names, memory, and the number of simultaneous paths.
+The module also reports the name and memory of a device, and the number of paths that it traces at once.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ def device_name(variant: str) -> str:
 
 
 def ask_gpu(query: str) -> list[str]:
-    """Return the line that `nvidia-smi` prints for each GPU, numbers without their units.
+    """Return the line that `nvidia-smi` prints for each GPU. Numbers have no units.
 
-    The list is empty if there is no such program, or if it does not answer in time.
+    The list is empty if the program is missing or does not answer in time.
     """
     command = shutil.which("nvidia-smi")
     if command is None:
@@ -51,7 +51,9 @@ def ask_gpu(query: str) -> list[str]:
 
 
 def gpu_bytes(kind: str, most: int) -> int:
-    """Return the smallest `memory.total` or `memory.free` of the GPUs, at most `most`; `most` if it is unknown."""
+    """Return the smallest `memory.total` or `memory.free` of the GPUs, at most `most`. Returns `most` if it is
+    unknown.
+    """
     return min([most, *(int(line) * 2**20 for line in ask_gpu(kind) if line.isdigit())])
 
 
@@ -65,8 +67,8 @@ def of_system(file: str, name: str) -> str | None:
 
 
 def memory_bytes(variant: str) -> int:
-    """Return the memory that `variant` can use: that of the GPU, or that of the machine as far as this process may use
-    it.
+    """Return the memory that `variant` can use, in bytes: the GPU's memory, or the part of the machine's memory that
+    this process may use.
     """
     if variant.startswith("cuda"):
         return gpu_bytes("memory.total", 2**40)  # unknown: more than any has, so that it never counts as scarce
@@ -103,8 +105,9 @@ _WITHOUT_METADATA = ["mitsuba", "drjit", "numpy"]
 
 @dataclass(frozen=True)
 class Backend:
-    """Backend: `missing` says in one line what it lacks (empty: nothing), and `trial` has the times of a kernel and a
-    ray.
+    """Backend of Dr.Jit.
+
+    `missing` says in one line why it does not work, or is empty. `trial` has the times of a kernel and a ray.
     """
 
     variant: str
@@ -116,7 +119,7 @@ class Backend:
 
 @dataclass(frozen=True)
 class Report:
-    """Result of the examination; `variant` is the one that `auto` selects, None if no backend works."""
+    """Result of the examination. `variant` is the variant that `auto` selects, or None if no backend works."""
 
     variant: str | None
     python: str

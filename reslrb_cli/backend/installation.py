@@ -1,10 +1,10 @@
-"""Installation of Mitsuba and Dr.Jit: whether they are complete, supported and loadable; and Mitsuba's plugins.
+"""Installation of Mitsuba and Dr.Jit: completeness, supported versions, and plugins.
 
 `python_command` is the command line of a new Python process that finds the same packages.
 
-Plugins are loaded only from Mitsuba's own folder. A plugin is a shared library, and loading it runs its code. Mitsuba
-looks for `plugins/NAME.so` in the folder of the scene and in the working folder before its own, for any NAME in a scene
-file.
+Plugins are loaded only from Mitsuba's own folder. A plugin is a shared library, and loading it runs its code. A scene
+file can name any plugin, and Mitsuba looks for `plugins/NAME.so` in the folder of the scene and in the working folder
+before its own folder.
 """
 
 from __future__ import annotations
@@ -144,7 +144,9 @@ _WANTED = {
 
 
 def load_packages() -> tuple[ModuleType, ModuleType]:
-    """Import Dr.Jit and Mitsuba, and return both. Raises BackendError, which says what was found where, on failure."""
+    """Import Dr.Jit and Mitsuba, and return both. If this fails, raises a BackendError that lists the packages
+    found.
+    """
     drjit, mitsuba = (_load(name) for name in _WANTED)
     return drjit, mitsuba
 

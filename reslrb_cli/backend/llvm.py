@@ -32,7 +32,7 @@ _NAME = re.compile(r"libLLVM(?:-(\d+)(?:\.\d+)*)?(?:\.so(?:\.(\d+)(?:\.\d+)*)?|(
 
 @dataclass(frozen=True)
 class Library:
-    """Found libLLVM: its file and its version (`19.1.7`), or the `fault` because of which it is not used."""
+    """A libLLVM on this machine: its file, its version (`19.1.7`), and the `fault` that rules it out, if any."""
 
     path: Path
     version: str = ""
@@ -74,7 +74,7 @@ def require() -> Library:
 
 @functools.cache
 def choose() -> tuple[Library | None, list[Library]]:
-    """Return the newest working libLLVM on this machine (None: there is none), and the rejected ones."""
+    """Return the newest working libLLVM on this machine, or None, and the rejected ones."""
     passed_over: list[Library] = []
     best: Library | None = None
     for path in sorted(candidates(), key=lambda path: -(version_from_name(path) or MIN_VERSION)):
@@ -154,7 +154,7 @@ def _folders() -> Iterator[Path]:
 
 
 def _loader_cache() -> list[Path]:
-    """Return the libLLVMs that ldconfig knows; its folder is not on an ordinary user's PATH."""
+    """Return the libLLVMs in the cache of the dynamic loader. `ldconfig` is not on an ordinary user's PATH."""
     ldconfig = shutil.which("ldconfig", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
     if ldconfig is None or sys.platform != "linux":
         return []

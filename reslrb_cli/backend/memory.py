@@ -2,8 +2,9 @@
 
 `free_bytes`, `resident_bytes` and `local_bytes` are the limits for forecasts.
 
-`own_memory` copies, because Dr.Jit uses NumPy's memory in place, and compiles and records for its random alignment. The
-next array of the same size may have another alignment, and everything would be compiled and recorded again.
+`own_memory` copies an array. Without the copy, Dr.Jit uses NumPy's memory, and its kernels depend on the alignment of
+this memory. The next array of the same size may have another alignment, so Dr.Jit would compile and record everything
+again.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ _LANES = (("avx512vl", 16), ("avx", 8))
 
 
 def free_bytes(variant: str) -> int:
-    """Return the bytes that a process of `variant` can still allocate, of the GPU's memory or the machine's.
+    """Return the number of bytes that a process of `variant` can still allocate on the GPU or the machine.
 
-    If this is unknown, return all memory (`device.memory_bytes`). Memory of this process counts as used.
+    Memory of this process counts as used. If the free memory is unknown, returns all memory (`device.memory_bytes`).
     """
     if variant.startswith("cuda"):
         return gpu_bytes("memory.free", memory_bytes(variant))
@@ -57,9 +58,9 @@ def resident_bytes() -> int:
 
 
 def local_bytes() -> int:
-    """Return the thread-local bytes that a path can use on the CPU: its share of a thread's stack.
+    """Return the thread-local bytes that a path can use on the CPU, which is its share of a thread's stack.
 
-    A kernel that needs more overwrites other memory, or ends the process.
+    A kernel that needs more overwrites other memory, or crashes the process.
     """
     stack, _ = resource.getrlimit(resource.RLIMIT_STACK)
     stack = _UNLIMITED_STACK if stack == resource.RLIM_INFINITY else stack
@@ -68,7 +69,7 @@ def local_bytes() -> int:
 
 
 def own_memory(kind: type[Any], array: np.ndarray[Any, Any]) -> Any:
-    """Return `array` (n,) as a flat array of type `kind`, bit by bit, evaluated."""
+    """Return `array` (n,) as an evaluated flat array of type `kind` with the same bits."""
     given = kind(np.ascontiguousarray(array))
     copy = dr.empty(kind, dr.width(given))
     # A gather in index order would return the array itself.

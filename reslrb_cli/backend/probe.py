@@ -1,6 +1,6 @@
-"""Trial of a variant in a separate process: one kernel compiled and run, one ray traced, both timed.
+"""Trial of a variant in a separate process: it compiles and runs one kernel, traces one ray, and times both.
 
-A faulty driver or libLLVM may end the process instead of raising an exception, which only a parent can detect.
+A faulty driver or libLLVM may crash the process instead of raising an exception. Only a parent process can detect this.
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ _OURS = "reslrb_cli.errors.BackendError: "
 
 @dataclass(frozen=True)
 class Probe:
-    """Result of the trial of a variant: `failure` says in one line what went wrong (empty: nothing).
+    """Result of the trial of a variant. `failure` describes the fault in one line, or is empty.
 
-    compile_ms: a kernel of a million entries, compiled and run; run_ms: the same kernel again; ray_ms: the first ray
-    through a scene, including compilation.
+    `compile_ms` is the time to compile and run a kernel of a million entries, and `run_ms` the time to run it again.
+    `ray_ms` is the time of the first ray through a scene, including compilation.
     """
 
     failure: str = ""

@@ -1,7 +1,8 @@
-"""Load a shared library whose dependencies may lie beside it; as a script, print the LLVM version of one.
+"""Loader of a shared library with dependencies in the same folder. As a script, it prints the LLVM version of a
+library.
 
-The module imports nothing of this package, so that it can run by path in a bare interpreter. A library that crashes
-while it is loaded then ends only this interpreter.
+The module imports nothing of this package, so it can run by path in a bare interpreter. If a library crashes while it
+is loaded, only this interpreter ends.
 """
 
 from __future__ import annotations
@@ -18,18 +19,16 @@ _MISSING = re.compile(
 
 
 def missing_library(message: str) -> str | None:
-    """Return the file name of the library that the dynamic loader could not find, from `message`; None if it names
-    none.
-    """
+    """Return the file name of the library that the dynamic loader could not find, from its `message`, or None."""
     found = _MISSING.search(message)
     return (found["so"] or Path(found["dylib"]).name) if found else None
 
 
 def load(path: Path, depth: int = 0) -> ctypes.CDLL:
-    """Load `path`, and its dependencies that the system lacks and the folder of `path` contains. Raises OSError.
+    """Load the library `path`. Dependencies that the system lacks are loaded from the same folder. Raises OSError.
 
-    The dynamic loader uses libraries that are already in the process, so loading the dependencies first is enough,
-    without an rpath and without LD_LIBRARY_PATH.
+    The dynamic loader uses libraries that are already in the process. Loading the dependencies first is therefore
+    enough, without an rpath and without LD_LIBRARY_PATH.
     """
     while True:
         try:

@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 
 
 def set_variant(name: str = "auto") -> str:
-    """Set the variant `name` and return the variant that was set; `auto` is `cuda_ad_rgb` or else `llvm_ad_rgb`.
+    """Set the variant `name` and return the variant. `auto` is `cuda_ad_rgb` if it works, otherwise `llvm_ad_rgb`.
 
     Raises BackendError, before Mitsuba is imported, if the backend of `name` is missing.
     """
@@ -46,9 +46,10 @@ def set_variant(name: str = "auto") -> str:
 
 
 def keep_variant(name: str, source: object) -> str:
-    """Set the variant `name` if none is set, and return the current one; `auto` accepts any that works.
+    """Set the variant `name` if none is set, and return the current variant. `auto` accepts any supported variant.
 
-    Raises ConfigError, located in `source`, if another variant is set, because objects of this variant would be lost.
+    Raises ConfigError, located in `source`, if another variant is set. Changing it would invalidate the caller's
+    objects.
     """
     mi = sys.modules.get("mitsuba")
     now: str | None = None if mi is None else mi.variant()
@@ -62,7 +63,7 @@ def keep_variant(name: str, source: object) -> str:
 
 
 def choose(name: str = "auto") -> tuple[str, str]:
-    """Return the variant for `name`, and an addition to the log line."""
+    """Return the variant for `name`, and an explanation for the log."""
     if name != "auto":
         return name, ""
     missing = missing_cuda("cuda_ad_rgb")
@@ -70,7 +71,9 @@ def choose(name: str = "auto") -> tuple[str, str]:
 
 
 def works_under(variant: str) -> bool:
-    """Whether the integrators support this variant of Mitsuba: with derivatives, with three colour channels or one."""
+    """Whether the integrators support this variant of Mitsuba: it must have derivatives, and three colour channels or
+    one.
+    """
     return variant.endswith(("_ad_rgb", "_ad_mono"))
 
 
@@ -86,10 +89,10 @@ def check_variant(variant: str | None) -> None:
 
 
 def missing_cuda(variant: str = "cuda_ad_rgb") -> str:
-    """Return why Mitsuba cannot trace rays with the CUDA variant; empty if it can.
+    """Return the reason why Mitsuba cannot trace rays with the CUDA variant, or "" if it can.
 
-    Without NVIDIA's driver the answer is immediate. With the driver, a ray is traced in a separate process, because a
-    GPU in a container often has CUDA but no OptiX.
+    Without NVIDIA's driver the answer is immediate. With the driver, a separate process traces a ray, because a GPU in
+    a container often has CUDA but no OptiX.
     """
     try:
         ctypes.CDLL(os.environ.get("DRJIT_LIBCUDA_PATH") or "libcuda.so.1")

@@ -1,7 +1,7 @@
 """Command line: `main` is the group of commands, and `run` is the program, which also handles signals.
 
-`main` is the only place where an error becomes an exit code. Each command is a module of this package with a click
-command named `command`; it is loaded when it is called.
+Only `main` turns an error into an exit code. Each command is a click command named `command` in a module of this
+package. The module is loaded when the command is called.
 """
 
 from __future__ import annotations

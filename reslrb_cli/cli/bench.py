@@ -75,10 +75,10 @@ def command(
 ) -> int:  # fmt: skip
     """Measure time and peak memory of gradient steps against path depth, or another quantity (--sweep).
 
-    A step consists of image, loss and gradient of every parameter of CONFIG, through its first sensor. Without CONFIG,
-    the scene is a Cornell box (--set scene.options.size=64, run.spp=4, ...). Each integrator runs in its own processes;
-    if one runs out of memory, this is recorded as out_of_memory, and the others continue. Ctrl-C keeps finished
-    results. The same command again continues from the file of --json, however the process ended.
+    A step computes image, loss and gradient of every parameter of CONFIG, through its first sensor. Without CONFIG, the
+    scene is a Cornell box (--set scene.options.size=64, run.spp=4, ...). Each integrator runs in its own processes. If
+    one runs out of memory, this is recorded as out_of_memory, and the others continue. Ctrl-C keeps finished results.
+    To continue after any interruption, repeat the command with the same --json file.
     """
     began = time.monotonic()
     from reslrb_cli.backend.installation import load_packages

@@ -69,9 +69,9 @@ def command(
     """Measure how fast the error of each method falls on CONFIG, at its initial values, through its first sensor.
 
     Each method takes steps of run.spp samples per pixel in its own process, in turn. Errors are relative to the size of
-    the estimated quantity; independent samples have a slope of -1/2. Efficiency is 1 / (relative variance * seconds).
-    Ctrl-C keeps finished results. The same command again continues from the file of --json, however the process ended.
-    docs/convergence.md explains the columns.
+    the estimated quantity. With independent samples, the slope is -1/2. Efficiency is 1 / (relative variance *
+    seconds). Ctrl-C keeps finished results. To continue after any interruption, repeat the command with the same --json
+    file. docs/convergence.md explains the columns.
     """
     began = time.monotonic()
     from reslrb_cli.backend.installation import load_packages

@@ -1,7 +1,7 @@
 """`reslrb example`: list the experiments that come with the program, and copy them.
 
-They are in `configs/` and `scenes/` of the repository; `reslrb_cli/examples` links to them. A wheel contains the files
-themselves there.
+The experiments are in `configs/` and `scenes/` of the repository. `reslrb_cli/examples` links to them; in a wheel it
+contains copies.
 """
 
 from __future__ import annotations

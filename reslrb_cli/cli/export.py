@@ -24,11 +24,11 @@ def command(run: Path, overrides: tuple[str, ...], output: Path, tolerances: boo
     """Write the scene of the run in the folder RUN with its recovered values.
 
     Mitsuba needs only FOLDER/scene.xml and the files beside it: `mi.load_file("FOLDER/scene.xml")`. Variables and
-    includes are resolved, repaired elements are written for Mitsuba 3, and textures and meshes are copied; recovered
-    ones are in FOLDER/recovered.
+    includes are resolved, and outdated elements are written for Mitsuba 3. Textures and meshes are copied. Recovered
+    textures and meshes are in FOLDER/recovered.
 
-    If the configuration has a section `fabrication`, as that of `reslrb lens`, the folder also contains the closed
-    solid in millimetres (lens.stl, .3mf, .obj, .ply), its heights (heights.png, .exr) and fabrication.json.
+    For a configuration with a section `fabrication`, such as one from `reslrb lens`, the folder also contains the
+    closed solid in millimetres (lens.stl, .3mf, .obj, .ply), its heights (heights.png, .exr) and fabrication.json.
     """
     from reslrb_cli.runs.export import check_export, write_export
 

@@ -184,12 +184,14 @@ def command(
 ) -> None:
     """Write a commented configuration for the scene in the file SCENE, to use with `reslrb optimize`.
 
-    It recovers the colours of the materials that are largest in view, the roughness of metals, and the brightness of
-    lamps in view (not from a photograph of 8 or 16 bits, in which they are clipped). Other parameters that can be
-    recovered are comments, with bounds and current values; --recover selects other parameters. With --target, the film
-    gets the ratio of sides of the photograph, at a size for a run of minutes, and a copy of the photograph of this size
-    is written beside the configuration. If there are several sensors, the first one is used, unless --sensor names
-    another.
+    The configuration recovers the colours of the materials that are largest in view, the roughness of metals, and the
+    brightness of visible lamps. Lamps are left out for a photograph of 8 or 16 bits, in which they are clipped. All
+    other recoverable parameters are listed as comments with bounds and current values. --recover selects other
+    parameters.
+
+    With --target, the film gets the aspect ratio of the photograph, at a size at which a run takes minutes. A copy of
+    the photograph of this size is written beside the configuration. If there are several sensors, the first one is
+    used, unless --sensor names another.
     """
     from reslrb_cli.backend.variant import set_variant
 

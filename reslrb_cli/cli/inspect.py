@@ -392,7 +392,9 @@ def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[
 
 
 def sides_of(subject: Subject, options: dict[str, Any], reasons: dict[str, str]) -> dict[str, Any]:
-    """Return `paths` and `light_share` of a run, or the values before a run; add to the `reasons` of features."""
+    """Return `paths` and `light_share` of a run, or the values before a run. Adds explanations to the `reasons` of
+    features.
+    """
     from reslrb_cli.config.integrators import UNDECIDED
     from reslrb_cli.integrators.plan_report import PATHS_FROM
     from reslrb_cli.records.decisions import PathsRecord

@@ -114,8 +114,8 @@ def command(
 ) -> None:
     """Write an experiment that shapes a lens, or a mirror, whose caustic shows PICTURE in parallel light.
 
-    Run it with `reslrb optimize FOLDER/lens.yaml`. The initial face already shows the picture, by a transport of light.
-    The depth of its relief, and that at twice the distance, is printed before anything is rendered.
+    Run it with `reslrb optimize FOLDER/lens.yaml`. The initial face already casts the picture. The command prints the
+    depth of its relief, and the depth at twice the distance, before anything is rendered.
     """
     import numpy as np
 

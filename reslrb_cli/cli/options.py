@@ -51,11 +51,11 @@ def origin_of(variant: str) -> Origin:
 
 
 class Keeper:
-    """Writer of a JSON file and the samples beside it, so that a killed process loses only seconds of work.
+    """Writer of a JSON file and of a file of samples, so that a killed process loses only seconds of work.
 
-    `origin` is the first line, `final` returns the lines that will not change, and `provisional` the others in their
-    current state. `kept` returns the data that a later session needs, or None if there is none yet. Does nothing
-    without a file.
+    `origin` is the first line. `final` returns the lines that will not change, and `provisional` the current state of
+    the others. `kept` returns the data for a later session, or None if there is none yet. Without a file, the writer
+    does nothing.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Keeper:
         self._live = LivePage(lambda: self._write(self._final(), self._provisional()), "the file of --json")
 
     def refresh(self) -> None:
-        """Write every few seconds, within a small share of the time. Call it between steps."""
+        """Write every few seconds, in a small share of the time. Call this method between steps."""
         if self._file is None:
             return
         if self._file.is_stream:  # a stream gets only final lines
@@ -112,10 +112,10 @@ def measuring(
     kind: type[A], plan: Measurement, json_file: Path | None, began: float, of: str,
     say: Callable[[str], None] = echo,
 ) -> Iterator[tuple[A, Interrupts]]:  # fmt: skip
-    """Yield a session that measures `plan`, and its interrupts; removes its folder and workers at the end.
+    """Yield a session that measures `plan`, and its interrupts. Removes the session's folder and workers at the end.
 
     The session continues from the samples of `json_file`, if any. `began` is the `monotonic` time of the command's
-    call, and `of` the unit of `plan.rounds` in the message. Raises ConfigError.
+    call. `of` is the unit of `plan.rounds` in the message. Raises ConfigError.
     """
     from reslrb_cli.measure.processes import abandon_all
 
@@ -149,7 +149,7 @@ def look_at(path: Path) -> None:
 
 
 def exit_code(interrupted: bool, done: bool, states: set[BenchStatus]) -> ExitCode:
-    """Return the exit code of a comparison: `done` if anything was measured, otherwise by the reason."""
+    """Return the exit code of a comparison: `done` if anything was measured, otherwise a code for the reason."""
     if interrupted:
         return ExitCode.INTERRUPTED
     memory = states == {BenchStatus.OUT_OF_MEMORY}
@@ -175,7 +175,7 @@ FOLDER = FolderPath(path_type=Path)
 
 
 def complete_setting(_context: click.Context, _parameter: click.Parameter, start: str) -> list[CompletionItem]:
-    """Return the settings whose keys start with `start`, as `KEY=`; indices may be any number."""
+    """Return the settings whose keys start with `start`, in the form `KEY=`. Indices may be any number."""
     plain = re.sub(r"\[\d+\]", "[0]", start)
     return [CompletionItem(f"{start}{key[len(plain) :]}=") for key in setting_keys() if key.startswith(plain)]
 
@@ -187,7 +187,9 @@ def setting_keys() -> list[str]:
 
 
 def _keys(schema: Mapping[str, Any], definitions: Mapping[str, Any], at: str) -> Iterator[str]:
-    """Yield the keys below `at` for each alternative in `schema`. At most 6 levels: it may refer to itself."""
+    """Yield the keys below `at` for each alternative in `schema`. At most 6 levels, because a schema may refer to
+    itself.
+    """
     if "$ref" in schema:
         schema = definitions[schema["$ref"].rpartition("/")[2]]
     for alternative in (*schema.get("anyOf", ()), *schema.get("oneOf", ())):

@@ -37,9 +37,10 @@ LEAST_FRAME = "{percentage:3.0f}%|{bar}|"
 
 
 class Progress:
-    """Progress on standard error of a run with `total` iterations; as a context manager it closes the bar at the end.
+    """Progress bar on standard error for a run with `total` iterations. As a context manager, it closes the bar at the
+    end.
 
-    `done` iterations were finished before a resumed run. `meter` measures the parameters' errors.
+    `done` iterations were finished before the run was resumed. `meter` measures the errors of the parameters.
     """
 
     def __init__(self, total: int, quiet: bool, meter: ErrorMeter, done: int = 0) -> None:
@@ -108,9 +109,9 @@ class Progress:
 
 
 class Reading:
-    """Progress on standard error of reading long files; callable like `records.reading.Tell`.
+    """Progress bar on standard error for reading long files, which can be called like `records.reading.Tell`.
 
-    As a context manager it closes the bar and, after a long reading, prints that drawing follows.
+    As a context manager, it closes the bar. After a long reading, it prints that the page is drawn next.
     """
 
     def __init__(self) -> None:

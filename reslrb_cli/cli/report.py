@@ -23,10 +23,10 @@ MOST_SOURCES = 100
 def command(paths: tuple[Path, ...], output: Path | None) -> int:
     """Write one self-contained page about runs and measurements.
 
-    RUN is the folder of a run of `optimize`, or of a `sweep`; a file that `bench`, `gradcheck` or `convergence` wrote
-    with --json; or a folder of maps that `gradcheck` wrote with --images. The page shows losses and errors of several
-    runs in one picture, and their images, times and memory side by side. Running and killed runs are shown as far as
-    they came.
+    RUN is the folder of a run of `optimize` or of a `sweep`, a file that `bench`, `gradcheck` or `convergence` wrote
+    with --json, or a folder of maps that `gradcheck` wrote with --images. The page shows losses and errors of several
+    runs in one picture, and their images, times and memory side by side. Unfinished runs are shown up to their last
+    iteration.
     """
     from reslrb_cli.backend.installation import load_packages
 

@@ -1,7 +1,7 @@
 """`reslrb sweep`: run an experiment with several settings and seeds, one run after the other, and tabulate the results.
 
-Each run is `reslrb optimize` in its own process, so that runs do not share memory, kernels or failures. The process
-ends with this one (`follow`), so that a killed sweep can be continued at once.
+Each run is `reslrb optimize` in its own process, so runs do not share memory, kernels or failures. If the sweep is
+killed, `follow` ends its current run, so the sweep can be continued at once.
 """
 
 from __future__ import annotations
@@ -129,10 +129,10 @@ def command(
 ) -> int:
     """Run the experiment of CONFIG with every combination of settings, with several seeds, one run after the other.
 
-    Each run has its folder in FOLDER, named by its settings; sweep.html there has the table, curves and pictures. All
-    combinations are checked before the first run starts. The row of a failed run says so, and the others continue.
-    Ctrl-C ends the sweep after the current iteration. The same command again, or --resume FOLDER, continues the sweep,
-    also after a kill.
+    Each run has its folder in FOLDER, named by its settings. FOLDER/sweep.html has the table, curves and pictures. All
+    combinations are checked before the first run starts. If a run fails, its row says so, and the others continue.
+    Ctrl-C ends the sweep after the current iteration. To continue a sweep, even after a kill, repeat the command or use
+    --resume FOLDER.
     """
     from reslrb_cli.runs.sweep import make_plan, opened
 
@@ -241,11 +241,11 @@ def _json_lines(source: SweepRuns) -> list[Line]:
 def call(
     arguments: Sequence[str], interrupts: Interrupts, verbose: bool = False, fresh: bool = False
 ) -> tuple[int, str]:
-    """Run `reslrb` with these arguments in its own process; return its exit code and its last line.
+    """Run `reslrb` with these arguments in its own process. Returns its exit code and its last line.
 
-    The first signal in `interrupts` is passed on to the process; a second one ends it with this process. `verbose`
-    shows its output; otherwise its warnings are in its folder. A `fresh` process has no kernels or decisions of earlier
-    runs, so that runs of equal time all pay for their own.
+    The first signal in `interrupts` is passed on to the process. A second one ends it together with this process.
+    `verbose` shows the output of the process; otherwise its warnings are in its folder. A `fresh` process has no cached
+    kernels or decisions, so that all runs of equal time start equally.
     """
     if fresh:
         with tempfile.TemporaryDirectory(prefix="reslrb-sweep-", ignore_cleanup_errors=True) as folder:
@@ -324,7 +324,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def follow(parent: int) -> None:
-    """Run the program `reslrb` in a process that ends with the process `parent` in any case."""
+    """Run the program `reslrb` in a process that always ends together with the process `parent`."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, int(signal.SIGKILL))  # PR_SET_PDEATHSIG
         if os.getppid() != parent:  # the parent has ended already

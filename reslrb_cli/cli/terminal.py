@@ -1,17 +1,17 @@
 """Output on the terminal, error messages, and signals.
 
-- `echo`, `LogLines`: print and log lines. Keys, names and paths come from users and files, so control characters in
-  them are escaped.
-- `tell`: turns an error into a line and an exit code, for errors of arguments and all others (`errors.tell`).
-- `Interrupts`: handles SIGINT, SIGTERM and SIGHUP.
+- `echo` and `LogLines` print and log lines. Keys, names and paths come from users and files, so control characters in
+    them are escaped.
+- `tell` turns an error into a line and an exit code.
+- `Interrupts` handles SIGINT, SIGTERM and SIGHUP.
 
-A signal handler never raises an exception. An exception inside Mitsuba or Dr.Jit would cause a crash (a module that is
-half imported) or an unrelated error (a recording without its end). The first signals therefore only set a flag, which
-is checked where it is safe to stop. One signal more ends the process at once, after its last message.
+A signal handler never raises an exception. An exception inside Mitsuba or Dr.Jit could crash the program or cause an
+unrelated error, for example in a half-imported module. The first signals therefore only set a flag, which the program
+checks when it is safe to stop. One more signal ends the process at once, after its last message.
 
-Python runs signal handlers in the main thread, between two instructions, and merges two signals that arrive while a
-kernel runs. A separate thread therefore counts the signals, from the descriptor that Python's C code writes to. It runs
-while a kernel runs, but not while one is compiled.
+Python runs signal handlers in the main thread, between two instructions. It merges two signals that arrive while a
+kernel runs. A separate thread therefore counts the signals, from the descriptor that Python's C code writes to. This
+thread runs while a kernel runs, but not while one is compiled.
 """
 
 from __future__ import annotations
@@ -40,11 +40,12 @@ _LEAVE = b"\0"  # no signal has the number 0
 
 
 class Interrupts:
-    """Context manager in which `requested` tells whether a signal came. Signals after `tolerated` ones end the process.
+    """Context manager in which `requested` tells whether a signal came.
 
-    To end it, a thread calls `last_act`, removes unfinished files, prints `interrupted`, and exits with 130.
-    `notice` is printed at the first tolerated signal. Signals that were ignored at the start of the program (`nohup`)
-    stay ignored. An inner context replaces an outer one. Outside of the main thread it does nothing.
+    Signals after `tolerated` ones end the process: a thread calls `last_act`, removes unfinished files, prints
+    `interrupted`, and exits with 130. `notice` is printed at the first tolerated signal. Signals that were ignored at
+    the start of the program (`nohup`) stay ignored. An inner context replaces an outer one. Outside of the main thread,
+    the context does nothing.
     """
 
     def __init__(

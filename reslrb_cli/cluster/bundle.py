@@ -1,4 +1,5 @@
-"""The files of an experiment for processes that have none of them: the configuration, the scene, and their files.
+"""The files of an experiment, for processes on machines without them: the configuration, the scene, and all other
+files.
 
 The scene is one file, without includes.
 

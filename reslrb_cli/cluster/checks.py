@@ -1,9 +1,9 @@
 """Samples of `gradcheck`, and cases of its suite, on workers (`crew.Crew`).
 
-A sample is a function of the participants, which are made from an experiment's files, of the steps of finite
-differences, which only the process of `gradcheck` chooses, and of its seed. A case is a function of its name.
+A sample depends on the experiment's files, on the steps of finite differences, and on its seed. Only the process of
+`gradcheck` chooses the steps. A case depends only on its name.
 
-Imports dask, so it is only imported for `--cluster`.
+The module imports dask, so it is imported only for `--cluster`.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def participants_in(
 
 
 def nothing_in(folder: Path, threads: int, variant: str) -> tuple[Stop, dict[str, float]]:
-    """Return the arguments of a case besides its name: a `stop` that is never true."""
+    """Return the argument of a case besides its name: a `stop` function that always returns false."""
     set_variant(variant)
     _with_threads(threads)
     return lambda: False, {}

@@ -156,7 +156,7 @@ def _started(workers: int, folder: Path) -> Iterator[tuple[object, object]]:
 
 
 def _extensions() -> dict[str, Any]:
-    """Return dask's extensions of a scheduler. The one that records every call until the end is replaced."""
+    """Return dask's extensions of a scheduler. They exclude the extension that records every call."""
     from distributed.scheduler import DEFAULT_EXTENSIONS
     from distributed.spans import SpansSchedulerExtension
 

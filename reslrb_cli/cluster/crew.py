@@ -1,7 +1,7 @@
 """Calls on the workers of a dask scheduler: available workers, answers, and failures.
 
 dask distributes calls to workers that are ready, and repeats the calls of a worker that died. This module repeats calls
-of slow workers: if a worker does not answer within three times the usual time, another worker is asked, and the first
+of slow workers. If a worker does not answer within three times the usual time, another worker is asked, and the first
 answer counts. If it does not answer for much longer, dask restarts it. `worker.py` is the workers' side.
 
 All messages pass through the scheduler, so no direct connection to a worker is needed.
@@ -60,13 +60,14 @@ LOSSES = 100
 
 @dataclass
 class Spent:
-    """Seconds of a worker, or of all rounds of calls.
+    """Time in seconds that one worker, or all rounds of calls, have spent.
 
-    - `computing`, and before it `standing` (setting the context of calls): the mean over a round's workers.
-    - `waiting`: time in which these waited for the worker with the most work.
-    - `wall`: from the first question to the last answer. The rest of it is communication.
+    - `standing`: time to set the context of calls, as a mean over a round's workers.
+    - `computing`: time to compute, as a mean over a round's workers.
+    - `waiting`: time in which these workers waited for the slowest one.
+    - `wall`: time from the first question to the last answer. The rest of it is communication.
 
-    `calls` were answered, and `again` of them were repeated.
+    `calls` is the number of answered calls, and `again` the number of repeated ones.
     """
 
     wall: float = 0.0
@@ -79,7 +80,9 @@ class Spent:
 
 @dataclass
 class _Round:
-    """The calls of a round: the indices `left` to answer, and for each future its index and the workers that may
+    """The calls of a round.
+
+    `left` holds the indices without an answer. For each future, `flying` holds its index and the workers that may
     answer.
     """
 
@@ -96,7 +99,7 @@ class _Round:
 
     @property
     def name(self) -> str:
-        """The name under which calls take about equally long."""
+        """The name of a kind of calls with similar durations."""
         return self.function.__name__ if self.cold is None else f"{self.function.__name__} {self.cold}"
 
     def answerable(self, workers: Mapping[str, Any]) -> set[int]:
@@ -140,7 +143,7 @@ class Crew:
     def start(self) -> None:
         """Wait until one worker is ready, and some time for the others.
 
-        Raises MachineError if none is ready, with the failures of the others and errors of the experiment.
+        Raises MachineError if no worker is ready. The message lists failures and errors of the experiment.
         """
         begin = time.monotonic()
         first_s: float | None = None
@@ -228,7 +231,7 @@ class Crew:
         return self._names.get(worker, "a worker")
 
     def _take_opened(self, future: Future) -> bool:
-        """Note that a worker has loaded the opening, or why it has not. Returns False for another kind of future."""
+        """Record that a worker has loaded the opening, or why it has not. Returns False for another kind of future."""
         worker = next((worker for worker, (own, _) in self._opening.items() if own is future), None)
         if worker is None:
             return False

@@ -1,10 +1,10 @@
-"""The shards of a run's steps on workers (`crew.Crew`): the problem that they load, and the values of its parameters.
+"""The shards of a run's steps on workers (`crew.Crew`), and the data that workers need for them.
 
-A call is a pure function of an experiment (files, by their digest), the values of its parameters and tables
-(`Standing`), a shard and its dL/dI. It returns NumPy arrays. The result does not depend on the worker, on repetitions,
-or on the number of workers. Optimiser, checkpoints and page stay in the process of `optimize`.
+A call depends only on the experiment (files, by their digest), on the values of its parameters and tables (`Standing`),
+on the shard and on its dL/dI. It returns NumPy arrays. The result does not depend on the worker, on repetitions, or on
+the number of workers. Optimiser, checkpoints and page stay in the process of `optimize`.
 
-Imports dask, so it is only imported for `--cluster`.
+The module imports dask, so it is imported only for `--cluster`.
 """
 
 from __future__ import annotations

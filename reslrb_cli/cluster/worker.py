@@ -1,7 +1,7 @@
 """The workers' side: a worker loads an `Opening`, sets the `Context` of a round of calls, and executes calls.
 
-An opening contains files, which are sent once, and a function that makes a state of them, which the worker keeps. A
-call is a function of this state and its context. Its value must be serialisable.
+An opening contains files, which are sent once, and a function that builds a state from them. The worker keeps this
+state. A call is a function of the state and its context. Its value must be serialisable.
 """
 
 from __future__ import annotations
@@ -52,10 +52,11 @@ class Anywhere:
 
 @dataclass(frozen=True)
 class Opening:
-    """The work of workers: `function(folder, threads, *arguments)` makes the state from the files in a folder.
+    """The work of workers: `function(folder, threads, *arguments)` builds the state from the files in a folder.
 
     The function returns the state, and the seconds per call of each function whose kernels it has compiled, by name.
-    `digest` is that of the files. `asks_for_code`: users' own code must run, and the workers do not belong to this run.
+    `digest` is the digest of the files. `asks_for_code` is true if users' own code must run and the workers do not
+    belong to this run.
     """
 
     digest: str
@@ -104,7 +105,7 @@ class Lacks(Reply):
 
 @dataclass(frozen=True)
 class Fault(Reply):
-    """A failure of a worker's machine instead of the call. `memory`: it has no memory left. `stays`: a restart does not
+    """A failure of a worker's machine. `memory` is true if no memory is left, and `stays` if a restart does not
     help.
     """
 
@@ -164,7 +165,7 @@ def stand(opening: str, context: Context) -> Reply:
 
 
 def perform(opening: str, context: str, function: Callable[..., Any], arguments: Sequence[Any]) -> Reply:
-    """Return the value of `function` for the state with `context`, and `arguments`."""
+    """Call `function` with the state, after setting `context`, and with `arguments`; return its value."""
     begin, me = time.perf_counter(), get_worker().address
     if _state is None or _state.opening != opening:
         return Lacks(me, "opening")

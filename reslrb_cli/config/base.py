@@ -1,4 +1,4 @@
-"""Base classes and validators of the configuration's sections: strict types, paths, unions by `type`, numbers."""
+"""Base classes and validators of the configuration's sections: strict types, paths, unions by `type`, and numbers."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def _folder(info: ValidationInfo) -> Path:
 
 
 def _path(folder: Path, value: Any) -> Path:
-    """Return the path `value` relative to `folder`. `..` is not resolved, because it may follow a symbolic link."""
+    """Return the path `value` relative to `folder`. `..` is kept, because it may follow a symbolic link."""
     if not isinstance(value, (str, Path)) or not str(value).strip() or "\0" in str(value):
         raise wrong("must be a path")
     try:

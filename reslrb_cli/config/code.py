@@ -20,9 +20,10 @@ from reslrb_cli.errors import ConfigError, describe, is_machine_fault, is_out_of
 
 
 def load_named(file: Path, name: str, source: object, key: str) -> Callable[..., Any]:
-    """Run a file and return the object `name`. The file can import modules from its folder, after all others.
+    """Run a file and return the object `name`. The file can import modules from its own folder.
 
-    Raises ConfigError, located at `key` of `source`, if the file cannot be read or run, or has no callable `name`.
+    Installed modules take precedence over modules in the folder. Raises ConfigError, located at `key` of `source`, if
+    the file cannot be read or run, or has no callable `name`.
     """
     try:
         text = read_file(file)

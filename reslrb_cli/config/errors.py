@@ -128,9 +128,7 @@ def _problem(detail: ErrorDetails, data: Any) -> Problem:
 
 
 def _location(loc: tuple[int | str, ...], data: Any) -> Location:
-    """Return pydantic's location without parts that are not in the file: tags of unions, and indices of lists made
-    here.
-    """
+    """Return pydantic's location without the parts that do not exist in the file, such as tags of unions."""
     location: list[str | int] = []
     for part in loc:
         if _is_tag(part) or (isinstance(part, int) and isinstance(data, str)):
@@ -204,7 +202,7 @@ def _nearest(word: str, known: Iterable[str]) -> list[str]:
 
 
 def _below(section: type[Section], name: str, key: str) -> list[str]:
-    """Return where `key` is known one level below `section`, which is at `name`."""
+    """Return the places one level below `section` where `key` is valid. `name` is the name of the section."""
     return [
         _join(name, f"{child}.{key}")
         for child, field in section.model_fields.items()

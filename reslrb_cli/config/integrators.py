@@ -182,7 +182,7 @@ class Reslrb(AttachingTracer):
 
     @model_validator(mode="after")
     def _leave_off(self) -> Self:
-        """Turn off the measured options that are not given if an estimator is named."""
+        """Turn off measured options that the user has not set, if the user has named an estimator."""
         if self.estimator != "auto":  # without assignment, which would mark them as given
             self.__dict__.update({name: off for name, off in UNDECIDED.items() if name not in self.model_fields_set})
         return self
@@ -300,10 +300,10 @@ def _check_share(paths: str, light_share: float | str) -> None:
 
 
 def passes_obstacle(spp: int, per_pass: int | None, pixels: int, splits: bool = True) -> str | None:
-    """Return why `spp` samples per pixel of a film with `pixels` pixels cannot be traced, and what to change; or None.
+    """Return why `spp` samples per pixel of a film with `pixels` pixels cannot be traced, and a remedy; or None.
 
-    `per_pass` is the integrator's `samples_per_pass`. It divides `spp`, or is larger. `splits` tells whether the
-    integrator splits its samples by itself; integrators that do not have no `samples_per_pass`.
+    `per_pass` is the integrator's `samples_per_pass`. It divides `spp`, or is larger. `splits` is true for integrators
+    that split their samples themselves. Other integrators have no `samples_per_pass`.
     """
     unit = min(per_pass or spp, spp)
     parts = -(-unit // PASS_SAMPLES) if splits else 1

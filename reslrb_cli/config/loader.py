@@ -237,9 +237,10 @@ def _blame(stages: list[dict[str, Any]], overrides: Sequence[Override], problem:
 
 
 def with_integrator(config: Config, values: dict[str, Any], blame: str, adjoint: dict[str, Any]) -> Config:
-    """Return the experiment with the integrator of `values`, and other settings of `run.adjoint`.
+    """Return the experiment with the integrator in `values`, and with other settings of `run.adjoint`.
 
-    `adjoint` has `adjoint` and its related settings, or is empty for no change. Raises ConfigError that names `blame`.
+    `adjoint` has the key `adjoint` and its related settings, or is empty for no change. Raises ConfigError that names
+    `blame`.
     """
     data = config.model_dump(mode="json", exclude_none=True) | {"integrator": values}
     if "adjoint" in adjoint:

@@ -59,7 +59,7 @@ class ByWord(Section):
 
 
 def or_words(plain: str) -> Discriminator:
-    """Return a discriminator that tags mappings by the parts of a motion as `words`, and anything else as `plain`."""
+    """Return a discriminator that tags a mapping by parts of a motion as `words`, and any other value as `plain`."""
     return Discriminator(lambda value: MARK + (ByWord.TAG if isinstance(value, (dict, ByWord)) else plain))
 
 
@@ -414,7 +414,7 @@ class ParameterSpec(Section):
         return [self.key] if isinstance(self.key, str) else list(self.key or ())
 
     def objects(self) -> list[tuple[str, int | None, str]]:
-        """Return the keys and ids that are named, each with its option and, in a list, its index."""
+        """Return the named keys and ids. Each comes with its option and, in a list, its index."""
         lists: list[tuple[str, Any]] = [("key", self.key)]
         lists += [] if self.heightmap is None else [("heightmap.mesh", self.heightmap.mesh)]
         lists += [] if self.motion is None else [("motion.of", self.motion.of)]
@@ -436,7 +436,7 @@ class ParameterSpec(Section):
         return f"{option}.{word}" if isinstance(getattr(self, option, None), ByWord) else option
 
     def settings(self, word: str = "") -> Settings:
-        """Return the settings of the part `word` of a motion, or with "" those of any other parameter."""
+        """Return the settings for the part `word` of a motion, or for any other parameter if `word` is ""."""
 
         def of(option: str, default: Any = None) -> Any:
             value = getattr(self, option)

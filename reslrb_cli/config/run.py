@@ -36,7 +36,7 @@ def folder_name(name: str) -> str:
 
 
 def check_name(name: str) -> str:
-    """Return `name` if it can name a run. Raises an error that says what is wrong otherwise."""
+    """Return `name` if it is a valid name of a run; otherwise raise an error that says why."""
     folder = folder_name(name)
     if _PATH.search(name.strip()):
         raise wrong("must be a name and not a path; set run.output to choose the folder")

@@ -75,7 +75,9 @@ class SceneConfig(Section):
 
 
 class Fabrication(Section):
-    """Solid of a lens or a mirror with a face of heights, in millimetres. `reslrb export` writes and checks it."""
+    """Solid of a lens or a mirror with a heightmap on its face, in millimetres. `reslrb export` writes and
+    checks it.
+    """
 
     kind: Literal["lens", "mirror"] = Field(default="lens", description="Whether the face refracts or reflects light.")
     faces: Annotated[
@@ -138,7 +140,7 @@ class Config(Section):
         return "batched" if self._splits(self.run.spp, self.run.batches) else "independent"
 
     def _splits(self, spp: int, sets: int) -> bool:
-        """Return whether `spp` samples per pixel can be split into this many sets, their halves, and their passes."""
+        """Whether `spp` samples per pixel can be split into this many sets, with halves and passes."""
         parts = sets * self.halves
         return spp % parts == 0 and _passes_divide(self.integrator, spp // parts)
 
@@ -268,7 +270,9 @@ class Config(Section):
         return self.run.stages[number] if number < len(self.run.stages) else AS_CONFIGURED
 
     def stage_number(self, progress: float) -> int:
-        """Return the number of the stage at `progress` (0 to 1) of the run; the number of stages after the last one."""
+        """Return the number of the stage at `progress` (0 to 1) of the run, or the number of stages after the
+        last one.
+        """
         return sum(progress >= stage.until for stage in self.run.stages)
 
     def without_stages(self) -> Config:
@@ -276,7 +280,7 @@ class Config(Section):
         return self.model_copy(update={"run": self.run.model_copy(update={"stages": []})})
 
     def step_options(self, shard: bool = False) -> dict[str, Any]:
-        """Return the options of a gradient step about its samples, those of an iteration or of a `shard`."""
+        """Return the sampling options of a gradient step: those of an iteration, or those of a `shard`."""
         options: dict[str, Any] = {"spp": self.share_spp if shard else self.run.spp, "adjoint": self.adjoint}
         if self.adjoint == "batched":
             options["batches"] = self.run.batches

@@ -28,7 +28,7 @@ INTEGER_END = 2**64
 
 
 class Loader(yaml.SafeLoader):
-    """Reads one text; `at` names a line of it in errors."""
+    """Reader of one YAML text. `at` names a line of the text in errors."""
 
     yaml_implicit_resolvers: dict[str, list[Any]] = {}  # noqa: RUF012 (PyYAML's own convention)
     yaml_constructors = {  # noqa: RUF012

@@ -1,33 +1,34 @@
-"""Attached derivatives by `stack`: a walk back over the stack evaluates each segment again, in its own AD scope.
+"""Attached derivatives by `stack`: the walk back over the stack evaluates each segment again, in its own AD scope.
 
 Segment i maps the ray v_i that reaches vertex i to the next ray v_{i+1}, to a factor s_i and to a connection (c_i,
-u_i). Let P_i be the path's throughput before vertex i, r_i the weight of its roulette, and B_i the contribution of all
-later connections to the objective per unit of throughput behind it, all of them detached. Then, from the last vertex to
-the first,
+u_i). P_i is the path's throughput before vertex i, and r_i the weight of its roulette. B_i is the contribution of all
+later connections to the objective, per unit of throughput behind the vertex. P_i, r_i and B_i are detached. The
+recursion starts at the last vertex.
 
     S_i     = <P_i, delta(u_i) c_i + r_i s_i B_i> + <a_{i+1}, v_{i+1}>
     a_i     = dS_i/dv_i,   B_{i-1} = delta(u_i) c_i + r_i s_i B_i         a_{k+1} = 0,   B_k = 0 behind the last one
     dS     += dS_i/dtheta
 
-and at the emitter dS += <a_1, dv_1/dtheta> + <B_0, dE/dtheta>. Nothing is divided or inverted, so zero factors and the
-conditioning of the chain do not matter.
+    dS     += <a_1, dv_1/dtheta> + <B_0, dE/dtheta>                       at the emitter
 
-A vertex can also stay at its place on its surface, instead of following a direction that turns; `Before` stores the
-data of the previous vertex for this. Behind a vertex i-1 that is not specular, light goes to all places. With `follow`,
-the sampled direction turns with surface i-1, so that x_i slides over the next surface. With `stay`, the integral is
-over places: x_i moves only with its own surface, and the factor of the scattering contains the change,
+Nothing is divided or inverted, so zero factors and the conditioning of the chain do not matter.
+
+Behind a vertex i-1 that is not specular, light goes to all places. There are two ways to differentiate such a segment.
+With `follow`, the sampled direction rotates with surface i-1, so x_i slides over the next surface. With `stay`, the
+integral is over the places x_i, and x_i moves only with its own surface. The factor of the scattering then contains the
+change.
 
     s_{i-1} = f_{i-1}(x_{i-2}, x_{i-1}, x_i) |cos_i| / |x_i - x_{i-1}|^2 dA_i / (the same density, detached)
 
-where dA_i is the area of a piece of surface i. Vertex i differentiates all of it except the dependence of f_{i-1} on
-x_{i-1}. Its adjoint then gives vertex i-1 a derivative with respect to its place, and none with respect to its
-direction.
+dA_i is the area of a piece of surface i. Vertex i differentiates this factor, except for the dependence of f_{i-1} on
+x_{i-1}. The adjoint of vertex i then gives vertex i-1 a derivative with respect to its place, and none with respect to
+its direction. `Before` stores the data of the previous vertex for this.
 
-Source: Worchel et al. 2025, "Radiative Backpropagation with Non-Static Geometry", which has this surface-integral form.
-No edges at rest are swept over, so their contribution is not lost. That of visibility is lost in either form.
+Source: Worchel et al. 2025, "Radiative Backpropagation with Non-Static Geometry", for this surface-integral form. With
+it, edges that do not move contribute no error. Neither form has the derivative of visibility.
 
-All vertices are pushed from the first one on that a parameter moves, or whose BSDF has a parameter. Earlier vertices
-depend only on parameters of the emitter. The stack is that of `stack.py`: behind the last pushed vertex its T is r_i.
+The stack starts with the first vertex that moves or whose BSDF has a parameter. Earlier vertices depend only on
+parameters of the emitter. The stack is that of `stack.py`, where T behind the last pushed vertex is r_i.
 """
 
 from __future__ import annotations
@@ -68,7 +69,9 @@ from reslrb_cli.transport.walk import (
 
 @dataclass
 class Before:
-    """Vertex before the current one; `stays` is 1 if it is not specular, so that the current vertex stays."""
+    """Vertex before the current one. `stays` is 1 if it is not specular, so that the current vertex stays at its
+    place.
+    """
 
     point: SurfacePoint
     stays: mi.UInt32
@@ -96,11 +99,10 @@ def reach(
     plan: Plan, before: list[Before], ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool,
     parameters: bool = True,
 ) -> tuple[Hit, mi.Spectrum]:  # fmt: skip
-    """Return the vertex at the intersection `pi` of `ray`, and a factor (C,) of value 1 with the derivatives of s_{i-1}
-    that belong to this vertex.
+    """Return the vertex at the intersection `pi` of `ray`, and a factor (C,) of value 1.
 
-    Call under `dr.resume_grad()` with a differentiable ray; without `parameters` if gradients are resumed only for the
-    ray.
+    The factor carries the derivatives of s_{i-1} that belong to this vertex. Call the function under `dr.resume_grad()`
+    with a differentiable ray. Set `parameters` to false if gradients are resumed only for the ray.
     """
     if not before:
         return find_vertex(ray, pi, active), mi.Spectrum(1)
@@ -124,7 +126,7 @@ def segment_again(
     samples: Samples, before: list[Before], ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, numbers: Numbers,
     connected: mi.Bool, scattered: mi.Bool, evaluates: bool = True, parameters: bool = True,
 ) -> tuple[Segment, mi.Spectrum]:  # fmt: skip
-    """Return the segment from a vertex with attached derivatives, and the factor of `reach`."""
+    """Return the segment from a vertex with attached derivatives, and the factor that `reach` returns."""
     hit, factor = reach(samples.plan, before, ray, pi, connected | scattered, parameters)
     return segment(samples, hit, numbers, connected, scattered, evaluates, attached=True), factor
 
@@ -134,7 +136,10 @@ def segment_again(
 
 @dataclass
 class Adjoint:
-    """Adjoint on the walk back: a = dS/dv of the ray's origin and direction, and B (C,)."""
+    """Adjoint on the walk back.
+
+    a = dS/dv is the adjoint of the ray's origin and direction. B (C,) is that of the throughput.
+    """
 
     origin: mi.Vector3f
     direction: mi.Vector3f
@@ -154,10 +159,10 @@ class Adjoint:
 
 @dataclass
 class AttachedFrame:
-    """Vertex on the stack: the data to evaluate its segment again, P_i, and r_{i-1}.
+    """Vertex on the stack, with the data to evaluate its segment again, and with P_i and r_{i-1}.
 
-    `connected` is 1 if the sensor was visible. `aperture` holds the sample of the aperture if the sensor has one, and
-    `before` the previous vertex if vertices can stay.
+    `connected` is 1 if the sensor was visible. `aperture` holds the sample of the aperture if the sensor has one.
+    `before` is the previous vertex if vertices can stay.
     """
 
     point: SurfacePoint
@@ -205,15 +210,16 @@ class AttachedFrame:
 
 @dataclass
 class AttachedState:
-    """Loop state of the way out: the stack, and the data that the next vertex needs of the current one."""
+    """Loop state of the forward pass: the stack, and the data of the current vertex that the next vertex needs."""
 
     stack: StackState
     before: list[Before]
 
 
 class AttachedSweep(VertexHooks):
-    """Way out: splat, and push the vertices before number `end`; paths end there. If `end` is None, all vertices are
-    pushed.
+    """Forward pass: it splats the image and pushes the vertices before number `end`, where paths end.
+
+    If `end` is None, it pushes all vertices.
     """
 
     def __init__(self, p: Pass, ring: Ring, end: mi.UInt32 | None = None) -> None:
@@ -226,7 +232,7 @@ class AttachedSweep(VertexHooks):
         return AttachedState(stack, Before.start(plan))
 
     def wants(self, state: AttachedState, vertex: Vertex) -> mi.Bool:
-        """Return all lanes if there is an image, otherwise those behind a differentiated vertex."""
+        """Return all lanes if there is an image. Otherwise return the lanes behind a differentiated vertex."""
         return mi.Bool(True) if self.p.block is not None else self._useful(state, vertex)
 
     def goes_on(self, state: AttachedState, vertex: Vertex) -> mi.Bool:
@@ -292,7 +298,7 @@ class AttachedStack(Estimator):
         return sum(entry_bytes(AttachedFrame.blank(plan))) * (places(plan, self.stack_size) + 1)
 
     def _sweep(self, p: Pass) -> Adjoint:
-        """Trace the paths, splat them if there is an image, and walk back; return the adjoint at the emitter."""
+        """Trace the paths, splat them if there is an image, and walk back. Returns the adjoint at the emitter."""
         ring, again = Ring.of(p.plan, self.stack_size), Pass(p.samples, None, p.adjoint)
         state: AttachedState = p.walk(AttachedSweep(p, ring))
 
@@ -313,7 +319,7 @@ def concerns_emission(plan: Plan) -> bool:
 
 
 def differentiate_start(p: Pass, adjoint: Adjoint) -> None:
-    """Add the derivatives of the rays that leave the emitters, and of E, if a parameter affects them."""
+    """Add the derivatives of the emitters' rays and of E, if a parameter affects them."""
     plan = p.plan
     if not concerns_emission(plan):
         return

@@ -65,11 +65,11 @@ class Pass:
 class Estimator(ABC):
     """Estimator of the gradient of a path's contributions without storing the path.
 
-    `forward` splats the image and returns the stored data of each path; `backward` adds the derivatives once dL/dI is
+    `forward` splats the image and returns the stored data of each path. `backward` adds the derivatives once dL/dI is
     known. If dL/dI is known from the start (`Pass.adjoint` in `forward`), an estimator may use it there.
 
-    OPTIONS maps the estimator's options of the plugin to their defaults. The constructor takes them, and raises
-    ValueError if one is wrong.
+    OPTIONS maps the names of the plugin's options to their defaults. The constructor takes these options, and raises
+    ValueError for a wrong value.
     """
 
     OPTIONS: ClassVar[dict[str, Any]] = {}
@@ -83,8 +83,8 @@ class Estimator(ABC):
 
     @abstractmethod
     def forward(self, p: Pass) -> Any:
-        """Splat the image and return the state to store, a PyTree of arrays with one entry per path; not evaluated
-        here.
+        """Splat the image and return the state to store, a PyTree of arrays with one entry per path. Does not evaluate
+        the state.
         """
 
     @abstractmethod
@@ -93,9 +93,7 @@ class Estimator(ABC):
 
     @abstractmethod
     def kept(self, plan: Plan) -> Any:
-        """Return all simultaneously stored data of a path, a PyTree of the same form; only the types of its leaves
-        matter.
-        """
+        """Return a PyTree with the types of all data that are stored for a path at the same time."""
 
     def scratch_bytes(self, plan: Plan) -> int:
         """Return the thread-local bytes of each traced path, which the allocator does not count."""
@@ -110,7 +108,7 @@ def arrays(tree: Any) -> list[dr.ArrayBase]:
 
 
 def like(form: T, values: Iterator[dr.ArrayBase]) -> T:
-    """Return a PyTree of the same form, filled with the next of these arrays."""
+    """Return a PyTree of the same form, filled with the next of the given arrays."""
     made: Any = type(form)
     if isinstance(form, list):
         return made(like(part, values) for part in form)
@@ -129,7 +127,8 @@ def entry_bytes(tree: Any) -> list[int]:
 def allocate(form: Any, size: int) -> list[dr.Local]:
     """Return thread-local memory for `size` PyTrees of this form, and one more place for discarded values.
 
-    No place may be written twice, even if the first write is masked out: the second write was lost (Dr.Jit 1.5, LLVM).
+    No place may be written twice, even if the first write is masked. Otherwise the second write is lost (Dr.Jit 1.5,
+    LLVM).
     """
     return [dr.alloc_local(type(array), size + 1) for array in arrays(form)]
 
@@ -146,7 +145,7 @@ def read(stack: list[dr.Local], form: T, place: mi.UInt32) -> T:
 
 
 def differentiate_emission(p: Pass, weight: Callable[[mi.Spectrum], mi.Spectrum]) -> None:
-    """Add the derivative of E, (C,), times `weight(E)`, if the plan differentiates emission."""
+    """Add the derivative of E (C,), multiplied by `weight(E)`, if the plan differentiates emission."""
     if p.plan.differentiate_emission:
         with dr.resume_grad(), dr.isolate_grad():
             E = p.emission().weight
@@ -157,8 +156,8 @@ def differentiate_emission(p: Pass, weight: Callable[[mi.Spectrum], mi.Spectrum]
 class PathAdjoint:
     """Sensitivity of the objective to one connection of a path.
 
-    `value` is (C,): delta times the product of the nonzero factors, including the weight of the estimator, and 0 in
-    lanes without a connection. `product` says which factor is zero, if any.
+    `value` (C,) is delta times the product of the nonzero factors, including the estimator's weight. It is 0 in lanes
+    without a connection. `product` tells which factor is zero, if any.
     """
 
     value: mi.Spectrum
@@ -168,9 +167,11 @@ class PathAdjoint:
 def adjoint_of_factor(
     adjoint: PathAdjoint, index: mi.UInt32 | mi.Int32, f: mi.Spectrum, rest: mi.Spectrum | float
 ) -> mi.Spectrum:
-    """Return d(objective)/df (C,) for the factor `f * rest` at position `index` of the path; detached.
+    """Return the detached derivative (C,) of the objective with respect to the factor `f * rest` at position `index` of
+    the path.
 
-    A nonzero factor gets adjoint / f if no factor is zero; a zero factor gets adjoint * rest if it is the only one.
+    If no factor is zero, the derivative is adjoint / f. If only this factor is zero, it is adjoint * rest. Otherwise it
+    is 0.
     """
     f, value, zeros = dr.detach(f), adjoint.value, adjoint.product.zero
     if not zeros:
@@ -188,8 +189,8 @@ def differentiate_passage(
 ) -> mi.Spectrum:  # fmt: skip
     """Return the transmittance (C,) of the masks between a vertex and the sensor, and add its derivative.
 
-    A mask with a transmission of zero ends the segment, so a mask is never the zero factor of a product. Only beside a
-    zero factor is the transmittance needed. Otherwise, without a derivative, nothing is traced.
+    A mask with a transmission of zero ends the segment, so a mask is never the zero factor of a product. The value is
+    only needed beside a zero factor. If neither value nor derivative is needed, nothing is traced.
     """
     if not p.plan.passage_in_gradient:
         return mi.Spectrum(1)
@@ -221,11 +222,15 @@ class VertexHooks(Hooks):
         self.p = p
 
     def concerned(self, state: Any) -> mi.Bool:
-        """Return the lanes with a differentiated vertex before the current one, if emission is not differentiated."""
+        """Return the lanes with a differentiated vertex before the current one. Returns all lanes if emission is
+        differentiated.
+        """
         return mi.Bool(True)
 
     def wants(self, state: Any, vertex: Vertex) -> mi.Bool:
-        """Return all lanes if there is an image, otherwise connections with something to differentiate."""
+        """Return all lanes if there is an image. Otherwise return the connections that depend on a differentiated
+        parameter.
+        """
         plan = self.p.plan
         if self.p.block is not None or plan.differentiate_emission:
             return mi.Bool(True)
@@ -243,7 +248,7 @@ def places(plan: Plan, stack_size: int) -> int:
 
 
 def one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
-    """Raise ValueError if an option has none of its allowed values."""
+    """Raise ValueError if an option has another value than the allowed ones."""
     if value not in allowed:
         raise ValueError(f'"{name}" must be one of {", ".join(allowed)}, not "{value}"')
 

@@ -1,11 +1,11 @@
 """Camera paths: their image, and its derivative in one traversal, for a film with known dL/dI.
 
-All light that a camera path finds arrives at one place of the film, so delta is one number per channel, known before
-the path is traced. The walk back is that of `stack.py`, with c_j the contribution of vertex j's next event. Light that
-is met at a vertex does not depend on the BSDF there, so it belongs to the vertices before.
+All light of a camera path arrives at one place of the film. Therefore delta is one number per channel, which is known
+before the path is traced. The walk back is that of `stack.py`, where c_j is the contribution of next event estimation
+at vertex j. The emission of a hit emitter does not depend on the BSDF there, so it belongs to the earlier vertices.
 
-The radiance of both is a last factor, whose derivative needs nothing that comes later. It is differentiated on the way
-out. The weights of combined paths have no derivative.
+The radiance of an emitter is the last factor of a contribution. Its derivative needs no later data, so the forward pass
+adds it. The weights of combined paths have no derivative.
 """
 
 from __future__ import annotations
@@ -57,16 +57,16 @@ def splat_camera_paths(samples: Samples, block: mi.ImageBlock, tracked: bool = F
 
 @dataclass
 class CameraState:
-    """Loop state of the way out: the stack, and the radiance so far, (C,), if there is an image."""
+    """Loop state of the forward pass: the stack and, if there is an image, the radiance so far (C,)."""
 
     stack: StackState
     L: list[mi.Spectrum]
 
 
 class CameraSweep(CameraHooks):
-    """Way out of camera paths: sum the image, differentiate radiances, and push vertices.
+    """Forward pass of camera paths: it sums the image, differentiates radiances, and pushes vertices.
 
-    With `end`, the vertices before that number are traced again: they are pushed, and the path ends with them.
+    With `end`, it traces paths again, pushes only vertices before number `end`, and ends the paths there.
     """
 
     def __init__(self, p: Pass, ring: Ring, end: mi.UInt32 | None = None) -> None:
@@ -110,7 +110,7 @@ class CameraSweep(CameraHooks):
         return CameraState(state.stack.scaled(weight), state.L)
 
     def _differentiate_emission(self, vertex: Vertex, met: MetLight | None, event: NextEvent | None) -> None:
-        """Add the derivatives with respect to the radiance that a vertex finds."""
+        """Add the derivatives with respect to the radiance of emitters at a vertex."""
         weight = self.delta * vertex.product.value()
         with dr.resume_grad():
             objective = mi.Spectrum(0)
@@ -125,7 +125,7 @@ class CameraSweep(CameraHooks):
 
 
 def differentiate_camera_paths(p: Pass, stack_size: int = STACK_SIZE) -> None:
-    """Add the derivatives of the camera paths of a pass with known dL/dI, and their image to its block, if any."""
+    """Add the derivatives of a pass's camera paths with known dL/dI, and splat their image if there is one."""
     ring, again = Ring.of(p.plan, stack_size), Pass(p.samples, None, p.adjoint)
     first, state = camera_walk(p.samples, CameraSweep(p, ring))
     if p.block is not None:

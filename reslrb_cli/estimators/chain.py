@@ -1,31 +1,31 @@
 """Attached derivatives of a reservoir's connections, by chains of Jacobians: constant memory, no stack.
 
-Chain: let p_i be the coordinates of the ray that reaches vertex i, J_i = dp_{i+1}/dp_i, and J_{0->i} their product from
-the first vertex on that depends on a parameter. Each channel also carries the logarithmic derivative of the factors so
-far,
+Chain: p_i are the coordinates of the ray that reaches vertex i, and J_i = dp_{i+1}/dp_i. J_{0->i} is the product of
+these matrices, starting at the first vertex that depends on a parameter. Each channel also carries the logarithmic
+derivative of the factors so far.
 
     G_i = sum_{m<i} dlog s_m/dp_m J_{0->m}
 
-For a selected connection I, du_I/dp_I J_{0->I} and dlog c_I/dp_I J_{0->I} + G_I are stored. With delta they give the
-adjoint of the first ray (without the factor W / (m w_I)),
+A selected connection I stores du_I/dp_I J_{0->I} and dlog c_I/dp_I J_{0->I} + G_I. Together with delta, they give the
+adjoint of the first ray, up to the factor W / (m w_I).
 
     a_0 = <d delta/du, C_I> du_I/dp_I J_{0->I} + delta C_I (dlog c_I/dp_I J_{0->I} + G_I)
 
 Damping (`segment_jacobian`) makes singular Jacobians invertible, but costs digits at every vertex that is not specular.
 Paths are therefore divided into blocks of BLOCK such vertices. A chain starts with one block, chosen with equal
-probability among the blocks before the connection, and the replay takes the adjoint only through this block, multiplied
-by the number of blocks. Radiometric derivatives, which need no chain, are added at every vertex.
+probability among the blocks before the connection. The replay takes the adjoint only through this block, multiplied by
+the number of blocks. Radiometric derivatives need no chain, and are added at every vertex.
 
-Replay: it takes a_0 to every vertex through the inverse of the passed Jacobians, and differentiates each segment:
+Replay: it takes a_0 to every vertex through the inverses of the passed Jacobians, and differentiates each segment.
 
     a_{j+1} = (a_j - delta C_I dlog s_j/dp_j) J_j^{-1}
     dS     += a_{j+1} dp_{j+1}/dtheta + delta C_I ds_j/s_j          at I:   d<delta(u_I), C_I> by c_I and u_I
 
-This is J_{j+1->I} = J_{0->I} J_{0->j+1}^{-1} of the ResLRB paper's Section 2.5, one factor of the inverse at a time.
-Chain and replay compute the same J_j to the last bit, so the inverse undoes it for any conditioning.
+The product of the inverses is J_{j+1->I} = J_{0->I} J_{0->j+1}^{-1} of the ResLRB paper. Chain and replay compute the
+same J_j to the last bit, so the inverse cancels it for any conditioning.
 
-Source: the ResLRB paper, Section 2.5, which has neither G nor blocks, and regularises the inverse at vertices that are
-not specular. A random sign of the regularisation avoids its bias.
+Source: the ResLRB paper, Section 2.5. The paper has neither G nor blocks, and regularises the inverse at vertices that
+are not specular. Here, a random sign of the regularisation avoids its bias.
 """
 
 from __future__ import annotations
@@ -72,9 +72,10 @@ JACOBIAN_DAMPING = 0.1
 class ChainSlot:
     """Selected connection.
 
-    `last` is the last differentiated vertex up to its own, `number`; 0 if there is none. `prefix` (C,) is the path's
-    throughput before its vertex. `u_rows` and `C_rows` are du_I/dp_I J_{0->I} and dlog c_I/dp_I J_{0->I} + G_I. `block`
-    holds the number of the block that J starts with, and the number of blocks so far, if there may be several.
+    `number` is its vertex, and `last` the last differentiated vertex up to it, or 0 if there is none. `prefix` (C,) is
+    the path's throughput before this vertex. `u_rows` and `C_rows` are du_I/dp_I J_{0->I} and dlog c_I/dp_I J_{0->I} +
+    G_I. If there may be several blocks, `block` holds the number of the block that J starts with, and the number of
+    blocks so far.
     """
 
     w: mi.Float
@@ -90,8 +91,9 @@ class ChainSlot:
 
 @dataclass
 class ChainBlocks:
-    """Position of a path in its blocks: number of non-specular vertices passed, and the block that the chain starts
-    with.
+    """Position of a path in its blocks.
+
+    It holds the number of non-specular vertices passed, and the block that the chain starts with.
     """
 
     passed: mi.UInt32
@@ -104,7 +106,7 @@ class ChainBlocks:
 
     @property
     def number(self) -> mi.UInt32:
-        """Number of the block of the ray from here on, starting at 0."""
+        """Number of the current ray's block, starting at 0."""
         return self.passed // BLOCK
 
     def past(self, damped: mi.Bool) -> tuple[ChainBlocks, mi.Bool]:
@@ -115,9 +117,10 @@ class ChainBlocks:
 
 @dataclass
 class ChainState:
-    """Stored data of a path; lists exist only on the way.
+    """State of a path in the image pass.
 
-    `latest` is the latest differentiated vertex (0: none), `J` is J_{0->i}, and `G` has a row for each channel.
+    `latest` is the latest differentiated vertex, or 0 if there is none. `J` is J_{0->i}, and `G` has a row for each
+    channel. These lists exist only during the walk.
     """
 
     W: mi.Float
@@ -210,7 +213,7 @@ class ChainSelection(VertexHooks):
         return replace(self._begun_anew(after, jacobian.damped, numbers[-1]), before=before)
 
     def _begun_anew(self, state: ChainState, damped: mi.Bool, number: mi.Float) -> ChainState:
-        """Start the chain anew with a block, with probability one over the number of blocks."""
+        """Restart the chain at a block, with probability one over the number of blocks."""
         if not state.blocks:
             return state
         blocks, begins = state.blocks[0].past(damped)
@@ -225,8 +228,8 @@ class ChainSelection(VertexHooks):
 class KeptConnection:
     """Selected connection in a replay.
 
-    `share` is W / (m w_I), `adjoint` the sensitivity of the objective to the connection, `A` = delta C_I (C,) its
-    nonzero part, and `row` is a_0; each includes `share`.
+    `share` is W / (m w_I). `adjoint` is the sensitivity of the objective to the connection. `A` (C,) is the nonzero
+    part of delta C_I, and `row` is a_0. The last three include `share`.
     """
 
     slot: ChainSlot
@@ -253,7 +256,7 @@ class KeptConnection:
         return KeptConnection(slot, share, PathAdjoint(delta * slot.C.nonzero * share, slot.C), A, row)
 
     def part(self, blocks: list[ChainBlocks]) -> tuple[mi.Bool, mi.Float64]:
-        """Return whether a ray belongs to the block that the chain starts with, and the factor for all other blocks."""
+        """Return whether a ray belongs to the block that the chain starts with, and the factor for the other blocks."""
         if not blocks:
             return mi.Bool(True), mi.Float64(1)
         chosen, count = self.slot.block
@@ -262,7 +265,7 @@ class KeptConnection:
 
 @dataclass
 class ReplayState:
-    """Loop state of a replay: a_j of each slot, and whether the path has met a differentiated vertex."""
+    """Loop state of a replay: a_j for each slot, and whether the path has met a differentiated vertex."""
 
     rows: list[mi.Vector4d]
     begun: mi.Bool
@@ -306,7 +309,7 @@ class ChainReplay(SlotReplay):
     def _differentiate(
         self, vertex: Vertex, before: list[Before], numbers: Numbers, scattering: Scattering, rows: list[mi.Vector4d]
     ) -> None:
-        """Add the derivatives of the vertex's segment; `rows` are the adjoints of its outgoing ray."""
+        """Add the derivatives of the vertex's segment. `rows` are the adjoints of its outgoing ray."""
         p, plan, depth = self.p, self.p.plan, vertex.depth
         here = vertex.active & begins(plan, vertex)
         connected, scattered = mi.Bool(False), mi.Bool(False)
@@ -377,8 +380,8 @@ AXES = 4
 class SegmentJacobian:
     """Derivatives with respect to p_i, in double precision, because products of many of them are inverted.
 
-    `ray` is dp_{i+1}/dp_i, and `damped` says whether it contains `damping`. `log_s` and `log_c` have a row for each
-    channel, 0 if the factor is 0, and `u` one for each film coordinate (in pixels).
+    `ray` is dp_{i+1}/dp_i. `damped` tells whether it contains `damping`. `log_s` and `log_c` have a row for each
+    channel, or zeros if the factor is 0. `u` has a row for each film coordinate, in pixels.
     """
 
     ray: mi.Matrix4d
@@ -405,8 +408,8 @@ def coordinates(d: mi.Vector3f, o_change: mi.Vector3f, d_change: mi.Vector3f, st
 
 
 def spread(d: mi.Vector3f, row: mi.Vector4d, stays: mi.Bool) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Return the derivatives with respect to a ray's origin and direction `d`, from a row of derivatives with respect
-    to p.
+    """Return the derivatives with respect to a ray's origin and direction `d`, given the derivatives with
+    respect to p.
     """
     frame = mi.Frame3f(d)
     q_s, q_t, third, fourth = (mi.Float(value) for value in row)
@@ -418,13 +421,13 @@ def segment_jacobian(
     samples: Samples, vertex: Vertex, before: list[Before], numbers: Numbers, connected: mi.Bool | None,
     scattered: mi.Bool, damping: float,
 ) -> SegmentJacobian:  # fmt: skip
-    """Return the Jacobians of a vertex's segment; lanes without `connected` have none of the connection.
+    """Return the Jacobians of a vertex's segment. Lanes without `connected` have no Jacobian of the connection.
 
     Behind a diffuse scattering event, the next ray does not depend on the previous direction, so the Jacobian is
-    singular. The same holds for a vertex that stays on its surface. `damping` makes it invertible: behind a vertex that
-    is not specular, the ray turns by `damping` with the previous ray, and behind one that stays it is also shifted with
-    it, to either side with probability 1/2. The chain before the inverse is linear in each of these terms, so the
-    expected value does not change.
+    singular. The same holds for a vertex that stays on its surface. `damping` makes the Jacobian invertible. Behind a
+    vertex that is not specular, the next ray also rotates with the previous ray, by the fraction `damping`. Behind a
+    vertex that stays, it is also shifted with the previous ray. The sign of each damping term is random, with
+    probability 1/2. The chain before the inverse is linear in each term, so the expected value does not change.
     """
     p = [mi.Float(0) for _ in range(AXES)]
     frame, stays = mi.Frame3f(vertex.ray.d), is_staying(before)
@@ -469,7 +472,7 @@ def segment_jacobian(
 
 
 def sign(numbers: Numbers) -> mi.Float:
-    """Return 1 or -1 with probability 1/2 each: the last bit of a random number of the BSDF.
+    """Return 1 or -1 with probability 1/2 each, from the last bit of the BSDF's random number.
 
     This bit does not affect the direction, and a replay reads the same bit.
     """

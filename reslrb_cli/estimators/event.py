@@ -1,16 +1,16 @@
 """Select single scattering events of each path by two nested reservoirs, and differentiate them without a replay.
 
-The gradient of a path is a double sum over the connections i, and over the events of each connection: emission, the
-scattering events j < i, and the connection's own BSDF (j = i). The inner reservoir selects one of these events, with
-weight q_j = 1, or 0 if it has no parameter. The outer reservoir selects a connection with weight w_i Q_i, Q_i = sum_j
-q_j.
+The gradient of a path is a double sum over its connections i and over the events of each connection. The events are
+emission, the scattering events j < i, and the connection's own BSDF (j = i). The inner reservoir selects one event with
+weight q_j = 1, or 0 if the event has no parameter. The outer reservoir selects a connection with weight w_i Q_i, where
+Q_i is the sum of the q_j.
 
     the pair (i, j) is kept with probability w_i q_j / W,   W = sum_i w_i Q_i
     dS ~ 1/m sum_slots W / (w_i q_j) delta_i C_i df_j/f_j
 
-Reservoir sampling: Chao 1982. The stored event suffices to evaluate its BSDF again, and takes about 50 bytes. One
-random number selects both the event of a vertex's own connection and that of its prefix. Only one of the two is ever
-stored for a path, so they may depend on each other.
+Reservoir sampling: Chao 1982. A stored event contains enough data to evaluate its BSDF again, and takes about 50 bytes.
+One random number selects both the event of a vertex's own connection and that of its prefix. A path stores only one of
+the two, so they may depend on each other.
 """
 
 from __future__ import annotations
@@ -130,8 +130,9 @@ class EventSelection(VertexHooks):
 
 
 class EventEstimator(Estimator):
-    """Estimator with `capacity` independent pairs of a connection and an event, with selection weight `luminance` or
-    `adjoint`.
+    """Estimator with `capacity` independent pairs of a connection and an event.
+
+    The selection weight is `luminance` or `adjoint`.
     """
 
     OPTIONS: ClassVar[dict[str, Any]] = {"capacity": 1, "weight": "luminance"}

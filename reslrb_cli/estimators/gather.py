@@ -4,9 +4,9 @@ from it.
     S_0 = sum_i delta_i C_i,   S_j = S_{j-1} - delta_j C_j
     dS  = S_0 dE/E + sum_j [ S_j ds_j/s_j + delta_j C_j dc_j/c_j ]
 
-Source: the ResLRB paper's conclusion, second extension. The sum needs delta: if dL/dI is known only after the image, a
+Source: the ResLRB paper's conclusion, second extension. The sum needs delta. If dL/dI is known only after the image, a
 walk without shadow rays computes the sum first. One bit per vertex stores which connections were visible. Vertices
-beyond the last bit trace their shadow rays again, so that memory is constant.
+beyond the last bit trace their shadow rays again, so memory is constant.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class Visibility:
         return Visibility([mi.UInt32(0) for _ in range(min(WORDS, -(-plan_depth // 32)))], mi.UInt32(0))
 
     def with_vertex(self, depth: mi.UInt32, visible: mi.Bool, last: mi.UInt32) -> Visibility:
-        """Return the visibility with that of the connection from vertex `depth`; if visible, `last` is the last vertex
-        to visit.
+        """Return the visibility after adding the connection of vertex `depth`. If it is visible, `last` is set to the
+        last vertex that a replay must visit.
         """
         index = depth - 1
         bit = mi.UInt32(1) << (index & 31)
@@ -73,9 +73,9 @@ class Visibility:
 class AdjointSum:
     """Sum of delta_i C_i over connections of a path, (C,), as `value` + `rest`.
 
-    `rest` is the rounding error (Knuth's two-sum), so that subtracting all terms leaves zero after a thousand vertices.
-    `behind_zero` is the same pair for contributions whose prefix has exactly one zero factor, without this factor:
-    their value is zero, and their derivative with respect to the factor is the sum. It is empty if zeros are not
+    `rest` is the rounding error (Knuth's two-sum). With it, subtracting all terms leaves exactly zero, even after a
+    thousand vertices. `behind_zero` is a second sum, of contributions whose prefix has exactly one zero factor. This
+    sum leaves out the zero factor, so it is the derivative with respect to that factor. It is empty if zeros are not
     tracked.
     """
 
@@ -90,7 +90,7 @@ class AdjointSum:
         return AdjointSum(mi.Spectrum(0), mi.Spectrum(0), behind_zero)
 
     def plus(self, delta: mi.Spectrum, C: Product, index: mi.UInt32, active: mi.Bool) -> AdjointSum:
-        """Return the sum with delta C of one more connection, at vertex `index`."""
+        """Return the sum after adding delta C of the connection at vertex `index`."""
         delta = dr.select(active, delta, 0)
         value, rest = self._add(self.value, self.rest, delta * C.value())
         if not self.behind_zero:
@@ -102,12 +102,13 @@ class AdjointSum:
         return AdjointSum(value, rest, list(self._add(self.behind_zero[0], self.behind_zero[1], term)))
 
     def minus(self, delta: mi.Spectrum, C: Product, index: mi.UInt32, active: mi.Bool) -> AdjointSum:
-        """Return the sum without delta C of a connection that it contains."""
+        """Return the sum after removing delta C of the connection at vertex `index`."""
         return self.plus(-delta, C, index, active)
 
     def adjoint_of_factor(self, f: mi.Spectrum, prefix: Product, rest: mi.Float | float) -> mi.Spectrum:
-        """Return d(sum)/df (C,), for a factor `f * rest` of the path with this prefix, before all connections in the
-        sum.
+        """Return the derivative (C,) of the sum with respect to a factor `f * rest` of the path with this prefix.
+
+        The factor must come before all connections in the sum.
         """
         f, total = dr.detach(f), self.value + self.rest
         result = dr.select(f != 0, total / f, 0)
@@ -131,9 +132,9 @@ class AdjointSum:
 
 @dataclass
 class GatherState:
-    """Stored data of a path: visibility, and S_0 if delta is known (else nothing).
+    """Stored data of a path: visibility and, if delta is known, S_0.
 
-    If delta is known, `latest` is the latest differentiated vertex on the way.
+    If delta is known, `latest` is the latest differentiated vertex during the walk.
     """
 
     visibility: Visibility
@@ -184,7 +185,7 @@ class Revisiting(VertexHooks):
 
 
 class Summing(Revisiting, Gathering):
-    """Sum delta_i C_i along the same paths; the visibility says which vertex is the last to visit."""
+    """Sum delta_i C_i along the same paths. The visibility tells where each path may end."""
 
     def start(self, product: Product) -> GatherState:
         return GatherState(Visibility.none(0), [AdjointSum.zero(self.p.plan.track_zeros)], [mi.UInt32(0)])
@@ -221,16 +222,19 @@ class Taking(Revisiting):
 def adjoint_of_connection(
     p: Pass, vertex: Vertex, connection: Connection, active: mi.Bool, adjoint: PathAdjoint
 ) -> mi.Spectrum:
-    """Return d(objective)/df (C,) of a connection's BSDF, and add the derivative of masks on its way."""
+    """Return the derivative (C,) of the objective with respect to a connection's BSDF, and add the derivative of the
+    masks on its way.
+    """
     rest = mi.Spectrum(dr.rcp(stand_in(connection)[0]))
     rest *= differentiate_passage(p, vertex.si, vertex.depth, connection, active, adjoint)
     return adjoint_of_factor(adjoint, vertex.depth, connection.f, rest)
 
 
 def needed(latest: mi.UInt32, depth: mi.UInt32) -> mi.UInt32:
-    """Return the last vertex that a replay must visit for a connection from vertex `depth`; 0 if there is none.
+    """Return the last vertex that a replay must visit for a connection from vertex `depth`, or 0 if there is none.
 
-    This is the vertex after the latest differentiated one, whose scattering is then sampled, or that vertex itself.
+    It is the vertex after the latest differentiated vertex, because the scattering of the latter is sampled there. If
+    the connection starts at the latest differentiated vertex, it is this vertex.
     """
     return dr.select(latest > 0, dr.minimum(latest + 1, depth), 0)
 

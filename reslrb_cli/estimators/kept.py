@@ -14,11 +14,11 @@ from reslrb_cli.transport.walk import Vertex
 
 @dataclass
 class SurfacePoint:
-    """Data of a vertex that its BSDF reads, as plain numbers (pointers are their indices).
+    """Data of a vertex that its BSDF reads, as plain numbers. Pointers are stored as indices.
 
-    If BSDFs read only texture coordinates and directions, these are `[uv, wi, bsdf]`, without `bsdf` if just one is
-    differentiated. Otherwise they are the data to find the interaction again: `[t, prim_uv, prim_index, shape,
-    instance, o, d]`.
+    If BSDFs read only texture coordinates and directions, the data are `[uv, wi, bsdf]`, without `bsdf` if just one
+    BSDF is differentiated. Otherwise the data identify the interaction: `[t, prim_uv, prim_index, shape, instance, o,
+    d]`.
     """
 
     numbers: list[dr.ArrayBase]
@@ -56,7 +56,7 @@ class SurfacePoint:
         return pi, mi.Ray3f(o, d)
 
     def interaction(self, plan: Plan, active: mi.Bool | bool = True) -> tuple[mi.SurfaceInteraction3f, mi.BSDFPtr]:
-        """Return the surface interaction, as far as BSDFs read it, and the BSDF."""
+        """Return the surface interaction with all data that BSDFs read, and the BSDF."""
         if not plan.keep_geometry:
             si = dr.zeros(mi.SurfaceInteraction3f)
             si.uv, si.wi, *pointer = self.numbers
@@ -68,7 +68,7 @@ class SurfacePoint:
 
 
 def event(wo: mi.Vector3f, lobe: list[mi.UInt32 | mi.Float | mi.Point2f]) -> Scattering:
-    """Return a sampled event from its stored direction and `lobe`, as far as its factor needs it."""
+    """Return a sampled event from its stored direction and `lobe`, with all data that its factor needs."""
     kind, sample_1, sample_2 = lobe or [mi.UInt32(0), None, None]
     return Scattering(
         weight=None, f=None, wo=wo, d=None, pdf=None, eta=None, correction=None,
@@ -81,9 +81,9 @@ def _index(pointer: mi.BSDFPtr | mi.ShapePtr) -> mi.UInt32:
 
 
 def lobe(plan: Plan, scattering: Scattering | None) -> list[mi.UInt32 | mi.Float | mi.Point2f]:
-    """Return which lobe was sampled (1: delta, 2: null), with its random numbers; empty if only smooth lobes matter.
+    """Return the sampled lobe (1: delta, 2: null) with its random numbers; empty if only smooth lobes matter.
 
-    Without an event (None), return zeros of the same form.
+    Without an event (None), the function returns zeros of the same form.
     """
     if not (plan.differentiate_delta or plan.differentiate_null):
         return []

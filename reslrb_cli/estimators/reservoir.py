@@ -3,13 +3,16 @@
     slot k keeps candidate i with probability w_i / W,   W = sum_i w_i
     dS ~ 1/m sum_k (W / w_I) delta_I [ C_I dE/E + sum_{j<I} C_I ds_j/s_j + C_I dc_I/c_I ],   I = I_k
 
-Source: the ResLRB paper, Sections 2.2 to 2.4, for m = 1 and w = luminance(C); its conclusion names m > 1, here m
-independent slots with one common replay. Reservoir sampling: Chao 1982. If delta is known before the paths are traced,
-w = sum_c |delta_c C_c| has less variance. With zero factors, the weight is that of the nonzero factors, so that a
-connection whose value is zero but whose derivative is not can be selected. No weight is below SHARE of those before it.
-The surface point of the selected connection is stored, too: c_I is differentiated without a replay, which needs to
-reach only x_{I-1}, or the last differentiated vertex before it. A connection of a path without differentiated vertices
-is no candidate.
+Source: the ResLRB paper, Sections 2.2 to 2.4, for m = 1 and w = luminance(C). Its conclusion proposes m > 1. Here, m
+independent slots share one replay. Reservoir sampling: Chao 1982.
+
+If delta is known before the paths are traced, w = sum_c |delta_c C_c| has less variance. With zero factors, the weight
+uses only the nonzero factors. A connection with a zero value and a nonzero derivative can then be selected. Every
+weight is at least SHARE of the sum of the weights before it.
+
+The surface point of the selected connection is stored, too, so c_I is differentiated without a replay. The replay ends
+at x_{I-1}, or at the last differentiated vertex before it. A connection of a path without differentiated vertices is no
+candidate.
 """
 
 from __future__ import annotations
@@ -50,9 +53,9 @@ from reslrb_cli.transport.walk import Vertex
 
 @dataclass
 class Slot:
-    """Selected connection, 28 bytes (and 12 more if zero factors are tracked).
+    """Selected connection, 28 bytes. If zero factors are tracked, it takes 12 bytes more.
 
-    If BSDFs are differentiated, `event` holds c_I, about 50 bytes, so that the replay ends a vertex earlier.
+    If BSDFs are differentiated, `event` holds c_I in about 50 bytes, so that the replay ends a vertex earlier.
     """
 
     w: mi.Float  # its selection weight
@@ -112,7 +115,7 @@ class ReservoirSelection(VertexHooks):
 
 
 class ReservoirReplay(SlotReplay):
-    """Replay up to the last vertex that any slot differentiates before its own, and differentiate s_j."""
+    """Replay that differentiates s_j. It ends at the last differentiated vertex before the connections of all slots."""
 
     def __init__(self, p: Pass, slots: list[Slot], adjoints: list[PathAdjoint]) -> None:
         super().__init__(p, [slot.last for slot in slots])

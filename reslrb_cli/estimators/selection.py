@@ -1,8 +1,8 @@
 """Weighted reservoir sampling of a path's connections (Chao 1982), and replays up to the selected ones.
 
-slot k keeps candidate i with probability w_i / W,   W = sum_i w_i
+    slot k keeps candidate i with probability w_i / W,   W = sum_i w_i
 
-An `Event` stores a single factor of a path, so that its derivative needs no replay.
+An `Event` stores a single factor of a path. Its derivative needs no replay.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SHARE = 0.01  # minimum share of a candidate in the weights up to it
 
 
 class Chosen(Protocol):
-    """Common data of slots: selection weight (0: empty), contribution, film position."""
+    """Common data of slots: selection weight (0 if empty), contribution, and film position."""
 
     w: mi.Float
     C: Product
@@ -34,7 +34,7 @@ class Chosen(Protocol):
 
 
 def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -> mi.Float:
-    """Return w of a connection: `luminance` of C, or `adjoint`, sum_c |delta_c C_c|.
+    """Return w of a connection: the luminance of C for `luminance`, or sum_c |delta_c C_c| for `adjoint`.
 
     Raises ValueError for `adjoint` if delta is not known.
     """
@@ -47,44 +47,44 @@ def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -
 
 
 def is_taken(number: mi.Float, w: mi.Float, W: mi.Float) -> mi.Bool:
-    """Return whether a candidate of weight `w` takes the slot, with probability w / W; `W` is the sum including `w`.
+    """Return whether a candidate of weight `w` takes the slot, with probability w / W. The sum `W` includes `w`.
 
-    A weight that is not finite is always taken, and so are all later ones, so that errors are not lost.
+    A weight that is not finite is always taken, and so are all later ones, so errors are not lost.
     """
     return (w != 0) & ((number * W < w) | ~dr.isfinite(W))
 
 
 def at_least_share(w: mi.Float, W: mi.Float) -> mi.Float:
-    """Return a candidate's weight, raised to SHARE of the sum W of all before it, unless it is 0.
+    """Return a candidate's weight, raised to SHARE of the sum W of all earlier weights, unless it is 0.
 
-    Connections after a heavy one may be the only ones that depend on some parameter. They are selected with a
-    probability of at least SHARE, although their own weight may be a millionth. Earlier connections need no such
-    minimum, because the heavy one depends on their parameters, too.
+    Connections after a heavy one may be the only ones that depend on some parameter. Their own weight may be a
+    millionth of the heavy one. The minimum weight gives them a probability of at least SHARE. Earlier connections need
+    no minimum, because the heavy connection depends on the same parameters.
     """
     least = SHARE * W
     return dr.select((w != 0) & (w < least), least, w)  # a comparison, so that NaN is kept
 
 
 def inverse_probability(W: mi.Float, slot: Chosen, capacity: int) -> mi.Float:
-    """Return W / (m w): the inverse probability of a slot's selection, divided by the number of slots; 0 for an empty
-    slot.
+    """Return W / (m w), the inverse probability of a slot's selection divided by the number of slots. It is 0 for an
+    empty slot.
     """
     return dr.select(slot.w != 0, W / (capacity * slot.w), 0)
 
 
 def slot_adjoint(p: Pass, W: mi.Float, slot: Chosen, capacity: int) -> PathAdjoint:
-    """Return the sensitivity of the objective to a slot's connection, weighted for all candidates."""
+    """Return the sensitivity of the objective to a slot's connection, multiplied by the slot's inverse probability."""
     delta = p.delta(slot.u, slot.w != 0)
     return PathAdjoint(delta * slot.C.nonzero * inverse_probability(W, slot, capacity), slot.C)
 
 
 def chosen_by(numbers: list[mi.Float], w: mi.Float, W: mi.Float, this: S, slots: list[S]) -> list[S]:
-    """Return the slots after one more candidate, `this`; each slot has its own random number."""
+    """Return the slots after the candidate `this`. Each slot has its own random number."""
     return [dr.select(is_taken(number, w, W), this, slot) for number, slot in zip(numbers, slots, strict=True)]
 
 
 class SlotReplay(VertexHooks):
-    """Replay up to the last vertex, `last`, that any slot differentiates."""
+    """Replay up to the vertex `last`, the last one that any slot differentiates."""
 
     replaying = True
     connects = False
@@ -104,11 +104,12 @@ class SlotReplay(VertexHooks):
 
 @dataclass
 class Event:
-    """One factor of a path: f towards the local direction `wo`; `index` is its vertex, 0 for emission.
+    """One factor of a path: the BSDF value f towards the local direction `wo`. `index` is its vertex, or 0 for
+    emission.
 
-    The whole factor is `rest` times f, without the transmittance of masks; `rest` is stored only if zero factors are
-    tracked. `own` says whether the event is a connection's own, and holds the sample of the aperture, if masks may
-    stand between it and the sensor.
+    The whole factor is `rest` times f, without the transmittance of masks. `rest` is stored only if zero factors are
+    tracked. If masks may stand between the vertex and the sensor, `own` tells whether the event belongs to a
+    connection, and holds the sample of the aperture.
     """
 
     index: mi.UInt32
@@ -127,7 +128,7 @@ class Event:
 
     @staticmethod
     def of_connection(plan: Plan, vertex: Vertex, connection: Connection) -> Event:
-        """Return the BSDF of the vertex towards the sensor as an event; index 0 if nothing is differentiated."""
+        """Return the vertex's BSDF towards the sensor as an event. Its index is 0 if nothing is differentiated."""
         useful = mi.Bool(True) if plan.passage_in_gradient else plan.differentiates(vertex.bsdf)
         index, point = dr.select(useful, mi.UInt32(vertex.depth), 0), SurfacePoint.of(plan, vertex)
         rest = [dr.rcp(stand_in(connection)[0])] if plan.track_zeros else []
@@ -142,14 +143,14 @@ class Event:
 
 
 def _own(plan: Plan, connection: Connection | None) -> list[mi.Bool | mi.Point2f]:
-    """Return `Event.own` for the event of a connection, or of scattering."""
+    """Return the value of `Event.own` for a connection, or for scattering (None)."""
     if not plan.passage_in_gradient:
         return []
     return [mi.Bool(False), mi.Point2f(0)] if connection is None else [mi.Bool(True), connection.sample]
 
 
 def differentiate_event(p: Pass, kept: Event, adjoint: PathAdjoint, active: mi.Bool) -> None:
-    """Add the derivative of an event, of a connection with this adjoint, in `active` lanes that hold one."""
+    """Add the derivative of an event, given the adjoint of its connection, in `active` lanes that hold an event."""
     plan, active = p.plan, active & (kept.index > 0)
     si, bsdf = kept.point.interaction(plan, active)
     rest = mi.Spectrum(kept.rest[0] if kept.rest else 0)

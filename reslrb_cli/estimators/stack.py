@@ -1,26 +1,27 @@
 """Use every connection of a path without additional variance, in one traversal: push vertices, then walk back.
 
-Let P_j be the throughput before vertex j, s_j its scattering, and c_j its connection, both f = bsdf * cos times numbers
-without a derivative. Let B_j be the contribution of all later connections to the objective per unit of throughput
-behind s_j, and delta_j = dL/dI at the film position of c_j. Then, from the last vertex to the first,
+P_j is the throughput before vertex j. s_j is the factor of its scattering, and c_j that of its connection; both are f =
+bsdf * cos times numbers without a derivative. B_j is the contribution of all later connections to the objective, per
+unit of throughput behind s_j. delta_j is dL/dI at the film position of c_j. The recursion starts at the last vertex.
 
     dS     += P_j [ delta_j dc_j + B_j ds_j ]
     B_{j-1} = delta_j c_j + s_j B_j                      B = 0 behind the last vertex
+    dS     += B_0 dE                                     at the emitter
 
-and at the emitter dS += B_0 dE. Nothing is divided, so zero factors need no special treatment.
+Nothing is divided, so zero factors need no special treatment.
 
-Only differentiated vertices are pushed. The vertices between them are combined on the way out: behind the last pushed
-vertex, T is the throughput so far, including roulette, and D the contribution of the vertices since. When vertex k is
-pushed, it stores both, and the recursion becomes
+Only differentiated vertices are pushed. The forward pass combines the vertices between them. Behind the last pushed
+vertex, T is the throughput so far, including roulette, and D the contribution of the vertices since then. Vertex k
+stores both when it is pushed.
 
     B = (D + T delta_k c_k) + (T s_k) B_k                of the vertex that was pushed before k
 
-The stack is a ring of `stack_size` places in thread-local memory, about 95 bytes each, so it holds the last vertices.
-Longer paths are traced again for the vertices before, block by block, the last block first. If delta is known before
-the paths are traced, image and gradient are one kernel. Otherwise, paths are traced again for the gradient, without
-shadow rays.
+The stack is a ring of `stack_size` places in thread-local memory, about 95 bytes each, and holds the last vertices. For
+the earlier vertices of longer paths, the path is traced again, block by block, from the last block to the first. If
+delta is known before the paths are traced, image and gradient are one kernel. Otherwise, paths are traced again for the
+gradient, without shadow rays.
 
-`attached.py` has the same recursion for parameters that move light, and `camera.py` that of camera paths.
+`attached.py` has the same recursion for parameters that move light, and `camera.py` for camera paths.
 """
 
 from __future__ import annotations
@@ -67,12 +68,12 @@ class Differentiable(Protocol[A]):
     """Vertex on the stack: a PyTree of arrays."""
 
     def differentiate(self, p: Pass, adjoint: A) -> A:
-        """Add the derivatives of the vertex, given the adjoint behind it; return the adjoint before it."""
+        """Add the derivatives of the vertex, given the adjoint behind it. Returns the adjoint before it."""
 
 
 @dataclass(frozen=True)
 class Ring:
-    """Places of vertices on the stack, by number; the place number `size` is for discarded values."""
+    """Places of vertices on the stack, by vertex number. Place number `size` is for discarded values."""
 
     size: int
     wraps: bool
@@ -94,11 +95,11 @@ class Ring:
 
 @dataclass
 class StackState:
-    """Loop state of the way out.
+    """Loop state of the forward pass.
 
-    `count` vertices have been pushed, `needed` of them up to the last contribution. `throughput` is T at the current
-    vertex: roulette alone if no vertex is left out. `since` is D behind vertex number `needed`. `stack` has an array
-    for each member of a frame.
+    `count` vertices have been pushed, and `needed` of them come before the last contribution. `throughput` is T at the
+    current vertex. If no vertex is left out, it contains only the weight of roulette. `since` is D behind vertex number
+    `needed`. `stack` has an array for each member of a frame.
     """
 
     stack: list[dr.Local]
@@ -109,7 +110,9 @@ class StackState:
 
     @staticmethod
     def begin(form: Any, ring: Ring, throughput: mi.Float | mi.Spectrum) -> StackState:
-        """Return an empty stack of frames of this form (None: nothing is ever pushed); `throughput` is 1."""
+        """Return an empty stack of frames of this form. The form is None if nothing is ever pushed. `throughput`
+        is 1.
+        """
         stack = [] if form is None else allocate(form, ring.size)
         return StackState(stack, mi.UInt32(0), mi.UInt32(0), throughput, mi.Spectrum(0))
 
@@ -118,7 +121,7 @@ class StackState:
         return dr.select(self.needed == self.count, self.since, 0)
 
     def plus(self, value: mi.Spectrum, active: mi.Bool) -> StackState:
-        """Return the state with a contribution, delta times `value` per unit of throughput, in active lanes."""
+        """Return the state after a contribution in active lanes: delta times `value`, per unit of throughput."""
         since = dr.select(active, self.gap() + self.throughput * value, self.since)
         return replace(self, needed=dr.select(active, self.count, self.needed), since=since)
 
@@ -127,7 +130,7 @@ class StackState:
         return replace(self, throughput=self.throughput * weight)
 
     def pushed(self, frame: Any, ring: Ring, here: mi.Bool, contributes: mi.Bool) -> StackState:
-        """Return the state with a vertex on the stack, in lanes `here`; in lanes `contributes` the vertex has its own
+        """Return the state after pushing a vertex in lanes `here`. In lanes `contributes`, the vertex has its own
         contribution.
         """
         place = dr.select(here, ring.place(self.count), ring.size)
@@ -145,10 +148,10 @@ class StackState:
 def walk_back(
     p: Pass, form: Any, ring: Ring, state: StackState, adjoint: A, again: Callable[[mi.UInt32], StackState]
 ) -> A:
-    """Differentiate all vertices, the last one first; return the adjoint before the first.
+    """Differentiate all vertices, from the last to the first. Returns the adjoint before the first vertex.
 
-    `adjoint` is that behind the last contribution. `again(end)` traces the paths again, and pushes the vertices before
-    number `end`; it is called only if paths may be longer than the stack.
+    `adjoint` is the adjoint behind the last contribution. `again(end)` traces the paths again, and pushes the vertices
+    before number `end`. It is called only if paths may be longer than the stack.
     """
     if not state.stack:
         return adjoint
@@ -172,7 +175,7 @@ def walk_back(
 
 
 def pop(p: Pass, form: Any, ring: Ring, state: StackState, top: mi.UInt32, bottom: mi.UInt32, adjoint: A) -> A:
-    """Differentiate the vertices number top - 1 to bottom, in this order. Traces no ray."""
+    """Differentiate the vertices from number top - 1 down to bottom. Traces no ray."""
 
     def body(number: mi.UInt32, adjoint: A, stack: list[dr.Local]) -> tuple[mi.UInt32, A, list[dr.Local]]:
         frame: Differentiable[A] = read(stack, form, ring.place(number - 1))
@@ -195,8 +198,9 @@ def pop(p: Pass, form: Any, ring: Ring, state: StackState, top: mi.UInt32, botto
 class Frame:
     """Vertex on the stack, whose BSDF is evaluated again towards the sensor and along the path.
 
-    `weight_c` is P_k delta_k c_k / f_c and `weight_s` is P_k s_k / f_s, (C,): the weights of the derivatives of both f,
-    the latter times B_k. `own` + `onward` B_k is B of the vertex that was pushed before.
+    `weight_c` (C,) is P_k delta_k c_k / f_c, the weight of the derivative of f_c. `weight_s` (C,) is P_k s_k / f_s,
+    which multiplied by B_k is the weight of the derivative of f_s. B of the vertex pushed before is `own` + `onward`
+    B_k.
     """
 
     point: SurfacePoint
@@ -221,7 +225,9 @@ class Frame:
         return StackState.begin(Frame.blank(plan) if plan.differentiate_bsdfs else None, ring, throughput)
 
     def differentiate(self, p: Pass, adjoint: mi.Spectrum) -> mi.Spectrum:
-        """Add the derivatives of both factors, given B (C,) behind the vertex; return B of the vertex pushed before."""
+        """Add the derivatives of both factors, given B (C,) behind the vertex. Returns B of the vertex pushed
+        before.
+        """
         si, bsdf = self.point.interaction(p.plan)
         weight_c, weight_s = self.weight_c, showing(self.weight_s * adjoint)
         connected, scattered = dr.any(weight_c != 0), dr.any(weight_s != 0)
@@ -236,9 +242,9 @@ def push(
     plan: Plan, state: StackState, ring: Ring, here: mi.Bool, vertex: Vertex, scattering: Scattering,
     connection: Connection | None, weight: mi.Spectrum,
 ) -> StackState:  # fmt: skip
-    """Return the state behind a vertex, which is on the stack in lanes `here`.
+    """Return the state behind a vertex, after pushing it in lanes `here`.
 
-    `weight` (C,) is delta times the connection without its BSDF; 0 if the connection does not count.
+    `weight` (C,) is delta times the connection without its BSDF, or 0 if the connection does not count.
     """
     T, P, on = state.throughput, vertex.product.value(), scattering.active
     wo, own, seen = mi.Vector3f(0), mi.Spectrum(0), mi.Bool(False)
@@ -270,9 +276,10 @@ def is_gapless(plan: Plan) -> bool:
 
 
 class LightSweep(VertexHooks):
-    """Way out of light paths: splat, and push the vertices before number `end` (None: all of them).
+    """Forward pass of light paths: it splats the image and pushes the vertices before number `end`, or all vertices for
+    None.
 
-    `visibility` is that of an earlier walk, if there was one.
+    `visibility` is the result of an earlier walk, if there was one.
     """
 
     def __init__(self, p: Pass, ring: Ring, visibility: Visibility | None = None, end: mi.UInt32 | None = None) -> None:
@@ -325,7 +332,7 @@ class Stack(Estimator):
         self.stack_size = stack_size
 
     def forward(self, p: Pass) -> Visibility | mi.Spectrum:
-        """Trace the image pass; return B_0 (C,) if delta is known, otherwise the visibility of the connections."""
+        """Trace the image pass. Returns B_0 (C,) if delta is known, otherwise the visibility of the connections."""
         if p.adjoint is not None:
             return self._sweep(p, None)
         return p.walk(Gathering(p)).visibility

@@ -1,1 +1,1 @@
-"""Guided emission: contributions of light paths by the cell that they start in, and tables learned from them."""
+"""Guided emission: contributions of light paths by their starting cells, and tables learned from them."""

@@ -1,31 +1,31 @@
 """Contributions that guiding learns from, by the cells that light paths start in and pass through.
 
-Trail: the vertices of a path, stored until it ends, because the contribution behind each vertex is known only then. The
-first PLACES vertices are stored in thread-local memory. A walk back sums over all later vertices, as in
+Trail: the vertices of a path are stored until the path ends, because the contribution behind each vertex is known only
+then. The first PLACES vertices are stored in thread-local memory. A walk back sums over all later vertices, as in
 `estimators/stack.py`.
 
-Onward: later contributions of light paths by their position and direction, for roulette. For every cell
-(`transport/roulette.py`), two means over the rays that leave a vertex in it are learned: the squared later contribution
-at throughput 1 (m), and the number of later vertices (c). A ray that leaves with throughput w survives with probability
-q = min(1, max(LEAST, w s)). Variance times work is smallest for
+Onward: later contributions of light paths by their position and direction, for roulette. `transport/roulette.py`
+defines the cells. Two means over the rays that leave a vertex in a cell are learned: m, the squared later contribution
+at throughput 1, and c, the number of later vertices. A ray that leaves with throughput w survives with probability q =
+min(1, max(LEAST, w s)). The following value of s minimises variance times work.
 
     s = sqrt(m W / (c V))        V: mean squared contribution of whole paths; W: mean number of their vertices
 
-(Rath et al. 2022, "EARS: efficiency-aware Russian roulette and splitting"). Here s is SURE times larger: few of the
-paths of a cell have nearly all of its contribution, so most cells are underestimated, and ending a path too early costs
-much more noise than following it too long costs work.
+Source: Rath et al. 2022, "EARS: efficiency-aware Russian roulette and splitting". Here s is SURE times larger. Nearly
+all contribution of a cell comes from few paths, so most cells are underestimated. Ending a path too early adds much
+more noise than following it too long adds work.
 
-For the same reason, each cell is averaged with the larger cube around it with the weight of LEAN rays, that cube with
-the next larger, and so on up to the whole scene. No cell has less than FLOOR of the scene's m / c.
+For the same reason, each cell is averaged with the larger cube around it, which has the weight of LEAN rays. That cube
+is averaged with the next larger one, up to the whole scene. No cell has less than FLOOR of the scene's m / c.
 
-Hearing: contributions of light paths by the cell that they start in: their effect on gradient and image. This is a
-separate walk with its own random numbers. For each path and each differentiated BSDF,
+Hearing: contributions of light paths to gradient and image, by the cell that they start in. A separate walk with its
+own random numbers computes them, for each path and each differentiated BSDF.
 
     G = sum_i delta_i C_i n_i        n_i: number of factors of C_i from this BSDF
 
-is the derivative with respect to the logarithm of a factor common to all its values; for emission, n = 1. If light
-moves, it is the sum of |delta_i C_i|. The squares of G p / v are summed, the contributions if all paths started
-uniformly, because they determine the variance of the sum over all paths.
+G is the derivative with respect to the logarithm of a factor on all values of the BSDF. For emission, n = 1. If light
+moves, G is the sum of |delta_i C_i|. The tables sum the squares of G p / v, the contribution if all paths started
+uniformly. These squares determine the variance of the sum over all paths.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ PLACES = 32  # vertices
 class Trail:
     """Loop state of a path's vertices.
 
-    For each vertex: its contribution to each quantity (C,) and to the image; the cell of the outgoing ray, and the
-    inverse of its throughput (0 without a ray); the weight of roulette. Vertices beyond the last place share one place
-    that is not read; `later` is the sum of their contributions.
+    For each vertex it stores the contribution to each quantity (C,) and to the image, the cell of the outgoing ray, the
+    inverse of the ray's throughput (0 without a ray), and the weight of roulette. Vertices beyond the last place share
+    one place that is never read. `later` is the sum of their contributions.
     """
 
     said: list[dr.Local]
@@ -76,7 +76,7 @@ class Trail:
         return Trail(said, left, allocate([mi.Float(0)], PLACES), mi.UInt32(0), later)
 
     def with_vertex(self, said: list[mi.Spectrum | mi.Float]) -> Trail:
-        """Return the trail with one more vertex and its contributions, that to the image last."""
+        """Return the trail with one more vertex and its contributions. The contribution to the image comes last."""
         fits, place = self._place(self.count)
         write(self.said, said, place, fits)
         later = [a + dr.select(fits, 0, part) for a, part in zip(self.later, said, strict=True)]
@@ -99,10 +99,10 @@ class Trail:
 
 
 def walk_back(trail: Trail) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Return the later contributions of all paths in the form of `Said`; values that are not finite do not count.
+    """Return the later contributions of all paths in the form of `Said`. Values that are not finite do not count.
 
-    Roulette divides the weight of surviving paths by q. For all rays, whether they survive or not, q times the squared
-    contribution and 1 / q times the number of vertices have the means without roulette.
+    Roulette divides the weight of surviving paths by q. The walk back undoes this: it multiplies the squared
+    contribution by q, and divides the number of vertices by q. The means then equal those without roulette.
     """
     squares, followed, left = (dr.zeros(mi.Float, rows * CELLS) for rows in (len(trail.later), 1, 1))
 
@@ -141,11 +141,12 @@ RAY = 0.2  # cost of a ray that hits nothing, in vertices
 
 @dataclass
 class Walked:
-    """Result of one walk, float64.
+    """Result of one walk, as float64.
 
-    For each cell, sums over the paths: squared later contributions at throughput 1 (voices, CELLS), number of later
-    vertices, and number of rays. Means over the paths: `said`, the squared contributions (voices); `light`, their
-    weight at the emitter; `length`, the number of their vertices, plus one for the start.
+    For each cell there are three sums over the paths: squared later contributions at throughput 1 (voices, CELLS),
+    number of later vertices, and number of rays. There are also three means over the paths. `said` is the mean squared
+    contribution (voices), `light` the mean squared weight at the emitter, and `length` the mean number of vertices plus
+    one.
     """
 
     squares: Array
@@ -158,9 +159,9 @@ class Walked:
 
 @dataclass
 class Onward:
-    """Sums (4, CELLS), float32: squared contributions to gradient and image, later vertices, rays.
+    """Sums (4, CELLS) as float32: squared contributions to gradient and image, later vertices, and rays.
 
-    Squares are in units of those of whole paths, and of `light`. The box (2, 3) `box` is divided into cubes. Arrays are
+    Squares are relative to those of whole paths, and to `light`. The box `box` (2, 3) is divided into cubes. Arrays are
     never modified.
     """
 
@@ -175,7 +176,7 @@ class Onward:
         return Onward(np.asarray(box, np.float32), np.zeros((4, CELLS), np.float32))
 
     def with_more(self, walked: Walked) -> Onward:
-        """Return the state after one more walk; all quantities of the gradient have equal weights, and the image is
+        """Return the state after one more walk. All quantities of the gradient have equal weights, and the image is
         last.
 
         A walk without contributions to gradient or image adds nothing.
@@ -191,7 +192,7 @@ class Onward:
         return Onward(self.box, (KEEP * self.sums + newest).astype(np.float32), light, length)
 
     def arrays(self) -> dict[str, Array]:
-        """Return all arrays by name; the inverse of `taken`."""
+        """Return all arrays by name. `taken` reads them back."""
         frame = np.array([*self.box.ravel(), self.light, self.length], np.float64)
         return dict(zip(NAMES, (self.sums, frame), strict=True))
 
@@ -207,9 +208,9 @@ class Onward:
         return Onward(box, sums.astype(np.float32), float(frame[6]), float(frame[7]))
 
     def chances(self, share: float) -> Array:
-        """Return s of all cells (CELLS); `share` is the weight of the gradient, and the rest is that of the image.
+        """Return s of all cells (CELLS). `share` is the weight of the gradient, and 1 - `share` that of the image.
 
-        If no ray has ever left a vertex, all are infinite, so that every path survives.
+        If no ray has ever left a vertex, all values are infinite, so every path survives.
         """
         if not (self.light > 0 and self.sums[3].any()):
             return np.full(CELLS, np.inf)
@@ -222,7 +223,9 @@ class Onward:
 
 
 def _leaning(sums: Array, counts: Array) -> Array:
-    """Return the means (K, CELLS) of sums (K, CELLS) over counts (CELLS), averaged with those of the larger cubes."""
+    """Return the means (K, CELLS), `sums` divided by `counts`, each averaged with the means of the larger cubes around
+    it.
+    """
     total = max(float(counts.sum()), 1.0)
     means = np.broadcast_to((sums.sum(1) / total)[:, None, None, None, None], (len(sums), 1, 1, 1, SHAPE[-1]))
     for level in range(BITS + 1):
@@ -235,7 +238,7 @@ def _leaning(sums: Array, counts: Array) -> Array:
 
 
 def _cubes(values: Array, level: int) -> Array:
-    """Return sums over the cubes of a level, 2^level along each axis, per octant: (K, 2^level, 2^level, 2^level, 8)."""
+    """Return sums over the cubes of a level, per octant: (K, 2^level, 2^level, 2^level, 8)."""
     few, each = 1 << level, 1 << (BITS - level)
     return np.asarray(values.reshape(len(values), few, each, few, each, few, each, SHAPE[-1]).sum((2, 4, 6)))
 
@@ -257,7 +260,9 @@ def bsdf_groups(plan: Plan) -> list[tuple[mi.BSDF, ...]]:
 
 
 def meets(group: tuple[mi.BSDF, ...], vertex: Vertex) -> mi.UInt32:
-    """Return 1 if a vertex is on a surface with one of the group's BSDFs (any for an empty group), otherwise 0."""
+    """Return 1 if a vertex is on a surface with one of the group's BSDFs, otherwise 0. An empty group contains all
+    BSDFs.
+    """
     met = mi.Bool(not group)
     for bsdf in group:
         met |= vertex.bsdf == mi.BSDFPtr(bsdf)
@@ -265,16 +270,18 @@ def meets(group: tuple[mi.BSDF, ...], vertex: Vertex) -> mi.UInt32:
 
 
 def voices(plan: Plan) -> int:
-    """Return the number of separate quantities: groups of BSDFs, emission, moving parameters, and the image, which is
-    last.
+    """Return the number of separate quantities: groups of BSDFs, emission, moving parameters, and the image as the last
+    one.
     """
     return len(bsdf_groups(plan)) + plan.differentiate_emission + plan.attached + 1
 
 
 @dataclass
 class Heard:
-    """Loop state. `counts` is how often the path met each group's BSDFs, `sums` are G (C,) of groups, emission and
-    moving parameters. `image` is sum_i |C_i|^2, and `light` the weight of the path at the emitter.
+    """Loop state of the hooks.
+
+    `counts` tells how often the path met each group's BSDFs. `sums` are G (C,) of groups, emission and moving
+    parameters. `image` is sum_i |C_i|^2, and `light` the weight of the path at the emitter.
     """
 
     counts: list[mi.UInt32]
@@ -286,8 +293,8 @@ class Heard:
 
 
 class Hearing(Hooks):
-    """Hooks that sum the contributions of each path; dL/dI and contributions are scaled by `loudness` and the number of
-    paths.
+    """Hooks that sum the contributions of each path. dL/dI and contributions are divided by `loudness` and the number
+    of paths.
     """
 
     def __init__(self, samples: Samples, adjoint: AdjointImage, loudness: mi.Float) -> None:
@@ -347,13 +354,11 @@ class Hearing(Hooks):
 class Said:
     """Evaluated contributions of guided samples: sums over paths.
 
-    - `starts` (voices * cells), quantity by quantity with the image last, are squares by the cell that a path starts
-      in.
-    - By the cell of a ray that leaves a vertex (`transport/roulette.py`): `squares` (voices * CELLS) of later
-      contributions at throughput 1, later vertices `followed`, and rays `left` (CELLS).
+    - `starts` (voices * cells) are squared contributions by the cell that a path starts in, with the image last.
+    - `squares` (voices * CELLS) are squared later contributions at throughput 1, by the cell of a ray that leaves a
+        vertex. `followed` counts later vertices, and `left` (CELLS) counts rays.
     - `whole` (rows * BINS) are squares by quantity, the weights of paths at the emitter, and their vertices.
-    - `places` (voices * blocks, or empty) are squares of contributions at a block of the film, as if no path had been
-      aimed.
+    - `places` (voices * blocks, or empty) are squared contributions by block of the film, as if no path had been aimed.
     """
 
     starts: mi.Float
@@ -373,7 +378,7 @@ class Said:
         return np.array(self.places[0]).reshape(rows, -1) if self.places else None
 
     def walked(self, paths: int) -> Walked:
-        """Return the result for `Onward`, for this number of paths."""
+        """Return the result for `Onward`, given the number of paths."""
         *said, light, count = np.array(self.whole, np.float64).reshape(-1, BINS).sum(1) / paths
         squares, followed, left = (np.array(sums) for sums in (self.squares, self.followed, self.left))
         squares = squares.reshape(len(said), CELLS)
@@ -381,8 +386,8 @@ class Said:
 
 
 def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
-    """Return the contributions of guided samples with dL/dI `gradient` (H, W, C), without values that are not
-    finite.
+    """Return the contributions of guided samples with dL/dI `gradient` (H, W, C). Values that are not finite are left
+    out.
     """
     plan, adjoint = samples.plan, samples.film.adjoint(gradient)
     assert plan.grid is not None
@@ -410,7 +415,7 @@ def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
 
 
 def _sums(values: list[mi.Float], width: int) -> mi.Float:
-    """Return sums (len(values) * BINS) over paths, without values that are not finite."""
+    """Return sums (len(values) * BINS) over paths. Values that are not finite are left out."""
     result, lane = dr.zeros(mi.Float, len(values) * BINS), dr.arange(mi.UInt32, width) % BINS
     for number, value in enumerate(values):
         dr.scatter_reduce(dr.ReduceOp.Add, result, value, lane + number * BINS, dr.isfinite(value))

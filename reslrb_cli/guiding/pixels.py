@@ -1,21 +1,22 @@
 """Distribution of camera paths over the pixels by the effect of their noise on the gradient.
 
-The pixels of a mirror may be the only ones that show a wall, by camera paths alone, while light paths also show other
-pixels. Some pixels show nothing that is differentiated. Before the first iteration, a few camera paths are therefore
-traced through each pixel, and their effect on the gradient of a loss with dL/dI = 1 is recorded. For each
-differentiated BSDF, as in `collect.py`,
+In some scenes, only a few pixels matter. For example, a wall may be visible to camera paths only in the pixels of a
+mirror, while other pixels show nothing that is differentiated. Before the first iteration, a few camera paths are
+therefore traced through each pixel. Their effect on the gradient of a loss with dL/dI = 1 is recorded for each
+differentiated BSDF, as in `collect.py`.
 
     G = sum_i C_i n_i        n_i: number of factors of contribution C_i from this BSDF;  n = 1 for emission
 
-Near the end of a run, dL/dI is mostly noise: w_j times the noise of the pixel I_j. w_j is the curvature of the loss, 0
-in an excluded pixel. With n_j paths in pixel j, the variance of the gradient has parts
+Near the end of a run, dL/dI is mostly noise: it is w_j times the noise of the pixel I_j. The weight w_j is the
+curvature of the loss, and 0 in an excluded pixel. With n_j paths in pixel j, the variance of the gradient is a sum over
+the pixels.
 
     w_j^2 Var(I_j) (E G_j)^2 / n_j        The sum is least, at equal sums of n_j, for  n_j ~ w_j sd(I_j) E|G_j|.
 
 The variances of several groups are added. Each is divided by the square of the group's whole gradient, sum_j w_j
-E|G_j|, and multiplied by the number K of its entries, because each texel is visible in K times fewer pixels than a
-colour. A rare bright path would attract all others to its pixel, so means are over blocks of pixels, and no pixel has
-more than MOST times the mean.
+E|G_j|, and multiplied by the number K of its entries. Each texel is visible in K times fewer pixels than a colour, so
+its relative variance is K times larger. A rare bright path would attract all others to its pixel. Means are therefore
+over blocks of pixels, and no pixel has more than MOST times the mean.
 """
 
 from __future__ import annotations
@@ -45,8 +46,9 @@ LEAST_PATHS, MOST_PART = 1e7, 0.02  # for a run that has time for it, and the re
 
 @dataclass
 class NotedSums:
-    """Loop state. `counts` is how often the path met each group's BSDFs; `sums` are G (C,) of groups, emission and,
-    last, radiance.
+    """Loop state of the hooks.
+
+    `counts` tells how often the path met each group's BSDFs. `sums` are G (C,) of groups, emission and, last, radiance.
     """
 
     counts: list[mi.UInt32]
@@ -94,10 +96,9 @@ def note(samples: Samples) -> NDArray[np.float64]:
 
 
 def noted_part(paths: float, spp: float) -> float | None:
-    """Return the share of the recorded paths in a run of this number of paths, `spp` through each pixel in all
-    iterations.
+    """Return the share of the recorded paths in a run, or None if the run has no time for the measurement.
 
-    None if the run has no time for the measurement.
+    `paths` is the number of the run's paths, and `spp` the number through each pixel in all iterations.
     """
     part = NOTED_SPP / spp
     return part if paths >= LEAST_PATHS and part <= MOST_PART else None
@@ -107,10 +108,11 @@ def wanted(
     plan: Plan, scene: mi.Scene, sensor: mi.Sensor, entries: list[int], light_share: float,
     emitters: EmitterDensities | None, curvature: NDArray[np.floating] | None = None,
 ) -> NDArray[np.float32]:  # fmt: skip
-    """Return the density of camera paths over the pixels (H, W), with mean 1, as the scene is now.
+    """Return the density of camera paths over the pixels (H, W), with mean 1, for the current scene.
 
-    `entries` are the numbers that each group of BSDFs, and emission, has derivatives of. `light_share` and `emitters`
-    are as in `samples.passes`, and `curvature` (H, W) is the loss's, None where all pixels have the same.
+    `entries` has the number of differentiated entries of each group of BSDFs, and of emission. `light_share` and
+    `emitters` are as in `samples.passes`. `curvature` (H, W) is the curvature of the loss, or None if it is the same in
+    all pixels.
     """
     spp = math.ceil(NOTED_SPP / (1 - light_share)) if plan.weighs else NOTED_SPP
     seed = dr.opaque(mi.UInt32, NOTING_STREAM)
@@ -121,8 +123,10 @@ def wanted(
 def density_of(
     rows: NDArray[np.float64], entries: list[int], curvature: NDArray[np.floating] | None = None
 ) -> NDArray[np.float32]:
-    """Return the density of camera paths over the pixels (H, W), with mean 1, from the means that `note` returns and
-    the loss's curvature (H, W)."""
+    """Return the density of camera paths over the pixels (H, W), with mean 1.
+
+    `rows` are the means that `note` returns, and `curvature` (H, W) is the curvature of the loss.
+    """
     from scipy import ndimage  # imported here: few commands need it, and all import this module
 
     # The variance of each pixel comes first, then the mean over a block: the joint variance of a block would count

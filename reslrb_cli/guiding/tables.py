@@ -1,13 +1,13 @@
 """Tables of the starts of light paths, for each sensor, learned from earlier steps for later ones.
 
-Cells are sampled by the contributions of the paths that started in them. The variance of a sum over paths depends on
-the mean square contribution in each cell, and is smallest if cells are sampled in proportion to its root (`collect.py`
-defines the contributions). Each quantity is scaled to a total of 1, so that no parameter dominates another.
+Cells are sampled by the contributions of the paths that started in them. `collect.py` defines these contributions. The
+variance of a sum over paths depends on the mean square contribution in each cell. It is smallest if cells are sampled
+in proportion to the root of this mean. Each quantity is scaled to a total of 1, so that no parameter dominates another.
 
-The resolution of the cells depends on the number of recorded paths: after a few thousand paths, hundreds of cells are
+The resolution of the cells depends on the number of recorded paths. After a few thousand paths, hundreds of cells are
 merged. With more paths, cells are divided, up to the cells of the grid.
 
-`Guiding` holds the tables of one scene. Samples that serve image and gradient are drawn half for each.
+`Guiding` holds the tables of one scene. If samples serve image and gradient, half of them are drawn for each.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ FINE = 2.0  # maximum number of cells per recorded path
 
 
 def most_cells(paths: int) -> float:
-    """Return an upper limit for the number of distinguishable cells if each learning walk has this number of paths.
+    """Return an upper limit for the number of cells that can be distinguished if each learning walk has this many
+    paths.
 
     The total weight of all recorded paths stays below the sum of the geometric series of the past.
     """
@@ -48,16 +49,17 @@ def most_cells(paths: int) -> float:
 
 @dataclass
 class Learned:
-    """Contributions of the paths of one sensor: sums of squares (2, cells) for gradient and image, and the number of
-    paths that started in each cell.
+    """Contributions of the paths of one sensor.
 
-    - `calls` is the number of gradients so far, or since a table was found to be wrong. Arrays are float32, and never
-      modified.
-    - `onward` are the later contributions by position; None if unknown.
+    `squares` (2, cells) are the sums for gradient and image, and `draws` the number of paths that started in each cell.
+    Arrays are float32, and never modified.
+
+    - `calls` is the number of gradients so far. It restarts when a table is found to be wrong.
+    - `onward` are the later contributions by position, or None if unknown.
     - `worse` is the mean square contribution of the newest paths divided by that of uniform paths. Far above 1, the
-      table did harm, as after a change of the scene.
-    - `film` (2, blocks) are sums of squares by block of the film (`transport/aim.py`); without blocks if no path is
-      aimed.
+        table is harmful, for example after a change of the scene.
+    - `film` (2, blocks) are sums of squares by block of the film (`transport/aim.py`). There are no blocks if no path
+        is aimed.
     """
 
     sums: Array
@@ -76,10 +78,10 @@ class Learned:
     def with_more(
         self, grid: Grid, heard: Array, draws: Array, onward: Onward | None = None, film: Array | None = None
     ) -> Learned:
-        """Return the state after newer paths, with contributions (voices, cells), the image last, and `draws` (cells)
-        paths.
+        """Return the state after newer paths.
 
-        Each quantity is scaled to a total of 1. `onward` has already learned from the same paths.
+        `heard` (voices, cells) are their contributions, with the image last, and `draws` (cells) their numbers. Each
+        quantity is scaled to a total of 1. `onward` has already learned from the same paths.
         """
         sums = np.float32(KEEP) * self.sums
         means = np.zeros(grid.cells, np.float32)
@@ -91,7 +93,7 @@ class Learned:
         return Learned(sums, started, self.calls, onward, self._places(film), worse)
 
     def _places(self, heard: Array | None) -> Array:
-        """Return `film` after newer contributions by block (voices, blocks), the image last."""
+        """Return `film` after newer contributions by block (voices, blocks), with the image last."""
         if heard is None:
             return self.film
         shape = 2, heard.shape[1]
@@ -106,9 +108,9 @@ class Learned:
         return Learned(sums.astype(np.float32), draws, self.calls, self.onward, self.film)
 
     def density(self, grid: Grid, share: float) -> Array:
-        """Return the density of the cells (cells,), normalised, before the uniform part is added.
+        """Return the normalised density of the cells (cells,), before the uniform part is added.
 
-        `share` is the weight of the gradient, and the rest is that of the image. Cells with few recorded paths are
+        `share` is the weight of the gradient, and 1 - `share` that of the image. Cells with few recorded paths are
         merged.
         """
         if self._densities is None:
@@ -132,9 +134,10 @@ class Learned:
 
 
 def _add(sums: Array, heard: Array, means: Array) -> list[float]:
-    """Add the contributions to each quantity (voices, n), the image last, scaled to a total of 1, to `sums` (2, n).
+    """Add contributions (voices, n), with the image last, to `sums` (2, n). Each quantity is first scaled to a total of
+    1.
 
-    `means` (n) are the weights of the places in this total. Returns the mean of `means` for each quantity; a quantity
+    `means` (n) are the weights of the places in this total. Returns the mean of `means` for each quantity. A quantity
     without a finite total is left out.
     """
     found = []
@@ -169,7 +172,7 @@ KNOWN = ("sums", "draws", "film", *NAMES)
 
 
 class Purpose(enum.Enum):
-    """Purpose of samples; the value is the weight of the gradient in their table, and the rest is that of the image."""
+    """Purpose of samples. Its value is the weight of the gradient in the table; the rest is the weight of the image."""
 
     IMAGE = 0.0
     GRADIENT = 1.0
@@ -177,8 +180,8 @@ class Purpose(enum.Enum):
 
 
 def sensor_bytes(grid: Grid, aims: bool = True) -> int:
-    """Return the bytes for one sensor: a table for each purpose, and the recorded contributions; with `aims`, also
-    aiming.
+    """Return the bytes for one sensor: a table for each purpose, the recorded contributions and, with `aims`, the
+    aiming table.
     """
     emission = len(Purpose) * (grid.slots + 2 * grid.cells) + 3 * grid.cells
     aim = (len(Purpose) + 1) * (AIM_SLOTS + BLOCKS) + 2 * BLOCKS
@@ -186,9 +189,10 @@ def sensor_bytes(grid: Grid, aims: bool = True) -> int:
 
 
 def grid_for(used: Sequence[bool], weights: Sequence[float], sensors: int, paths: int | None = None) -> Grid:
-    """Return a grid whose tables fit into memory for this number of sensors; more sensors share tables.
+    """Return a grid whose tables fit into memory for this number of sensors. If there are more sensors, they share
+    tables.
 
-    The grid is not finer than walks of `paths` paths can resolve (None: the number is unknown).
+    The grid is not finer than walks of `paths` paths can resolve. If the number of paths is unknown, it is None.
     """
     grids = (make_grid(used, weights, bits) for bits in range(CELL_BITS, LEAST_BITS, -1))
     fitting = (grid for grid in grids if sensors * sensor_bytes(grid) <= MOST_BYTES)
@@ -199,7 +203,7 @@ def grid_for(used: Sequence[bool], weights: Sequence[float], sensors: int, paths
 class Guiding:
     """Grid and tables of one scene, for a light tracer.
 
-    `images` says whether samples that serve only an image are guided. Tables that are `held` do not learn. `lessons`
+    `images` tells whether samples that serve only an image are guided. Tables that are `held` do not learn. `lessons`
     counts how often any table has learned.
     """
 
@@ -224,10 +228,10 @@ class Guiding:
         self._tables.clear()
 
     def grid_of(self, samples: Samples, paths: int | None) -> Grid:
-        """Return the grid of the samples' scene for walks of this number of paths.
+        """Return the grid for the samples' scene and for walks of this number of paths.
 
-        A coarser grid, or one for an unknown number of paths that has learned nothing, is replaced; recorded
-        contributions are kept.
+        A coarser grid is replaced by a finer one, and keeps its recorded contributions. A grid for an unknown number of
+        paths is replaced if it has not learned yet.
         """
         if self._emission is None:
             weights = [float(emitter.sampling_weight()) for emitter in samples.scene.emitters()]
@@ -247,7 +251,7 @@ class Guiding:
     def table(self, number: int, purpose: Purpose, delta: mi.TensorXf | None = None) -> Table:
         """Return the table for samples of sensor `number`.
 
-        If dL/dI `delta` (H, W, C) is known before the samples, it determines some of the film positions that paths are
+        If dL/dI `delta` (H, W, C) is known before the samples, it selects some of the film positions that paths are
         aimed at.
         """
         table = self._table(number, purpose)[0]
@@ -274,7 +278,7 @@ class Guiding:
         return self._tables[number, purpose]
 
     def aims(self, number: int, film: Blocks) -> bool:
-        """Return whether the paths of a sensor with this film are aimed; not if the sensor shares its tables."""
+        """Whether the paths of a sensor with this film are aimed. They are not if the sensor shares its tables."""
         assert self._emission is not None
         if max(number + 1, self._emission[2]) > self._apart:
             return False
@@ -284,7 +288,7 @@ class Guiding:
     def _aim(
         self, number: int, purpose: Purpose, learned: Learned | None, delta: mi.TensorXf | None = None
     ) -> Aim | None:
-        """Return the film positions that paths of a sensor are aimed at, by recorded contributions and the current
+        """Return the film positions that paths of a sensor are aimed at, from recorded contributions and the current
         dL/dI.
         """
         if number not in self.films:
@@ -298,7 +302,7 @@ class Guiding:
         return Aim.of(film, purpose.value * gradient + (1 - purpose.value) * image)
 
     def _onward(self, number: int) -> Onward:
-        """Return the later contributions by position for a sensor; `number` is that of its tables."""
+        """Return the later contributions by position. `number` is the sensor that owns the tables."""
         learned = self.learned.get(number)
         return Onward.nothing(self.box) if learned is None or learned.onward is None else learned.onward
 
@@ -326,9 +330,9 @@ class Guiding:
         return {str(number): learned.calls for number, learned in self.learned.items()}, arrays
 
     def restore(self, calls: Mapping[str, int], take: Callable[[str], Array]) -> str | None:
-        """Restore the result of `state`; `take(name)` returns the array of a name.
+        """Restore the result of `state`. `take(name)` returns the array of a name.
 
-        Returns the name of an array that does not fit this scene's grid; the state is then unchanged.
+        If an array does not fit this scene's grid, returns its name and leaves the state unchanged.
         """
         assert self.grid is not None
         found = {}
@@ -357,9 +361,9 @@ class Guiding:
         return learned is None or learns_after(calls)
 
     def learn(self, number: int, paths: int, said: Said) -> None:
-        """Let the table of a sensor learn from the contributions of this number of paths (`collect.py`).
+        """Update the table of a sensor with the contributions of this number of paths (`collect.py`).
 
-        The paths are drawn from its table for BOTH, and serve nothing else.
+        These paths are drawn from the table for BOTH, and are used for nothing else.
         """
         assert self.grid is not None
         counts, number = self.counts(number, Purpose.BOTH), self._shared(number)
@@ -379,15 +383,15 @@ class Guiding:
 
 
 def _shares(row: Array, even: Array) -> Array:
-    """Return each share of the total; `even` if the total is zero."""
+    """Return each entry divided by the total, or `even` if the total is zero."""
     return row / row.sum() if row.sum() > 0 else even
 
 
 def learns_after(gradients: int) -> bool:
     """Whether a table learns from the gradient of this number, counted from 1.
 
-    At first the knowledge doubles each time. Later, the table must check often enough whether the scene has changed. If
-    it has, counting starts again.
+    At first, the number of recorded paths doubles each time. Later, the table must check regularly whether the scene
+    has changed. After a change, counting starts again.
     """
     return gradients % EVERY == 0 or (gradients < EVERY and gradients.bit_count() == 1)
 

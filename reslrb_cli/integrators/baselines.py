@@ -1,7 +1,7 @@
 """Baselines: Mitsuba's integrators, and the light paths of `reslrb` with other derivatives.
 
-`Replayed`, `Projective` and `NaiveAD` adapt Mitsuba's integrators to a gradient step. `WalkAd` and `Trajectory`
-differentiate light paths by naive AD, and by Dr.Jit's reversal of loops.
+`Replayed`, `Projective` and `NaiveAD` adapt Mitsuba's integrators to a gradient step. `WalkAd` differentiates light
+paths by naive AD. `Trajectory` uses Dr.Jit's reversal of loops.
 """
 
 from __future__ import annotations
@@ -47,15 +47,13 @@ class Reversed:
         raise NotImplementedError
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """Return the image, and add the gradient of the same samples with the dL/dI that `derivative(image)`
-        returns.
-        """
+        """Return the image. Adds the gradient of the same samples with dL/dI = `derivative(image)`."""
         image = self.image(job)
         self.backward(job, derivative(image))
         return image
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
-        """Return the image, and add the gradient, with dL/dI known before the image."""
+        """Return the image. Adds the gradient for a dL/dI that is known before the image."""
         return self.correlated(job, lambda image: gradient)
 
 
@@ -88,7 +86,7 @@ class Replayed(Reversed):
 
 
 class Projective(Replayed):
-    """Mitsuba's projective integrators, such as `prb_projective`, as functions of the seed alone."""
+    """Mitsuba's projective integrators, such as `prb_projective`, made independent of earlier calls."""
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
         given = {name: getattr(self.plugin, name) for name in ("sppc", "sppp", "sppi")}
@@ -161,12 +159,12 @@ class WalkAd(LightTracer, Reversed):
         self, attached: bool = False, filter_normalization: str = "attached", paths: str = "light",
         light_share: float = 0.5, **common: Any,
     ) -> None:  # fmt: skip
-        """Make the integrator; with `attached`, rays and film positions have derivatives, too."""
+        """Make the integrator. With `attached`, rays and film positions have derivatives, too."""
         super().__init__(motion=Motion(attached, filter_normalization), **common)
         self.have_paths(paths, light_share)
 
     def graph(self, job: Job) -> mi.TensorXf:
-        """Return the image (H, W, C) with its whole graph; call with enabled gradients."""
+        """Return the image (H, W, C) with its whole graph. Call it with enabled gradients."""
         parts = self.passes(job)
         film = parts[0].film
         block = film.block()
@@ -190,7 +188,7 @@ class WalkAd(LightTracer, Reversed):
 
 
 class Trajectory(LightTracer, Reversed):
-    """The same light paths in a loop that Dr.Jit reverses, from a record of its state in thread-local memory."""
+    """The same light paths in a loop that Dr.Jit reverses. Dr.Jit records the loop state in thread-local memory."""
 
     def __init__(self, max_depth: int = -1, **common: Any) -> None:
         super().__init__(max_depth, motion=Motion(attached=False), **common)

@@ -1,7 +1,7 @@
-"""Facts of a scene, its sensors and its differentiated parameters, which a light tracer finds once and keeps.
+"""Facts about a scene, its sensors and its differentiated parameters. A light tracer finds them once and keeps them.
 
 `Preparation` has the options and the facts of the last scene. Facts of a scene (`AboutScene`) and of a set of
-parameters (`AboutParameters`) are separate objects. Another scene or another set gets new ones, so a reused tracer
+parameters (`AboutParameters`) are separate objects. Another scene or another set gets new objects, so a reused tracer
 gives the results of a new one. `Renewal` updates plans after shapes have moved.
 """
 
@@ -35,7 +35,10 @@ from reslrb_cli.transport.sobol import make_coordinates
 
 
 def _has_singular(key: str, value: dr.ArrayBase, least: float) -> bool:
-    """Whether a factor of this parameter is at most `least` somewhere: near 0, or at 1 if 1 - x is a factor, too."""
+    """Whether a factor that depends on this parameter is at most `least` somewhere.
+
+    The factor is near 0 if the parameter is near 0. If 1 - x is a factor, too, it is also near 0 at x = 1.
+    """
     flat = dr.detach(value.array if dr.is_tensor_v(value) else dr.ravel(value))
     singular = flat <= least
     if {"opacity", "weight"} & set(key.split(".")):
@@ -44,7 +47,7 @@ def _has_singular(key: str, value: dr.ArrayBase, least: float) -> bool:
 
 
 class Renewal:
-    """Updates of the plans of one scene before tracing, limited to what has changed."""
+    """Updates of the plans of one scene before tracing. Only plans that have changed are updated."""
 
     def __init__(self, scene: mi.Scene) -> None:
         graph = SceneGraph.of(scene)
@@ -93,7 +96,7 @@ def sensors_in_words(count: int) -> str:
 
 
 def sensor_number(scene: mi.Scene, sensor: mi.Sensor) -> int:
-    """Return the number of a sensor of a scene; for any other sensor, the number of sensors."""
+    """Return the number of a sensor of a scene. For any other sensor, return the number of sensors."""
     known = [one.ptr for one in scene.sensors()]
     return known.index(sensor.ptr) if sensor.ptr in known else len(known)
 
@@ -157,9 +160,9 @@ class Preparation:
         return self._found.recordings
 
     def afresh(self, guided: bool | None, images: bool | None, low_discrepancy: bool | None) -> Preparation:
-        """Return a new object with the same options, with the given changes; None keeps an option.
+        """Return a new object with the same options, except for the given ones. None keeps an option.
 
-        `images` says whether samples that serve only an image are guided, too.
+        `images` tells whether samples that serve only an image are guided, too.
         """
         own = self.guiding
         guided = own is not None if guided is None else guided
@@ -180,10 +183,10 @@ class Preparation:
         self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None, spp: int | None = None,
         image: bool = False,
     ) -> Plan:  # fmt: skip
-        """Return the plan to differentiate `params` in this scene; None: nothing is differentiated.
+        """Return the plan to differentiate `params` in this scene. For None, nothing is differentiated.
 
         `spp` is the number of samples per pixel of a pass, if the plan is for one. With `image`, the plan is for the
-        image of a step that differentiates `params`: it has the same paths as the gradient, and no derivatives. Raises
+        image of a step that differentiates `params`. It has the same paths as the gradient, and no derivatives. Raises
         UnsupportedScene.
         """
         self._turn_to(scene)
@@ -213,18 +216,18 @@ class Preparation:
         return plan
 
     def noted(self, params: mi.SceneParameters) -> dict[int, NDArray[np.float32]]:
-        """Return the densities of camera paths for the derivatives of `params`, by sensor; the caller may add to
-        them.
+        """Return the densities of camera paths for the derivatives of `params`, by sensor. The caller may add
+        densities.
         """
         return self._look_through(params).noted
 
     def shares(
         self, number: int, known: NDArray[np.float32], size: tuple[int, int]
     ) -> Callable[[int], PixelShares | None]:
-        """Return a function from a number of camera paths to their distribution, in proportion to the `known` density
-        (H, W).
+        """Return a function that takes a number of camera paths and returns their distribution over the pixels.
 
-        The film (crop window) of the sensor has this `size` (width, height).
+        The distribution is proportional to the `known` density (H, W). `size` is the (width, height) of the sensor's
+        crop window.
         """
         made = self._found.shares
 
@@ -272,9 +275,9 @@ class Preparation:
         return self._with_numbers(plan, samples)
 
     def _look_through(self, params: mi.SceneParameters) -> AboutParameters:
-        """Return the facts of the currently differentiated parameters, and whether zeros must be tracked.
+        """Return the facts about the currently differentiated parameters, and whether zeros must be tracked.
 
-        The owner of a parameter does not change, but whether it tracks derivatives or is zero may change.
+        The owner of a parameter never changes. Whether it tracks derivatives or is zero may change.
         """
         with dr.resume_grad():  # with suspended gradients, nothing shows that it tracks them
             values = {key: entry_value(params, key) for key in params.properties}
@@ -290,7 +293,7 @@ class Preparation:
         return about
 
     def _with_numbers(self, plan: Plan, samples: Samples) -> Plan:
-        """Return the plan with the choice of its random numbers."""
+        """Return the plan with its kind of random numbers set."""
         grid, aims = None, False
         if self.guiding is not None:
             spp, sensors = self.expected or self._found.met, samples.scene.sensors()
@@ -308,7 +311,8 @@ class Preparation:
     def _meet(self, spp: int, differentiated: bool) -> None:
         """Make the cells as fine as passes of `spp` samples per pixel can resolve.
 
-        These are the first pass, and gradients with more samples. Images with more paths teach the tables nothing.
+        The first pass, and gradients with more samples, refine the cells. Images with more paths do not, because tables
+        do not learn from them.
         """
         if self.expected is None and (self._found.met == 0 or (differentiated and spp > self._found.met)):
             self._found.met = spp
@@ -328,7 +332,7 @@ class Preparation:
                 self.guiding.clear()
 
     def _bsdfs(self, scene: mi.Scene, nodes: tuple[mi.Object, ...]) -> tuple[mi.BSDF, ...]:
-        """Return the surfaces' BSDFs that use any of these nodes; empty if all of them do."""
+        """Return the BSDFs of surfaces that use any of these nodes. The result is empty if all BSDFs do."""
         owners = self._found.owners
         if any(node not in owners for node in nodes):
             graph = SceneGraph.of(scene)
@@ -341,8 +345,8 @@ class Preparation:
 def settle(scene: mi.Scene) -> None:
     """Make textures and emitters set up their data (padded storage, distributions) now instead of at their first use.
 
-    During tracing, this would split the kernels of the first step, and the second step would compile new ones. Raises
-    UnsupportedScene for an emitter that Mitsuba cannot sample, such as a spot with a checkerboard.
+    If they did so during tracing, the kernels of the first step would be split, and the second step would compile new
+    ones. Raises UnsupportedScene for an emitter that Mitsuba cannot sample, such as a spot with a checkerboard.
     """
     with dr.suspend_grad():
         for texture in SceneGraph.of(scene).of_type(mi.Texture):

@@ -1,9 +1,9 @@
-"""Differentiated parameters, and the features of a walk that their derivatives need, above all for moving light.
+"""Differentiated parameters, and the features of a walk that their derivatives need, mainly for moving light.
 
-`Motion` has the options of attached derivatives, and `attach` adds them to a plan. `bounces` finds out whether moving
-light is scattered by a surface that is not specular, and then seen from another one. Only there do the two values of
-`attached_sampling`, `follow` and `stay` (`estimators/attached.py`), differ. In a caustic of few segments, light ends
-where it lands first.
+`Motion` has the options of attached derivatives, and `attach` adds them to a plan. The values `follow` and `stay` of
+`attached_sampling` (`estimators/attached.py`) differ only if moving light is scattered by a surface that is not
+specular and then reaches another visible surface. `bounces` finds out whether this happens. In a caustic of few
+segments, it does not: light ends where it lands first.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ class Differentiated:
     """Parameters that track derivatives.
 
     - `bsdf_nodes` are the nodes of BSDFs with such parameters: textures, nested BSDFs, and meshes whose attributes are
-      textures.
-    - `emission_nodes` are those of emission: emitters and their textures.
-    - `shapes` are moving shapes, and `emitters` those with moving rays.
-    - `least` maps parameters that are factors of a path to the value up to which they count as zero.
+        textures.
+    - `emission_nodes` are the nodes of emission: emitters and their textures.
+    - `shapes` are moving shapes, and `emitters` are emitters with moving rays.
+    - `least` gives the value up to which a parameter counts as zero, for parameters that are factors of a path.
     - `entries` are the numbers of differentiated entries by node.
     """
 
@@ -57,8 +57,8 @@ class Differentiated:
     def of(params: mi.SceneParameters, keys: Iterable[str]) -> Differentiated:
         """Return the differentiated parameters among `keys`.
 
-        Raises UnsupportedScene, with the reason, for a parameter whose derivative light tracing would silently leave at
-        zero.
+        Raises UnsupportedScene for a parameter whose derivative would silently be zero in light tracing. The message
+        gives the reason.
         """
         nodes: dict[mi.Object, None] = {}
         emitting: dict[mi.Object, None] = {}
@@ -95,9 +95,9 @@ class Differentiated:
 class Motion:
     """Options of attached derivatives.
 
-    `attached` is true, false, or `auto` (if a parameter moves anything). `filter_normalization` is `attached` or
+    `attached` is true, false, or `auto` (true if a parameter moves anything). `filter_normalization` is `attached` or
     `detached`, and `sampling` is `auto`, `follow` or `stay`. Raises ValueError for other values. `obstacle` is the
-    reason if an integrator has no attached derivatives.
+    reason why an integrator has no attached derivatives.
     """
 
     attached: bool | str = "auto"
@@ -168,7 +168,7 @@ SEED = 0xB0A2CE
 
 
 def bounces(plan: Plan, scene: mi.Scene, sensor: mi.Sensor) -> bool:
-    """Whether any of a fixed number of paths bounces; `plan` has attached derivatives with vertices that stay."""
+    """Whether any of a fixed number of paths bounces. `plan` has attached derivatives with vertices that stay."""
     width, height = sensor.film().size()
     spp = max(PATHS // int(width * height), 1)
     with dr.suspend_grad():

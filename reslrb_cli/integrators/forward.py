@@ -1,8 +1,9 @@
-"""Forward mode and naive AD: hooks of walks that store nothing of a path.
+"""Forward mode and naive AD: hooks of walks that store no data of a path.
 
-- `TrackedSplat`, `RecordedObjective`: the image, or the objective, with tracked derivatives (naive AD, and Dr.Jit's
-  reversal).
-- `TangentSplat`, `CameraTangents`: the forward-mode derivative of the image, by light paths and by camera paths.
+- `TrackedSplat` and `RecordedObjective` compute the image, or the objective, with tracked derivatives. Naive AD and
+    Dr.Jit's reversal use them.
+- `TangentSplat` and `CameraTangents` compute the forward-mode derivative of the image, by light paths and by camera
+    paths.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ from reslrb_cli.transport.walk import Hooks, Splat, Vertex, walk
 
 
 class TrackedSplat(Splat):
-    """Hooks that splat every connection with tracked derivatives of its factors, and of rays and film positions if
-    `attached`.
+    """Hooks that splat every connection with tracked derivatives of its factors. If `attached`, rays and film positions
+    have derivatives, too.
     """
 
     tracked = True
@@ -45,9 +46,10 @@ class TrackedSplat(Splat):
 
 
 class RecordedObjective(Hooks):
-    """Hooks that sum each path's share of the objective, S = sum_i delta_i C_i, with tracked derivatives (trajectory).
+    """Hooks that sum each path's share of the objective, S = sum_i delta_i C_i, with tracked derivatives.
 
-    A splat in a reversed loop would have no derivative, because side effects are not part of the loop's state.
+    `trajectory` uses them. A splat in a reversed loop would have no derivative, because side effects are not part of
+    the loop's state.
     """
 
     tracked = True
@@ -71,8 +73,8 @@ class RecordedObjective(Hooks):
 class Tangent:
     """Derivatives along the parameters' tangents.
 
-    They are those of the product of the factors so far, (C,), and, if light moves, of the ray's origin and direction.
-    `before` is the previous vertex if vertices stay at their places.
+    The state has the derivative of the product of the factors so far (C,). If light moves, it also has the derivatives
+    of the ray's origin and direction. `before` is the previous vertex if vertices stay at their places.
     """
 
     d_product: mi.Spectrum
@@ -81,9 +83,10 @@ class Tangent:
 
 
 class TangentSplat(Hooks):
-    """Hooks that splat the derivative of every connection along the parameters' tangents; `dE` is that of emission.
+    """Hooks that splat the derivative of every connection along the parameters' tangents. `dE` is the derivative of
+    emission.
 
-    The product rule along the path needs no division:
+    The product rule along the path needs no division.
 
         d(P s) = dP s + P ds,   dC = dP c + P dc,   d(k_p(u) C) = dk_p/du du C + k_p dC
 
@@ -125,8 +128,8 @@ class TangentSplat(Hooks):
     def _attached(self, state: Tangent, vertex: Vertex, connection: Connection, scattering: Scattering) -> Tangent:
         """Return the tangent behind a vertex if light moves.
 
-        The derivatives of a segment with respect to its ray, whose tangents are known, and to the scene's parameters
-        take one propagation.
+        The tangents of the segment's ray are known. One propagation computes the derivatives with respect to the ray
+        and to the scene's parameters together.
         """
         s, P, dP, scattered = self.samples, vertex.product.value(), state.d_product, scattering.active
         plan = s.plan
@@ -157,14 +160,14 @@ class TangentSplat(Hooks):
 
 @dataclass
 class CameraTangent:
-    """Derivatives along the parameters' tangents of the product of the factors so far, and of the radiance, (C,)."""
+    """Derivatives (C,) along the parameters' tangents: of the product of the factors so far, and of the radiance."""
 
     d_product: mi.Spectrum
     d_radiance: mi.Spectrum
 
 
 class CameraTangents(CameraHooks):
-    """Hooks with the same product rule for camera paths, whose radiance is summed."""
+    """Hooks for camera paths with the same product rule. They sum the radiance."""
 
     def __init__(self, samples: Samples) -> None:
         self.samples = samples
@@ -204,7 +207,7 @@ class CameraTangents(CameraHooks):
 def tangent_of_passage(
     samples: Samples, vertex: Vertex, connection: Connection
 ) -> tuple[mi.Bool, mi.Spectrum, mi.Spectrum]:
-    """Return the visibility of a connection's target, the transmittance (C,) of masks on the way, and its
+    """Return the visibility of a connection's target, the transmittance (C,) of the masks before it, and its
     derivative.
     """
     plan, active = samples.plan, connection.active
@@ -218,7 +221,7 @@ def tangent_of_passage(
 
 
 def tangent_of_scattering(scattering: Scattering, df: mi.Spectrum) -> mi.Spectrum:
-    """Return the derivative (C,) of an event's factor from that of its f."""
+    """Return the derivative (C,) of an event's factor. `df` is the derivative of the event's f."""
     return dr.select(scattering.active, df * (scattering.correction / scattering.pdf), 0)
 
 
@@ -254,7 +257,7 @@ def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
 
 
 def splat_tracked(samples: Samples, block: mi.ImageBlock) -> None:
-    """Add the contributions with tracked derivatives to the block: naive AD, with memory proportional to depth."""
+    """Splat the contributions to the block with tracked derivatives: naive AD, with memory proportional to depth."""
     with dr.resume_grad():
         splat_visible_emission(samples, block, "evaluated")
         for u, C, active in moving_splats(samples):  # twice, so that the image stays the same

@@ -1,7 +1,8 @@
-"""Recordings of the kernel launches of a step: no Python code between a seed and its gradient (`dr.freeze`).
+"""Recordings of the kernel launches of a step, so that no Python code runs between a seed and its gradient
+(`dr.freeze`).
 
-Tracing a step takes milliseconds for any image. There is a recording for each kind of call. Dr.Jit makes another one if
-inputs change in more than their values.
+Tracing a step in Python takes milliseconds, whatever the size of the image. There is a recording for each kind of call.
+Dr.Jit makes another one if inputs change in more than their values.
 """
 
 from __future__ import annotations
@@ -51,12 +52,12 @@ class Recordings:
         self._functions.clear()
 
     def call(self, kind: str, samples: Samples, function: Callable[..., Any], *inputs: Any) -> Any:
-        """Call `function(samples, *inputs)`, from a recording if there is one; its results are evaluated.
+        """Call `function(samples, *inputs)`, from a recording if there is one. Its results are evaluated.
 
-        `function` depends only on its inputs and, for values that are no Dr.Jit arrays, on `kind`. The derivatives that
-        it adds to parameters are proportional to the first of `inputs`. Calls that cannot be recorded are made
-        directly: for example, other living scenes take part in indirect calls, but are no inputs. So are calls that had
-        to be recorded again and again. Raises UnsupportedScene if a recording exists but does not fit any more.
+        `function` must depend only on its inputs and, for values that are no Dr.Jit arrays, on `kind`. The derivatives
+        that it adds to parameters must be proportional to the first of `inputs`. Calls that cannot be recorded are made
+        directly. For example, a second living scene takes part in indirect calls, but is no input. Calls that were
+        recorded too often are also made directly. Raises UnsupportedScene if a recording no longer fits.
         """
         s = samples
         # Sensors that share a recording would remake it at every change of sensor. The key holds the sensor, so no
@@ -99,9 +100,9 @@ def _record(
 ) -> Any:  # fmt: skip
     """Return a recording, or None if the call cannot be recorded.
 
-    Dr.Jit detects this after it has computed everything and added derivatives. The recording is therefore tried with a
-    first input of zeros, which adds none, and repeated until it is used, so that later work has the same kernels from
-    the first step on.
+    Dr.Jit detects a call that cannot be recorded only after it has computed everything and added derivatives. The
+    recording is therefore tried with zeros as first input, which add none. The trial is repeated until the recording is
+    used. All later work then has the same kernels from the first step on.
     """
     recorded = dr.freeze(plain, limit=KEPT)
     if inputs:

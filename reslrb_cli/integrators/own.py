@@ -20,7 +20,7 @@ from reslrb_cli.integrators.protocol import Job
 
 
 class OwnIntegrator(Reversed):
-    """User's integrator in a step; exceptions and wrong images become one line that names the class.
+    """User's integrator in a step. An exception or a wrong image becomes one line that names the class.
 
     The file runs when an image or a gradient is first needed, or in `ready`.
     """
@@ -32,10 +32,10 @@ class OwnIntegrator(Reversed):
         self, file: str, max_depth: int, rr_depth: int, hide_emitters: bool, arguments: dict[str, Any] | None = None,
         paths: str = "camera", allowed: bool = False,
     ) -> None:  # fmt: skip
-        """Prepare the class FILE.py:CLASS, to be made from a `mi.Properties` with these options and `arguments`.
+        """Prepare the class FILE.py:CLASS. It is constructed from a `mi.Properties` with these options and `arguments`.
 
-        Of the first three options, it receives those that it reads. `paths` are for checks (`config.Own`). Code runs
-        only if `allowed`.
+        The class receives only those of the first three options that it reads. `paths` are for checks (`config.Own`).
+        Code runs only if `allowed`.
         """
         self.file, self.name, self.allowed = code_file(file), file.rpartition(":")[2], allowed
         self._options = {"max_depth": max_depth, "rr_depth": rr_depth, "hide_emitters": hide_emitters}
@@ -44,8 +44,8 @@ class OwnIntegrator(Reversed):
     def ready(self) -> None:
         """Run the file and make the integrator.
 
-        Raises ConfigError, located by the file, if this is not allowed, fails, or if the class does not read one of the
-        `arguments`.
+        Raises ConfigError, located by the file, if code is not allowed, if the code fails, or if the class does not
+        read one of the `arguments`.
         """
         _ = self._work
 
@@ -80,7 +80,9 @@ class OwnIntegrator(Reversed):
             self._work.backward(job, gradient)
 
     def tangent(self, job: Job) -> mi.TensorXf:
-        """Return the derivative of the image along the tangents of the job's parameters, by its `render_forward`."""
+        """Return the derivative of the image along the tangents of the job's parameters, from the class's
+        `render_forward`.
+        """
         plugin = self._work.plugin
         with self._guarded("its render_forward"), dr.resume_grad():
             image = plugin.render_forward(job.scene, job.params, job.sensor, job.seed, job.spp)

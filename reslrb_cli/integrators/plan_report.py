@@ -93,7 +93,7 @@ def plan_rows(plan: Plan) -> list[PlanRow]:
 
 
 def with_reason(rows: Iterable[PlanRow], feature: str, reason: str) -> list[PlanRow]:
-    """Replace the reason of a feature; if the plan has the feature, add to its reason instead."""
+    """Replace the reason of a feature. If the plan has the feature, the reason is added to the existing one."""
     return [
         replace(row, reason=f"{row.reason}; {reason}" if row.needed else reason) if row.feature == feature else row
         for row in rows

@@ -22,8 +22,8 @@ _registered_with_callback = False
 def register() -> None:
     """Register the integrators with Mitsuba, for the current variant and for variants that are set later.
 
-    Raises BackendError, with the supported variants, if the current variant is not supported. Under an unsupported
-    variant that is set later, loading one of the integrators raises an error.
+    Raises BackendError, with the supported variants, if the current variant is not supported. If an unsupported variant
+    is set later, loading one of the integrators raises an error.
     """
     global _registered_with_callback
     if not _registered_with_callback:
@@ -51,7 +51,7 @@ def _on_variant(old: str | None, new: str) -> None:
 
 
 def _refuse(type: str, props: mi.Properties) -> NoReturn:
-    """Raise an error under a variant without the plugin, because "no such plugin" would be no help."""
+    """Raise an error under a variant without the plugin. Mitsuba's own message, "no such plugin", would not help."""
     check_variant(mi.variant())
     raise AssertionError("requires such a variant")
 

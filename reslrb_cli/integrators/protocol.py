@@ -18,9 +18,9 @@ Derivative: TypeAlias = "Callable[[mi.TensorXf], mi.TensorXf]"  # a string: the 
 class Job:
     """One set of samples of a scene, through a sensor, with random numbers.
 
-    `seed` is an opaque UInt32, and `spp` the number of samples per pixel. Entries of `params`, the scene's
-    `mi.traverse`, that track derivatives are differentiated; None for an image alone. `plans` stores what integrators
-    find out about scene and parameters for one step; jobs that are derived from one another share it.
+    `seed` is an opaque UInt32, and `spp` the number of samples per pixel. `params` is the scene's `mi.traverse`, and
+    its entries that track derivatives are differentiated. It is None for an image without derivatives. `plans` stores
+    facts about scene and parameters for one step. Jobs that are derived from one another share it.
     """
 
     scene: mi.Scene
@@ -32,7 +32,9 @@ class Job:
 
 
 class StepIntegrator(Protocol):
-    """Images and gradients; images and dL/dI are tensors (H, W, C), and gradients are added to the job's parameters."""
+    """Interface for images and gradients. Images and dL/dI are tensors (H, W, C). Gradients are added to the job's
+    parameters.
+    """
 
     #: Whether `correlated` evaluates the image and dL/dI before the rest of its work; naive AD does not.
     image_apart: bool
@@ -42,22 +44,20 @@ class StepIntegrator(Protocol):
         ...
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
-        """Add the gradient of the objective with dL/dI `gradient`."""
+        """Add the gradient of the objective. `gradient` is dL/dI."""
         ...
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """Return the image, and add the gradient of the same samples with the dL/dI that `derivative(image)`
-        returns.
-        """
+        """Return the image. Adds the gradient of the same samples with dL/dI = `derivative(image)`."""
         ...
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
-        """Return the image, and add the gradient of the same samples, with dL/dI known before."""
+        """Return the image. Adds the gradient of the same samples for a dL/dI that is known before the image."""
         ...
 
 
 def first_channels(image: mi.TensorXf, count: int) -> mi.TensorXf:
-    """Return `image[..., :count]`, whose derivative keeps a NaN.
+    """Return `image[..., :count]` with a derivative that keeps NaN.
 
     The derivative of a slice uses atomic sums, which drop NaN on a CPU (`transport.factors.showing`).
     """
@@ -71,7 +71,7 @@ def first_channels(image: mi.TensorXf, count: int) -> mi.TensorXf:
 
 
 def halves_of(image: mi.TensorXf) -> tuple[mi.TensorXf, mi.TensorXf]:
-    """Return the images (H, W, C) of the two halves of a set of samples, (2, H, W, C); for one image, that image
+    """Return the images (H, W, C) of the two halves of a set of samples (2, H, W, C). For a single image, returns it
     twice.
     """
     if len(image.shape) == 3:
@@ -86,7 +86,7 @@ def halves_of(image: mi.TensorXf) -> tuple[mi.TensorXf, mi.TensorXf]:
 
 
 def whole_of(image: mi.TensorXf) -> mi.TensorXf:
-    """Return the image (H, W, C) of a set of samples; the mean of its two halves (2, H, W, C) if it has them."""
+    """Return the image (H, W, C) of a set of samples. If the set has two halves (2, H, W, C), this is their mean."""
     if len(image.shape) == 3:
         return image
     first, second = halves_of(image)

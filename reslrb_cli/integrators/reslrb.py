@@ -1,7 +1,7 @@
 """Light tracers: the common base, and reservoir light replay backpropagation.
 
 `LightTracer` has the options of `ptracer`, a plan, passes, the image and its tangent. `Reslrb` adds gradients by one of
-the estimators. They are independent of Mitsuba's plugins; `plugin.py` makes plugins from them.
+the estimators. The classes do not depend on Mitsuba's plugins. `plugin.py` makes plugins from them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ PATHS = ("light", "camera", "both")
 
 
 class LightTracer:
-    """Light tracer with derivatives in forward mode only; OPTIONS are names and defaults of `ptracer`."""
+    """Light tracer with derivatives in forward mode only. OPTIONS are the names and defaults of `ptracer`'s options."""
 
     OPTIONS: ClassVar[Mapping[str, Any]] = {
         "max_depth": -1,
@@ -64,9 +64,9 @@ class LightTracer:
     ) -> None:  # fmt: skip
         """Make the tracer. Raises ValueError, which names the option, for an invalid value.
 
-        `freeze` says whether launches are recorded (`freezing.py`), `motion` has the options of attached derivatives,
-        `guided` says whether emission is guided (`tables.py`), and `low_discrepancy` whether the first numbers of a
-        path are of low discrepancy (`sobol.py`).
+        `freeze` tells whether launches are recorded (`freezing.py`), and `motion` has the options of attached
+        derivatives. `guided` tells whether emission is guided (`tables.py`). `low_discrepancy` tells whether the first
+        numbers of a path are low-discrepancy numbers (`sobol.py`).
         """
         if max_depth < -1:
             raise ValueError('"max_depth" must be -1 (no limit) or a value >= 0')
@@ -79,7 +79,7 @@ class LightTracer:
         self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion or Motion(), guided, low_discrepancy)
 
     def with_options(self, *, samples_per_pass: int | None, freeze: bool) -> Self:
-        """Return the same tracer with other passes, or without recordings; both share the facts of a scene."""
+        """Return the same tracer with other passes, or without recordings. Both tracers share the facts of a scene."""
         other = copy.copy(self)
         other.samples_per_pass, other.freeze = samples_per_pass, freeze
         return other
@@ -88,11 +88,11 @@ class LightTracer:
         self, *, guided: bool | None = None, images: bool | None = None, low_discrepancy: bool | None = None,
         light_share: float | None = None,
     ) -> Self:  # fmt: skip
-        """Return the same tracer without facts of any scene, with other ways of sampling; None keeps a value.
+        """Return the same tracer without facts of any scene, and with other ways of sampling. None keeps a value.
 
-        `guided` and `images` (for images, too) set guiding; low-discrepancy numbers or independent ones; paths from
-        both sides, with a share `light_share` of light paths. Images then have the film border of both kinds, for any
-        share.
+        `guided` turns guiding on or off, and `images` the guiding of images. `low_discrepancy` selects low-discrepancy
+        or independent numbers. `light_share` selects paths from both sides with this share of light paths. Images then
+        have the same film border for any share.
         """
         other = copy.copy(self)
         other.preparation = self.preparation.afresh(guided, images, low_discrepancy)
@@ -101,9 +101,9 @@ class LightTracer:
         return other
 
     def shared_out(self, noted: Mapping[str, NDArray[np.float32]]) -> Self:
-        """Return the same tracer without facts of any scene, with camera paths distributed by these densities.
+        """Return the same tracer without facts of any scene, and with camera paths distributed by these densities.
 
-        The densities are by the number of the sensor (`note_pixels`).
+        The densities (`note_pixels`) have the number of the sensor as key.
         """
         other = self.afresh()
         other.preparation.shares_out = True
@@ -111,24 +111,25 @@ class LightTracer:
         return other
 
     def to_measure(self) -> Self:
-        """Return this tracer or, if it is guided, one with its own tables.
+        """Return this tracer or, if it is guided, a tracer with its own tables.
 
-        Measurements before a run then do not teach the tables of the run, which are the same whether an earlier run
-        measured or not.
+        Measurements before a run must not update the tables of the run. Otherwise these tables would depend on whether
+        an earlier run has measured.
         """
         return self if self.preparation.guiding is None else self.afresh()
 
     def expect(self, spp: int) -> None:
-        """Set the number of samples per pixel of passes that tables learn from, before the first pass.
+        """Set the sample count of passes that tables learn from, before the first pass.
 
-        A run calls this, so that it has the same cells whether it starts or resumes.
+        A run calls this method, so that it has the same cells whether it starts or resumes.
         """
         self.preparation.expected = spp
 
     def have_paths(self, paths: str, light_share: float, whole: bool = False) -> None:
-        """Use light paths, camera paths, or both, with a share `light_share` of light paths; 0 or 1 leaves one kind.
+        """Use light paths, camera paths, or both. `light_share` is the share of light paths; with 0 or 1, only one kind
+        remains.
 
-        With `whole`, light paths alone have the film border of the other kinds.
+        With `whole`, light paths alone have the same film border as the other kinds.
         """
         one_of("paths", paths, PATHS)
         if not 0 <= light_share <= 1:
@@ -145,11 +146,11 @@ class LightTracer:
         return self.preparation.plan(scene, sensor, params)
 
     def passes(self, job: Job, purpose: Purpose | None = None, delta: mi.TensorXf | None = None) -> list[Samples]:
-        """Return the samples of a job; if its `spp` is 0, as many as the sensor has.
+        """Return the samples of a job. If its `spp` is 0, the sensor's own sample count is used.
 
-        `purpose` selects the table of guided samples; None: the gradient, or the image if there is no gradient. dL/dI
-        `delta` (H, W, C), which must not come from these samples, guides them as well. Raises ValueError for a negative
-        `spp`.
+        `purpose` selects the table of guided samples. None selects the table for the gradient, or for the image if
+        there is no gradient. If `delta` is given, it guides the samples as well. It is dL/dI (H, W, C), and must come
+        from other samples. Raises ValueError for a negative `spp`.
         """
         if job.spp < 0:
             raise ValueError(f'"spp" must be 0 (the sensor\'s own sample count) or more, not {job.spp}')
@@ -171,9 +172,9 @@ class LightTracer:
         return self.light_share, self.preparation.emitters(plan, scene) if plan.weighs else None
 
     def _shares(self, job: Job, plan: Plan) -> Callable[[int], PixelShares | None] | None:
-        """Return the distribution of the job's camera paths; None: evenly.
+        """Return the distribution of the job's camera paths, or None for a uniform distribution.
 
-        If it is not known yet, it is measured once for the differentiated parameters.
+        If it is unknown, it is measured once for the differentiated parameters.
         """
         preparation = self.preparation
         if plan.paths == "light" or not preparation.shares_out:
@@ -190,7 +191,7 @@ class LightTracer:
         """Return the density of camera paths over the pixels (H, W) of a job's sensor, with mean 1, for the current
         scene.
 
-        `curvature` (H, W) is that of the loss (`pixels.py`). The job's seed and samples do not matter.
+        `curvature` (H, W) is the curvature of the loss (`pixels.py`). The job's seed and samples do not matter.
         """
         plan = self.preparation.plan(job.scene, job.sensor, job.params)
         entries = self.preparation.entries(plan, job.params)
@@ -198,16 +199,16 @@ class LightTracer:
             return wanted(plan, job.scene, job.sensor, entries, *self._sides(plan, job.scene), curvature)
 
     def learn(self, job: Job, gradient: mi.TensorXf) -> None:
-        """Let the tables learn, if they are due, from samples other than those of the job; dL/dI is known.
+        """Update the tables, if an update is due, with samples other than those of the job. dL/dI is known.
 
-        Call this after a gradient. The result is used from the next gradient on.
+        Call this method after a gradient. The next gradient uses the result.
         """
         guiding = self.preparation.guiding
         if guiding is not None and guiding.due(sensor_number(job.scene, job.sensor)):
             self.learn_now(job, gradient)
 
     def learn_now(self, job: Job, gradient: mi.TensorXf) -> None:
-        """Let the tables learn, due or not."""
+        """Update the tables, even if no update is due."""
         guiding = self.preparation.guiding
         assert guiding is not None
         with dr.suspend_grad():
@@ -243,19 +244,21 @@ class LightTracer:
         self, kind: str, parts: list[Samples], work: Callable[..., Any], *inputs: Any,
         params: mi.SceneParameters | None = None,
     ) -> Any:  # fmt: skip
-        """Call `work(parts, *inputs, params)`, or launch a recording of it; with one pass, `params` may be None."""
+        """Call `work(parts, *inputs, params)`, or launch a recording of it. With one pass, `params` may be None."""
         if self.freezes(parts):
             recordings = self.preparation.recordings
             return recordings.call(kind, parts[0], lambda part, *given: work([part], *given), *inputs)
         return work(parts, *inputs) if params is None else work(parts, *inputs, params=params)
 
     def freezes(self, parts: list[Samples]) -> bool:
-        """Whether these samples are traced from a recording; large ones, and so several passes, gain little."""
+        """Whether these samples are traced from a recording. Large sets of samples gain little from a recording."""
         return self.freeze and len(parts) == 1 and parts[0].width <= freezing.MOST_PATHS
 
 
 class Reslrb(LightTracer):
-    """Derivatives by a replay of each path; the options besides OPTIONS are those of the estimator."""
+    """Light tracer with derivatives by a replay of each path. Options that are not in OPTIONS belong to the
+    estimator.
+    """
 
     OPTIONS: ClassVar[Mapping[str, Any]] = {
         **LightTracer.OPTIONS,
@@ -319,18 +322,16 @@ class Reslrb(LightTracer):
         return {"light": 1.0, "camera": 0.0}.get(plan.paths, self.light_share)
 
     def kept(self, plan: Plan) -> Any:
-        """Return all simultaneously stored data of a light path, as `Estimator.kept`; camera paths store nothing."""
+        """Return the types of all data stored for a light path, as in `Estimator.kept`. Camera paths store nothing."""
         return [] if plan.paths == "camera" else self.estimator.of(plan).kept(plan)
 
     def scratch_bytes(self, plan: Plan) -> int:
-        """Return the thread-local bytes of each traced path, of either kind."""
+        """Return the thread-local bytes of each traced path, for both kinds of paths."""
         light = 0 if plan.paths == "camera" else self.estimator.of(plan).scratch_bytes(plan)
         return light if plan.paths == "light" else max(light, stack_bytes(plan, self.estimator.stack_size))
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """Return the image, and add the gradient of the same samples with the dL/dI that `derivative(image)`
-        returns.
-        """
+        """Return the image. Adds the gradient of the same samples with dL/dI = `derivative(image)`."""
         with dr.suspend_grad():
             parts = self.passes(job, Purpose.BOTH)
             traced = Trace(parts, *self.launch("trace", parts, partial(trace_image, self.estimator)))
@@ -340,16 +341,16 @@ class Reslrb(LightTracer):
         return traced.image
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
-        """Add the gradient of the objective with dL/dI `gradient` (H, W, C)."""
+        """Add the gradient of the objective. `gradient` (H, W, C) is dL/dI."""
         with dr.suspend_grad():
             trace = Trace(self.passes(job, delta=gradient))
         self._replay(trace, gradient, job.params)
         self.learn(job, gradient)
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
-        """Return the image, and add the gradient of the objective with dL/dI `gradient` (H, W, C), known before.
+        """Return the image. Adds the gradient for `gradient`, a dL/dI (H, W, C) that is known before the image.
 
-        One set of samples is traced once for both if the estimator supports it.
+        If the estimator supports it, one set of samples is traced once for both.
         """
         with dr.suspend_grad():
             parts = self.passes(job, Purpose.BOTH, gradient)
@@ -371,7 +372,7 @@ def _no_attached(estimator: str) -> str:
 
 
 def image_of(samples: list[Samples]) -> mi.TensorXf:
-    """Return the image of all passes; nothing is stored."""
+    """Return the image of all passes without storing any data."""
     film = samples[0].film
     block = film.block()
 
@@ -390,10 +391,9 @@ def image_of(samples: list[Samples]) -> mi.TensorXf:
 def forward(
     samples: Samples, estimator: Estimator, block: mi.ImageBlock | None, adjoint: AdjointImage | None = None
 ) -> Any:
-    """Trace the samples: add their contributions to the block (None: no image), and return the stored data of each
-    path.
+    """Trace the samples and return the stored data of each path, without evaluating them.
 
-    The result is not evaluated.
+    Contributions are splatted to the block. If the block is None, there is no image.
     """
     if block is not None:
         splat_visible_emission(samples, block)
@@ -421,8 +421,8 @@ class Trace:
 def trace_image(estimator: Estimator, samples: list[Samples]) -> tuple[mi.TensorXf, Any]:
     """Return the image of all passes, and the estimator's stored data of each path.
 
-    Several passes store nothing, because the data would grow with the number of passes. Each is traced again before its
-    replay.
+    With several passes, nothing is stored, because the data would grow with the number of passes. Each pass is then
+    traced again before its replay.
     """
     state = None
     if len(samples) > 1:
@@ -440,9 +440,9 @@ def trace_image(estimator: Estimator, samples: list[Samples]) -> tuple[mi.Tensor
 
 
 def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointImage, done: bool = False) -> None:
-    """Add the derivatives of the objective, whose derivative with respect to the film is `adjoint`.
+    """Add the derivatives of the objective. `adjoint` is its derivative with respect to the film.
 
-    With `done`, the derivatives of camera paths have been added already, in their only traversal.
+    With `done`, the derivatives of camera paths have already been added in their only traversal.
     """
     differentiate_visible_emission(samples, adjoint)
     for side in samples.sides():
@@ -457,10 +457,10 @@ def replay_all(
     estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, state: Any = None,
     params: mi.SceneParameters | None = None,
 ) -> None:  # fmt: skip
-    """Add the gradient of the objective with dL/dI `gradient` (H, W, C) to `params`; with one pass, `params` may be
+    """Add the gradient of the objective to `params`. `gradient` (H, W, C) is dL/dI. With one pass, `params` may be
     None.
 
-    `state` is the stored data of the paths of one pass; None: they are traced again.
+    `state` is the stored data of the paths of one pass. If it is None, the paths are traced again.
     """
     adjoint = samples[0].film.adjoint(gradient)
     if state is None:
@@ -475,7 +475,7 @@ def replay_all(
 def fused(
     estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, params: mi.SceneParameters | None = None
 ) -> mi.TensorXf:
-    """Return the image, and add the same gradient, with dL/dI known before."""
+    """Return the image, and add the gradient for a dL/dI that is known before the image."""
     film = samples[0].film
     block = film.block()
     differentiate_passes(samples, estimator, block, film.adjoint(gradient), params)
@@ -486,7 +486,7 @@ def differentiate_passes(
     samples: list[Samples], estimator: Estimator, block: mi.ImageBlock | None, adjoint: AdjointImage,
     params: mi.SceneParameters | None,
 ) -> None:  # fmt: skip
-    """Trace samples with known dL/dI, and add their derivatives, and their contributions to the block (None: none).
+    """Trace samples with known dL/dI. Adds their derivatives and, if there is a block, their contributions to it.
 
     The data of a path stay within the kernel, and take no memory.
     """

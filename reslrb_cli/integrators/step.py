@@ -1,15 +1,18 @@
-"""Step: image, loss, and the gradient of every parameter, by any integrator, with a choice of samples for delta.
+"""Step: image, loss, and the gradient of every parameter, by any integrator.
 
-correlated     one set of samples for image and gradient, as naive AD of one rendering independent    the gradient's
-samples have their own seed, as in `mi.render` batched        the samples in batches, each with delta from the image of
-those before it (`_batched`)
+`adjoint` selects the samples that dL/dI comes from.
 
-With `halves`, each of these sets of samples consists of two with half the samples each, and images are (2, H, W, C). A
-loss that multiplies an image by itself takes both, because their noise is independent (`Halves`).
+- `correlated`: one set of samples serves image and gradient, as in naive AD of one rendering.
+- `independent`: the samples of the gradient have their own seed, as in `mi.render`.
+- `batched`: the samples are divided into batches. Each batch takes dL/dI from the image of the earlier ones
+    (`_batched`).
 
-Entries of dL/dI that are not finite are set to 0, and counted (`Refused`). One NaN in dL/dI would make a gradient NaN
-wherever a path of this pixel passes, and some estimators would lose it on the way. Both happen in the kernel that
-computes dL/dI, and only readers of the count wait for it.
+With `halves`, each set of samples has two halves, and images are (2, H, W, C). A loss that multiplies an image by
+itself takes both halves, because their noise is independent (`Halves`).
+
+Entries of dL/dI that are not finite are set to 0, and counted (`Refused`). One NaN in dL/dI would make the gradient of
+everything on the paths of its pixel NaN, and some estimators would lose the NaN. The kernel that computes dL/dI also
+counts these entries, so only readers of the count wait for it.
 """
 
 from __future__ import annotations
@@ -45,8 +48,8 @@ NONE = 0xFFFFFFFF
 class Refused:
     """Entries of dL/dI that were not finite.
 
-    They are their number, and the flat index of the first one, of width 1; also the shape of dL/dI, (H, W, C), or (2,
-    H, W, C) with halves.
+    It holds their number and the flat index of the first one, as arrays of width 1. It also holds the shape of dL/dI,
+    which is (H, W, C), or (2, H, W, C) with halves.
     """
 
     count: mi.UInt32 = field(default_factory=lambda: dr.zeros(mi.UInt32, 1))
@@ -54,7 +57,9 @@ class Refused:
     shape: tuple[int, ...] = (0, 0, 0)
 
     def take(self, gradient: mi.TensorXf) -> mi.TensorXf:
-        """Return dL/dI with 0 for entries that are not finite, and add them to the count; neither is evaluated here."""
+        """Return dL/dI with 0 for entries that are not finite, and add them to the count. Does not evaluate either of
+        them.
+        """
         self.shape, flat = gradient.shape, gradient.array
         bad = ~dr.isfinite(flat)
         # Only lanes with non-finite values use atomics: none if nothing is wrong.
@@ -76,7 +81,7 @@ class Refused:
 class StepResult:
     """Result of a step besides gradients: the image (H, W, C) and the loss (width 1), both detached.
 
-    Entries of dL/dI that are not finite count as 0; `refused` has their number, and the first of them. `seen` is the
+    Entries of dL/dI that are not finite count as 0. `refused` has their number and the first of them. `seen` is the
     image that the objective received, (2, H, W, C) with halves.
     """
 
@@ -87,11 +92,11 @@ class StepResult:
 
 
 def make_integrator(type: str, **options: Any) -> StepIntegrator:
-    """Make an integrator by its plugin's name and options.
+    """Make an integrator from its plugin's name and options.
 
-    Names are `reslrb`, `walk_ad`, stock ones such as `ptracer` and `prb`, and `custom` for a user's own
-    (`OwnIntegrator`). Options that are None are left out, because Mitsuba would end the process. Raises ValueError for
-    an unknown option.
+    The name is `reslrb`, `walk_ad`, `trajectory`, a stock integrator such as `ptracer` and `prb`, or `custom` for a
+    user's own integrator (`OwnIntegrator`). Options that are None are left out, because Mitsuba would crash. Raises
+    ValueError for an unknown option.
     """
     given = {name: value for name, value in options.items() if value is not None}
     if type in TRACERS:
@@ -122,10 +127,11 @@ def interface_of(integrator: StepIntegrator | mi.Integrator) -> StepIntegrator:
 
 
 class Halves:
-    """`work` with images (2, H, W, C) of two independent halves of a job's samples, whose mean is the image.
+    """Step interface for two independent halves of a job's samples. Images are (2, H, W, C), and their mean is the
+    image.
 
-    A dL/dI of this shape has the derivatives with respect to each half's image. Raises ValueError for an odd number of
-    samples per pixel.
+    dL/dI has the same shape, with the derivatives with respect to the image of each half. Raises ValueError for an odd
+    number of samples per pixel.
     """
 
     def __init__(self, work: StepIntegrator) -> None:
@@ -136,14 +142,12 @@ class Halves:
         return _both(*(self.work.image(half) for half in half_jobs(job)))
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
-        """Add the gradient of the objective with dL/dI `gradient`."""
+        """Add the gradient of the objective. `gradient` is dL/dI."""
         for half, own in zip(half_jobs(job), _apart(gradient), strict=True):
             self.work.backward(half, own)
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """Return the images, and add the gradient of the same samples with the dL/dI that `derivative(images)`
-        returns.
-        """
+        """Return the images. Adds the gradient of the same samples with dL/dI = `derivative(images)`."""
         first, second = half_jobs(job)
         images: list[mi.TensorXf] = []
 
@@ -162,7 +166,7 @@ class Halves:
         return images[0]
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
-        """Return the images, and add the gradient of the same samples, with dL/dI known before."""
+        """Return the images. Adds the gradient of the same samples for a dL/dI that is known before the images."""
         parts = zip(half_jobs(job), _apart(gradient), strict=True)
         return _both(*(self.work.known(half, own) for half, own in parts))
 
@@ -196,7 +200,9 @@ def _apart(gradient: mi.TensorXf) -> tuple[mi.TensorXf, mi.TensorXf]:
 
 def render_image(integrator: StepIntegrator, scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int,
                  halves: bool = False) -> mi.TensorXf:  # fmt: skip
-    """Return the image (H, W, C) without derivatives, or the images (2, H, W, C) of two halves of the samples."""
+    """Return the image (H, W, C) without derivatives. With `halves`, returns the images (2, H, W, C) of two halves of
+    the samples.
+    """
     work = Halves(integrator) if halves else integrator
     return work.image(Job(scene, resolve_sensor(scene, sensor), dr.opaque(mi.UInt32, seed), spp))
 
@@ -216,22 +222,20 @@ def gradient_step(
     on_samples: OnSamples | None = None,
     halves: bool = False,
 ) -> StepResult:
-    """Render, evaluate `objective(image)`, and add its gradient to every parameter of the scene that tracks
-    derivatives.
+    """Render, evaluate `objective(image)`, and add its gradient to the scene's parameters that track derivatives.
 
     - `objective` maps the image, a tensor (H, W, C) that tracks derivatives, to a scalar.
     - `sensor` is a sensor of the scene, or its index.
     - `params` are the scene's parameters, by default `mi.traverse(scene)`.
     - `spp` of 0 means the sensor's own number.
-    - `batches` belong to `adjoint="batched"`, whose loss is that of the image of all samples.
-    - `on_image` is called once the image and the loss are evaluated, if a step has such a moment.
-    - `on_samples` is called with the image of each differentiated set of samples, and with its dL/dI, so that a factor
-      of the image can be differentiated with the same samples.
-    - With `halves`, `objective` and `on_samples` receive the images (2, H, W, C) of two halves of the samples
-      (`protocol.whole_of`). Every set must then have an even number of samples.
+    - `batches` is the number of batches for `adjoint="batched"`. The loss is then the loss of the image of all samples.
+    - `on_image` is called once the image and the loss are evaluated, if there is such a moment.
+    - `on_samples` is called with the image of each differentiated set of samples, and with its dL/dI. A factor of the
+        image can then be differentiated with the same samples.
+    - With `halves`, `objective` and `on_samples` receive the images (2, H, W, C) of two halves of the samples.
+        `protocol.whole_of` returns their mean. Every set must then have an even number of samples.
 
-    Raises ValueError for numbers out of range and unknown words, and BackendError under an unsupported variant of
-    Mitsuba.
+    Raises ValueError for invalid arguments, and BackendError under an unsupported variant of Mitsuba.
     """
     check_variant(mi.variant())
     one_of("adjoint", adjoint, get_args(Adjoint))
@@ -269,10 +273,10 @@ def known_step(
     integrator: StepIntegrator | mi.Integrator, scene: mi.Scene, sensor: mi.Sensor | int, gradient: mi.TensorXf, *,
     seed: int, spp: int, params: mi.SceneParameters | None = None,
 ) -> StepResult:  # fmt: skip
-    """Make a step whose dL/dI, `gradient` (H, W, C), is known before its image: the loss is the sum of dL/dI times I.
+    """Make a step whose dL/dI, `gradient` (H, W, C), is known before its image. The loss is the sum of dL/dI times I.
 
-    One set of samples serves both; if the estimator of `reslrb` can, it splats and differentiates in one traversal. The
-    other arguments are those of `gradient_step`.
+    One set of samples serves both. If the estimator of `reslrb` supports it, one traversal splats and differentiates.
+    The other arguments are those of `gradient_step`.
     """
     refused = Refused()
     gradient = refused.take(dr.detach(gradient))
@@ -285,22 +289,22 @@ def given_step(
     seed: int, spp: int, params: mi.SceneParameters | None = None, on_samples: OnSamples | None = None,
     halves: bool = False,
 ) -> None:  # fmt: skip
-    """Add the gradient by the samples of `seed`, with dL/dI `gradient`, (H, W, C) or (2, H, W, C) with halves.
+    """Add the gradient by the samples of `seed`. `gradient` is dL/dI, (H, W, C) or, with halves, (2, H, W, C).
 
-    `gradient` comes from other samples, and is finite. The other arguments are those of `gradient_step`.
+    `gradient` must be finite and come from other samples. The other arguments are those of `gradient_step`.
     """
     work = interface_of(integrator)
     _differentiate(Halves(work) if halves else work, _job(scene, sensor, seed, spp, params), gradient, on_samples)
 
 
 def _check_number(name: str, value: object, least: int, most: int) -> None:
-    """Raise ValueError for an argument that is no whole number from `least` to `most`."""
+    """Raise ValueError if an argument is not a whole number between `least` and `most`."""
     if not isinstance(value, Integral) or not least <= int(value) <= most:
         raise ValueError(f'"{name}" must be an integer from {least} to {most}, not {value!r}')
 
 
 def _differentiate(work: StepIntegrator, job: Job, gradient: mi.TensorXf, on_samples: OnSamples | None) -> None:
-    """Add the gradient of samples with a known dL/dI; their image is rendered only if `on_samples` needs it."""
+    """Add the gradient of samples with a known dL/dI. Their image is rendered only if `on_samples` needs it."""
     if on_samples is None:
         work.backward(job, gradient)
     else:
@@ -318,10 +322,11 @@ def _job(scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int, params: 
 def _batched(
     integrator: StepIntegrator, job: Job, objective: Objective, batches: int, on_samples: OnSamples | None
 ) -> StepResult:
-    """Make a step in batches (dual buffer of Deng et al. 2022): batch b takes delta from the image of those before it.
+    """Make a step in batches (dual buffer of Deng et al. 2022). Batch b takes dL/dI from the image of the earlier
+    batches.
 
-    No path uses a delta that contains it, so the gradient of an L2 loss is unbiased, as with `independent`, from half
-    the paths. The first batch contributes only to the image.
+    No path uses a dL/dI that contains it. The gradient of an L2 loss is therefore unbiased, as with `independent`, with
+    half the paths. The first batch contributes only to the image.
     """
     if job.spp < 1 or job.spp % batches:
         raise ValueError(f"the samples per pixel ({job.spp}) must be a multiple of the batches ({batches})")
@@ -341,7 +346,7 @@ def _batched(
 def derivative_of(
     objective: Objective, image: mi.TensorXf, refused: Refused, on_image: Callable[[], None] | None = None
 ) -> tuple[mi.Float | mi.TensorXf, mi.TensorXf]:
-    """Return loss and dL/dI, evaluated together; entries of dL/dI that are not finite are refused."""
+    """Return loss and dL/dI, evaluated together. Entries of dL/dI that are not finite are refused."""
     with dr.resume_grad(), dr.isolate_grad():
         leaf = type(image)(image)
         dr.enable_grad(leaf)
@@ -356,7 +361,7 @@ def derivative_of(
 
 
 def sample_sets(seed: int, options: dict[str, Any]) -> list[tuple[str, mi.UInt32, int]]:
-    """Return the sets of samples of a step with these options (`Config.step_options`): name, seed, samples per
+    """Return the sets of samples of a step with these options (`Config.step_options`): name, seed, and samples per
     pixel.
     """
     spp, adjoint = options["spp"], options["adjoint"]

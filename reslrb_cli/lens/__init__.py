@@ -1,3 +1,1 @@
-"""From a picture to the surface whose caustic shows it: optimal transport (`transport.py`), rays and heights
-(`surface.py`).
-"""
+"""From a picture to the surface whose caustic shows it: optimal transport, rays and heights."""

@@ -1,9 +1,9 @@
 """The files that `reslrb lens` writes for a face: the scene, its mesh, and the configuration that refines the face.
 
-Contains only text and arrays, in millimetres, with the axes of `surface.py`. The lamp of parallel light is as large as
-the face in its direction, so its beam meets exactly the face. A light with the sun's angular diameter consists of
-`SUNS` such lamps. A point light is a spot whose cone ends at the face's corners. The mount around the face is black.
-The camera is a point on the receiver's normal, and throws no shadow.
+The module contains only text and arrays, in millimetres, with the axes of `surface.py`. The lamp of parallel light has
+the size of the face as seen along the light, so its beam exactly covers the face. A light with the sun's angular
+diameter consists of `SUNS` such lamps. A point light is a spot whose cone ends at the face's corners. The mount around
+the face is black. The camera is a point on the receiver's normal, and throws no shadow.
 """
 
 from __future__ import annotations
@@ -37,8 +37,9 @@ _LEAST = 0.02
 
 
 def leaving(surface: Surface) -> float:
-    """Return the light (mm^2) that leaves the face, for parallel light of irradiance 1 or a point light of
-    intensity 1.
+    """Return the light that leaves the face, in mm^2.
+
+    It is for parallel light of irradiance 1, or for a point light of intensity 1.
     """
     setting = surface.setting
     h, (ny, nx) = surface.heights, surface.heights.shape
@@ -51,7 +52,7 @@ def leaving(surface: Surface) -> float:
 
 
 def vertices(setting: Setting, nx: int, ny: int) -> tuple[Array, Array]:
-    """Return x and y (mm; ny, nx) of a face's vertices, from edge to edge. Each is at the centre of a texel of
+    """Return x and y (ny, nx) of a face's vertices in mm, from edge to edge. Each vertex is at the centre of a texel of
     the map.
     """
     x, y = (np.linspace(-side / 2, side / 2, n) for side, n in zip(setting.size, (nx, ny), strict=True))
@@ -60,8 +61,8 @@ def vertices(setting: Setting, nx: int, ny: int) -> tuple[Array, Array]:
 
 
 def at_vertices(surface: Surface, nx: int, ny: int) -> Array:
-    """Return heights (ny, nx) at `vertices`: by cubic interpolation between cells, and parabolic extrapolation to the
-    edges.
+    """Return heights (ny, nx) at `vertices`. Between cells, heights are cubic; at the edges, they are extrapolated by
+    parabolas.
     """
     h = surface.heights
     for axis in (0, 1):
@@ -95,17 +96,18 @@ def face_ply(setting: Setting, nx: int, ny: int, back: bool = False) -> bytes:
 
 
 def film_size(shape: tuple[int, int], margin: float) -> tuple[int, int]:
-    """Return (width, height) of a film that sees a picture of (rows, columns) with a margin, a fraction of its longer
-    side.
+    """Return the (width, height) of a film that sees a picture of (rows, columns) and a margin.
+
+    The margin is a fraction of the picture's longer side.
     """
     beside = round(margin * max(shape))
     return shape[1] + 2 * beside, shape[0] + 2 * beside
 
 
 def target_image(picture: Array, surface: Surface, margin: float) -> tuple[Array, float]:
-    """Return the wanted image (H, W), and the light's irradiance or intensity for a mean of 1 inside the picture.
+    """Return the target image (H, W), and the irradiance or intensity of the light for a mean of 1 inside the picture.
 
-    The image shows the luminance of the picture, row 0 at the top. Pixels darker than the floor are lifted to the
+    The image shows the luminance of the picture, with row 0 at the top. Pixels darker than the floor are raised to the
     floor. No light is lost.
     """
     setting = surface.setting
@@ -164,8 +166,8 @@ def lamps(surface: Surface, power: float, sun: float) -> str:
 
 
 def _half_cone(surface: Surface) -> float:
-    """Return the angle (radians) between a point light's axis and its rays to a face's corners, or to a round edge on
-    average.
+    """Return the angle (radians) between a point light's axis and its rays to a face's corners. For a round face,
+    returns the mean angle to the edge.
     """
     setting, rays = surface.setting, Rays(surface.setting)
     is_round = setting.outline == "round"
@@ -183,9 +185,9 @@ def _half_cone(surface: Surface) -> float:
 def scene_xml(
     surface: Surface, film: tuple[int, int], pixels: int, power: float, sun: float = 0.0, both: bool = False
 ) -> str:
-    """Return the XML of a face's scene. `pixels` is the width of the picture in pixels, on a `film` with a margin.
+    """Return the XML of a face's scene. `pixels` is the width of the picture on a `film` with a margin.
 
-    `power` and `sun` are those of `lamps`. With `both`, the back is a mesh as well, `back.ply`.
+    `power` and `sun` are as for `lamps`. With `both`, the back is a mesh as well, `back.ply`.
     """
     setting, rays = surface.setting, Rays(surface.setting)
     is_lens = setting.kind == "lens"
@@ -277,7 +279,7 @@ def scene_xml(
 def lens_yaml(
     surface: Surface, heights: NDArray[Any], name: str, iterations: int, sun: float = 0.0, both: bool = False
 ) -> str:
-    """Return the configuration. It starts at these `heights` (ny, nx), which `start.exr` holds; a free back starts
+    """Return the configuration. The run starts at these `heights` (ny, nx), which `start.exr` holds. A free back starts
     flat.
     """
     s, (ny, nx) = surface.setting, heights.shape
@@ -338,7 +340,7 @@ def _rectangle(id: str, size: tuple[float, float], middle: Array, normal: Array,
 
 
 def _plane(type: str, id: str, size: tuple[float, float], middle: Array, normal: Array, up: Array, content: str) -> str:
-    """Return the XML of a rectangle or disk that faces along `normal`, with its height along `up`, projected to its
+    """Return the XML of a rectangle or disk that faces along `normal`. Its vertical axis is `up`, projected to its
     plane.
     """
     across = np.cross(up, normal) / np.linalg.norm(np.cross(up, normal))

@@ -1,11 +1,11 @@
 """The solid behind a face of heights: a closed mesh in millimetres, its files, and measurements for its maker.
 
-The solid has the scene's axes: the face is near z = 0 with its outside towards +z, the back is at z = -thickness, and y
-points up. Front and back consist of the triangles with which light was traced, except where a round outline cuts them.
-A flat rim may surround the face, a little below the face's lowest edge, so that it casts no shadow on the face.
+The solid has the scene's axes. The face is near z = 0 with its outside towards +z, the back is at z = -thickness, and y
+points up. Front and back consist of the traced triangles, except where a round outline cuts them. A flat rim may
+surround the face. The rim is slightly lower than the face's lowest edge, so it casts no shadow on the face.
 
-Faces are height fields over grids: no two points of a face lie above each other. Front and back therefore cross exactly
-where the thickness along z is not above 0.
+Faces are height fields over grids, so no two points of a face lie above each other. Front and back therefore cross
+exactly where the thickness along z is zero or negative.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ _SAME, _SIZE = 1e-5, 1e-3
 class Sheet:
     """A face over a grid.
 
-    - `points`: (ny nx, 3), mm, in rows of equal y, the least y first; `x` (nx,) and `y` (ny,).
-    - `triangles`: (n, 3), counterclockwise as seen from +z.
-    - `name`: the id of its mesh.
-    - `smooth`: the mesh has interpolated normals, with which light goes elsewhere than its flat triangles would send
-      it.
+    - `points` (ny nx, 3) are in mm, in rows of equal y, the least y first. `x` (nx,) and `y` (ny,) are the coordinates
+        of columns and rows.
+    - `triangles` (n, 3) are counterclockwise as seen from +z.
+    - `name` is the id of its mesh.
+    - `smooth` tells whether the mesh has interpolated normals. Flat triangles would then send light elsewhere.
     """
 
     name: str
@@ -89,7 +89,7 @@ class Solid:
 
 
 def as_sheet(name: str, points: Array, triangles: Indices, smooth: bool = False) -> Sheet:
-    """Convert a mesh to a grid. The mesh has vertices (n, 3), and triangles (m, 3) with either orientation.
+    """Convert a mesh to a grid. Its vertices (n, 3) and triangles (m, 3) may have either orientation.
 
     Raises ConfigError, with the key `fabrication.faces`, if the mesh is no grid or no height field.
     """
@@ -125,16 +125,16 @@ def as_sheet(name: str, points: Array, triangles: Indices, smooth: bool = False)
 
 
 def _areas(points: Array, triangles: Indices) -> Array:
-    """Return the areas (m,) of triangles as seen from +z, negative for clockwise triangles."""
+    """Return the areas (m,) of triangles as seen from +z. Clockwise triangles have negative areas."""
     a, b, c = (points[triangles[:, k], :2] for k in range(3))
     u, v = b - a, c - a
     return np.asarray((u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / 2)
 
 
 def make_solid(sheets: Sequence[Sheet], plan: Fabrication) -> Solid:
-    """Make the solid with the first of `sheets` as front, and with the second one, or a plane, as back.
+    """Make the solid. The first of `sheets` is its front, and the second one, or a plane, its back.
 
-    Raises ConfigError, with a key below `fabrication`, if the faces cross or have not the requested size.
+    Raises ConfigError, with a key below `fabrication`, if the faces cross or have another size than requested.
     """
     half = sheets[0].half if plan.size is None else (plan.size[0] / 2, plan.size[1] / 2)
     for sheet in sheets:
@@ -189,7 +189,9 @@ class _Building:
         return self.add(np.column_stack([at[:, :2] * scale, np.full(len(at), z)]))
 
     def add_face(self, sheet: Sheet, plan: Fabrication, side: int) -> Indices:
-        """Add a face with its rim. Its outside is towards +z or -z by `side`. Return the loop around both."""
+        """Add a face with its rim, and return the loop around both. Its outside is towards +z or -z, depending on
+        `side`.
+        """
         points, triangles = sheet.points, sheet.triangles
         if plan.outline == "round":
             points, triangles = cut_round(sheet, (self.half[0], self.half[1]))
@@ -206,7 +208,9 @@ class _Building:
         return outer
 
     def zip(self, lower: Indices, upper: Indices) -> None:
-        """Add the wall between two loops, which may have different numbers of vertices. Its outside points outwards."""
+        """Add the wall between two loops, which may have different numbers of vertices. The wall's outside points
+        outwards.
+        """
         points = np.concatenate(self.points)
         loops, angles = [], []
         for loop in (lower, upper):
@@ -229,7 +233,7 @@ class _Building:
 
 
 def edge_loop(triangles: Indices) -> Indices:
-    """Return the vertices around a sheet, counterclockwise: its edges are those that belong to only one triangle.
+    """Return the vertices around a sheet, counterclockwise. Edges of the loop belong to only one triangle.
 
     If there are several loops, one of them is returned.
     """
@@ -253,8 +257,8 @@ def is_closed(triangles: Indices) -> bool:
 
 
 def cut_round(sheet: Sheet, half: tuple[float, float]) -> tuple[Array, Indices]:
-    """Return vertices and triangles of a face within the ellipse of these half axes. Triangles on the ellipse
-    are cut.
+    """Return vertices and triangles of a face within the ellipse with these half axes. Triangles on the ellipse are
+    cut.
     """
     points, triangles = sheet.points.copy(), sheet.triangles
     axes = np.array(half)
@@ -308,8 +312,8 @@ def within(sheet: Sheet, plan: Fabrication) -> NDArray[np.bool_]:
 
 
 def least_thickness(sheets: Sequence[Sheet], plan: Fabrication) -> float:
-    """Return the least thickness along z inside the outline, including the rim (mm; negative if front and back
-    cross).
+    """Return the least thickness along z inside the outline, including the rim, in mm. It is negative if front and back
+    cross.
     """
     from scipy.interpolate import RegularGridInterpolator
 
@@ -340,9 +344,10 @@ def _edge_heights(sheet: Sheet, plan: Fabrication) -> Array:
 
 
 def hollows(sheet: Sheet, plan: Fabrication, side: int) -> Array:
-    """Return the larger principal curvature (1/mm) of each inner vertex inside the outline, positive in hollows.
+    """Return the larger principal curvature (1/mm) of each inner vertex inside the outline. It is positive in hollows.
 
-    Uses central differences of the heights as seen from outside, which is towards +z or -z by `side`.
+    The function uses central differences of the heights as seen from outside, which is towards +z or -z, depending on
+    `side`.
     """
     h, dx, dy = side * sheet.z, float(np.diff(sheet.x).mean()), float(np.diff(sheet.y).mean())
     c = h[1:-1, 1:-1]
@@ -367,14 +372,14 @@ def steepest(sheet: Sheet, plan: Fabrication) -> float:
 
 
 def outwards(sheet: Sheet, plan: Fabrication, side: int) -> Array:
-    """Return heights (ny, nx; mm) above the flat face, positive outwards. Row 0 has the greatest y; columns go
-    along x.
+    """Return heights (ny, nx) above the flat face in mm, positive outwards. Row 0 has the greatest y; columns go along
+    x.
     """
     return (sheet.z if side > 0 else -plan.thickness - sheet.z)[::-1]
 
 
 def scaled(heights: Array, inside: NDArray[np.bool_]) -> tuple[NDArray[np.uint16], float, float]:
-    """Return heights as 16-bit numbers n with `offset` and `step`: h = offset + step n. Heights not `inside` are
+    """Return heights as 16-bit numbers n with `offset` and `step`, where h = offset + step n. Heights not `inside` are
     clipped.
     """
     low, high = float(heights[inside].min()), float(heights[inside].max())
@@ -384,7 +389,7 @@ def scaled(heights: Array, inside: NDArray[np.bool_]) -> tuple[NDArray[np.uint16
 
 
 def measured(solid: Solid, sheets: Sequence[Sheet], plan: Fabrication) -> dict[str, Any]:
-    """Return the content of fabrication.json, in mm, mm^3 and degrees; `warnings` are sentences."""
+    """Return the content of fabrication.json, in mm, mm^3 and degrees. `warnings` are sentences."""
     thin, warnings, faces = least_thickness(sheets, plan), [], {}
     for sheet, side in zip(sheets, (1, -1), strict=False):
         inside, curvature = within(sheet, plan), hollows(sheet, plan, side)
@@ -447,9 +452,7 @@ def summary(numbers: dict[str, Any]) -> list[str]:
 
 
 def stl(solid: Solid) -> bytes:
-    """Return binary STL with normals by the right-hand rule and 32-bit floats. STL has no unit; programs read it
-    as mm.
-    """
+    """Return binary STL with normals by the right-hand rule and 32-bit floats. STL has no unit; programs assume mm."""
     corners = solid.points[solid.triangles].astype("<f4")
     a, b, c = (corners[:, k].astype(np.float64) for k in range(3))
     normal = np.cross(b - a, c - a)

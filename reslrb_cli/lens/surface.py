@@ -1,13 +1,14 @@
 """The face of a lens or mirror whose caustic shows a picture: rays by Snell's law, heights by `transport.py`.
 
 Lengths are in millimetres. The face is z = h(x, y) near the plane z = 0, with its normal towards the receiver. Light
-comes to a lens from z < 0 through a plane face at z = -thickness, and to a mirror from z > 0. The central ray meets the
+reaches a lens from z < 0 through a plane face at z = -thickness, and a mirror from z > 0. The central ray meets the
 centre of the face. A flat face would send this ray to the receiver's centre, at `distance`. The receiver is
-perpendicular to the ray, except for its tilt. Up is y on both.
+perpendicular to the ray, except for its tilt. On both, y points up.
 
-The unknown of the transport problem is h itself. T(x, y) is the point at which a ray meets the receiver if it meets the
-face at (x, y, h) with the normal (-dh/dx, -dh/dy, 1). All lights, tilts and depths of relief are therefore treated in
-the same way and exactly. No normals need to be integrated to heights, which may be impossible in part.
+The unknown of the transport problem is h itself. T(x, y) is the point where a ray meets the receiver after it meets the
+face at (x, y, h) with the normal (-dh/dx, -dh/dy, 1). All lights, tilts and depths of relief are therefore treated
+exactly and in the same way. Computing normals first would require integrating them to heights, which is not always
+possible.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ Array = NDArray[np.float64]
 class Setting:
     """The arrangement of light, face and receiver.
 
-    - `size`: width and height of the face. `outline`: round is the ellipse within this size.
-    - `picture_size`: the size of the picture on the receiver.
-    - `light_distance`: the distance of a point light, or of an area light's centre, from the first face on its way;
-      infinite for parallel light.
-    - `incidence`: the angle (degrees, about y) between the central ray and z.
-    - `tilt`: the angles (degrees) of the receiver about its horizontal and its vertical axis.
-    - `through`: the picture is seen from behind the receiver.
+    - `size` is the width and height of the face. A round `outline` is the ellipse within this size.
+    - `picture_size` is the size of the picture on the receiver.
+    - `light_distance` is the distance of a point light, or of an area light's centre, from the first face that it
+        meets. It is infinite for parallel light.
+    - `incidence` is the angle (degrees, about y) between the central ray and z.
+    - `tilt` has the angles (degrees) of the receiver about its horizontal and its vertical axis.
+    - `through` is true if the picture is seen from behind the receiver.
     """
 
     kind: Literal["lens", "mirror"] = "lens"
@@ -55,11 +56,12 @@ class Setting:
 class Surface:
     """A face with its relief and floor.
 
-    - `heights` (ny, nx): h at the centres of a grid's cells, row 0 at the least y. A round face has heights outside of
-      its outline too.
-    - `inside` (ny, nx): the cells inside the outline.
-    - `floor`: the fraction of the maximum to which darker parts of the picture were lifted.
-    - `relief`: the height between the lowest and the highest point; `relief_at_twice`: the same at twice the distance.
+    - `heights` (ny, nx) are h at the centres of a grid's cells, with row 0 at the least y. A round face has heights
+        outside of its outline, too.
+    - `inside` (ny, nx) marks the cells inside the outline.
+    - `floor` is the fraction of the maximum to which darker parts of the picture were raised.
+    - `relief` is the height between the lowest and the highest point, and `relief_at_twice` the same at twice the
+        distance.
     """
 
     setting: Setting
@@ -104,7 +106,7 @@ class Rays:
     def incoming(self, x: Array, y: Array, h: Array) -> tuple[Array, Array]:
         """Return the direction (3, ...) of light that arrives at (x, y, h), and the irradiance on a plane z = h.
 
-        For a lens, the direction is inside of the glass.
+        For a lens, this is the direction inside the glass.
         """
         s = self.setting
         if s.kind == "mirror":
@@ -132,7 +134,7 @@ class Rays:
         return np.stack([sine * dx / radius, sine * dy / radius, cosine]), light
 
     def outgoing(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
-        """Return the direction (3, ...) of the light that leaves; NaN for total reflection."""
+        """Return the direction (3, ...) of the light that leaves. Total reflection gives NaN."""
         d, _ = self.incoming(x, y, h)
         normal = np.stack([-gx, -gy, np.ones_like(gx)]) / np.sqrt(1 + gx * gx + gy * gy)
         cosine = np.sum(d * normal, axis=0)
@@ -182,8 +184,8 @@ def within(setting: Setting, x: Array, y: Array) -> NDArray[np.bool_]:
 
 
 def on_receiver(picture: Array, through: bool) -> Array:
-    """Convert `picture` (row 0 at the top) to the receiver's axes: row 0 at the least y, columns along x. Also converts
-    back.
+    """Convert `picture` (row 0 at the top) to the receiver's axes, with row 0 at the least y and columns along x. The
+    conversion is its own inverse.
 
     An observer who looks at the receiver from the light's side, with y up, has x to the left. An observer behind the
     receiver has x to the right.
@@ -194,7 +196,7 @@ def on_receiver(picture: Array, through: bool) -> Array:
 def shape_surface(
     picture: Array, setting: Setting, cells: int = 256, floor: float | Literal["auto"] = "auto"
 ) -> Surface:
-    """Return the face whose caustic shows `picture` (rows, columns; luminance, row 0 at the top).
+    """Return the face whose caustic shows `picture` (rows, columns), a luminance with row 0 at the top.
 
     The grid has `cells` along its longer side. Raises ConfigError, with the setting as key and a remedy, if there is no
     such face.
@@ -262,7 +264,7 @@ def _twice(setting: Setting, target: Array, shape: tuple[int, int]) -> float:
 
 
 def _start(rays: Rays) -> Array:
-    """Return the polynomial of degree 2 (`transport.solve`) that sends the face about evenly to the picture."""
+    """Return the polynomial of degree 2 (`transport.solve`) that maps the face approximately evenly to the picture."""
     s = rays.setting
     x, y = transport.grid((9, 9), s.size)
     wanted = np.stack([x * (s.picture_size[0] / s.size[0]), y * (s.picture_size[1] / s.size[1])])
@@ -280,8 +282,8 @@ def _start(rays: Rays) -> Array:
 
 
 def is_even(picture: Array) -> bool:
-    """Whether a picture has only one colour: one level of 8 bits, or dithering between two levels, counts as one
-    colour.
+    """Whether a picture has only one colour. One level of 8 bits counts as one colour, and so does dithering between
+    two levels.
     """
     return bool(picture.max() - picture.min() <= 0.02 * picture.max())
 
@@ -330,8 +332,8 @@ def _reaches(setting: Setting) -> bool:
     """Whether the face can send light from its corners and centre to those of the picture, on the front of the
     receiver.
 
-    N proportional to n_i d_i - n_t d_t points to the light's side of the face only if n_i d_i . d_t > n_t: refraction
-    turns light by less than arccos(1 / n).
+    N, proportional to n_i d_i - n_t d_t, points to the light's side of the face only if n_i d_i . d_t > n_t. Refraction
+    therefore turns light by less than arccos(1 / n).
     """
     rays = Rays(setting)
     x, y = (a.ravel() for a in transport.grid((3, 3), (1.5 * setting.size[0], 1.5 * setting.size[1])))

@@ -2,11 +2,11 @@
 method.
 
 The unknown is a potential h at the centres of a grid's cells. An `Optics` maps a point of the aperture, with h and its
-gradient g there, to the picture: T(x, h, g). Light is conserved if
+gradient g, to the picture: T(x, h, g). The following equation conserves light.
 
     nu(T(x)) det DT(x) = mu(x),                                                                                     (1)
 
-with mu the light that arrives on the aperture, nu the picture, both of equal total, and the aperture's edges mapped to
+mu is the light that arrives on the aperture, and nu the picture, with equal totals. The aperture's edges are mapped to
 the picture's edges. For T = g this is optimal transport with squared distance (Brenier). With T from Snell's law, h is
 the surface itself, so nothing needs to be integrated afterwards (`surface.py`). The logarithm of (1) is solved on grids
 from coarse to fine. Each Newton step uses GMRES, preconditioned by the Laplacian, which SciPy's cosine transform
@@ -42,30 +42,33 @@ FADE = 0.7
 
 
 class Optics(Protocol):
-    """The map of light. Lengths are those of the aperture and of the picture, each about its own centre."""
+    """The map of light. Lengths of the aperture and of the picture are relative to their own centres."""
 
     def hit(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
-        """Return T (2, ...) of points (x, y) with potential h and gradient (gx, gy); NaN if light does not reach the
-        picture.
+        """Return T (2, ...) of points (x, y) with potential h and gradient (gx, gy). T is NaN if light does not reach
+        the picture.
         """
 
     def arriving(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
-        """Return mu (...): the light that arrives per area of the aperture, in any unit; 0 outside of the aperture."""
+        """Return mu (...), the light that arrives per area of the aperture, in any unit. It is 0 outside of the
+        aperture.
+        """
 
 
 @dataclass
 class Transport:
     """A solution of (1).
 
-    - `h` (ny, nx): the potential. `slopes`: its derivatives along the axis at the edges, (left, right, bottom, top).
-    - `T` (2, ny, nx): the images of the cells' centres. `light` (ny, nx): mu, with mean 1.
-    - `residual`: the root mean square residual of (1)'s logarithm, weighted by the light.
-    - `converged`: whether it became small, possibly for a picture blurred by a few pixels.
-    - `error`: sum |pushed - nu| / sum nu, over the picture's pixels or larger cells. `pushed`: the picture that T
-      makes, with mean 1.
-    - `folded`: the share of cells that T turns over. `stretch`: the largest factor by which T lengthens a segment,
-      relative to the even map.
-    - `steps`: the number of Newton steps on all grids.
+    - `h` (ny, nx) is the potential. `slopes` are its derivatives along the axes at the edges (left, right, bottom,
+        top).
+    - `T` (2, ny, nx) are the images of the cells' centres. `light` (ny, nx) is mu, with mean 1.
+    - `residual` is the root mean square residual of (1)'s logarithm, weighted by the light.
+    - `converged` tells whether the residual became small, possibly for a picture blurred by a few pixels.
+    - `pushed` is the picture that T makes, with mean 1. `error` is sum |pushed - nu| / sum nu, over the picture's
+        pixels or larger cells.
+    - `folded` is the share of cells that T turns over. `stretch` is the largest factor by which T lengthens a segment,
+        relative to the even map.
+    - `steps` is the number of Newton steps on all grids.
     """
 
     h: Array
@@ -83,17 +86,20 @@ class Transport:
 
 
 def sample(values: Array, size: tuple[float, float], x: Array, y: Array) -> Array:
-    """Return `values` (ny, nx) of a rectangle of `size` about 0 at points (x, y), linear between centres of cells."""
+    """Interpolate `values` (ny, nx) linearly at points (x, y). The values are at the centres of cells of a rectangle of
+    `size` about 0.
+    """
     ny, nx = values.shape
     places = np.stack([(y / size[1] + 0.5) * ny - 0.5, (x / size[0] + 0.5) * nx - 0.5])
     return scipy.ndimage.map_coordinates(values, places, order=1, mode="nearest")
 
 
 def resized(values: NDArray[Any], shape: tuple[int, int], between: bool = False) -> NDArray[Any]:
-    """Return `values` (ny, nx, ...) with another number of rows and columns, and no value beyond theirs.
+    """Return `values` (ny, nx, ...) resampled to another number of rows and columns, within the range of the old
+    values.
 
-    Each new cell is the mean over its area, so the sum times the cell's area stays. With `between`, an axis that gets
-    more cells is interpolated linearly between the old cells' centres instead.
+    Each new cell is the mean over its area, so the sum times the cell's area is preserved. With `between`, an axis with
+    more new cells than old ones is interpolated linearly between the old cells' centres instead.
     """
     for axis, (old, new) in enumerate(zip(values.shape, shape)):  # noqa: B905  # `values` may have channels as well
         if old != new:
@@ -103,7 +109,7 @@ def resized(values: NDArray[Any], shape: tuple[int, int], between: bool = False)
 
 
 def _shares(old: int, new: int, between: bool) -> Array:
-    """Return the share that each of `new` cells takes of each of `old` cells on a line: (new, old), rows sum to 1."""
+    """Return the share (new, old) that each new cell takes of each old cell on a line. Rows sum to 1."""
     if between:
         at = np.clip((np.arange(new) + 0.5) * (old / new) - 0.5, 0, old - 1)
         return np.asarray(np.maximum(1 - np.abs(at[:, None] - np.arange(old)), 0))
@@ -116,7 +122,7 @@ def _shares(old: int, new: int, between: bool) -> Array:
 
 
 def _shrunk(picture: Array, part: float) -> Array:
-    """Return `picture` with `part` of its rows and columns, or unchanged if that would be more."""
+    """Return `picture` reduced to `part` of its rows and columns. A larger `part` than 1 returns it unchanged."""
     ny, nx = picture.shape
     return picture if part >= 1 else resized(picture, (max(2, round(ny * part)), max(2, round(nx * part))))
 
@@ -140,12 +146,13 @@ def solve(
 ) -> Transport:
     """Solve (1) from the coarsest grid up to `shape`.
 
-    - `picture` (my, mx): nu, positive, row 0 at the least y, on a rectangle of `target` (width, height) about 0.
-    - `size`: the size of the aperture.
-    - `start` (6,): the polynomial c0 + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2 that sends the aperture about evenly to
-      the picture.
+    - `picture` (my, mx) is nu, with positive values and row 0 at the least y. It covers a rectangle of `target` (width,
+        height) about 0.
+    - `size` is the size of the aperture.
+    - `start` (6,) is the polynomial c0 + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2. It maps the aperture approximately
+        evenly to the picture.
 
-    If a sharp picture leads to no solution, the solver starts with a blurred picture.
+    If the solver finds no solution for a sharp picture, it starts with a blurred picture.
     """
     levels = [shape]
     while min(levels[-1]) >= 2 * COARSEST:
@@ -193,7 +200,7 @@ class _State:
 
 
 def _padded(h: Array, slopes: list[Array], cell: tuple[float, float]) -> Array:
-    """Return h (ny + 2, nx + 2) with a ring of cells such that the derivatives at the edges equal `slopes`."""
+    """Return h (ny + 2, nx + 2) with a ring of cells, chosen so that the derivatives at the edges equal `slopes`."""
     left, right, bottom, top = slopes
     wide = np.concatenate([(h[:, 0] - left * cell[0])[:, None], h, (h[:, -1] + right * cell[0])[:, None]], axis=1)
     bottom, top = np.pad(bottom, 1, mode="edge"), np.pad(top, 1, mode="edge")
@@ -201,7 +208,7 @@ def _padded(h: Array, slopes: list[Array], cell: tuple[float, float]) -> Array:
 
 
 def _faces(p: Array, cell: tuple[float, float]) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
-    """Return (h, gx, gy) at the faces across x (ny, nx + 1), and at those across y (ny + 1, nx), of a padded h."""
+    """Return (h, gx, gy) at the faces across x (ny, nx + 1) and at those across y (ny + 1, nx), from a padded h."""
     dx, dy = cell
     row, column = p[1:-1], p[:, 1:-1]
     along_y, along_x = (p[2:] - p[:-2]) / (2 * dy), (p[:, 2:] - p[:, :-2]) / (2 * dx)
@@ -219,7 +226,9 @@ def _face_places(shape: tuple[int, int], size: tuple[float, float]) -> tuple[tup
 
 
 def _derivative(optics: Optics, place: tuple[Array, Array], at: tuple[Array, Array, Array], T: Array) -> Array:
-    """Return B (2, 2, ...): dT / dg by differences. B[a, b] is the derivative of T's component a by g's component b."""
+    """Return B (2, 2, ...), the derivative dT / dg by differences. B[a, b] is the derivative of T's component a with
+    respect to g's component b.
+    """
     h, gx, gy = at
     e = 1e-6
     return np.stack([optics.hit(*place, h, gx + e, gy) - T, optics.hit(*place, h, gx, gy + e) - T], axis=1) / e
@@ -270,7 +279,9 @@ class _Equation:
         return (T[0][:, :, 1:] + T[0][:, :, :-1] + T[1][:, 1:] + T[1][:, :-1]) / 4
 
     def _over_cells(self, nu: Array, by: tuple[float, float] = (0.0, 0.0)) -> Array:
-        """Return the mean of nu over the image of each cell under T, shifted `by`, from four points."""
+        """Return the mean of nu over the image of each cell under T, from four points. The images are shifted by
+        `by`.
+        """
         total = np.zeros(self.det.shape)
         for a in (-0.25, 0.25):
             for b in (-0.25, 0.25):
@@ -297,7 +308,7 @@ class _Equation:
         ])  # fmt: skip
 
     def along(self, v: Array) -> Array:
-        """Return the derivative of (1)'s logarithm along v (ny, nx), which has slopes 0 at the edges, times `scale`."""
+        """Return the derivative of (1)'s logarithm along v (ny, nx), times `scale`. v has slopes of 0 at the edges."""
         p = np.pad(v, 1, mode="edge")
         dT = [
             np.einsum("ab...,b...->a...", B, np.stack(at[1:]))
@@ -329,8 +340,8 @@ class _Equation:
 
 
 def _dim(mu: Array, fade: float, dim: float) -> Array:
-    """Return mu (ny, nx) with a little light outside of the aperture, decreasing per cell, so that T is determined
-    there.
+    """Return mu (ny, nx) with a little light outside of the aperture, which decreases per cell. T is then determined
+    there, too.
     """
     lit = mu > 0
     if lit.all():
@@ -387,9 +398,10 @@ def _newton(
 def _started(
     state: _State, optics: Optics, nu: Array, target: tuple[float, float], contrast: float, blur: float
 ) -> _Equation:
-    """Return the equation at a state, which is smoothed and mixed with the even map until T folds nowhere.
+    """Return the equation at a state without folds. The state is first smoothed and mixed with the even map until T
+    folds nowhere.
 
-    Convex functions stay convex under both, and the even map moves points away from the edges.
+    Convex functions stay convex under both operations, and the even map moves points away from the edges.
     """
     h, slopes = state.h, list(state.slopes)
     even, even_slopes = _even(state.start, state.h.shape, state.size)
@@ -458,9 +470,10 @@ def _told(state: _State, optics: Optics, picture: Array, target: tuple[float, fl
 
 
 def pushed(T: Array, light: Array, shape: tuple[int, int], target: tuple[float, float], fine: int = 4) -> Array:
-    """Return the picture (shape), of mean 1, that `light` (ny, nx) makes at T (2, ny, nx), filtered by a tent.
+    """Return the picture (shape) that T makes of the light, with mean 1, filtered by a tent.
 
-    Each cell sends `fine`^2 equal shares, with T linear between centres. Each share falls on the four nearest pixels.
+    `light` (ny, nx) arrives at T (2, ny, nx). Each cell sends `fine`^2 equal shares, with T linear between centres.
+    Each share falls on the four nearest pixels.
     """
     ny, nx = light.shape
     at = np.meshgrid(
@@ -476,7 +489,7 @@ def splat(column: Array, row: Array, share: Array, shape: tuple[int, int]) -> Ar
     """Add shares of light at positions in pixels, each to the four nearest pixels. Shares outside of the picture are
     lost.
 
-    At an edge a tent is folded back, as in `through_tent`. The mean is 1 if nothing is lost.
+    At an edge, a tent is folded back, as in `through_tent`. If nothing is lost, the mean is 1.
     """
     result = np.zeros(shape)
     inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
@@ -510,7 +523,7 @@ UNSOLVED, FOR_LINES = 0.03, 0.1
 
 
 def lifted(picture: Array, floor: float) -> Array:
-    """Return `picture` with values below `floor` times its maximum raised to that value."""
+    """Return `picture` with all values raised to at least `floor` times its maximum."""
     return np.maximum(picture, max(floor, 1e-3) * picture.max())
 
 
@@ -518,7 +531,9 @@ def least_floor(
     optics: Optics, picture: Array, size: tuple[float, float], target: tuple[float, float], start: Array,
     floors: Sequence[float] = FLOORS,
 ) -> float | None:  # fmt: skip
-    """Return the least of `floors` with which the transport neither folds nor tears; None if the largest does."""
+    """Return the lowest of `floors` for which the transport neither folds nor tears, or None if the highest one
+    fails.
+    """
     ratio = size[0] / size[1]
     shape = (round(TRIAL / max(ratio, 1)), round(TRIAL * min(ratio, 1)))
     small = _shrunk(picture, TRIAL / max(picture.shape))

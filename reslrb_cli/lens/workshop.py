@@ -1,6 +1,6 @@
-"""Figures that a workshop needs: allowed errors, balls that cut the relief, grey blacks and unlit corners.
+"""Figures for a workshop: allowed errors, cutters for the relief, grey blacks, and unlit corners.
 
-Pure functions of arrays and numbers. Lengths are in mm, angles in degrees.
+The functions are pure functions of arrays and numbers. Lengths are in mm, angles in degrees.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ CORNER, LIT = 0.1, 0.5
 
 
 def largest_ball_radius(curvature: Array) -> float | None:
-    """Return the largest radius (mm) of a ball that fits into the hollows of 99 % of a face; None for any radius.
+    """Return the largest radius (mm) of a ball that fits into the hollows of 99 % of a face, or None if any ball fits.
 
-    `curvature` (n,) is the larger principal curvature at each vertex in 1/mm, above 0 in hollows. Only curvature
-    counts: a ball may still not reach a narrow gap between ridges.
+    `curvature` (n,) is the larger principal curvature at each vertex in 1/mm, positive in hollows. The function
+    considers only curvature. A ball may still not reach a narrow gap between ridges.
     """
     if not curvature.size:
         return None
@@ -48,7 +48,7 @@ def largest_ball_radius(curvature: Array) -> float | None:
 
 
 def stepover(radius: float, scallop: float = SCALLOP) -> float:
-    """Return the distance (mm) between passes of a ball of this `radius` that leaves scallops of this height (mm)."""
+    """Return the distance (mm) between passes of a ball of this `radius` that leave scallops of this height (mm)."""
     height = min(scallop, radius)
     return float(2 * np.sqrt(2 * radius * height - height**2))
 
@@ -56,7 +56,7 @@ def stepover(radius: float, scallop: float = SCALLOP) -> float:
 def cutter(curvature: Array, radius: float | None) -> dict[str, float | None]:
     """Return the largest radius of a ball cutter for a face, and the step between passes of the cutter, in mm.
 
-    `radius` is that of the cutter; None: the largest one. `curvature` is as in `largest_ball_radius`.
+    `radius` is the radius of the cutter; for None, the largest one is used. `curvature` is as in `largest_ball_radius`.
     """
     largest = largest_ball_radius(curvature)
     used = largest if radius is None else radius
@@ -67,12 +67,14 @@ def cutter(curvature: Array, radius: float | None) -> dict[str, float | None]:
 def allowed_errors(
     found: Mapping[str, Mapping[str, Any]], kind: str, deviations: Mapping[str, float]
 ) -> dict[str, dict[str, Any]]:
-    """Return the deviation at which SSIM has fallen by `ALLOWED_LOSS`, for each kind of deviation that was measured.
+    """Return the deviation at which SSIM has fallen by `ALLOWED_LOSS`, for each measured kind of deviation.
 
     `found` are the figures of each image by name, as from `tolerances`. `kind` is `lens` or `mirror`. `deviations` are
-    the measured amounts: `distance` in mm, `index`, and `turn` in degrees. The result is keyed as `TOLERANCES`. Each
-    entry has the `value`, its `unit`, the stated `tolerance`, `at_least` (SSIM falls less even at the measured
-    deviation), and `passes`: None if the measured deviation is smaller than the tolerance and SSIM falls less.
+    the measured amounts: `distance` in mm, `index`, and `turn` in degrees. The result has the keys of `TOLERANCES`.
+
+    Each entry has the `value`, its `unit` and the stated `tolerance`. `at_least` is true if SSIM falls less even at the
+    measured deviation. `passes` tells whether the tolerance is met. It is None if this is unknown, because the measured
+    deviation is smaller than the tolerance and SSIM falls less.
     """
     planned = found.get("as planned")
     if planned is None:
@@ -97,15 +99,17 @@ def allowed_errors(
 
 
 def allowed_error(fall: float, deviation: float) -> float:
-    """Return the deviation at which SSIM has fallen by `ALLOWED_LOSS`, if it falls linearly by `fall` at `deviation`.
+    """Return the deviation at which SSIM has fallen by `ALLOWED_LOSS`, at most `deviation`.
 
-    Never more than `deviation`, because nothing larger was measured.
+    SSIM is assumed to fall linearly by `fall` at `deviation`. Nothing larger was measured.
     """
     return deviation * min(1.0, ALLOWED_LOSS / fall) if fall > 0 else deviation
 
 
 def shown_ssim(entry: Mapping[str, Any]) -> float:
-    """Return the SSIM that the sheet shows: with the original picture if it is known, otherwise with the target."""
+    """Return the SSIM that the sheet shows. It refers to the original picture if that is known, otherwise to the
+    target.
+    """
     value = entry.get("ssim_of_picture")
     return float(entry["ssim"] if value is None else value)
 
@@ -140,7 +144,7 @@ def unlit_corners(image: Array, picture: Array) -> list[str]:
 
 
 def light_warnings(dark: Mapping[str, float], corners: list[str]) -> list[str]:
-    """Return a sentence if black comes out grey, and one if `corners` are unlit; `dark` is a result of `blacks`."""
+    """Return a sentence if black comes out grey, and one if `corners` are unlit. `dark` is a result of `blacks`."""
     lines = []
     if dark["picture"] <= BLACK and dark["image"] > dark["picture"] + GREY:
         lines.append(f"Black parts of the picture come out at {100 * dark['image']:.0f} % of the mean brightness "

@@ -1,7 +1,7 @@
-"""Workers that take turns: the common part of `bench` and `convergence`, from start to end.
+"""Workers that take turns, from start to end: the common part of `bench` and `convergence`.
 
-One worker computes at a time, so a drift of the machine affects all alike. One more worker may serve all of them, the
-referee: it makes their common reference, and nothing is measured if it fails.
+Only one worker computes at a time, so drift of the machine affects all workers alike. An additional worker, the
+referee, can make the common reference. If the referee fails, nothing is measured.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ def in_turn(workers: Sequence[Item], round: int) -> list[Item]:
 
 
 def start_process(first: dict[str, Any], does: str) -> Process:
-    """Start a process that runs the function `load` finds by this name; `first` is its first message."""
+    """Start a process. It runs the function that `load` returns for the name `does`. `first` is its first message."""
     imports = "from reslrb_cli.measure.arena import load\nfrom reslrb_cli.measure.workers import run"
     return Process(first, python_command(f"{imports}\nrun(lambda: load({does!r}))"))
 
 
 class Arena(Generic[Measured, Worker]):
-    """Running workers, `members`; their files go to `folder`, which the caller removes.
+    """Running workers, `members`. Their files go to `folder`, which the caller removes.
 
-    `facts` are the referee's; `spent_s` of the budget are already spent. Measurements of an `earlier` session count,
-    and are continued. Raises ConfigError if they belong to another measurement.
+    `facts` come from the referee. `spent_s` is the part of the budget that is already spent. Measurements of an
+    `earlier` session count, and are continued. Raises ConfigError if they belong to another measurement.
     """
 
     #: Maximum number of rounds.
@@ -81,14 +81,14 @@ class Arena(Generic[Measured, Worker]):
         self._end = now() + self._budget_s
 
     def _set_up(self, earlier: Earlier | None) -> int:
-        """Set up the parts of a specific kind of session, with data of an earlier one.
+        """Set up the parts that only one kind of session has, with the data of an earlier session.
 
         Returns the number of depths that share the time. Raises ConfigError.
         """
         raise NotImplementedError
 
     def _taking_turns(self, course: Iterator[Item]) -> Iterator[Item]:
-        """Yield the items of `course`, until it ends or `stop()` returns true; all workers have then ended."""
+        """Yield the items of `course` until it ends or `stop()` returns true. Then all workers have ended."""
         try:
             yield from course
         except Stopped:
@@ -108,7 +108,9 @@ class Arena(Generic[Measured, Worker]):
         return sum(member.peak_mib for member in self._alive()) * MIB > MEMORY_SHARE * self.plan.memory
 
     def _take_rounds(self, workers: Callable[[], Sequence[Stepping]], first: int, before: int) -> Iterator[int]:
-        """Yield the number of rounds after each of them, from number `first` on; `before` are known already."""
+        """Yield the number of completed rounds after each round. Rounds start at number `first`, and `before` were
+        completed earlier.
+        """
         tight, done = self._tight(), 0
         self._pace.begin_rounds(before)
         while workers() and self._pace.another(done):
@@ -118,12 +120,12 @@ class Arena(Generic[Measured, Worker]):
             yield first + done
 
     def _budget_for(self, seconds: float) -> float:
-        """Return the budget that leaves this number of seconds for measuring, from the beginning on."""
+        """Return the total budget that leaves this number of seconds for measuring."""
         return (seconds + self.AFTERWARDS_S) / (1 - self.AFTERWARDS)
 
     def _ask_referee(self, plan: Plan, question: dict[str, Any] | None = None) -> dict[str, Any] | None:
-        """Return an answer of the referee, or its first message; None if the budget is spent. Raises Refused if it
-        ended.
+        """Return an answer of the referee, or its first message. Returns None if the budget is spent. Raises Refused if
+        the referee ended.
         """
         assert self._referee is not None, "it is started first"
         if question is not None:
@@ -136,7 +138,7 @@ class Arena(Generic[Measured, Worker]):
         return answer
 
     def _open(self, member: Contestant) -> dict[str, Any] | None:
-        """Return a worker's first message, with its scene loaded; None if it ended, or time was up."""
+        """Return a worker's first message, after it has loaded its scene. Returns None if it ended, or time was up."""
         opening = member.answer(self._stop, self._pace.over)
         self._warn(opening or {})
         return opening
@@ -177,7 +179,7 @@ class Arena(Generic[Measured, Worker]):
         return self._without(case) is None
 
     def _without(self, case: Case) -> str | None:
-        """Return why a method of the default list is left out; None if it takes part."""
+        """Return why a method of the default list is left out, or None if it takes part."""
         if not self.plan.default:
             return None
         if self.facts.get("paths") == "light" and case.options.get("paths", "light") != "light":
@@ -187,7 +189,7 @@ class Arena(Generic[Measured, Worker]):
 
 
 def load(does: str) -> Begin:
-    """Return the function that starts a process, by name; imports happen here and in that function."""
+    """Return the function that starts a process, by name. Imports happen here and in that function."""
     if does == "measured_steps":
         from reslrb_cli.measure.stepper import begin_steps
 

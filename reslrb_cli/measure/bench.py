@@ -1,14 +1,14 @@
 """Time and memory of a step against path depth, or another quantity, for several integrators side by side.
 
-At each depth (or number of samples, or size of the film or of textures, by `sweep`), every case (`BenchRun`) has its
-own process, and all run at once (`Bench`). They take a cold step each, then steps until no new kernel is compiled, and
-then rounds of one step each, in an order that changes from round to round. Ratios are taken within a round, whose steps
-share a seed.
+`sweep` selects the quantity: depth, number of samples, size of the film or of textures. At each value, every case
+(`BenchRun`) has its own process, and all processes exist at once (`Bench`). Each takes a cold step, then steps until no
+new kernel is compiled. Then follow rounds of one step each, in an order that changes from round to round. The steps of
+a round share a seed, and ratios are taken within a round.
 
-A case that runs out of memory is tried again at greater depths, so that records are observations; a failure only takes
-the time to fill the memory once. A case of the default list that does not support the scene is left out, with the
-reason. Once the budget, which includes loading and compiling, is spent, cases that are not warm are left out, with the
-time that they need; warm cases take one round if they had none.
+A case that runs out of memory is tried again at greater depths, so every record is an observation. A case of the
+default list that does not support the scene is left out, with the reason. The budget includes loading and compiling.
+Once it is spent, cases that still compile are left out, and the output says how long they would have taken. Cases that
+have compiled take at least one round.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ TIMES = ("step_ms", "kernel_ms", "codegen_ms", "tracing_ms")
 
 @dataclass(frozen=True)
 class BenchResult:
-    """Record, its baseline, and data beyond the record.
+    """A record, its baseline, and data beyond the record.
 
-    `value` is that of the swept quantity. `kernel_ratio` and `step_ratio` are times divided by those of the baseline,
-    round by round; None if either is missing.
+    `value` is the value of the varied quantity. `kernel_ratio` and `step_ratio` are times divided by those of the
+    baseline, round by round. They are None if either time is missing.
     """
 
     case: Case
@@ -48,9 +48,9 @@ class BenchResult:
 
 @dataclass(kw_only=True)
 class BenchRun(Stepping):
-    """One case at one value; `steps` are by round.
+    """One case at one value. `steps` has its steps by round.
 
-    `size` is the film's, width and height in pixels; `texels` are those of all recovered textures.
+    `size` is the film's width and height in pixels, and `texels` the size of all recovered textures.
     """
 
     case: Case
@@ -118,7 +118,7 @@ def _result(run: BenchRun, value: int, sweep: Sweep, runs: Sequence[BenchRun]) -
 
 
 def _ratio(run: BenchRun, baseline: BenchRun, key: str) -> Spread | None:
-    """Return ratios of the common rounds; None if there is none, or one of them has ended."""
+    """Return ratios of the common rounds. Returns None if there are none, or if one of the runs has ended."""
     both = [(step[key], baseline.steps[round][key]) for round, step in run.steps.items() if round in baseline.steps]
     ratios = [own / its for own, its in both if its and run.end is None and baseline.end is None]
     return Spread.of(ratios) if ratios else None
@@ -131,7 +131,7 @@ SLOW = 10.0
 class Bench(Arena[Sweep, BenchRun]):
     """Measurement for each value of the sweep (see `Arena`). No process writes into its folder.
 
-    `runs` are by value, `done` are the finished values, and `left_out` the cases that do not support the scene.
+    `runs` has the runs by value, `done` the finished values, and `left_out` the cases that do not support the scene.
     """
 
     AFTERWARDS, AFTERWARDS_S, MOST_ROUNDS = 0.0, 0.0, MAX_ROUNDS
@@ -160,7 +160,9 @@ class Bench(Arena[Sweep, BenchRun]):
         return BenchRun(process=None, may_refuse=may_refuse, case=case, config=self.plan.at(case, value))
 
     def results(self, done: bool | None = None) -> list[BenchResult]:
-        """Return the results in the order of the sweep: of all values, or only those that are `done`, or not."""
+        """Return the results in the order of the sweep: of all values, only of finished values, or only of unfinished
+        ones.
+        """
         return [
             result
             for value in self.plan.values
@@ -169,7 +171,7 @@ class Bench(Arena[Sweep, BenchRun]):
         ]
 
     def kept(self) -> Kept | None:
-        """Return the data for a later session; None if there are none yet."""
+        """Return the data for a later session, or None if there are none yet."""
         values = [(value, [run.kept() for run in runs if run.done]) for value, runs in self.runs.items()]
         if not any(entries for _, entries in values):
             return None
@@ -177,7 +179,7 @@ class Bench(Arena[Sweep, BenchRun]):
         return resume_store.head(self.plan.KIND, self.settings, values=values, left_out=left_out), {}
 
     def run(self) -> Iterator[list[BenchResult]]:
-        """Measure; yield the results of each value, and nothing after each round before.
+        """Measure. Yields an empty list after each round, and the results of a value once it is finished.
 
         Ends early, with the finished results, after `stop()`. Prints missing measurements and, once, warnings of
         loading. Raises Refused if a required case cannot start.
@@ -214,7 +216,9 @@ class Bench(Arena[Sweep, BenchRun]):
                 return
 
     def _begin(self, value: int) -> None:
-        """Start the cases at one value with their measurements so far, except those that ended at it."""
+        """Start the cases at one value with their earlier measurements. Cases that ended at this value are not
+        started.
+        """
         plan, before = self.plan, {run.case.label: run for run in self.runs.get(value, ())}
         self.members = self.runs[value] = []
         for case in plan.cases:
@@ -244,7 +248,7 @@ class Bench(Arena[Sweep, BenchRun]):
         return self._take_rounds(self._alive, first, min((len(run.steps) for run in self._alive()), default=0))
 
     def _needed(self, left: int) -> str:
-        """Return the time that the value that has just ended, and those `left`, would have taken."""
+        """Describe the time that the remaining values would have taken, including the value that has just ended."""
         late, warm = sum(run.late for run in self.members), len(self._alive())
         if warm == 0:
             return "; nothing had compiled by then, so allow several times as much"

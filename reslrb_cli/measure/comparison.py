@@ -1,27 +1,30 @@
 """Comparisons of Monte Carlo estimates of gradients and images with a reference.
 
-Welch's test of each entry compares two means over N and M independent samples:
+Welch's test of each entry compares two means over N and M independent samples.
 
     t = (mean_a - mean_b) / sqrt(s_a^2 / N + s_b^2 / M)
 
-t is converted to the standard normal z of the same probability (Welch-Satterthwaite degrees of freedom), so that few
-samples do not look like a bias.
+t is converted to the standard normal z of the same probability, with the degrees of freedom of Welch and Satterthwaite.
+A small number of samples then does not look like a bias.
 
-A gradient is compared in the entries of a small parameter, or in tiles and projections of a large one. The gradient of
-a texel that few paths meet has noise far from normal, and z scores of thousands of them raise false alarms. A large
-texture is therefore compared in tiles, each the sum over its texels, per channel; any other large parameter in runs of
-consecutive entries. Errors that cancel within a tile show in projections on random signs, which include every texel,
-and whose noise is closer to normal. The last entry is the sum of all, in which small errors add up.
+The gradient of a small parameter is compared entry by entry, and that of a large one by tiles and projections. The
+gradient of a texel on few paths has noise far from normal, so thousands of its z scores would raise false alarms. A
+large texture is therefore compared in tiles. Each tile is a sum over texels, per channel. Other large parameters are
+compared in runs of consecutive entries. Errors that cancel within a tile show in projections on random signs. A
+projection includes every texel, and its noise is closer to normal. The last entry is the sum of all entries, in which
+small errors add up.
 
-Gradients are compared over many seeds by z scores (`compare_expectations`), or at equal seeds by relative L2
-(`compare_equal_seeds`). Samples are (N, P): N seeds, P entries. With equal seeds on both sides, the test of
-expectations uses their differences, which is valid for any common noise, and more powerful with more of it:
+Samples are (N, P): N seeds, P entries. Gradients are compared over many seeds by z scores (`compare_expectations`), or
+at equal seeds by relative L2 (`compare_equal_seeds`). With equal seeds on both sides, the test of expectations uses the
+differences a - b. This is valid for any common noise, and more powerful if there is more of it. z is the normal deviate
+with the same probability as t.
 
-    t_k = mean_k(a - b) / sqrt(var_k(a - b) / N + floor_k^2)         to z, the normal deviate of the same probability
+    t_k = mean_k(a - b) / sqrt(var_k(a - b) / N + floor_k^2)
 
-Two criteria must hold. The largest |z| must be below Sidak's threshold for all entries of all rows of a table, and the
-root mean square of a row's z below that of nu normal deviates, where nu is the row's effective number of independent
-entries (Satterthwaite, with the mean squared correlation r^2 of its entries' samples, corrected for chance):
+Two criteria must hold. First, the largest |z| must be below Sidak's threshold for all entries of all rows of a table.
+Second, the root mean square of a row's z must be below a limit for nu normal deviates. nu is the row's effective number
+of independent entries (Satterthwaite). r^2 is the mean squared correlation of the entries' samples, corrected for
+chance.
 
     nu = E / (1 + (E - 1) r^2)
 """
@@ -44,8 +47,8 @@ ALPHA = 1e-4
 def z_scores(a: np.ndarray, b: np.ndarray, rounding: float = 1e-5) -> np.ndarray:
     """Return standard normal scores of mean(a) - mean(b) along axis 0, for each of the other entries.
 
-    `rounding` is the relative error of floating point: it is added to the standard error, so that entries without noise
-    (a directly visible lamp) can be compared.
+    `rounding` is the relative error of floating point. It is added to the standard error, so that entries without
+    noise, such as a directly visible lamp, can be compared.
     """
     mean_a, mean_b = a.mean(0), b.mean(0)
     var_a, var_b = a.var(0, ddof=1) / len(a), b.var(0, ddof=1) / len(b)
@@ -62,8 +65,9 @@ def z_scores(a: np.ndarray, b: np.ndarray, rounding: float = 1e-5) -> np.ndarray
 def paired_z_scores(difference: np.ndarray, floor: Any = 0.0, bias: Any = 0.0) -> np.ndarray:
     """Return standard normal scores of mean(difference) along axis 0 against zero, for each of the other entries.
 
-    For estimates at equal seeds, which share some noise, `difference` is (N, ...). `floor`, the rounding error, is
-    added to the standard error; `bias`, such as truncation, is subtracted from the difference of the means.
+    The estimates have equal seeds and share some noise. `difference` is (N, ...). `floor` is the rounding error, and is
+    added to the standard error. `bias` is a known error such as truncation, and is subtracted from the difference of
+    the means.
     """
     mean, var, floor = difference.mean(0), difference.var(0, ddof=1) / len(difference), np.square(floor)
     mean = np.sign(mean) * np.maximum(np.abs(mean) - bias, 0.0)
@@ -91,7 +95,7 @@ def combined_z_rms(z: np.ndarray) -> float:
 
 
 def z_rms_limit(count: float, alpha: float = ALPHA) -> float:
-    """Return the limit that the root mean square of `count` independent normal deviates exceeds with probability
+    """Return a limit for the root mean square of `count` independent normal deviates. They exceed it with probability
     `alpha`.
     """
     return float(np.sqrt(stats.chi2.isf(alpha, count) / count))
@@ -123,7 +127,10 @@ PROJECTIONS = 16
 
 
 def divisions(shape: tuple[int, ...]) -> list[int]:
-    """Return the divisions of a parameter of this shape, the finest first: tiles along each side, 0 for every entry."""
+    """Return the divisions of a parameter of this shape, the finest first.
+
+    A division is given by its tiles along each side, or by 0 for single entries.
+    """
     size = int(np.prod(shape, dtype=int))
     if size <= 4:
         return [0]
@@ -132,7 +139,7 @@ def divisions(shape: tuple[int, ...]) -> list[int]:
 
 
 def parts(samples: np.ndarray, shape: tuple[int, ...], tiles: int) -> np.ndarray:
-    """Return sums over the parts of one division: (N, E) from the (N, P) gradients of a parameter of this shape."""
+    """Return sums (N, E) over the parts of one division, from gradients (N, P) of a parameter of this shape."""
     if tiles == 0:
         return samples
     height, width, channels = shape if len(shape) == 3 else (1, samples.shape[1], 1)
@@ -145,8 +152,8 @@ def parts(samples: np.ndarray, shape: tuple[int, ...], tiles: int) -> np.ndarray
 
 
 def overall(samples: np.ndarray) -> np.ndarray:
-    """Return the entries that include all P values: projections on random signs if there are many, and the sum;
-    (N, E).
+    """Return the entries (N, E) that include all P values: their sum and, for many values, projections on random
+    signs.
     """
     size = samples.shape[1]
     if size == 1:
@@ -205,8 +212,8 @@ class Family:
         return sidak(self.entries, self.alpha)
 
     def z_rms_limit(self, independent: float) -> float:
-        """Return the limit of the root mean square of a row's z; any row of a correct table exceeds it with probability
-        `alpha`.
+        """Return the limit of the root mean square of a row's z. In a correct table, any row exceeds it with
+        probability `alpha`.
         """
         return z_rms_limit(independent, float(-np.expm1(np.log1p(-self.alpha) / self.rows)))
 
@@ -217,10 +224,10 @@ def compare_expectations(
 ) -> Comparison:  # fmt: skip
     """Compare the means of (N, P) samples with those of a reference.
 
-    `reference` is (N, P) at the same seeds if `paired`, else (M, P) at others, or (P,): exact values. With the `shape`
-    of the parameter, z scores are those of its parts (`entries`) instead of each of the P. `bias` is the possible error
-    of the reference in its units (a number, or one for each entry; not for other seeds); only larger differences count.
-    `rounding` is relative to the entries, and added to the standard error.
+    `reference` is (N, P) at the same seeds if `paired`, otherwise (M, P) at other seeds, or (P,) for exact values. If
+    the `shape` of the parameter is given, z scores belong to its parts (`entries`) instead of single values. `bias` is
+    the possible error of the reference in its units, as a number or one for each entry. Only larger differences count.
+    `bias` cannot be used with other seeds. `rounding` is relative to the entries, and added to the standard error.
     """
     problem = _problem(ours, reference)
     if problem is not None:
@@ -267,7 +274,7 @@ def compare_expectations(
 
 
 def compare_equal_seeds(ours: np.ndarray, reference: np.ndarray, limit: float = ROUNDING) -> Comparison:
-    """Compare (N, P) samples with those of a reference at the same seeds, by relative L2 over all of them together."""
+    """Compare (N, P) samples with those of a reference at the same seeds, by relative L2 over all samples together."""
     problem = _problem(ours, reference)
     if problem is not None:
         return problem
@@ -279,7 +286,9 @@ def compare_equal_seeds(ours: np.ndarray, reference: np.ndarray, limit: float = 
 
 
 def _alikeness(ours: np.ndarray, reference: np.ndarray) -> tuple[float | None, float | None]:
-    """Return the cosine of the angle between the means, and the ratio of summed variances; None for 0 / 0."""
+    """Return the cosine of the angle between the means, and the ratio of the summed variances. A value of 0 / 0 is
+    None.
+    """
     a, b = ours.mean(0), np.atleast_2d(reference).mean(0)
     cosine = _ratio(a @ b, np.linalg.norm(a) * np.linalg.norm(b)) if a.size > 1 else None
     if reference.ndim == 1 or len(ours) < 2:
@@ -288,8 +297,9 @@ def _alikeness(ours: np.ndarray, reference: np.ndarray) -> tuple[float | None, f
 
 
 def tail_weight(samples: np.ndarray) -> float:
-    """Return how much of the variance of (N, E) samples single ones carry: 0 as for normal deviates, 1 for one sample
-    alone.
+    """Return the share of the variance of (N, E) samples that comes from single samples.
+
+    It is 0 for normal deviates, and 1 if one sample has all of the variance.
     """
     count = len(samples)
     squares = np.square(samples - samples.mean(0))
@@ -304,9 +314,7 @@ def tail_weight(samples: np.ndarray) -> float:
 def _entries(
     ours: np.ndarray, reference: np.ndarray, shape: tuple[int, ...] | None, joined: bool, rounding: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return both sides in the finest division of the parameter whose samples are close enough to normal, (N, E)
-    each.
-    """
+    """Return both sides (N, E) in the finest division of the parameter whose samples are close enough to normal."""
     if shape is None:
         return ours, reference
     for tiles in divisions(shape):
@@ -321,7 +329,7 @@ def _entries(
 
 
 def _detectable(standard_error: np.ndarray, bias: Any, expected: np.ndarray, family: Family) -> float:
-    """Return the smallest relative error of the whole gradient that its clearest entry would have shown."""
+    """Return the smallest relative error of the whole gradient that the most sensitive entry would detect."""
     seen = np.abs(expected) > 0
     if not seen.any():
         return np.inf

@@ -1,8 +1,8 @@
 """Check of an experiment's gradients: each estimator is compared with every valid reference.
 
 The objective is sum(G * I) with a fixed random image G, partly negative, so that all integrators estimate the same
-gradient. The configuration's own loss would add a bias to each, from the noise of its image. Comparisons are made one
-by one at equal seeds, each as soon as its samples are available.
+gradient. The loss of the configuration would bias each estimate through the noise of its image. Comparisons are made at
+equal seeds, each as soon as its samples are available.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ ALONG_DIRECTIONS = (Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE)
 
 @dataclass(frozen=True)
 class GradientMaps:
-    """Maps of a texture: mean gradient and reference (H, W, C), and z-scores (H, W) of the sums over channels."""
+    """Maps of a texture: mean gradient and reference (H, W, C), and z scores (H, W) of the sums over channels."""
 
     gradient: np.ndarray
     reference: np.ndarray
@@ -59,9 +59,7 @@ class CheckResult:
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison to be made: of the parameter `key` (None: the image) for the integrator `label` with the paths
-    `way`.
-    """
+    """A comparison of one parameter `key` (None: the image) for the integrator `label` with the paths `way`."""
 
     key: str | None
     label: str
@@ -71,7 +69,7 @@ class Row:
 
     @property
     def place(self) -> str:
-        """The parameter's name by way, the key of its data in `Participants`."""
+        """The parameter's name for these paths, which is the key of its data in `Participants`."""
         return self.way.named(str(self.key))
 
 
@@ -85,12 +83,14 @@ class Gradcheck:
         self.participants = self._sampling.participants
 
     def sample_with(self, engine: Engine) -> None:
-        """Let `engine` take the samples if the numbers of seeds are given."""
+        """Let `engine` take the samples if the number of seeds is fixed."""
         self._sampling.engine = engine
 
     @cached_property
     def rows(self) -> list[Row]:
-        """The comparisons in the order of the table. Those with naive AD, which takes longest to compile, come last."""
+        """The comparisons in the order of the table. Comparisons with naive AD come last, because they take longest to
+        compile.
+        """
         parts = self.participants
         found = [
             Row(None, "reslrb", reference, Kind.IMAGE, way)
@@ -137,13 +137,13 @@ class Gradcheck:
         ]
 
     def kept(self, settings: dict[str, Any]) -> Kept | None:
-        """Return the state for a later session with the same `settings`; None if there are no samples."""
+        """Return the state for a later session with the same `settings`, or None if there are no samples."""
         return self._sampling.kept(settings)
 
     def run(
         self, stop: Callable[[], bool], say: Callable[[str], None], between: Callable[[], None] = lambda: None
     ) -> Iterator[CheckResult]:
-        """Measure and compare, row by row. After `stop()`, compare only what has been measured.
+        """Measure and compare, row by row. After `stop()`, compare only finished samples.
 
         If the budget is too small for a comparison, its record says so. `between` is called after each sample.
         """
@@ -165,8 +165,8 @@ class Gradcheck:
             say(f"the minimum number of seeds takes {enough}; allow this with --budget")
 
     def _needs(self, row: Row) -> list[Name]:
-        """Return the names of the samples that a comparison needs: the estimator's, and the reference's unless it is
-        exact.
+        """Return the names of the samples for a comparison: those of the estimator and, unless it is exact, of the
+        reference.
         """
         naive = row.way.named("walk_ad")
         if row.key is None:

@@ -4,14 +4,15 @@
 same for every estimator. A gradient is one flat vector over all parameters of a case.
 
 Finite differences use common random numbers, along a few directions of one parameter (`Direction`). `choose_step`
-chooses the step h. The error of central differences, and of one-sided differences with three nodes, is c h^2 + ...
-Two steps therefore give the truncation error of the smaller one (L. F. Richardson, 1911):
+chooses the step h. The error of central differences, and of one-sided differences with three nodes, is c h^2 + ... Two
+steps therefore give the truncation error of the smaller step (Richardson 1911).
 
     D(h) - F' ~ (D(r h) - D(h)) / (r^2 - 1)
 
-Noise from paths that change discontinuously grows as h shrinks. It shows in the variation of D(r h) - D(h) between
-seeds. If light moves, rounding of the scene can be equal for all seeds: a change that does not shrink with h is not
-truncation, and counts in full. The step with the smallest sum of errors is chosen, and its truncation error is stored.
+Paths that change discontinuously cause noise that grows as h shrinks. It shows in the variation of D(r h) - D(h)
+between seeds. If light moves, rounding of the scene can be equal for all seeds. A change that does not shrink with h is
+therefore not truncation, and counts in full. The step with the smallest sum of errors is chosen, and its truncation
+error is stored.
 """
 
 from __future__ import annotations
@@ -131,8 +132,8 @@ PLANNED_SEEDS = 16
 class Direction:
     """A direction in the space of all parameters (P,), in the parameters' own units.
 
-    `sides` is as in `Case.difference`. `step` is a fraction of `vector`. `truncation` is a bound on the absolute error
-    due to the step, in units of the difference.
+    `sides` is as in `Case.difference`. `step` is a fraction of `vector`. `truncation` bounds the absolute error due to
+    the step, in units of the difference.
     """
 
     vector: np.ndarray
@@ -148,9 +149,10 @@ class Direction:
 def directions(case: Case, key: str, bounds: tuple[float, float], count: int, seed: int = 3) -> list[Direction]:
     """Return up to `count` directions that change only the parameter `key` and stay within its `bounds`.
 
-    In the first direction all entries grow, so that nothing cancels. In the others signs are random. If some entry is
-    too near to a bound for the largest step, differences are one-sided, and every entry moves away from its nearer
-    bound. Entries are 0.5 to 1 times the width of the bounds, or times the parameter's size if the bounds are infinite.
+    In the first direction all entries grow, so nothing cancels. In the others, signs are random. If an entry is too
+    close to a bound for the largest step, differences are one-sided, and every entry moves away from its nearer bound.
+    Entries are 0.5 to 1 times the width of the bounds. If the bounds are infinite, they are 0.5 to 1 times the
+    parameter's size.
     """
     random, found = np.random.default_rng(seed), []
     values, (low, high) = case.initial[key], bounds
@@ -167,7 +169,9 @@ def directions(case: Case, key: str, bounds: tuple[float, float], count: int, se
 
 
 def all_directions(case: Case, selection: Selection, moving: int, others: int) -> dict[str, list[Direction]]:
-    """Return directions by parameter: `moving` smooth ones if it moves light, else `others` as in `directions`."""
+    """Return directions by parameter. A parameter that moves light gets `moving` smooth directions, another one
+    `others`.
+    """
     box, found = case.scene.bbox(), {}
     extent = float(np.linalg.norm(np.array(box.max - box.min)))
     for key in case.keys:
@@ -183,7 +187,7 @@ def all_directions(case: Case, selection: Selection, moving: int, others: int) -
 
 
 def choose_step(case: Case, integrator: Any, direction: Direction, seeds: Sequence[int], spp: int) -> Direction:
-    """Return the direction with the step of the smallest estimated error. Needs at least two seeds."""
+    """Return the direction with the step of the smallest estimated error. This needs at least two seeds."""
     samples = {
         step: np.array([replace(direction, step=step).difference(case, integrator, seed, spp) for seed in seeds])
         for step in STEPS
@@ -214,9 +218,9 @@ def natural_bounds(kind: str, values: np.ndarray) -> tuple[float, float]:
 
 
 def extrapolated(near: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """Combine differences of a step and of twice the step, D(h) and D(2 h), so that the error of order h^2 cancels.
+    """Combine differences D(h) and D(2 h) of a step and of twice the step, so that the error of order h^2 cancels.
 
-    E(h) = (4 D(h) - D(2 h)) / 3 (L. F. Richardson, 1911).
+    E(h) = (4 D(h) - D(2 h)) / 3 (Richardson 1911).
     """
     return np.asarray(near + (near - far) / 3)
 
@@ -231,7 +235,7 @@ def embed(case: Case, key: str, row: np.ndarray) -> np.ndarray:
 class Case:
     """A scene (or a dictionary to load) with one sensor, parameters, and a linear objective.
 
-    `keys` are keys of `values` if given, else of the scene.
+    `keys` are keys of `values`, or of the scene if `values` is not given.
     """
 
     def __init__(self, scene: Any, keys: Iterable[str], sensor: int = 0, values: Values | None = None) -> None:
@@ -286,7 +290,7 @@ class Case:
 
     def gradient(self, integrator: Any, seed: int, spp: int, objective: Callable | None = None,
                  step: Callable = gradient_step, **options: Any) -> np.ndarray:  # fmt: skip
-        """Return the gradient of all parameters in a row, from one step with these `options`."""
+        """Return the gradient of all parameters as a flat array, from one step with these `options`."""
         leaves = self.leaves()
         objective = objective or self.objective
         step(integrator, self.scene, self.sensor, objective, seed=seed, spp=spp, params=self.params, **options)
@@ -302,8 +306,8 @@ class Case:
     def leaves(self) -> dict[str, Any]:
         """Create leaves with derivatives for all parameters, and set them in the scene.
 
-        The leaves are separate copies: the scene may replace its values by derived ones (an environment map pads its
-        columns).
+        The leaves are separate copies, because the scene may replace its values by derived ones. For example, an
+        environment map pads its columns.
         """
         leaves = {}
         for key in self.keys:
@@ -335,9 +339,9 @@ class Case:
         return float(np.sum(image[:, :, : self.weights.shape[2]] * np.array(self.weights)))
 
     def along(self, direction: np.ndarray, tangent: Callable[[], Any]) -> np.ndarray:
-        """Return the image of `tangent()`, float64, while the parameters carry the tangent `direction` (P,).
+        """Return the image of `tangent()` as float64 while the parameters carry the tangent `direction` (P,).
 
-        For forward mode: `tangent` renders the derivative of the image along this direction.
+        For forward mode, `tangent` renders the derivative of the image along this direction.
         """
         leaves = self.leaves()
         for key, leaf in leaves.items():
@@ -357,7 +361,9 @@ class Case:
         )
 
     def directions(self, count: int, seed: int = 3) -> np.ndarray:
-        """Return random directions in the space of parameters, (count, P): entries of size 0.5 to 1, either sign."""
+        """Return random directions (count, P) in the space of parameters. Entries have sizes of 0.5 to 1 and either
+        sign.
+        """
         random, shape = np.random.default_rng(seed), (count, self.size)
         return random.uniform(0.5, 1.0, shape) * random.choice([-1.0, 1.0], shape)
 
@@ -365,7 +371,7 @@ class Case:
                    ) -> float:  # fmt: skip
         """Return the finite difference of the objective along `direction`, at common random numbers.
 
-        `sides` is `both`, or `up` or `down` at the edge of the domain. All are of second order.
+        `sides` is `both`, or at the edge of the domain `up` or `down`. All three have an error of second order.
         """
         nodes = {"both": (1, -1), "up": (0, 1, 2), "down": (0, -1, -2)}[sides]
         coefficients = {"both": (0.5, -0.5), "up": (-1.5, 2, -0.5), "down": (1.5, -2, 0.5)}[sides]
@@ -379,7 +385,7 @@ class Case:
     def differences(
         self, integrator: Any, directions: np.ndarray, seeds: Iterable[int], spp: int, step: float, sides: str = "both"
     ) -> np.ndarray:
-        """Return finite differences along each of K directions at each of N seeds, (N, K)."""
+        """Return finite differences (N, K) along each of K directions at each of N seeds."""
         fixed = spp, step, sides
         return np.array([[self.difference(integrator, d, seed, *fixed) for d in directions] for seed in seeds])
 

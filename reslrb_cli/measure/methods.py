@@ -69,7 +69,9 @@ _ITEM = re.compile(r"(?P<type>\w+)(?::(?P<estimator>\w+))?(?:\((?P<options>.*)\)
 
 @dataclass(frozen=True)
 class Case:
-    """One integrator with its options, but without a depth. `label` is the user's text, `source` its option."""
+    """One integrator with its options, but without a depth. `label` is the user's text, and `source` the option with
+    it.
+    """
 
     label: str
     type: str
@@ -79,8 +81,8 @@ class Case:
     def at(self, config: Config, max_depth: int, known: bool, auto: bool = False) -> Config:
         """Return the experiment with this integrator at this depth. Raises ConfigError if the integrator is invalid.
 
-        `known`: dL/dI is known before the image, so `run.adjoint` has no effect. `auto`: options may be `auto`, as in
-        whole runs.
+        `known` tells whether dL/dI is known before the image, so that `run.adjoint` has no effect. `auto` permits the
+        value `auto` of options, as in whole runs.
         """
         blame = f"{self.source} {self.label}"
         adjoint = {name: value for name, value in self.options.items() if name in ADJOINT}
@@ -131,8 +133,8 @@ class Case:
 def parse_cases(text: str, source: str = _OPTION, deep: bool = True) -> list[Case]:
     """Parse a list of cases. Raises ConfigError if one has a wrong format or is given twice.
 
-    `source` is the command-line option of the list. `deep`: the measurement varies depths. `Case.at` checks the options
-    of the cases.
+    `source` is the command-line option of the list. `deep` tells whether the measurement varies depths. `Case.at`
+    checks the options of the cases.
     """
     return _parse(text, source, "", "integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)]", deep)
 
@@ -248,11 +250,11 @@ def code_files(cases: Iterable[Case]) -> dict[str, Path]:
 class Measurement:
     """The settings common to all measurements that use processes.
 
-    - `memory_limit`: the limit of each process in bytes, or None.
-    - `memory`: the machine's memory in bytes.
-    - `device`: the name of the device.
-    - `rounds`: the number of rounds, whatever time they take; None: `budget_s` decides.
-    - `default`: the `cases` are the default list. Cases that do not support the scene are then left out.
+    - `memory_limit` is the limit of each process in bytes, or None.
+    - `memory` is the machine's memory in bytes.
+    - `device` is the name of the device.
+    - `rounds` is the number of rounds, or None if `budget_s` decides.
+    - `default` tells whether `cases` is the default list. Cases that do not support the scene are then left out.
     """
 
     config: Config
@@ -275,7 +277,7 @@ class Measurement:
                 "memory_limit": self.memory_limit, "allow_code": config.allows_code}  # fmt: skip
 
     def settings(self) -> dict[str, Any]:
-        """Return the settings that must be the same in all sessions, as JSON; see `resume_store.settings`."""
+        """Return the settings that must be the same in all sessions, as JSON (`resume_store.settings`)."""
         labels = [case.label for case in self.cases]
         options = {"integrators": labels, **self._options(), "memory limit": self.memory_limit}
         codes = code_files([*self.cases, *(each for each in vars(self).values() if isinstance(each, Case))])
@@ -351,7 +353,7 @@ ALL = "all"
 class Plan(Measurement):
     """The plan of `convergence`. Errors are relative to the `reference`.
 
-    `spps` are the samples per pixel of a step; empty: those of `run`.
+    `spps` are the samples per pixel of a step. If it is empty, those of `run` are used.
     """
 
     reference: Case
@@ -369,10 +371,10 @@ class Plan(Measurement):
 
     @property
     def camera(self) -> dict[str, bool]:
-        """Arguments of `survey`: which kinds of paths the measurement contains.
+        """Arguments of `survey`, which describe the kinds of paths in the measurement.
 
         - `camera`: some method may have camera paths.
-        - `named`: this is certain, whatever the scene supports.
+        - `named`: some method has camera paths whatever the scene supports.
         - `light`: some method has only light paths.
         """
         spp = self.config.run.spp
@@ -382,7 +384,7 @@ class Plan(Measurement):
                 "light": not (named and all(sides))}  # fmt: skip
 
     def _has_camera_paths(self, config: Config) -> bool:
-        """Whether an integrator's images are complete at the film's border, as far as its options tell."""
+        """Whether an integrator's images are complete at the film's border, judged by its options."""
         return str(paths_in_records(config)["paths"]) != "light"
 
     @property
@@ -411,7 +413,7 @@ class Plan(Measurement):
         return replace(self.reference, label=f"{kind}({text})" if text else kind, options=options)
 
     def independent_config(self, name: str) -> Config:
-        """Return the experiment with a stock integrator. `ptracer` has no roulette, since naive AD would be wrong."""
+        """Return the experiment with a stock integrator. `ptracer` has no roulette, because naive AD would be wrong."""
         depth = self.config.integrator.max_depth
         roulette = depth < 0 or self.config.integrator.rr_depth <= depth
         options = {"rr_depth": NEVER} if name == "ptracer" and roulette else {}
@@ -437,7 +439,7 @@ class Plan(Measurement):
 
 
 def compared(integrators: str | None, reference: str | None, usual: str) -> dict[str, Any]:
-    """Return cases and reference of a `Plan` from lists as text, or the defaults (`usual`). Raises ConfigError."""
+    """Return cases and reference of a `Plan` from lists as text, or from the defaults `usual`. Raises ConfigError."""
     cases = parse_cases(integrators or usual, deep=False)
     stands = parse_cases(reference or REFERENCE, "--reference", deep=False)
     if len(stands) != 1:

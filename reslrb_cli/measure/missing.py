@@ -1,13 +1,13 @@
 """Missing terms of derivatives: attached gradients lack silhouettes, shadow edges, and light that leaves the film.
 
-Finite differences of the image at common random numbers contain these terms (`Missing`). Let F_k be the difference and
-g_k the attached gradient along direction k of K. Then
+Finite differences of the image at common random numbers contain these terms (`Missing`). F_k is the difference and g_k
+the attached gradient along direction k of K.
 
     m_k = F_k - g_k,   share = sqrt(sum_k m_k^2 / sum_k F_k^2)
 
-Two steps cancel the leading error of a difference: E(h), `extrapolated`. Steps are halved, and the step around which E
-changes least is used. At larger steps E has truncation errors. At smaller ones it has rounding errors, which are the
-same for all seeds if the scene's geometry is rounded, or errors of paths that change discontinuously. The remaining
+E(h) (`extrapolated`) combines two steps and cancels the leading error of a difference. Steps are halved, and the step
+around which E changes least is used. Larger steps have truncation errors. Smaller steps have rounding errors, or errors
+of paths that change discontinuously. Rounding errors of the scene's geometry are the same for all seeds. The remaining
 change of E counts as an error if it exceeds the noise. The contribution of noise to the squares is subtracted. The
 standard error is that of the mean over seeds. `MissingCheck` is `gradcheck --missing` on an experiment.
 
@@ -64,9 +64,10 @@ HALVINGS = 8
 
 @dataclass
 class Missing:
-    """Samples of the derivatives of one parameter along K directions: N times `ours` (K,), and `differences` (3, K).
+    """Samples of the derivatives of one parameter along K directions: N times `ours` (K,), and N times `differences`
+    (3, K).
 
-    The first differences have the direction's step, the others twice and four times that step.
+    The three differences use the direction's step, twice this step and four times this step.
     """
 
     directions: list[Direction]
@@ -104,8 +105,8 @@ class Missing:
 def share_of(whole: np.ndarray, missing: np.ndarray, left: np.ndarray) -> tuple[float, float] | None:
     """Return the share of `missing` in `whole`, both (N, K) samples, and its standard error.
 
-    Returns None if `whole` is not significantly different from 0. `left` (K,) are squares of errors of `whole` that are
-    the same in all seeds.
+    Returns None if `whole` is not significantly different from 0. `left` (K,) has the squares of errors of `whole` that
+    are equal for all seeds.
     """
     mean, error = _mean(whole)
     size = np.square(mean).sum() - np.square(error).sum()
@@ -123,8 +124,8 @@ def share_of(whole: np.ndarray, missing: np.ndarray, left: np.ndarray) -> tuple[
 
 
 def _ratio(missing: np.ndarray, whole: np.ndarray) -> float:
-    """Return the ratio of the root mean squares of (N, K) samples, `missing` over `whole`, without the part due to
-    noise.
+    """Return the ratio of the root mean squares of (N, K) samples, `missing` over `whole`. The part due to noise is
+    subtracted.
     """
     squares = [np.square(mean).sum() - np.square(error).sum() for mean, error in (_mean(missing), _mean(whole))]
     return float(np.sqrt(max(squares[0], 0.0) / squares[1]))
@@ -164,8 +165,8 @@ ESTIMATOR = "stack"
 class MissingCheck:
     """The measurement of missing terms on a loaded experiment. A variant must be set.
 
-    dL/dI is that of the experiment's loss at the initial values, and stays fixed. With an `earlier` session, new seeds
-    are added, and `count` is the total number. Raises ConfigError and UnsupportedScene.
+    dL/dI is that of the experiment's loss at the initial values, and stays fixed. New seeds are added to those of an
+    `earlier` session, and `count` is the total number. Raises ConfigError and UnsupportedScene.
     """
 
     def __init__(
@@ -196,7 +197,9 @@ class MissingCheck:
         return f"{self.source}, film {width}x{height}, {self.spp} spp, dL/dI of the loss at the initial values"
 
     def run(self, stop: Callable[[], bool], between: Callable[[], None] = lambda: None) -> Iterator[MissingRecord]:
-        """Measure each parameter for its share of the budget until `stop()`. `between` is called after each seed."""
+        """Measure the parameters in turn until `stop()`, each in its share of the budget. `between` is called after
+        each seed.
+        """
         for place, key in enumerate(self.case.keys):
             if stop():
                 return
@@ -211,7 +214,7 @@ class MissingCheck:
         return [self._record(key) for key, found in self._found.items() if found.count >= least]
 
     def kept(self, settings: Mapping[str, Any]) -> Kept | None:
-        """Return the state for a later session with the same `settings`; None if there are no samples."""
+        """Return the state for a later session with the same `settings`, or None if there are no samples."""
         taken = {key: found for key, found in self._found.items() if found.count}
         steps = {key: [direction.step for direction in found.directions] for key, found in taken.items()}
         samples = {("ours", key): found.ours for key, found in taken.items()}
@@ -285,10 +288,11 @@ def check_missing(problem: Problem, warn: Callable[[str], None]) -> list[Missing
 
 
 def measure_missing(problem: Problem) -> list[MissingRecord]:
-    """Measure the missing share by parameter that moves light, for at most `run.measuring` of the run's samples.
+    """Measure the missing share of each parameter that moves light, with at most `run.measuring` of the run's samples.
 
     The parameters keep their values. A parameter without enough time has a record without a share. Heightmaps with an
-    unknown share are left out, because their rims hardly move. Restores the scene, and leaves no gradients.
+    unknown share are left out, because their rims hardly move. The function restores the scene, and leaves no
+    gradients.
     """
     selection, kind = problem.selection, problem.config.integrator.type
     moving = [key for key in selection.keys if key not in selection.factors and moves_light(selection.params, key)]
@@ -326,7 +330,9 @@ class _Short:
         return self.problem.selection.params
 
     def _directions(self, key: str) -> list[np.ndarray]:
-        """Return the directions of a parameter: each entry of a small one, two smooth directions of a large one."""
+        """Return the directions of a parameter. A small parameter has one for each entry, and a large one has two
+        smooth directions.
+        """
         case = self._cases[0]
         size, value = case.initial[key].size, case.values.value(key)
         if size > MOST_ENTRIES:
@@ -336,7 +342,9 @@ class _Short:
         return [embed(case, key, row) for row in rows]
 
     def measure(self) -> list[MissingRecord]:
-        """Measure all parameters with the shorter step, and those with an unknown share again with the longer step."""
+        """Measure all parameters with the shorter step. Parameters with an unknown share are measured again with the
+        longer step.
+        """
         image_spp, fewest = 2 * self.problem.config.run.spp, seeds(FEWEST)
         along = sum(map(len, self._rows.values()))
         if image_spp + FEWEST * (1 + 2 * along) * self._spp > self._left or not self._weigh(image_spp):
@@ -364,7 +372,9 @@ class _Short:
         return record
 
     def _record(self, key: str, samples: list[np.ndarray] | None) -> MissingRecord:
-        """Return the record of a parameter with these (K,) samples of differences; None: there are no samples."""
+        """Return the record of a parameter with these (K,) samples of differences, or without a share if there are none
+        (None).
+        """
         share = None
         if samples is not None:
             for seed in seeds(MOST_SEEDS)[len(self._ours) : len(samples)]:
@@ -387,7 +397,7 @@ class _Short:
                        for case in self._cases], axis=0)  # fmt: skip
 
     def _weigh(self, spp: int) -> bool:
-        """Set dL/dI of the loss as the weights of the cases; return whether any is not zero."""
+        """Set dL/dI of the loss as the weights of the cases. Returns whether any weight is not zero."""
         problem, weights = self.problem, []
         for case, view in zip(self._cases, self._views, strict=True):
             gradient = problem.image_gradient(view, problem.render(view.sensor, spp, 0, "missing"))

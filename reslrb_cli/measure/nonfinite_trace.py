@@ -1,8 +1,8 @@
 """Search for the origin of a value that is not finite: the path, its vertex and the factor, or the pixel of the loss.
 
 `find_offenders` traces the paths of the step again from their seeds, and `SearchHooks` checks every factor. It also
-checks the factor's derivative in the direction in which all entries of the parameters grow equally: a derivative that
-is not finite in some direction is not finite in this one.
+checks the factor's derivative along one direction, in which all entries of the parameters grow equally. A derivative
+that is not finite in some direction is not finite in this one.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
 @dataclass(frozen=True)
 class PathVertex:
-    """A vertex of a path, with all that is needed to trace the path again.
+    """A vertex of a path, with all data for tracing the path again.
 
-    - `samples`: which of the step's samples the path belongs to; `seed`: their sampler's seed; `path`: its index among
-      `paths`.
-    - `vertex`: the number of the vertex. Vertex 0 is on the emitter, or on the sensor for camera paths, which `samples`
-      names.
-    - `position`: in world space; `surface`: the shape's id.
+    - `samples` names the samples of the step that the path belongs to, `seed` is their sampler's seed, and `path` is
+        its index among `paths`.
+    - `vertex` is the number of the vertex. Vertex 0 is on the emitter or, for camera paths, on the sensor. `samples`
+        tells which of the two.
+    - `position` is in world space, and `surface` is the shape's id.
     """
 
     samples: str
@@ -63,9 +63,9 @@ class PathVertex:
 class Offender:
     """The first value of a view that is not finite, in the order of paths and of their vertices.
 
-    `quantity` names the value, and `value` has one number per channel, none for a derivative of the loss. `pixel` (x,
-    y) is its place on the film. `where` is None for a derivative of the loss. `image` and `target`, the values that the
-    loss compares there, are None for a path.
+    `quantity` names the value. `value` has one number per channel, or none for a derivative of the loss. `pixel` (x, y)
+    is its place on the film. `where` is None for a derivative of the loss. `image` and `target` are the values that the
+    loss compares there. They are None for a path.
     """
 
     sensor: int
@@ -78,9 +78,9 @@ class Offender:
 
 
 class Witness(Guiding):
-    """A wrapper of another guide that continues learning, and notes from which tables samples are drawn.
+    """A wrapper of another guide. It continues learning, and records the tables from which samples are drawn.
 
-    `drawn` are the tables of the samples so far, in order, without samples that were only drawn for learning.
+    `drawn` has the tables of the samples so far, in order, without samples that were only drawn for learning.
     """
 
     def __init__(self, other: Guiding) -> None:
@@ -102,8 +102,8 @@ class Witness(Guiding):
 
 
 def purposes(problem: Problem, view: View) -> list[tuple[int, str, Purpose]]:
-    """Return the purposes of a step's or shard's samples, in order: the index in `sample_sets`, a word, and the
-    purpose.
+    """Return the purposes of a step's or shard's samples, in order. Each has the index in `sample_sets`, a word, and
+    the purpose.
     """
     options = problem.config.step_options(shard=True)
     gradient = Purpose.GRADIENT if problem.on_samples(view) is None else Purpose.BOTH
@@ -154,7 +154,7 @@ class Suspect:
         return Suspect(mi.UInt32(0), mi.UInt32(0), mi.Point3f(0), mi.UInt32(0), mi.Spectrum(0))
 
     def otherwise(self, other: Suspect, active: Any) -> Suspect:
-        """Return this suspect; in `active` lanes without one, return `other` if its value is not finite."""
+        """Return this suspect. In `active` lanes without one, return `other` if its value is not finite."""
         take: Suspect = dr.select((self.kind == 0) & active & is_bad(other.value), other, self)
         return take
 
@@ -176,9 +176,9 @@ def reaches(film: Film, u: Any, pixel: tuple[int, int] | None) -> Any:
 class Search:
     """Loop state.
 
-    `first` is the first suspect of the path so far. `found` is the first suspect of the first connection that reached
-    the film with one, at position `u`; a connection that reaches the wanted pixel (`there`) takes precedence. `largest`
-    is the largest contribution, which lands at `largest_u`.
+    `first` is the first suspect of the path so far. `found` is the first suspect of the first connection with a suspect
+    that reached the film, at position `u`. A connection that reaches the wanted pixel (`there`) takes precedence.
+    `largest` is the largest contribution, which lands at `largest_u`.
     """
 
     first: Suspect
@@ -193,7 +193,9 @@ class SearchHooks(Hooks):
     """Checks every factor of a connection, its derivative along the parameters' tangents, and the product of all."""
 
     def __init__(self, samples: Samples, emission: Any, derivative: Any, pixel: tuple[int, int] | None) -> None:
-        """`emission` is a ray of each path with E, `derivative` is dE (C,), and `pixel` the wanted pixel, if any."""
+        """Make the hooks. `emission` is a ray of each path with E, and `derivative` is dE (C,). `pixel` is the wanted
+        pixel, or None.
+        """
         self.samples, self.emission, self.derivative, self.pixel = samples, emission, derivative, pixel
 
     def start(self, product: Product) -> Search:
@@ -297,9 +299,7 @@ Array = np.ndarray[Any, Any]
 
 @dataclass
 class Found:
-    """The offender of the first path that has one, whether it reaches the wanted pixel, and the largest
-    contribution.
-    """
+    """The offender of the first path with one, whether it reaches the wanted pixel, and the largest contribution."""
 
     offender: Offender | None
     there: bool
@@ -339,7 +339,7 @@ def search_paths(samples: Samples, sensor: int, label: str, pixel: tuple[int, in
 
 
 def _seen_emission(samples: Samples) -> Iterator[tuple[Suspect, mi.Spectrum, mi.Point2f, mi.Bool]]:
-    """Yield emission that the sensor sees directly: by primary rays, then for emitters smaller than a pixel.
+    """Yield emission that the sensor sees directly: first by primary rays, then for emitters smaller than a pixel.
 
     Each item has radiance (C,) with its tangent, film positions, and active lanes.
     """
@@ -364,7 +364,7 @@ def _seen_emission(samples: Samples) -> Iterator[tuple[Suspect, mi.Spectrum, mi.
 
 
 def _first(bad: Array, there: Array) -> tuple[int | None, bool]:
-    """Return the first bad lane, preferably one that is `there`, and whether it is `there`."""
+    """Return the first bad lane, and whether it is `there`. A lane that is `there` takes precedence."""
     lanes = np.flatnonzero(bad)
     preferred = np.flatnonzero(bad & there)
     if preferred.size:
@@ -423,10 +423,10 @@ def find_offenders(problem: Problem, iteration: int) -> list[Offender]:
 
 
 def _of_view(problem: Problem, view: View, step_seed: int, word: str) -> Offender | None:
-    """Return the same for one view, from its samples or those of the shard that `word` names.
+    """Return the same for one view, from its samples or from the samples of the shard named `word`.
 
-    With `adjoint: others`, dL/dI is computed at an image of the shard's own samples, not at the mean image of the
-    others.
+    With `adjoint: others`, dL/dI is computed from an image of the shard's own samples instead of the mean image of the
+    other shards.
     """
     guiding = guiding_of(problem)
     witness = None if guiding is None else Witness(guiding)
@@ -454,9 +454,9 @@ def _of_view(problem: Problem, view: View, step_seed: int, word: str) -> Offende
 def _parts(
     problem: Problem, view: View, step_seed: int, witness: Witness | None = None
 ) -> Iterator[tuple[Samples, int, str]]:
-    """Yield a step's samples pass by pass, with the sensor's index and a name. Light paths are those of the run.
+    """Yield a step's samples pass by pass, with the sensor's index and a name. Light paths are the same as in the run.
 
-    The `witness` of a guided step supplies the tables from which samples were drawn.
+    For a guided step, `witness` supplies the tables from which samples were drawn.
     """
     scene, sensor = problem.scene, problem.scene.sensors()[view.sensor]
     given = problem.config.integrator.options()
@@ -493,7 +493,7 @@ def _parts(
 
 
 def _set_tangents(problem: Problem) -> None:
-    """Give every entry of every parameter the tangent 1, as far as the scene uses it."""
+    """Set the tangent of every entry of every parameter in the scene to 1."""
     params, keys = problem.selection.params, problem.selection.keys
     keys = [key for key in keys if key in params]  # an exposure is not part of any path
     for key in keys:
@@ -508,7 +508,7 @@ def _set_tangents(problem: Problem) -> None:
 
 @dataclass
 class TracedStep:
-    """Image (H, W, C) and gradients of a step, and the first refused entry of dL/dI, (x, y, channel)."""
+    """Result of a step: its image (H, W, C), its gradients, and the first refused entry of dL/dI as (x, y, channel)."""
 
     image: Array
     gradients: dict[str, Array]
@@ -530,7 +530,7 @@ def _take_step(problem: Problem, view: View, step_seed: int) -> TracedStep:
 
 
 def _of_step(step: TracedStep, view: View, largest: Offender | None) -> Offender | None:
-    """Return the remaining explanation if no path has one: the loss, overflow of sums, or paths that were not
+    """Return the explanation if no path has an offender: the loss, an overflow of sums, or paths that were not
     checked.
     """
     image, target = step.image, np.array(view.target)

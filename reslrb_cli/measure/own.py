@@ -1,14 +1,14 @@
 """Diagnosis of a user's own integrator that `gradcheck` found wrong, derived from measurements.
 
-The integrator is compared with `reslrb` with the same kind of paths, as a ratio. For gradients, along the reference's
-own direction,
+The integrator is compared with `reslrb` with the same kind of paths, as a ratio r with its standard error. For
+gradients, both are projected on the reference's own direction u. For images, r is the ratio of their sums.
 
-    r = E<g, u> / E<G, u>,      u from other seeds of G than the denominator,
+    r = E<g, u> / E<G, u>,      u from other seeds of G than the denominator
 
-with its standard error; for images, the ratio of their sums. Ratios are measured for paths of 1, 2, 3, ... segments
-without Russian roulette, and for each parameter. Images are linear in emission, so at each seed sum(dL/dE E) equals the
-image if both passes trace the same paths and add the same terms. Each measurement rules out possible faults, and the
-message names those that remain. It reports what was measured, and is no proof.
+Ratios are measured for paths of 1, 2, 3, ... segments without Russian roulette, and for each parameter. Images are
+linear in emission. At each seed, sum(dL/dE E) therefore equals the image if both passes trace the same paths and add
+the same terms. Each measurement rules out possible faults, and the message names the remaining ones. The message
+reports measurements, and is no proof.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ CONSTANTS = {"2": 2.0, "1/2": 0.5, "pi": np.pi, "1/pi": 1 / np.pi, "2 pi": 2 * n
 
 @dataclass(frozen=True)
 class Ratio:
-    """An estimate divided by its correct value; None if the reference is too noisy."""
+    """An estimate divided by its correct value, or None if the reference is too noisy."""
 
     value: float
     error: float
@@ -127,7 +127,7 @@ def _check(stop: Callable[[], bool]) -> None:
 
 
 def _ours(parts: Participants, label: str, **other: int) -> StepIntegrator:
-    """Return the reference: `reslrb` with the same kind of paths, and `other` depths."""
+    """Return the reference: `reslrb` with the same kind of paths. `other` may change the depths."""
     options = parts.options_of(label) | other
     return make_integrator("reslrb", estimator="stack", **parts.ways[label].options, **options)
 
@@ -148,7 +148,7 @@ class Looking:
     # --- measuring ----------------------------------------------------------------------------------------------------
 
     def _pair(self, **other: int) -> tuple[StepIntegrator, StepIntegrator]:
-        """Return the integrator and the reference, with `other` depths."""
+        """Return the integrator and the reference. `other` may change the depths of both."""
         return self.parts.own_with(self.label, **other), _ours(self.parts, self.label, **other)
 
     def images(self, **other: int) -> Ratio:
@@ -164,7 +164,7 @@ class Looking:
         return mine, ours
 
     def gradients(self, **other: int) -> dict[str, Ratio]:
-        """Return the ratio for each parameter of which the reference has a gradient."""
+        """Return the ratio for each parameter with a nonzero gradient in the reference."""
         self._measure("gradients", other)
         own, ours = self._pair(**other)
         reference = np.stack([self.parts.gradient(ours, seed) for seed in self._each(2 * self._seeds, 6)])
@@ -185,9 +185,9 @@ class Looking:
     ) -> tuple[Ratio, float] | None:
         """Return the ratio of sum(dL/dE E) to the image, which must be 1 because images are linear in emission.
 
-        Also returns how much the ratio varies between seeds; at each seed both terms have the same paths. Returns None
-        if some light is not given by a number (`.value`, `scale`). The paths have `depth` segments. The image is
-        `seen`. `even`: dL/dI is 1 in all pixels and channels.
+        Also returns how much the ratio varies between seeds. At each seed, both terms have the same paths. Returns None
+        if some light is not given by a number (`.value`, `scale`). The paths have `depth` segments, and the image is
+        `seen`. `even` sets dL/dI to 1 in all pixels and channels.
         """
         depth = self.depth if depth is None else depth
         keys = self._lamps()
@@ -217,15 +217,17 @@ class Looking:
         return derivatives, images
 
     def _lamps(self) -> list[str]:
-        """Return the keys in which all light is linear; empty if some light is not given by a number (`.value`,
-        `scale`).
+        """Return the keys in which all light is linear. The list is empty if some light is not given by a number
+        (`.value`, `scale`).
         """
         params = mi.traverse(self.parts.case.scene)
         keys = [key for key, _ in params if parameter_kind(params, key) == "emitter" and key.endswith(LINEAR)]
         return keys if len(keys) == len(self.parts.case.scene.emitters()) else []
 
     def _surfaces(self) -> list[str]:
-        """Return the keys in which all light scattered once is linear; empty if some BSDF is not linear."""
+        """Return the keys in which all light with a single scattering event is linear. The list is empty if some BSDF
+        is not linear.
+        """
         params = mi.traverse(self.parts.case.scene)
         graph = SceneGraph.of(self.parts.case.scene)
         bsdfs = dict.fromkeys(each for bsdf in graph.surface_bsdfs() for each in graph.nested_bsdfs(bsdf))
@@ -234,7 +236,7 @@ class Looking:
         return keys if set(kinds) <= SCALING and len(keys) == kinds.count("SmoothDiffuse") else []
 
     def _of_length(self, at: int, sums: Callable[..., tuple[Array, Array]]) -> Ratio:
-        """Return the ratio for paths of exactly `at` segments. `sums` are both terms of a ratio by depth."""
+        """Return the ratio for paths of exactly `at` segments. `sums` has both terms of the ratio for each depth."""
         own, reference = sums(max_depth=at, rr_depth=NEVER)
         if at > 1:
             shorter = sums(max_depth=at - 1, rr_depth=NEVER)
@@ -242,8 +244,8 @@ class Looking:
         return _over(own, reference)
 
     def _limited(self, at: int, sums: Callable[..., tuple[Array, Array]], before: Ratio) -> str:
-        """Describe an upper limit on values: with darker lamps or surfaces, paths of `at` segments are less wrong than
-        `before`.
+        """Describe an upper limit on values. It exists if darker lamps or surfaces make paths of `at` segments less
+        wrong than `before`.
         """
         if not np.isfinite(before.value):
             return ""
@@ -336,7 +338,9 @@ class Looking:
         return f"its image holds; it has {_list(wrong)} of the reference's gradient{beside}"
 
     def _narrowed(self, wrong: dict[str, Ratio]) -> list[str]:
-        """Return the remaining faults: passes that differ, roulette, derivatives from some depth on, or lobes."""
+        """Return the faults that the measurements leave: different passes, roulette, derivatives from some depth on, or
+        lobes.
+        """
         worst = max(wrong, key=lambda key: abs(wrong[key].value - 1) / max(wrong[key].error, 1e-12))
         passes = self._of_passes(wrong)
         if passes is not None:
@@ -365,9 +369,7 @@ class Looking:
         return [each for each in said if each]
 
     def _of_passes(self, wrong: dict[str, Ratio]) -> str | None:
-        """Return why the differentiated pass differs from that of the image: its terms or its paths. None if it does
-        not.
-        """
+        """Return how the differentiated pass differs from the pass of the image, in its terms or its paths, or None."""
         measured = self.emission()
         if measured is None:
             return None
@@ -396,12 +398,14 @@ class Looking:
         return "; ".join(filter(None, said))
 
     def _right_if_even(self) -> bool:
-        """Whether only dL/dI is wrong in the differentiated pass: with a constant dL/dI everything is right."""
+        """Whether only the use of dL/dI is wrong in the differentiated pass. With a constant dL/dI, everything is then
+        right.
+        """
         found = self.emission(even=True)
         return found is not None and not found[0].wrong and found[1] <= SAME_PATHS
 
     def _too_short(self) -> bool:
-        """Whether the differentiated pass, for paths of three segments, has only paths of two."""
+        """Whether the differentiated pass has only paths of two segments when it should have paths of three."""
         found = self.emission(3, 2) if self.deepest >= 3 else None
         return found is not None and not found[0].wrong and found[1] <= SAME_PATHS
 
@@ -409,7 +413,7 @@ class Looking:
         return not 0 <= self.depth <= self._options["rr_depth"]
 
     def _from_depth(self, ratio: Callable[[int], Ratio | None]) -> tuple[int | None, bool]:
-        """Return the least length of wrong paths, and whether shorter paths were measured as right."""
+        """Return the shortest length of wrong paths, and whether shorter paths were measured as right."""
         seen = False
         for depth in range(1, self.deepest + 1):
             found = ratio(depth)
@@ -442,7 +446,7 @@ def _from(depth: int, before: bool) -> str:
 
 
 def _segments(depth: int, hides: bool, before: bool = True) -> str:
-    """Describe what paths with this number of segments have that shorter ones do not."""
+    """Describe the features of paths with this number of segments that shorter paths lack."""
     what = "throughput, and the BSDF's value over its density"
     if depth == 1:
         hidden = " (hide_emitters is on here)" if hides else ""
@@ -456,8 +460,8 @@ def _segments(depth: int, hides: bool, before: bool = True) -> str:
 
 
 def _over(own: Array, reference: Array) -> Ratio:
-    """Return the ratio of two means with its standard error: 1 if both are zero, infinite if only the reference is
-    zero.
+    """Return the ratio of two means with its standard error. It is 1 if both are zero, and infinite if only the
+    reference is zero.
     """
     if not reference.any():
         return Ratio(np.inf if own.any() else 1.0, 0.0)

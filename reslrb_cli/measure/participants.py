@@ -75,9 +75,9 @@ PILOT_SEEDS = 2
 class CheckSettings:
     """Settings of a check. `seeds` and `spp` are None if they are chosen automatically.
 
-    - `named`: the user named the integrators. Otherwise those that cannot take part are left out.
-    - `spent_s`: the part of the budget that earlier sessions used.
-    - `initial`: values of parameters, as `Selection.array` returns them, that replace those of `config`.
+    - `named` tells whether the user named the integrators. Otherwise integrators that cannot take part are left out.
+    - `spent_s` is the part of the budget that earlier sessions used.
+    - `initial` has values of parameters, as `Selection.array` returns them. They replace those of `config`.
     """
 
     config: Config
@@ -104,9 +104,9 @@ def settings_of(
     config: Config, estimators: str | None, budget_s: float, seeds: int | None, spp: int | None, spent_s: float,
     integrators: str | None = None,
 ) -> CheckSettings:  # fmt: skip
-    """Return the settings of a check of `config`, from the lists `estimators` and `integrators` of the command line.
+    """Return the settings of a check of `config`. `estimators` and `integrators` are lists from the command line.
 
-    Without either, all estimators are checked. Raises ConfigError if one is invalid.
+    Without either list, all estimators are checked. Raises ConfigError if one is invalid.
     """
     listed = [] if estimators is None else parse_estimators(estimators)
     listed += [] if integrators is None else parse_own(integrators)
@@ -118,14 +118,14 @@ def settings_of(
 
 @dataclass(frozen=True)
 class Way:
-    """The kinds of paths and the share of light paths. They decide what is visible, and what naive AD must trace."""
+    """The kinds of paths and the share of light paths. They determine what is visible and what naive AD must trace."""
 
     paths: str = "light"
     light_share: float = 0.5
 
     @classmethod
     def of(cls, config: Config) -> Way:
-        """Return the paths of an integrator; light paths if it has no such option."""
+        """Return the paths of an integrator. Integrators without this option use light paths."""
         options = config.integrator.options()
         paths, share = options.get("paths", "light"), options.get("light_share", "auto")
         share = 0.5 if share == "auto" else share
@@ -135,12 +135,12 @@ class Way:
 
     @property
     def options(self) -> dict[str, Any]:
-        """The options for integrators; empty for light paths."""
+        """The options for integrators. They are empty for light paths."""
         share = {"light_share": self.light_share} if self.paths == "both" else {}
         return {} if self.paths == "light" else {"paths": self.paths} | share
 
     def named(self, name: str) -> str:
-        """Return the name for these paths of an item that is called `name` for light paths."""
+        """Return the name of an item for these paths. `name` is its name for light paths."""
         words = {"light": "", "camera": ", paths: camera", "both": f", paths: both, light_share: {self.light_share:g}"}
         return name + words[self.paths]
 
@@ -148,12 +148,12 @@ class Way:
 class Participants:
     """The loaded scene with every integrator by its label. A variant must be set.
 
-    - `ways`: the paths of each estimator, by its label. Dictionaries "by way" have the names for light paths first,
-      then those for other paths (`Way.named`).
-    - `stock`: the stock reference of each parameter's gradient, or None; `why`: the reasons against the others.
-    - `images`: references of the image, by way; `exact`: gradients in closed form.
-    - `listed`: the estimators that take part. If derivatives are attached, these are the estimators with attached
-      derivatives on light paths.
+    - `ways` has the paths of each estimator, by its label. Dictionaries "by way" have the names for light paths first,
+        then the names for other paths (`Way.named`).
+    - `stock` has the stock reference of each parameter's gradient, or None. `why` has the reasons against the others.
+    - `images` has references of the image, by way. `exact` has gradients in closed form.
+    - `listed` has the estimators that take part. If derivatives are attached, only estimators with attached derivatives
+        on light paths take part.
 
     Raises ConfigError and UnsupportedScene.
     """
@@ -320,7 +320,7 @@ class Participants:
         return [*found, Reference.WALK_AD, Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE]
 
     def sampled(self, label: str, reference: Reference) -> str:
-        """Return the integrator whose gradients stand for those of `label` in comparisons with this reference
+        """Return the integrator whose gradients represent those of `label` in comparisons with this reference
         (`ALIKE`).
         """
         alike = _alike(label, reference)
@@ -332,8 +332,9 @@ class Participants:
         return len(sides | {divides_by_film(way.paths) for way in self.each_way}) > 1
 
     def _weigh(self, inside: bool) -> None:
-        """Set random weights of mean 1, a sixth of them negative. `inside`: 0 at the border. If light moves, they are
-        smooth.
+        """Set random weights of mean 1, a sixth of them negative. If light moves, they are smooth.
+
+        With `inside`, weights are 0 at the border.
         """
         shape = tuple(self.case.weights.shape)
         if self._situation.moved:
@@ -349,18 +350,18 @@ class Participants:
         return value_shape(self.case.values.value(key))
 
     def choose_steps(self, of: str) -> None:
-        """Choose the steps of the finite differences of a parameter, by way."""
+        """Choose the steps of the finite differences of a parameter. `of` is its name by way."""
         _, way = self._of[of]
         image, pilot = self.integrators[way.named(DIFFERENCED)], seeds(PILOT_SEEDS, 9)
         self.directions[of] = [choose_step(self.case, image, d, pilot, self.spp) for d in self.directions[of]]
 
     def sample(self, kind: str, of: str, seed: int) -> np.ndarray:
-        """Return one sample in a row: `gradient` or `image` of an integrator, or along the directions of a parameter,
-        `of`.
+        """Return one sample as a flat array. `kind` is `gradient`, `image`, `differences` or `tangents`.
 
-        Gradients contain all parameters, from a step as in the experiment. Images are black along the border if they
-        are compared with images that lose no light there. Along directions, by way, there are finite `differences` and
-        `tangents`. Tangents are forward derivatives, which are the same for all estimators of the same paths.
+        A gradient contains all parameters, from a step as in the experiment. An image is black along the border if its
+        reference loses no light there. `of` is the label of an integrator. For `differences` and `tangents`, the sample
+        has the derivatives along the directions of a parameter, and `of` is its name by way. Tangents are forward
+        derivatives, which are equal for all estimators of the same paths.
         """
         if kind == "gradient":
             if of in (_alike(label, Reference.UNGUIDED) for label in self.unguided):
@@ -380,12 +381,12 @@ class Participants:
         return np.array([self.case.tangent(tracer, d.vector, seed, self.spp) for d in self.directions[of]])
 
     def gradient(self, integrator: StepIntegrator, seed: int) -> np.ndarray:
-        """Return the gradient of all parameters in a row, from a step as in the experiment."""
+        """Return the gradient of all parameters as a flat array, from a step as in the experiment."""
         options = {"step": self.case.known_step} if self.known else {}
         return self.case.gradient(integrator, seed, self.spp, **options)
 
     def _teach(self, of: str) -> None:
-        """Learn the tables of a guided integrator once and keep them, so that each sample depends only on its seed."""
+        """Train the tables of a guided integrator once and keep them, so that each sample depends only on its seed."""
         tracer = self.integrators[of]
         assert isinstance(tracer, LightTracer)
         guiding = tracer.preparation.guiding

@@ -1,8 +1,9 @@
-"""Worker processes as seen from outside. The end of a worker is detected and reported, and ends nothing else.
+"""Worker processes as seen from outside. The end of a worker is detected and reported, and does not end the
+measurement.
 
-- `Process`: one worker, which exchanges lines of JSON with `workers.py`.
-- `Contestant`: one of several workers that are compared, and how it ended. `Stepping` takes steps.
-- `Pace`: divides the time of a sweep among depths and rounds.
+- `Process` is one worker, which exchanges lines of JSON with `workers.py`.
+- `Contestant` is one of several workers that are compared, and how it ended. `Stepping` takes steps.
+- `Pace` divides the time of a sweep among depths and rounds.
 """
 
 from __future__ import annotations
@@ -174,9 +175,9 @@ def last_words(text: str) -> str:
 
 @dataclass(kw_only=True)
 class Contestant:
-    """One of several workers that are compared. A failure ends the measurement if the worker may not refuse.
+    """One of several workers that are compared. `process` is None if none is running, and `peak_mib` is its memory.
 
-    `process` is None if none is running, and `peak_mib` the memory that it uses.
+    A failure ends the measurement, unless the worker may refuse.
     """
 
     process: Any
@@ -194,7 +195,9 @@ class Contestant:
     def ask(
         self, question: dict[str, Any], stop: Callable[[], bool], over: Callable[[], bool] = lambda: False
     ) -> dict[str, Any] | None:
-        """Ask and wait for one answer; None if the process ended or the time was up. Raises Stopped after `stop()`."""
+        """Ask and wait for one answer. Returns None if the process ended or the time was up. Raises Stopped after
+        `stop()`.
+        """
         self.process.ask(question)
         return self.answer(stop, over)
 
@@ -236,7 +239,7 @@ class Stepping(Contestant):
     cold: dict[str, Any] | None = None
 
     def question(self, round: int | None) -> dict[str, Any]:
-        """Return the question for a round's steps; None: for a step that is not counted."""
+        """Return the question for a round's steps. For None, the step is not counted."""
         raise NotImplementedError
 
     def keep(self, round: int, answer: dict[str, Any]) -> None:
@@ -244,7 +247,7 @@ class Stepping(Contestant):
         raise NotImplementedError
 
     def warm_up(self, tight: Callable[[], bool], stop: Callable[[], bool], over: Callable[[], bool]) -> dict | None:
-        """Take a cold step, then others until nothing is compiled. Return the last answer, or None if the process
+        """Take a cold step, then more steps until nothing is compiled. Returns the last answer, or None if the process
         ended.
         """
         answer = self.ask(self.question(None) | {"cold": True, "release": False}, stop, over)
@@ -277,8 +280,8 @@ NO_TIME = "the budget was spent; allow more with --budget"
 class Pace:
     """Divides the time among depths. Each depth gets GROWTH times as much as the one before.
 
-    Time that one depth leaves goes to the others. While there is time, each depth gets at least MIN_ROUNDS rounds, and
-    at most `most`. With `rounds`, time does not count. Rounds of earlier sessions count.
+    Unused time of one depth goes to the others. While there is time, each depth gets at least MIN_ROUNDS rounds, and at
+    most `most`. With `rounds`, time does not count. Rounds of earlier sessions count.
     """
 
     def __init__(

@@ -1,10 +1,10 @@
 """Stock integrators as references: `ptracer`, `path` and `prb` for images, `ptracer` and `prb` for gradients.
 
-Each public function after `of_gradient` returns the reason against a reference, or None if it is valid. The section
-Baselines of docs/method.md explains the reasons.
+Each public function after `of_gradient` checks one reference. It returns the reason against it, or None if it is valid.
+The section Baselines of docs/method.md explains the reasons.
 
 Light tracing loses light along the film's border, from samples just outside of the film. `divides_by_film` tells which
-images lose none. `known_gradient` recognises scenes whose gradient is known in closed form.
+images have no such loss. `known_gradient` recognises scenes with a known gradient in closed form.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ CAMERA_PATHS = (Reference.PRB, Reference.PATH)
 
 
 def divides_by_film(paths: str) -> bool:
-    """Whether images by these paths (`loading.paths_of`) lose no light along the film's border, like those of
+    """Whether images by these paths (`loading.paths_of`) lose no light along the film's border, like images of
     `path`.
     """
     return paths != "light"
 
 
 def known_gradient(at: Situation, sensor: mi.Sensor, key: str, weights: np.ndarray) -> np.ndarray | None:
-    """Return the gradient of sum(image * weights) by `key` in a row; None if it is not known in closed form.
+    """Return the gradient of sum(image * weights) by `key` as a flat array, or None if there is no closed form.
 
-    It is known for the furnace: a sphere around the sensor with constant emission and constant diffuse reflectance.
+    There is one for the furnace, a sphere around the sensor with constant emission and constant diffuse reflectance.
     `weights` are (H, W, C).
     """
     shapes, emitters = at.graph.shapes(), at.scene.emitters()
@@ -79,10 +79,10 @@ _ROUGHNESS = ("alpha", "alpha_u", "alpha_v")
 
 @dataclass(frozen=True)
 class Situation:
-    """The conditions for references: a scene seen by one sensor, the maximum depth, and whether emitters are hidden.
+    """The conditions for references: a scene and a sensor, the maximum depth, and whether emitters are hidden.
 
-    `attached`: derivatives are attached; `moved`: the recovered parameters that move light. `paths` (`light`, `camera`,
-    `both`) are those of the estimator; a valid reference sees exactly the same light.
+    `attached` tells whether derivatives are attached. `moved` has the recovered parameters that move light. `paths`
+    (`light`, `camera`, `both`) are those of the estimator. A valid reference contains exactly the same light.
     """
 
     scene: Any
@@ -129,14 +129,16 @@ def choose(reasons: Mapping[Reference, str | None]) -> tuple[Reference | None, s
 
 
 def of_image(at: Situation) -> dict[Reference, str | None]:
-    """Return the reasons against each stock integrator as reference of the image. The one with an equal border comes
+    """Return the reason against each stock integrator as reference of the image. The one with an equal border comes
     first.
     """
     return _alike_first(at, {Reference.PTRACER: ptracer_image(at), Reference.PRB: prb_image(at)})
 
 
 def of_gradient(at: Situation, key: str) -> dict[Reference, str | None]:
-    """Return the reasons against each stock integrator as reference of the gradient by `key`, in the same order."""
+    """Return the reason against each stock integrator as reference of the gradient with respect to `key`, in the same
+    order.
+    """
     return _alike_first(at, {Reference.PTRACER: ptracer_gradient(at, key), Reference.PRB: prb_gradient(at, key)})
 
 
@@ -146,7 +148,7 @@ def _alike_first(at: Situation, reasons: dict[Reference, str | None]) -> dict[Re
 
 
 def ptracer_image(at: Situation) -> str | None:
-    """Check stock light tracing without roulette as reference of the image."""
+    """Return the reason against stock light tracing without roulette as reference of the image, or None."""
     if any(_is_turned(emitter) for emitter in at.scene.emitters()):
         return "it has wrong emission from a rotated environment map"
     if at.needs.has_null:
@@ -179,14 +181,14 @@ def ends(max_depth: int) -> bool:
 
 
 def path_image(at: Situation) -> str | None:
-    """Check `path` as reference of the image."""
+    """Return the reason against `path` as reference of the image, or None."""
     if at.needs.has_null and (at.needs.environment is None or at.hide_emitters):
         return "it loses light reflected by masks if nothing is behind them"
     return prb_image(at)
 
 
 def prb_image(at: Situation) -> str | None:
-    """Check `prb` as reference of the image."""
+    """Return the reason against `prb` as reference of the image, or None."""
     if any(emitter.class_name() == "DirectionalArea" for emitter in at.scene.emitters()):
         return "camera paths cannot find a `directionalarea` emitter"
     if at.has_pointlike and at.needs.has_null:
@@ -204,7 +206,7 @@ def prb_image(at: Situation) -> str | None:
 
 
 def ptracer_gradient(at: Situation, key: str) -> str | None:
-    """Check stock light tracing under naive AD as reference of the gradient by `key`."""
+    """Return the reason against stock light tracing under naive AD as reference of the gradient by `key`, or None."""
     reason = ptracer_image(at)
     if reason is not None:
         return reason
@@ -223,7 +225,7 @@ def ptracer_gradient(at: Situation, key: str) -> str | None:
 
 
 def _ptracer_motion(at: Situation, keys: tuple[str, ...]) -> str | None:
-    """Check stock light tracing as reference of the gradient by moving parameters."""
+    """Return the reason against stock light tracing as reference of the gradient by moving parameters, or None."""
     for key in keys:
         node = at.params.properties[key][2]
         if not isinstance(node, mi.Shape) or node.is_emitter():
@@ -236,7 +238,7 @@ def _ptracer_motion(at: Situation, keys: tuple[str, ...]) -> str | None:
 
 
 def prb_gradient(at: Situation, key: str) -> str | None:
-    """Check path replay backpropagation from the sensor as reference of the gradient by `key`."""
+    """Return the reason against path replay backpropagation as reference of the gradient by `key`, or None."""
     if moves_light(at.params, key):
         return "it has no derivatives of moving light"
     reason = prb_image(at)

@@ -1,4 +1,6 @@
-"""Stored samples: samples of an earlier call, for the same experiment and settings, are not taken again."""
+"""Stored samples. If an earlier call with the same experiment and settings has taken a sample, it is not taken
+again.
+"""
 
 from __future__ import annotations
 
@@ -36,9 +38,7 @@ _SHOWN = 60
 
 @functools.cache
 def program() -> dict[str, str]:
-    """Return the versions that results depend on, and a digest of this program's code, which may be under
-    development.
-    """
+    """Return the versions that results depend on, and a digest of this program's code."""
     code = hashlib.blake2b(digest_size=16)
     for path in sorted(Path(__file__).parent.parent.rglob("*.py")):
         code.update(path.read_bytes())
@@ -49,7 +49,7 @@ def settings(config: Config, codes: Mapping[str, Path], variant: str, device: st
     """Return the settings that must be the same in all sessions of a measurement, as JSON.
 
     `codes` are the files of integrators that the command names, and `options` the command's options. Files are compared
-    by their contents. The variant and the device count too, because times of all sessions are compared.
+    by their contents. The variant and the device are included, because times of all sessions are compared.
     """
     from reslrb_cli.scene.files import file_digests, files_of  # which loads Mitsuba
 
@@ -66,7 +66,7 @@ def settings(config: Config, codes: Mapping[str, Path], variant: str, device: st
 class Earlier:
     """Samples stored beside the file of `--json`, `source`: a `head` as JSON, and `arrays`.
 
-    Raises ConfigError if they belong to another `kind` of measurement, or another version wrote them.
+    Raises ConfigError if they belong to another `kind` of measurement, or if another version wrote them.
     """
 
     def __init__(self, kind: str, source: Path, head: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
@@ -77,16 +77,17 @@ class Earlier:
             raise self.other(f"it belongs to `{head.get('kind')}`, this is `{kind}`")
 
     def check(self, now: Mapping[str, Any]) -> None:
-        """Raise ConfigError, with the first difference, unless the `settings` are those of this session."""
+        """Raise ConfigError, with the first difference, if the `settings` differ from those of this session."""
         found = first_difference(self.head["settings"], now)
         if found is not None:
             raise self.other(found)
 
     @classmethod
     def read(cls, kind: str, json_file: Path | None, now: Mapping[str, Any] | None = None) -> Earlier | None:
-        """Return the stored samples beside a JSON file; None if there are none.
+        """Return the stored samples beside a JSON file, or None if there are none.
 
-        Raises ConfigError, also if their settings differ from `now`, unless `now` is not known yet.
+        Raises ConfigError for unreadable samples, and for settings other than `now`. If `now` is None, settings are not
+        compared.
         """
         if json_file is None or not json_file.is_file() or not samples_file(json_file).exists():
             return None
@@ -114,7 +115,7 @@ def head(kind: str, settings: Mapping[str, Any], **content: Any) -> dict[str, An
 def kept(
     kind: str, settings: Mapping[str, Any], samples: Mapping[Any, Sequence[np.ndarray]], **content: Any
 ) -> Kept | None:
-    """Return the data to store for samples, by `Name`, in the order of their seeds; None if there are none."""
+    """Return the data to store for samples, by `Name`, in the order of their seeds, or None if there are none."""
     import numpy as np  # the help of a command does not need it
 
     taken = {name: rows for name, rows in samples.items() if len(rows)}
@@ -123,7 +124,7 @@ def kept(
 
 
 def first_difference(there: Any, here: Any, place: str = "") -> str | None:
-    """Describe the first entry in which two nested mappings differ; None if they are equal."""
+    """Describe the first difference between two nested mappings, or return None if they are equal."""
     if isinstance(there, Mapping) and isinstance(here, Mapping):
         for key in dict.fromkeys([*there, *here]):
             inner = str(key) if place in ("", "config") else f"{place}.{key}"

@@ -1,7 +1,7 @@
 """Samples of the participants of a gradcheck, taken on demand until they suffice or the time is up.
 
 A session can continue from the samples of an earlier one, with the following seeds. An `Engine` can take samples in
-another process: a sample depends only on the participants, the steps of differences, and its seed.
+another process, because a sample depends only on the participants, the steps of differences, and its seed.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def take_sample(participants: Participants, kind: str, of: str, seed: int) -> np
 
 
 def steps_of(participants: Participants, keys: Iterable[str]) -> dict[str, list[Step]]:
-    """Return the steps of finite differences of parameters, by way, one for each direction."""
+    """Return the steps of finite differences of parameters, by way, with one step for each direction."""
     return {key: [(one.step, one.truncation) for one in participants.directions[key]] for key in keys}
 
 
@@ -78,12 +78,13 @@ MEMORY = 2**30
 class Sampling:
     """Samples by kind and name. `now` is the clock for the budget, which starts at the beginning.
 
-    The budget includes loading and compilation. Its rest is divided among the remaining samples; time that one leaves
-    goes to the others. Only running samples are waited for. A first sample, which includes compilation, is not started
-    if it would take longer than the rest, judged by earlier samples of its kind, or by those of other kinds.
+    The budget includes loading and compilation. Its rest is divided among the remaining samples, and unused time of one
+    name goes to the others. A sample that has started is always finished. The first sample of a name includes
+    compilation. It is not started if it would probably take longer than the rest, judged by earlier samples of its
+    kind, or by those of other kinds.
 
-    Samples of an `earlier` session count, and new seeds follow its seeds. The `engine` takes the samples of a name.
-    With a budget this process takes them, because the budget is its own time.
+    Samples of an `earlier` session count, and new seeds follow its seeds. If there is no budget, `engine` takes the
+    samples. With a budget, this process takes them, because the budget is its own time.
     """
 
     engine: Engine = staticmethod(serially)
@@ -116,13 +117,13 @@ class Sampling:
         self._to_do = list(self._expected)
 
     def kept(self, settings: dict[str, Any]) -> Kept | None:
-        """Return the state for a later session with the same `settings`; None if there are no samples."""
+        """Return the state for a later session with the same `settings`, or None if there are no samples."""
         return resume_store.kept(KIND, settings, self._samples, steps=steps_of(self.participants, self._chosen))
 
     def take(self, name: Name, stop: Callable[[], bool], say: Callable[[str], None]) -> bool:
-        """Take the samples of `name` unless this was done. Return whether there are enough for a comparison.
+        """Take the samples of `name` unless this was done. Returns whether there are enough for a comparison.
 
-        After `stop()`, ends with the samples taken so far.
+        After `stop()`, the method ends with the samples taken so far.
         """
         if name not in self._taken and not stop():
             self._taken.add(name)
@@ -131,7 +132,7 @@ class Sampling:
         return len(self._samples.get(name, [])) >= FEWEST
 
     def of(self, name: Name) -> np.ndarray:
-        """Return the samples: (N, P) of gradients and images, (N, directions) of differences and tangents."""
+        """Return the samples: (N, P) for gradients and images, (N, directions) for differences and tangents."""
         return np.stack(self._samples[name]).astype(np.float64)
 
     def _measure(self, name: Name, stop: Callable[[], bool], say: Callable[[str], None]) -> None:
@@ -168,8 +169,8 @@ class Sampling:
             say(f"{kind} {name[1]}: seeds {len(samples)}, {now - begin:.1f} s, of which the first {first_s:.1f} s")
 
     def needed_s(self) -> float | None:
-        """Return the estimated time for the minimum number of all samples, including those taken; None if none was
-        taken.
+        """Return the estimated time for the minimum number of all samples, including finished samples, or None if there
+        are none.
         """
         if not self._first_s:
             return None
@@ -184,11 +185,10 @@ class Sampling:
         return self._first_s.get(_kind(name), max(self._first_s.values(), default=0.0))
 
     def _ends(self, name: Name, now: float) -> list[tuple[float, float]]:
-        """Return the times until which samples of `name` are taken, each with the number of samples up to which it
-        applies.
+        """Return the times at which sampling of `name` ends, each with the number of samples for which it applies.
 
-        Samples that a comparison needs have all the time. The others leave time for the first samples of all remaining
-        names. Samples beyond the minimum have a share of the rest.
+        Samples that a comparison needs may take all the time. Later samples leave time for the first samples of all
+        remaining names. Samples beyond the minimum get a share of the rest.
         """
         kept = self._end - sum(self._expected_s(other) for other in self._to_do)
         own = self._share(name)
@@ -199,13 +199,13 @@ class Sampling:
         return LARGE_SHARE if self._is_cheap(name) else SMALL_SHARE
 
     def _is_cheap(self, name: Name) -> bool:
-        """Whether more than LEAST_SEEDS are taken: for estimators and stock references, which have the most noise."""
+        """Whether more than LEAST_SEEDS are taken. This applies to estimators and stock references, which have the most
+        noise.
+        """
         return name[0] == "image" or (name[0] == "gradient" and not name[1].startswith("walk_ad"))
 
     def _most(self, name: Name) -> int:
-        """Return the maximum number of seeds of `name`. With a budget, an earlier session does not reduce the
-        new ones.
-        """
+        """Return the maximum number of seeds of `name`. With a budget, seeds of an earlier session do not count."""
         if self.settings.seeds is not None:
             return self.settings.seeds
         return self._before.get(name, 0) + self._most_more(name)
@@ -225,6 +225,6 @@ class Sampling:
 
 
 def _kind(name: Name) -> tuple[str, bool]:
-    """Return the kind of samples that take equally long to compile, and whether it is naive AD."""
+    """Return the kind of samples with similar compile times, and whether it is naive AD."""
     kind, of = name
     return kind, kind == "gradient" and of.startswith(NAIVE)

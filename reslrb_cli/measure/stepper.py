@@ -43,8 +43,8 @@ def shrink(scene: Any, sensor: int, pixels: int) -> None:
 
 
 def scale(scene: Any, sensor: int, factor: float) -> None:
-    """Multiply width and height of a sensor's film, and of its crop window, by `factor`. The sensor is given by its
-    index.
+    """Multiply width and height of a sensor's film and of its crop window by `factor`. `sensor` is the index of the
+    sensor.
     """
     params = mi.traverse(scene.sensors()[sensor])
 
@@ -123,8 +123,8 @@ class Steps:
         return gradients, times
 
     def told(self, answer: dict[str, Any], cold: bool, release: bool) -> dict[str, Any]:
-        """Return the answer for a step. A `cold` step has the peak of Dr.Jit's arrays; `release` frees the allocator's
-        cache.
+        """Return the answer for a step. For a `cold` step it includes the peak of Dr.Jit's arrays. `release` frees the
+        allocator's cache.
         """
         if cold:
             answer["peak_mib"] = peak_mib(dr.backend_v(mi.Float))
@@ -137,9 +137,9 @@ class Steps:
 class Stepper(Steps):
     """The steps of `bench`.
 
-    `objective` is `fixed`, sum(G * I) with an image G known before the image I, or `l2`, the mean of (I - G)^2 with
-    `run.adjoint`. G is noise, since its content does not affect the time. `film_width` in pixels, and `texture_width`
-    in texels, replace the widths of the film and of all textures that are parameters.
+    `objective` is `fixed` or `l2`. `fixed` is sum(G * I) with an image G that is known before the image I. `l2` is the
+    mean of (I - G)^2 with `run.adjoint`. G is noise, because its content does not affect the time. `film_width` in
+    pixels and `texture_width` in texels replace the widths of the film and of all textures that are parameters.
     """
 
     def __init__(
@@ -160,8 +160,8 @@ class Stepper(Steps):
         self._given = image if objective == "fixed" else lambda seen: dr.mean(dr.square(whole_of(seen) - image).array)
 
     def step(self, round: int, cold: bool, release: bool) -> dict[str, Any]:
-        """Take one step and measure it, with memory if it is `cold`. Other steps are taken twice, and the second
-        counts.
+        """Take one step and measure it. A `cold` step is also measured for memory. Other steps are taken twice, and the
+        second counts.
 
         `release` frees the allocator's cache afterwards.
         """
@@ -186,7 +186,7 @@ class Stepper(Steps):
 
 
 def begin_steps(first: dict[str, Any]) -> Begun:
-    """Start the process. It first reports the size of film and textures; questions and answers are about steps."""
+    """Start the process. It first reports the size of film and textures. Each question then asks for a step."""
     config = told(first)
     stepper = Stepper(config, first["objective"], first.get("film_width"), first.get("texture_width"))
     size = {"width": stepper.size[0], "height": stepper.size[1], "texels": stepper.texels}

@@ -1,8 +1,8 @@
 """Images of a finished lens or mirror: where its light goes, and how errors of light, position, glass or tool change
 it.
 
-Each error is a rendering of a scene with the changed part, by a stock integrator of Mitsuba. If a rotation shifts the
-whole picture, the shift is reported, and removed before images are compared.
+For each error, a stock integrator of Mitsuba renders the scene with the changed part. If a rotation shifts the whole
+picture, the shift is reported, and removed before images are compared.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ _DIRECTIONS = [(0.0, 0.0), *((np.cos(a) * (7 / 12) ** 0.5, np.sin(a) * (7 / 12) 
 
 
 def closed_by_ball(heights: Array, pitch: Sequence[float], radius: float) -> Array:
-    """Return heights (ny, nx) as a ball-end cutter of this `radius` leaves them: their grey closing by the ball.
+    """Return heights (ny, nx) as a ball-end cutter of this `radius` leaves them, by their grey closing with the ball.
 
-    `pitch`: the distance of columns and of rows, in the unit of the heights.
+    `pitch` is the distance of columns and of rows, in the unit of the heights.
     """
     relief = float(np.ptp(heights))
     widest = radius if relief >= radius else (2 * radius * relief - relief**2) ** 0.5  # parts that can touch
@@ -53,8 +53,8 @@ def figures(image: Array, target: Array) -> dict[str, float]:
     """Compare luminances (H, W) within the picture: SSIM, L1 and contrast (standard deviation over mean).
 
     Also returns the target's `contrast`, and the share of the film's light that falls into the picture. The picture is
-    the bounding rectangle of the target's nonzero pixels. Both images are divided by their mean there. SSIM is from
-    scikit-image, with data_range the target's maximum.
+    the bounding rectangle of the target's nonzero pixels. Both images are divided by their mean there. SSIM is computed
+    by scikit-image, with the target's maximum as data_range.
     """
     from skimage.metrics import structural_similarity
 
@@ -79,13 +79,12 @@ def picture_within(target: Array) -> tuple[slice, slice]:
 def where_light_goes(
     scene: mi.Scene, sensor: mi.Sensor, plan: Fabrication, target: Array, seed: int = 0
 ) -> dict[str, float]:
-    """Return shares of the light that leaves the front face: `inside` the picture, `beside` it on the film, and
-    `beyond`.
+    """Return the shares of the front face's light that go `inside` the picture, `beside` it on the film, and `beyond`.
 
-    `beyond` is elsewhere on the receiver, or past it. The shares are of `RAYS` rays from the lamps, with Mitsuba's own
-    BSDF samples, including reflections in the glass. The picture consists of the nonzero pixels of the luminance
-    `target` (H, W). Light reflected back to the lamp, and light past the lens, do not count. All shares are 0 if no
-    light leaves the lens.
+    `beyond` is elsewhere on the receiver, or past it. The shares are those of `RAYS` rays from the lamps, with
+    Mitsuba's own BSDF samples and reflections in the glass. The picture consists of the nonzero pixels of the luminance
+    `target` (H, W). Light reflected back to the lamp, and light past the lens, do not count. If no light leaves the
+    lens, all shares are 0.
     """
     rows, columns = picture_within(target)
     shapes = {shape.id(): shape for shape in scene.shapes()}
@@ -139,7 +138,9 @@ def shift_between(image: Array, reference: Array) -> Array:
 
 
 class OpticalBench:
-    """A scene whose parts can be moved and restored. `params` are the scene's parameters."""
+    """Scene of a lens or mirror whose parts can be changed. `plan` describes it, and `params` are the scene's
+    parameters.
+    """
 
     def __init__(
         self, scene: mi.Scene, params: mi.SceneParameters, plan: Fabrication, integrator: mi.Integrator, sensor: int
@@ -188,7 +189,9 @@ class OpticalBench:
         return self.moved(ids, mi.ScalarTransform4f().rotate(list(axis), degrees))
 
     def farther(self, part: float) -> dict[str, Any]:
-        """Return receiver and camera, farther away by this share of the receiver's distance."""
+        """Return the parameters of receiver and camera, moved away by the fraction `part` of the receiver's
+        distance.
+        """
         key = f"{self.plan.receiver}.to_world"
         middle = np.ravel(self.params[key] @ mi.Point3f(0)).astype(float)
         way = mi.ScalarTransform4f().translate((part * middle).tolist())
@@ -231,7 +234,7 @@ class OpticalBench:
             return self.render(spp, seed)
 
     def sun(self, spp: int) -> Array:
-        """Render light with the angular diameter `plan.sun`: the mean over its directions."""
+        """Render light with the angular diameter `plan.sun` as the mean over several directions."""
         half, images = self.plan.sun / 2, []
         for i, (x, y) in enumerate(_DIRECTIONS):  # each has its own noise, so that it averages out
             angle = float(np.hypot(x, y))
@@ -250,11 +253,11 @@ def tolerances(
     original: Array | None = None,
     keep: Callable[[str, Array], None] = lambda name, image: None,
 ) -> dict[str, dict[str, Any]]:
-    """Return `figures` against the luminance `target` (H, W) for the `planned` scene and for each error, by name.
+    """Return the `figures` of the `planned` scene and of each error, by name, against the luminance `target` (H, W).
 
-    `shift` (columns, rows; pixels) is the shift of the whole picture due to a rotation, and is removed first. With an
-    `original` (H, W), the picture before its dark parts were lifted, `ssim_of_picture` is the SSIM with it. `keep`
-    receives the name and the luminance (H, W) of each image.
+    `shift` (columns, rows; pixels) is the shift of the whole picture due to a rotation, which is removed first.
+    `original` (H, W) is the picture before its dark parts were raised. If it is given, `ssim_of_picture` is the SSIM
+    with it. `keep` receives the name and the luminance (H, W) of each image.
     """
     plan, both = bench.plan, bench.solid_parts()
     found: dict[str, dict[str, Any]] = {}

@@ -1,7 +1,7 @@
 """Worker processes as seen from inside: measuring processes that `processes.py` starts and controls.
 
-A worker (`run`) reads one JSON object per line from standard input, and answers each with one on standard output. The
-first describes the case, and each further one asks for a step. Other output goes to standard error.
+A worker (`run`) reads one JSON object per line from standard input, and answers each with one line on standard output.
+The first object describes the case, and each later one asks for a step. Other output goes to standard error.
 """
 
 from __future__ import annotations
@@ -117,8 +117,8 @@ def _answer(answers: IO[str], message: dict[str, Any]) -> None:
 
 
 def run(load: Callable[[], Begin]) -> None:
-    """Answer questions until standard input ends, or until a failure, which the last answer describes; then end the
-    process.
+    """Answer questions until standard input ends or a failure occurs, then end the process. The last answer describes a
+    failure.
     """
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())

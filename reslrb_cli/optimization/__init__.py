@@ -1,1 +1,1 @@
-"""Losses, optimisers, constraints, schedules, and the loop that combines them; nothing here writes files."""
+"""Losses, optimisers, constraints, schedules, and the loop that combines them. Nothing in this package writes files."""

@@ -1,4 +1,4 @@
-"""From a configuration to its problem, loaded and checked, with targets and decisions, and to the coarser problem of a
+"""From a configuration to its problem, loaded and checked, with targets and decisions. Also the coarser problem of a
 stage.
 """
 
@@ -55,13 +55,12 @@ def assemble(
     to_run: bool = False,
     settled: Stored | None = None,
 ) -> Problem:
-    """Load and check the experiment of `config`, make the targets, and decide open settings; a variant must be set.
+    """Load and check the experiment of `config`, make the targets, and decide open settings. A variant must be set.
 
-    All checks happen before anything is rendered. `say` is called with lines about slow work, and `cache` has
-    measurements of earlier runs (None: nothing is stored). With `to_run`, everything for an optimisation is prepared:
-    exposures are checked, and the entries that light and sensor reach are known. With `settled`, nothing is measured
-    again: the result is the problem of a resumed run before its first iteration. Raises ConfigError and
-    UnsupportedScene.
+    All checks happen before anything is rendered. `say` is called with lines about slow work. `cache` has measurements
+    of earlier runs, or is None to store nothing. With `to_run`, everything for an optimisation is prepared: exposures
+    are checked, and the entries that light and sensor reach are known. With `settled`, nothing is measured again, and
+    the result is the problem of a resumed run before its first iteration. Raises ConfigError and UnsupportedScene.
     """
     if to_run:
         check_code(config)
@@ -90,7 +89,7 @@ def assemble(
 def load_for_rendering(
     config: Config, initial: bool, values: Mapping[str, Any] | None = None
 ) -> tuple[Any, list[int], Any, int | None]:
-    """Load the scene (with the parameters' initial values, if `initial`, or with `values`), and make the integrator.
+    """Load the scene and make the integrator. The parameters get `values`, or with `initial` their initial values.
 
     Returns the scene, the indices of the used sensors, the integrator, and its `samples_per_pass`.
     """
@@ -115,7 +114,7 @@ def check_passes(source: str, spp: int, multiple: int | None) -> None:
 
 
 def set_values(problem: Problem, values: Mapping[str, Any]) -> Problem:
-    """Return the problem before its first iteration, with `values` of some parameters: arrays of their shape.
+    """Return the problem before its first iteration. `values` are arrays for some of its parameters, with their shapes.
 
     Raises ConfigError, located by `values` and the key.
     """
@@ -141,8 +140,8 @@ def set_values(problem: Problem, values: Mapping[str, Any]) -> Problem:
 def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array] | None = None) -> Problem:
     """Load and check the experiment of `config` without its targets.
 
-    `scene` replaces `scene.file`, and `values` replace the initial values of the parameters. Raises ValueError if
-    `values` are not one finite array of the right shape for each parameter.
+    `scene` replaces `scene.file`, and `values` replace the initial values of the parameters. Raises ValueError unless
+    `values` has one finite array of the right shape for each parameter.
     """
     check_announced(config)
     scene = load_configured(config, functools.partial(check_described, config)) if scene is None else scene
@@ -186,7 +185,7 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
 
 
 def _check_plates(problem: Problem) -> None:
-    """Raise ConfigError if two free faces start nearer to each other than their minimum distance."""
+    """Raise ConfigError if two free faces start closer to each other than their minimum distance."""
     for key, plate in problem.plates.items():
         thin = float(plate.thickness(*(problem.selection.array(each).astype(np.float64) for each in (key, plate.other)))
                      .min())  # fmt: skip
@@ -217,8 +216,8 @@ def _check_values(selection: Selection, values: Mapping[str, Array]) -> None:
 def at_stage(problem: Problem, number: int, values: Mapping[str, Array] | None = None) -> Problem:
     """Return the problem of a stage with its own resolution or film: another scene with coarser maps and targets.
 
-    It samples like `problem`, but what was learned is cleared. `values` are those of its parameters, in its resolution;
-    None: the current values of `problem`, resampled. Raises ValueError for wrong shapes.
+    It samples like `problem`, but without learned state. `values` are those of its parameters, in its resolution. For
+    None, the current values of `problem` are resampled. Raises ValueError for wrong shapes.
     """
     config, film = problem.config.without_stages(), _film_at(problem, number)
     scene = config.scene if film is None else config.scene.model_copy(update={"size": film})
@@ -248,7 +247,9 @@ def at_stage(problem: Problem, number: int, values: Mapping[str, Array] | None =
 
 
 def _film_at(problem: Problem, number: int) -> tuple[int, int] | None:
-    """Return the (width, height) of all films in a stage; None if it uses those of the scene. Raises ConfigError."""
+    """Return the (width, height) of all films in a stage, or None if it uses the films of the scene. Raises
+    ConfigError.
+    """
     config, share, key = problem.config, problem.config.stage(number).film, f"run.stages[{number}].film"
     if share == 1:
         return None
@@ -270,9 +271,9 @@ def _film_at(problem: Problem, number: int) -> tuple[int, int] | None:
 
 
 def _specs_at(problem: Problem, number: int) -> list[ParameterSpec]:
-    """Return the parameters of a stage, with globs replaced by the keys that they select.
+    """Return the parameters of a stage, with globs replaced by the selected keys.
 
-    Raises ConfigError if the stage should make some parameters coarser, and there are none.
+    Raises ConfigError if the stage should make parameters coarser, but no parameter can be.
     """
     config, selection, share = problem.config, problem.selection, problem.config.stage(number).resolution
     specs: list[ParameterSpec] = []
@@ -303,7 +304,7 @@ def _specs_at(problem: Problem, number: int) -> list[ParameterSpec]:
 
 
 def _is_grid(problem: Problem, key: str, spec: ParameterSpec) -> bool:
-    """Whether a heightmap's mesh is a flat grid with a vertex at each of its texels, so that both can be coarser."""
+    """Whether a heightmap's mesh is a flat grid with a vertex at each texel, so that both can be coarser."""
     assert spec.heightmap is not None
     height, width = problem.selection.array(key).shape[:2]
     points, uv = problem.selection.deformation.laid_over(key)
@@ -319,10 +320,10 @@ def _is_grid(problem: Problem, key: str, spec: ParameterSpec) -> bool:
 
 
 def resized(problem: Problem, key: str, value: Array) -> Array:
-    """Return another problem's value of a parameter, or a change of it, in the resolution of `problem`.
+    """Return a value of a parameter from another problem, or a change of it, in the resolution of `problem`.
 
-    Heights are resampled by cubic splines at their places in space, from edge to edge of a grid with a vertex for each
-    height. Textures are resampled bilinearly, and smoothed first if they shrink.
+    Heights are resampled by cubic splines at their positions in space. They cover a grid from edge to edge, with a
+    vertex for each height. Textures are resampled bilinearly, and smoothed first if they shrink.
     """
     shape, selection = problem.selection.array(key).shape, problem.selection
     if value.shape == shape:
@@ -351,7 +352,7 @@ def _places(new: int, old: int, edge_to_edge: bool) -> Array:
 
 
 def _see_coarsely(view: View, whole: View, film: mi.Film) -> None:
-    """Give a view of a smaller film the target of the full film: weighted means over pixels."""
+    """Give a view with a smaller film the target of the full film, by weighted means over pixels."""
     target, weights = np.array(whole.target, dtype=np.float64), whole.fixed
     if weights is None:
         weights = np.ones(target.shape[:2]) if whole.weights is None else np.array(whole.weights)[:, :, 0]

@@ -13,8 +13,10 @@ from reslrb_cli.records.decisions import Jsonable
 
 @dataclass(frozen=True)
 class Estimate:
-    """Expected bytes of a step: data before the step and targets (`fixed`), images and parameters (`images`),
-    thread-local memory (`scratch`), and stored data of the paths of one pass (`paths`).
+    """Expected bytes of a step, in four parts.
+
+    `fixed` is data before the step and targets, `images` is images and parameters, `scratch` is thread-local memory,
+    and `paths` is the stored data of the paths of one pass.
     """
 
     fixed: int
@@ -30,7 +32,7 @@ class Estimate:
 
 @dataclass
 class MemoryPlan(Jsonable):
-    """Memory budget: samples per pass, expected bytes, and, after the first iterations, the peak."""
+    """Memory budget with the samples per pass, the expected bytes and, after the first iterations, the peak."""
 
     budget_bytes: int
     samples_per_pass: int
@@ -40,7 +42,7 @@ class MemoryPlan(Jsonable):
     exceeded: bool = False
 
     def check(self, peak: float) -> str | None:
-        """Record the allocator's peak in MiB; return a warning the first time that it exceeds the budget."""
+        """Record the allocator's peak in MiB. Returns a warning the first time that it exceeds the budget."""
         self.peak_mib = peak
         used, before = peak * MIB + self.expected_bytes.scratch, self.exceeded
         self.exceeded = used > self.budget_bytes
@@ -56,10 +58,11 @@ Need = tuple[float, float]
 
 @dataclass
 class Allowance:
-    """Seconds that all measurements before the first iteration may take: a share of `run_s`, the time of the run.
+    """Seconds that all measurements before the first iteration may take, a share of the run's time `run_s`.
 
-    The run consists of the compilation of kernels (`compile_s`, for one step) and iterations of `iteration_s`, from two
-    first steps of few samples. The run would take these steps as well, so they do not count as `spent_s`.
+    The run consists of the compilation of kernels (`compile_s`, for one step) and iterations of `iteration_s`. Two
+    first steps with few samples give these times. The run would take these steps as well, so they do not count as
+    `spent_s`.
     """
 
     share: float
@@ -77,7 +80,7 @@ class Allowance:
         return max(self.share * self.run_s - self.spent_s - self.aside_s - running, 0.0)
 
     def affords(self, *needs: Need) -> bool:
-        """Whether there is time for all of these."""
+        """Whether there is time for all of these measurements."""
         return self._seconds(needs) <= self.left_s
 
     def _seconds(self, needs: Sequence[Need]) -> float:
@@ -85,18 +88,18 @@ class Allowance:
 
     @contextmanager
     def spending(self, later: Sequence[Need]) -> Iterator[None]:
-        """Count the block's time as spent, and reserve time for `later` measurements until the block ends."""
+        """Count the block's time as spent. Time for `later` measurements is reserved until the block ends."""
         self.aside_s, self.since_s = self._seconds(later), time.perf_counter()
         yield
         self.spent_s += time.perf_counter() - self.since_s
         self.aside_s, self.since_s = 0.0, None
 
     def iterations_left(self, kernels: float) -> float:
-        """Return the remaining time in iterations, after the kernels of this number of steps are compiled."""
+        """Return the remaining time in iterations, after compiling the kernels of this number of steps."""
         return max(self.left_s - kernels * self.compile_s, 0.0) / max(self.iteration_s, 1e-9)
 
     def note(self) -> str:
-        """Return a note for measurements without time."""
+        """Return a note for options that there is no time to measure."""
         return f"not measured (over {100 * self.share:.3g} % of this run)"
 
     def line(self) -> str:
@@ -107,10 +110,10 @@ class Allowance:
 
 @dataclass(frozen=True)
 class Sensitivity(Jsonable):
-    """Measured sensitivity of a parameter of `entries` numbers, in the scene's units.
+    """Measured sensitivity of a parameter with `entries` numbers, in the scene's units.
 
-    `value`, `gradient` and `noise` are root mean squares over the entries: of the values, of the gradient (0 if it
-    cannot be distinguished from noise), and of the standard deviation of one step's gradient. `change` is relative, per
+    `value`, `gradient` and `noise` are root mean squares over the entries. `gradient` is 0 if it cannot be
+    distinguished from noise, and `noise` is the standard deviation of one step's gradient. `change` is relative, per
     unit. `change`, `curvature` (loss per unit²) and `length` are None if the image did not change.
     """
 
@@ -128,7 +131,7 @@ class Sensitivity(Jsonable):
 class Scaled(Sensitivity):
     """Sensitivity of a parameter, and the resulting scale.
 
-    `own_length` is `length` in the optimiser's variable, and `first_step` is the initial movement of the value by one
+    `own_length` is `length` in the optimiser's variable. `first_step` is the initial movement of the value by one
     learning rate, in the scene's units. Both are None if the parameter was not scaled.
     """
 

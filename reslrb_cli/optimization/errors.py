@@ -48,10 +48,10 @@ def quantity(params: Any, key: str) -> str:
 class ErrorMeter:
     """Errors of parameters relative to true values, over the entries that light and sensor reach.
 
-    `truth` and `masks` are those of a `Problem`, and `quantities` those of the parameters (`quantity`). If the
-    resolutions of a texture and its true value differ, both are resampled bilinearly to the finer grid, and a cell
-    counts if the texel of the parameter at its centre counts. The error of a coarse texture therefore includes detail
-    that it cannot show, and that of a fine one includes its noise.
+    `truth` and `masks` are those of a `Problem`, and `quantities` those of the parameters (`quantity`). If a texture
+    and its true value have different resolutions, both are resampled bilinearly to the finer grid. A cell counts if the
+    texel of the parameter at its centre counts. The error of a coarse texture therefore includes detail that the
+    texture cannot show. The error of a fine texture includes its noise.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class ErrorMeter:
         self.one_unit = len({(quantities or {}).get(key, "") for key in self._truth}) <= 1
 
     def errors(self, value: Callable[[str], Array]) -> dict[str, float]:
-        """Return the root mean square error of each parameter with a true value; `value` returns a current value."""
+        """Return the root mean square error of each parameter with a true value. `value` returns a current value."""
         found = {}
         for key, true in self._truth.items():
             mask, array = self._masks[key], value(key)
@@ -80,7 +80,7 @@ class ErrorMeter:
         return found
 
     def total(self, errors: Mapping[str, float]) -> float | None:
-        """Return the root mean square error over the entries of all parameters; None if units differ, or nothing is
+        """Return the root mean square error over the entries of all parameters, or None if units differ or nothing is
         known.
 
         `errors` is the result of the method `errors`.
@@ -96,8 +96,8 @@ class ErrorMeter:
 
 
 def comparison_grid(shape: tuple[int, ...], true_shape: tuple[int, ...]) -> tuple[int, int] | None:
-    """Return the (height, width) for comparing a texture with its true value; None if the shapes are equal or not
-    textures.
+    """Return the (height, width) for comparing a texture with its true value. Returns None for equal shapes, and for
+    other parameters.
     """
     if len(true_shape) != 3 or shape[:2] == true_shape[:2]:
         return None
@@ -105,7 +105,7 @@ def comparison_grid(shape: tuple[int, ...], true_shape: tuple[int, ...]) -> tupl
 
 
 def on_grid(array: Array, grid: tuple[int, ...] | None) -> Array:
-    """Return a texture resampled bilinearly to `grid`, (height, width); unchanged if `grid` is None."""
+    """Return a texture resampled bilinearly to `grid`, (height, width), or unchanged if `grid` is None."""
     return array if grid is None or array.shape[:2] == grid else resample(array, (grid[1], grid[0]))
 
 

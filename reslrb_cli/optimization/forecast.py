@@ -1,8 +1,8 @@
-"""Forecast of the memory and time of a run, measured with a few of its steps, with a target of few samples.
+"""Forecast of the memory and time of a run. It is measured with a few of the run's steps, and a target of few samples.
 
-If a step takes long, steps with fewer samples per pixel are used: time and memory are a constant plus a part
-proportional to the samples, which two sizes determine. Memory is allocated in powers of two, which such a line misses,
-so two full steps measure the memory if they do not take long.
+If a step takes long, two sizes of steps with fewer samples per pixel are measured instead. Time and memory are a
+constant plus a part proportional to the samples, so two sizes determine them. Memory is allocated in powers of two, so
+this line is not exact. If full steps do not take long, two of them measure the memory.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ WARM_UP, LEAST, MOST, SECONDS = 5, 4, 40, 5.0
 class Steps:
     """Steps of `spp` samples per pixel, one per iteration.
 
-    `iteration_s` is the time of one, `start_s` the additional time of the first ones with cached kernels, and there is
-    the current time for compiling. The peak is in bytes, as `peak_mib` in `metrics.jsonl`.
+    `iteration_s` is the time of one step. `start_s` is the additional time of the first steps with cached kernels, and
+    `compile_s` is the current time for compiling. The peak is in bytes, as `peak_mib` in `metrics.jsonl`.
     """
 
     spp: int
@@ -60,7 +60,7 @@ class Steps:
 
 
 def measure_steps(problem: Problem) -> Steps:
-    """Measure the steps of the run; for a run with stages, return the mean over its iterations, and the sum of all
+    """Measure the steps of the run. For a run with stages, return the mean over its iterations, and the sum of all
     starts.
     """
     config, stages = problem.config, Stages(problem)
@@ -95,16 +95,14 @@ def _measure_stage(problem: Problem) -> Steps:
 
 
 def _peak(problem: Problem, spp: int) -> int:
-    """Return the peak bytes of two iterations of `spp` samples per pixel; the second one is recorded."""
+    """Return the peak bytes of two iterations of `spp` samples per pixel. The second iteration is recorded."""
     with trial(problem, spp) as tried:
         return _highest(problem, list(islice(optimize(tried), 2)))
 
 
 @contextmanager
 def trial(problem: Problem, spp: int) -> Iterator[Problem]:
-    """Provide the problem before its first iteration with `spp` samples per pixel; afterwards, the scene is as
-    before.
-    """
+    """Provide the problem before its first iteration, with `spp` samples per pixel. Restores the scene afterwards."""
     run = problem.config.run
     enough = {"spp": spp, "iterations": max(run.iterations, WARM_UP + MOST), "stages": [], "max_seconds": None}
     config = problem.config.model_copy(update={"run": run.model_copy(update=enough)})
@@ -115,7 +113,7 @@ def trial(problem: Problem, spp: int) -> Iterator[Problem]:
 
 
 def _highest(problem: Problem, records: Sequence[Record]) -> int:
-    """Return the peak in bytes, without kernels that occur only as values change, for example to 0."""
+    """Return the peak in bytes. Kernels that run only when values change, for example to 0, do not count."""
     return int(records[: problem.config.run.iterations][-1].peak_mib * MIB)
 
 
@@ -147,7 +145,8 @@ def _measure(problem: Problem, spp: int) -> Steps:
 def _with_learning(times: Sequence[float], learned: Sequence[int], mean: float) -> float:
     """Return the seconds of an iteration in which tables learn `mean` times.
 
-    `times` are those of early iterations, in which tables learned as often as `learned` says, more often than later.
+    `times` are those of early iterations, and `learned` tells how often tables learned in them. This is more often than
+    later.
     """
     plain = [seconds for seconds, count in zip(times, learned, strict=True) if count == 0]
     if not plain or sum(learned) == 0:
@@ -164,9 +163,9 @@ VERDICTS = 30
 class Forecast(Steps):
     """Measured steps, and the resulting forecast of the run.
 
-    It has bytes by part (`parts`, which sum to `peak`), thread-local memory `scratch`, `free` memory, and seconds
-    before and after its iterations. `kept` says whether a run finds the decisions in the cache, which took
-    `measuring_s` now.
+    `parts` has bytes by part, which sum to `peak`. `scratch` is thread-local memory, and `free` the free memory. The
+    other fields are seconds before and after the iterations. `kept` tells whether a run finds the decisions in the
+    cache. They took `measuring_s` now.
     """
 
     parts: dict[str, int]
@@ -198,11 +197,10 @@ def make_forecast(
     cache: PilotCache | None = None,
     before: Callable[[Problem], object] = lambda problem: None,
 ) -> Forecast:
-    """Measure a few steps of the run of `config`; a variant must be set.
+    """Measure a few steps of the run of `config`. A variant must be set.
 
-    `say` is called with lines about slow work. Decisions are stored in `cache`, for the run. `before` is called with
-    the problem before its first iteration, for measurements that no cache stores. Raises ConfigError and
-    UnsupportedScene as the run would, and the errors of its steps.
+    `say` is called with lines about slow work. Decisions are stored in `cache` for the run. `before` is called with the
+    problem before its first iteration, for measurements that no cache stores. Raises the same errors as the run.
     """
     # Errors are not part of a step.
     problem = replace(assemble(with_short_target(config), say, cache), truth={})
@@ -241,7 +239,7 @@ def make_forecast(
 
 
 def with_short_target(config: Config) -> Config:
-    """Return the experiment with a target of at most four steps' samples."""
+    """Return the experiment with a target that has at most the samples of four steps."""
     render = config.target.render
     if render is None:
         return config
@@ -252,7 +250,7 @@ def with_short_target(config: Config) -> Config:
 
 
 def _image_seconds(problem: Problem) -> float:
-    """Return the seconds per sample per pixel of a saved image, of the first view."""
+    """Return the seconds per sample per pixel of a saved image, for the first view."""
     view, spp = problem.views[0], saved_spp(problem, between=True)
     problem.render(view.sensor, spp, 0, "forecast")  # compiles, and records small calls: several times as long
     begin = time.perf_counter()
@@ -261,7 +259,7 @@ def _image_seconds(problem: Problem) -> float:
 
 
 def _parts(problem: Problem) -> dict[str, int]:
-    """Return the bytes beside a step: accessible values of the scene, targets, the optimiser's state."""
+    """Return the bytes outside of a step: accessible values of the scene, targets, and the optimiser's state."""
     geometry = values = 0
     params = problem.selection.params
     for key in params.properties:

@@ -3,14 +3,13 @@
 There are two checks: which entries of a parameter affect the images (`find_reached`), and whether the images
 distinguish exposures from parameters (`check_exposures`).
 
-For the second, let D_k be the change of all views' images, with exposure and without masked pixels, with the logarithm
-of parameter k, all its entries together: (J((1 + h) x_k) - J(x_k)) / h, at common random numbers. For an exposure, it
-is the images of its views themselves. If all emission is unknown, for example, the sum over the lamps equals the
-exposure's. In general, there are combinations without effect if the matrix of cosines
+For the second check, D_k is the change of all views' images with the logarithm of parameter k. All entries of the
+parameter change together: (J((1 + h) x_k) - J(x_k)) / h, at common random numbers. Images have their exposure, without
+masked pixels. For an exposure, D_k consists of the images of its views. For example, if all emission is unknown, the
+sum over the lamps equals the D_k of the exposure. In general, there are combinations without effect if the matrix of
+cosines has an eigenvalue near 0. Its eigenvector gives the values in the combination.
 
     G_kl = <D_k, D_l> / (|D_k| |D_l|)
-
-has an eigenvalue near 0; its eigenvector gives the values in the combination.
 """
 
 from __future__ import annotations
@@ -52,9 +51,9 @@ PART = 0.1
 def find_reached(problem: Problem) -> Problem:
     """Return the problem with its `masks`, for parameters with known true values.
 
-    An entry counts as reached if light reaches it (the gradient of the image's sum with respect to it, over `REACH_SPP`
-    samples per pixel, is not 0 in some channel) and, for a texel, if some sensor also sees its centre. A texel that
-    only illuminates others is determined by interreflection alone.
+    An entry counts as reached if light reaches it: the gradient of the image's sum with respect to it, over `REACH_SPP`
+    samples per pixel, is not 0 in some channel. For a texel, some sensor must also see its centre. A texel that only
+    illuminates others is determined by interreflection alone.
     """
     if not problem.truth:
         return problem
@@ -71,8 +70,8 @@ def find_reached(problem: Problem) -> Problem:
 
 
 def shown_texels(problem: Problem, key: str) -> Array | None:
-    """Return the texels (H, W) of a texture that some training view shows in unmasked pixels; None for other
-    parameters.
+    """Return the texels (H, W) of a texture that training views show in unmasked pixels. For other parameters, return
+    None.
     """
     if key not in problem.selection.params or problem.selection.array(key).ndim != 3:
         return None
@@ -81,7 +80,7 @@ def shown_texels(problem: Problem, key: str) -> Array | None:
 
 
 def _visible(problem: Problem, key: str, pixels: Sequence[Array | None] = ()) -> Array:
-    """Return the texels that training views show, in these pixels, or in any."""
+    """Return the texels that training views show in these pixels, or in any pixel."""
     sensors = [problem.scene.sensors()[view.sensor] for view in problem.trained]
     seen, halo = (
         visible_texels(problem.scene, sensors, key, pixels, problem.paths != "light"),
@@ -91,7 +90,7 @@ def _visible(problem: Problem, key: str, pixels: Sequence[Array | None] = ()) ->
 
 
 def sensitivity(problem: Problem) -> dict[str, Array]:
-    """Return for each parameter which of its entries affect the mean image: booleans of the parameter's shape."""
+    """Return for each parameter which of its entries affect the mean image, as booleans with the parameter's shape."""
     run, integrator, multiple = problem.config.run, unrecorded(problem.integrator), samples_per_pass(problem.config)
     # A recording takes as long as some passes, and there is usually only one.
     paths_per_pass = MOST_PATHS if isinstance(integrator, LightTracer) else PATHS_PER_PASS
@@ -113,10 +112,10 @@ def sensitivity(problem: Problem) -> dict[str, Array]:
 
 
 def check_exposures(problem: Problem) -> None:
-    """Raise ConfigError if the images cannot distinguish an exposure from parameters, with their names.
+    """Raise ConfigError if the images cannot distinguish an exposure from parameters. The message names them.
 
-    Takes one image of each view for every parameter; nothing if no exposure is recovered. The problem must have its
-    targets, and is not changed.
+    Takes one image of each view for every parameter. If no exposure is recovered, does nothing. The problem must have
+    its targets, and is not changed.
     """
     found = find_ambiguous(problem) if problem.selection.factors else None
     if found is None:
@@ -162,6 +161,6 @@ def find_ambiguous(problem: Problem) -> tuple[list[str], list[str]] | None:
 
 
 def _row(problem: Problem) -> Array:
-    """Return the images of all views in a row, each multiplied by the root of its share of the loss."""
+    """Return the images of all views as a flat array, each multiplied by the root of its share of the loss."""
     pairs = zip(problem.trained, see_images(problem), strict=True)
     return np.concatenate([np.sqrt(view.share) * image.ravel() for view, image in pairs])

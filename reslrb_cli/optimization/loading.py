@@ -1,4 +1,4 @@
-"""Loading and checking of scene, sensors and integrator of an experiment; images of many samples, in passes.
+"""Loading and checking of scene, sensors and integrator of an experiment. Also images of many samples, in passes.
 
 A pass is small enough to fit into memory.
 """
@@ -44,9 +44,10 @@ BETWEEN_SPP = 64
 
 
 def passes(spp: int, pixels: int, multiple: int | None, paths_per_pass: int = PATHS_PER_PASS) -> Iterator[int]:
-    """Yield the samples per pixel of each pass; they sum to `spp`.
+    """Yield the samples per pixel of each pass. They sum to `spp`.
 
-    `multiple` is the integrator's `samples_per_pass`, which divides `spp` and the samples of every pass (None: any).
+    `multiple` is the integrator's `samples_per_pass`. It divides `spp` and the samples of every pass. None sets no such
+    limit.
     """
     unit = multiple or 1
     most = max(paths_per_pass // (pixels * unit), 1) * unit
@@ -65,10 +66,10 @@ def render_in_passes(
     purpose: str,
     multiple: int | None,
 ) -> np.ndarray[Any, Any]:
-    """Render `sensor` with `spp` samples per pixel; return the image, (H, W, C) float32.
+    """Render `sensor` with `spp` samples per pixel and return the image, (H, W, C) float32.
 
-    Each pass has its own seed, from `run_seed`, `iteration`, `sensor`, `purpose` and the number of the pass. The mean
-    is computed in double precision.
+    Each pass has its own seed, which depends on `run_seed`, `iteration`, `sensor`, `purpose` and the number of the
+    pass. The mean is computed in double precision.
     """
     width, height = scene.sensors()[sensor].film().crop_size()
     pixels = int(width) * int(height)
@@ -94,7 +95,7 @@ def load_configured(
     selects: bool = True,
     warn: bool = True,
 ) -> mi.Scene:
-    """Load the scene of `config`; `look` is called with its description before it is built. Raises ConfigError.
+    """Load the scene of `config`. `look` is called with its description before it is built. Raises ConfigError.
 
     With `selects`, textures of 8 or 16 bits that the parameters select are read as floating point. With `warn`,
     doubtful parts of the scene cause warnings.
@@ -115,7 +116,7 @@ def load_configured(
 
 
 def selected_keys(config: Config) -> list[str]:
-    """Return the keys and globs of parameters that `config` recovers, or gives true values."""
+    """Return the keys and globs of parameters that `config` recovers, or whose true values it gives."""
     render = config.target.render
     return [*(key for spec in config.parameters for key in spec.keys), *(render.parameters if render else ())]
 
@@ -136,16 +137,17 @@ def choose_sensors(config: Config, scene: mi.Scene) -> list[int]:
 def are_upright(config: Config) -> bool:
     """Whether images of views are rotated by their EXIF orientation.
 
-    Cameras of a file refer to pixels as they are stored: COLMAP ignores orientations on purpose, because all images of
+    Cameras of a file refer to pixels as they are stored. COLMAP ignores orientations on purpose, because all images of
     one camera must have one projection.
     """
     return config.scene.cameras is None
 
 
 def paths_of(integrator: Integrator, scene: mi.Scene, sensors: list[int], moves: bool = False) -> str:
-    """Return which paths render the images of `integrator`: `light`, `camera`, or `both`; `light` if `moves`.
+    """Return which paths render the images of `integrator`: `light`, `camera`, or `both`. If anything `moves`, it is
+    `light`.
 
-    If this is left to measurement, it is `both`, or the only kind that can render the scene.
+    If measurement decides this, the result is `both`, or the only kind that can render the scene.
     """
     if isinstance(integrator, Own):
         return integrator.paths
@@ -207,8 +209,8 @@ def make_configured(config: Config, integrator: Integrator, paths: str) -> StepI
 
 
 def pass_spp(config: Config) -> int:
-    """Return the samples per pixel of each pass of a step's gradient; the maximum if `run.memory_budget` chooses
-    passes.
+    """Return the samples per pixel of each pass of a step's gradient. If `run.memory_budget` chooses passes, return the
+    maximum.
     """
     call = config.set_spp
     return min(samples_per_pass(config) or call, call)

@@ -1,6 +1,6 @@
 """The optimisation loop, which yields records and opens no file, and its learning-rate schedules.
 
-A schedule is the factor of iteration i of n, from 1 at the first to `final_fraction` at the last.
+A schedule gives the factor of iteration i of n, from 1 at the first iteration to `final_fraction` at the last.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ SCHEDULES: dict[str, Callable[[float, float], float]] = {
 def learning_rate_factor(
     schedule: str, iteration: int, iterations: int, final_fraction: float, least: float = 0.0
 ) -> float:
-    """Return the factor of `iteration` (0-based) of `iterations`. Raises KeyError for an unknown schedule.
+    """Return the factor on the learning rate in `iteration` (0-based) of `iterations`. Raises KeyError for an unknown
+    schedule.
 
     `least` (0 to 1) is the minimum progress of a run that ends before its last iteration.
     """
@@ -66,14 +67,16 @@ Told = Callable[[Findings], None]
 
 
 def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None) -> tuple[State, Record]:
-    """Make the iteration after `state`; return the new state and the record.
+    """Make the iteration after `state` and return the new state and the record.
 
-    It consists of a step (image, loss and gradient of every sensor; the loss is the mean over the sensors) and an
-    update. Equal states lead to equal states: a problem with other values is first set to `state`, and has the values
-    of the returned state afterwards. Values that are not finite reach no parameter; `nonfinite` describes the reaction,
-    and when a run ends (`State.end`). `on_nonfinite` is called before the update, while the scene is unchanged.
-    `optimizer.scale: auto` measures before the first iteration, and `elapsed_s` includes this time. The schedule
-    follows the iterations or the time (`run.max_seconds`), whichever is further.
+    An iteration consists of a step and an update. The step computes image, loss and gradient of every sensor, and the
+    loss is the mean over the sensors. Equal states lead to equal states. If the problem has other values than `state`,
+    it is first set to `state`. Afterwards it has the values of the returned state.
+
+    Values that are not finite reach no parameter. `nonfinite` describes the reaction, and when a run ends
+    (`State.end`). `on_nonfinite` is called before the update, while the scene is unchanged. `optimizer.scale: auto`
+    measures before the first iteration, and `elapsed_s` includes this time. The schedule follows the iterations or the
+    time (`run.max_seconds`), whichever is further.
     """
     config, optimizer, iteration = problem.config, problem.optimizer, state.iteration
     if optimizer.stands_at is not state:
@@ -153,8 +156,8 @@ def iterate(
 ) -> Iterator[tuple[State, Record]]:
     """Make the iterations from `state` to the last of the run, each by `step` with the problem of its stage.
 
-    `watch` has seen the iterations before, and says which is the last; None without such a test. Raises NonFinite if
-    the run fails.
+    `watch` has seen the earlier iterations, and decides which iteration is the last. It is None without such a test.
+    Raises NonFinite if the run fails.
     """
     reset_peak()
     watch = Watch(stages.whole.config) if watch is None else watch
@@ -168,7 +171,7 @@ def iterate(
 
 
 def optimize(problem: Problem, on_nonfinite: Told = lambda found: None) -> Iterator[Record]:
-    """Yield the records of all iterations of `problem` from its current values; parameters are updated before each
+    """Yield the records of all iterations of `problem` from its current values. Parameters are updated before each
     record.
     """
     stages = Stages(problem)
@@ -180,7 +183,7 @@ def optimize(problem: Problem, on_nonfinite: Told = lambda found: None) -> Itera
 def _findings(
     problem: Problem, iteration: int, loss: float, counts: dict[str, Any], refused: list[tuple[int, Refused]]
 ) -> Findings:
-    """Return the values of a step that were not finite; `refused` are the counts by sensor."""
+    """Return the values of a step that were not finite. `refused` are the counts by sensor."""
     found = Findings(iteration, loss=not math.isfinite(loss), own=own_losses(problem.config))
     found.gradients = {key: int(count[0]) for key, count in counts.items() if count[0]}
     found.lost = [key for key, bad in found.gradients.items() if bad == dr.prod(dr.shape(problem.optimizer[key]))]
@@ -220,11 +223,11 @@ class Split:
 def gradient(
     problem: Problem, iteration: int, split: Split
 ) -> tuple[Any, dict[str, Any], dict[str, Any], list[tuple[int, Refused]], dict[str, dict[str, float]] | None]:
-    """Accumulate the gradient of the loss into the parameters.
+    """Accumulate the gradient of the loss into the parameters. `split` is called for each part of a view.
 
-    `split` is called for each part of a view. Returns width-1 arrays: the loss, for each parameter the sum of squares
-    of the gradient's finite entries and the number of other entries, the refused entries by sensor, and the costs of
-    regularizers by key and type (None without any).
+    Returns arrays of width 1: the loss, two numbers for each parameter, the refused entries by sensor, and the costs of
+    regularizers by key and type (None without any). The two numbers are the sum of squares of the gradient's finite
+    entries, and the number of other entries.
     """
     config = problem.config
     total: Any = 0.0

@@ -1,8 +1,8 @@
 """Losses between an image and its target, by functions that Dr.Jit differentiates.
 
-Each takes the image I, (H, W, C), attached to the AD graph, and the target T of the same shape, both in linear
-radiance, and the weights of that shape with a mean of 1 (None: all equal). It returns a width-1 array: a mean over
-pixels and channels, so that it depends neither on the resolution nor on the number of masked pixels.
+Each takes the image I (H, W, C), attached to the AD graph, and the target T of the same shape, both in linear radiance.
+Optional weights have the same shape and a mean of 1. A loss is an array of width 1. It is a mean over pixels and
+channels, so it depends neither on the resolution nor on the number of masked pixels.
 
 `weighted` and `fitted` modify losses: a weighted sum, and the loss of the image multiplied by the best factor.
 """
@@ -39,10 +39,10 @@ def l2(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = No
 def relative_l2(
     image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /, epsilon: float = 1e-2
 ) -> mi.Float:
-    """Return mean (I - T)² / (T² + ε), ε in squared units of radiance.
+    """Return mean (I - T)² / (T² + ε), with ε in squared units of radiance.
 
-    The denominator uses the target, a constant, so the gradient is that of the loss itself. With the (detached) noisy
-    image in its place, the noise of a pixel would be in numerator and denominator at once.
+    The denominator uses the target, a constant, so the gradient is that of the loss itself. If it used the (detached)
+    noisy image, the noise of a pixel would be in numerator and denominator at once.
     """
     return _mean(dr.square(image - target) / (dr.square(target) + epsilon), weights)
 
@@ -56,11 +56,11 @@ def ssim(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = 
 
         SSIM = (2 μ_I μ_T + C_1) (2 σ_IT + C_2) / ((μ_I² + μ_T² + C_1) (σ_I² + σ_T² + C_2)),  C_k = (K_k L)²
 
-    per channel and window, a Gaussian with a standard deviation of 1.5 pixels, 11 pixels wide; the variances are those
-    of the window itself. It equals scikit-image's with `gaussian_weights=True, use_sample_covariance=False`: the mean
-    is over the windows that lie within the image. Each has the weight of its central pixel; a masked pixel must be the
-    same in both images, which `View.judge` ensures. L is the largest value of the target. Raises ValueError for smaller
-    images.
+    SSIM is computed for each channel and window. A window is a Gaussian with a standard deviation of 1.5 pixels, 11
+    pixels wide, and the variances are those of the window itself. The result equals scikit-image's with
+    `gaussian_weights=True, use_sample_covariance=False`. The mean is over the windows that lie within the image, each
+    with the weight of its central pixel. A masked pixel must be the same in both images, which `View.judge` ensures. L
+    is the largest value of the target. Raises ValueError for smaller images.
     """
     if min(image.shape[:2]) < SSIM_SIDE:
         raise ValueError(f"SSIM needs images of {SSIM_SIDE}x{SSIM_SIDE} pixels, not {image.shape[1]}x{image.shape[0]}")
@@ -84,7 +84,7 @@ def ssim(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = 
 
 
 def _windows(image: mi.TensorXf) -> mi.TensorXf:
-    """Return the means over SSIM's windows of an image (H, W, C), (H - 10, W - 10, C), attached."""
+    """Return the means over SSIM's windows of an image (H, W, C). The result (H - 10, W - 10, C) is attached."""
     margin = SSIM_SIDE // 2
     raw = [math.exp(-0.5 * (place / SSIM_SIGMA) ** 2) for place in range(-margin, margin + 1)]
     factors = [each / sum(raw) for each in raw]
@@ -137,12 +137,12 @@ def best_scale(
     weights: mi.TensorXf | None = None,
     across: bool = False,
 ) -> mi.Float:
-    """Return s = <I, T> / <I, I>, of width 1, attached; I is the mean of two images with the same expected value (H, W,
-    C).
+    """Return s = <I, T> / <I, I>, of width 1, attached. I is the mean of two images (H, W, C) with the same expected
+    value.
 
     If one of the products is not positive, as for black images, s is 1, without a derivative. <I, I> is computed as the
     product of the two images, whose noise is independent. Its derivative is 2 <I, dI>, which the noise of I does not
-    bias if dI has other samples; with `across`, it is <I_a, dI_b> + <I_b, dI_a>.
+    bias if dI has other samples. With `across`, the derivative is <I_a, dI_b> + <I_b, dI_a>.
     """
     image, square = 0.5 * (halves[0] + halves[1]), _product(*halves, weights)
     if not across:
@@ -161,13 +161,13 @@ def fitted(
     /,
     across: bool = False,
 ) -> mi.Float:
-    """Return the loss of s I, with s = <I, T> / <I, I> (`best_scale`), for an image (H, W, C) or two halves (2, H, W,
+    """Return the loss of s I with s = <I, T> / <I, I> (`best_scale`), for an image (H, W, C) or two halves (2, H, W,
     C).
 
-    Its derivative is  s l(s I) + L_s ds/dI,  with l the derivative of the loss. L_s = <l(s I), I> contains the image
-    twice, and is computed as the mean of <l(s I_a), I_b> and <l(s I_b), I_a>. The derivative of a quadratic loss then
+    Its derivative is s l(s I) + L_s ds/dI, where l is the derivative of the loss. L_s = <l(s I), I> contains the image
+    twice. It is computed as the mean of <l(s I_a), I_b> and <l(s I_b), I_a>, so the derivative of a quadratic loss
     contains no product of noise with itself. For one image given twice, it is the exact derivative. With `across`, the
-    derivative with respect to I_a uses I_b in place of I, and vice versa, so that no path of a half uses a delta that
+    derivative with respect to I_a uses I_b in place of I, and vice versa. No path of a half then uses a delta that
     contains it.
     """
     first, second = halves_of(image)

@@ -1,8 +1,8 @@
 """Memory of a run: the needs of a step, passes that keep a budget, and limits.
 
 Sizes in the configuration and the scene file are checked before anything is built (`check_announced`,
-`check_described`), because films and textures of a hundred million entries take a minute to make. The estimates are
-lower bounds, so that nothing is refused that fits into the machine.
+`check_described`). Films and textures of a hundred million entries would take a minute to make. The estimates are lower
+bounds, so nothing is refused that fits into the machine.
 """
 
 from __future__ import annotations
@@ -89,9 +89,9 @@ def standing() -> int:
 
 
 def estimate(problem: Problem, integrator: Reslrb, samples: int, fixed: int) -> Estimate:
-    """Estimate the memory of a step whose passes have `samples` samples per pixel; `fixed` is allocated before it.
+    """Estimate the memory of a step whose passes have `samples` samples per pixel. `fixed` is allocated before it.
 
-    The targets, which may not exist yet, are not part of `fixed`, but of the result's.
+    `fixed` does not contain the targets, which may not exist yet, but the `fixed` part of the result does.
     """
     paths = images = targets = scratch = 0
     pixels = pixels_of(problem.scene, problem.sensors)
@@ -115,10 +115,9 @@ def estimate(problem: Problem, integrator: Reslrb, samples: int, fixed: int) -> 
 
 
 def choose_samples(problem: Problem, integrator: Reslrb, samples: int, budget: int, fixed: int) -> tuple[int, Estimate]:
-    """Return the largest divisor of `samples` that fits into the budget, and its estimate; 0 and the smallest if none
-    does.
+    """Return the largest divisor of `samples` that fits into the budget, and its estimate.
 
-    `samples` are those of a batch, or of a step.
+    If none fits, returns 0 and the estimate of the smallest one. `samples` are those of a batch, or of a step.
     """
     pixels = max(pixels_of(problem.scene, problem.sensors))
     for size in reversed([size for size in divisors(samples) if passes_obstacle(samples, size, pixels) is None]):
@@ -129,10 +128,10 @@ def choose_samples(problem: Problem, integrator: Reslrb, samples: int, budget: i
 
 
 def fit_memory(problem: Problem) -> Problem:
-    """Return `problem` with passes that keep `run.memory_budget`, if there is one.
+    """Return `problem` with passes that keep `run.memory_budget`. Without a budget, the passes do not change.
 
-    Needs no targets. Raises ConfigError if one sample per pixel exceeds the budget, or, without a budget, if a step
-    exceeds the free memory.
+    The problem needs no targets. Raises ConfigError if one sample per pixel exceeds the budget. Without a budget,
+    raises it if a step exceeds the free memory.
     """
     config, integrator, budget = problem.config, problem.integrator, problem.config.run.budget_bytes
     if not isinstance(integrator, Reslrb):
@@ -185,9 +184,10 @@ def check_announced(config: Config) -> None:
 
 
 def check_described(config: Config, description: Description) -> None:
-    """Raise ConfigError if the scene's film is too large for the samples of a step, or a step for the free memory.
+    """Raise ConfigError if the scene's film is too large for the samples of a step, or a step too large for the free
+    memory.
 
-    The used sensors are not known yet, so the smallest film counts. The log has a line about large steps that fit.
+    The used sensors are not known yet, so the smallest film counts. Large steps that fit are logged.
     """
     film = min(film_sizes(description), key=lambda size: size.cropped, default=None)
     if film is None or not film.cropped:
@@ -220,7 +220,7 @@ def check_described(config: Config, description: Description) -> None:
 
 
 def _textures(config: Config) -> dict[str, tuple[int, int]]:
-    """Return the (width, height) of parameters whose size the configuration names, by the key of this setting."""
+    """Return the (width, height) of each parameter with a size in the configuration, by the key of this setting."""
     found = {}
     for place, spec in enumerate(config.parameters):
         at, size = ("resolution", spec.resolution)
@@ -247,7 +247,7 @@ def _check_film(config: Config, key: str, size: tuple[int, int]) -> None:
 def _check_size(config: Config, key: str, what: str, size: tuple[int, int], each: int) -> None:
     """Raise ConfigError at `key` if an array of (width, height) entries of `each` bytes needs more memory than is free.
 
-    The error names the largest size of the same shape that fits.
+    The error names the largest size with the same aspect ratio that fits.
     """
     needed = size[0] * size[1] * each
     free = free_for(needed)
@@ -264,14 +264,14 @@ def _check_samples(config: Config, pixels: int) -> None:
 
 
 def free_for(needed: int) -> int:
-    """Return the free bytes; for small needs this is not queried, because a GPU's driver takes a while."""
+    """Return the free bytes. For small needs they are not queried, because a GPU's driver takes a while."""
     return needed if needed < SMALL else free_bytes(mi.variant())
 
 
 def check_memory(problem: Problem, integrator: Reslrb) -> None:
     """Raise ConfigError if a step takes more memory than is free.
 
-    With a `memory_budget`, passes are chosen to keep it, and only they are checked.
+    With a `memory_budget`, passes keep the budget, so only a single pass is checked.
     """
     config = problem.config
     if config.run.memory_budget is not None:
@@ -315,7 +315,7 @@ def check_baseline(problem: Problem) -> None:
 
 
 def outlook(config: Config, scene: mi.Scene, sensors: Sequence[int]) -> str | None:
-    """Return a line about a run whose light paths take hours or more; None for others. Such a run is allowed."""
+    """Return a line about a run whose light paths take hours or more, or None. Such a run is allowed."""
     run = config.run
     each = run.spp * sum(pixels_of(scene, sensors)) * (2 if config.adjoint == "independent" else 1)
     paths = each * run.iterations

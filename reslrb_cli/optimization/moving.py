@@ -33,9 +33,10 @@ from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
 
 def border_share(tracer: LightTracer, job: Job) -> float:
-    """Return the share of the light that a job's parameters move that lands at the film's border, from 0 to 1.
+    """Return the share (0 to 1) of moving light that lands at the film's border.
 
-    The border is as wide as the reconstruction filter. 0 if nothing moves.
+    Moving light is light that a job's parameters move. The border is as wide as the reconstruction filter. The share is
+    0 if nothing moves.
     """
     at_border, total = 0.0, 0.0
     with dr.suspend_grad():
@@ -65,7 +66,7 @@ class Sums:
 
 
 class BorderLight(Hooks):
-    """Hooks that sum the contributions behind anything that moves."""
+    """Hooks that sum the contributions of light behind moving objects."""
 
     def __init__(self, samples: Samples) -> None:
         self.samples, self.plan = samples, samples.plan
@@ -88,10 +89,10 @@ class BorderLight(Hooks):
 
 
 def is_at_border(samples: Samples, u: mi.Point2f) -> mi.Bool:
-    """Return whether film position `u` (pixels, relative to the crop window) is within the filter's radius of the
+    """Return whether film position `u` (in pixels, relative to the crop window) is within the filter's radius of the
     border.
 
-    This is the border of the crop window: sensors see no light beyond it.
+    Sensors see no light beyond the crop window, so this is its border.
     """
     radius, size = samples.film.film.rfilter().radius(), samples.film.size
     inside = dr.minimum(dr.minimum(u.x, int(size.x) - u.x), dr.minimum(u.y, int(size.y) - u.y))

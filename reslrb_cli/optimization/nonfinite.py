@@ -1,11 +1,12 @@
 """Reaction of a run to values that are not finite (`run.on_nonfinite`). They never reach a parameter.
 
-stop    the first iteration with such a value ends the run, and updates nothing
-skip    a parameter whose gradient has any is not updated; after a loss, or a derivative of the loss, no parameter is
-zero    such entries of gradients and of the loss's derivative count as 0, and the update continues; a parameter with no
-        finite gradient entry is not updated, and after a loss no parameter is
+- `stop`: the first iteration with such a value ends the run, and updates nothing.
+- `skip`: a parameter with such a value in its gradient is not updated. If the loss or its derivative has one, no
+    parameter is updated.
+- `zero`: such entries of gradients and of the loss's derivative count as 0, and the update continues. A parameter
+    without a finite gradient entry is not updated. If the loss is not finite, no parameter is updated.
 
-If something is skipped in `PATIENCE` iterations in a row, the run ends.
+If something is skipped in `PATIENCE` consecutive iterations, the run ends.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ PATIENCE = 10
 
 @dataclass
 class RefusedAt:
-    """Entries of one view's dL/dI that were not finite: their number, and the first, as (x, y, channel)."""
+    """Entries of one view's dL/dI that were not finite: their number, and the first one as (x, y, channel)."""
 
     count: int
     first: tuple[int, int, int]
@@ -31,10 +32,10 @@ class RefusedAt:
 
 @dataclass
 class Findings:
-    """Values of one iteration that were not finite: its loss, entries of dL/dI by sensor, and entries of gradients and
-    updates by parameter.
+    """Values of one iteration that were not finite.
 
-    `lost` are the gradients without any finite entry, and `own` the user's losses.
+    They can be its loss, entries of dL/dI by sensor, and entries of gradients and updates by parameter. `lost` are the
+    parameters whose gradient has no finite entry, and `own` are the user's losses.
     """
 
     iteration: int
@@ -88,7 +89,7 @@ def held_back(kind: OnNonFinite, found: Findings, keys: list[str]) -> list[str]:
 def why_end(kind: OnNonFinite, found: Findings, standstill: int) -> str:
     """Return why a run ends after an iteration, or "" if it continues.
 
-    `standstill` is the number of iterations in a row in which something was skipped.
+    `standstill` is the number of consecutive iterations with skipped updates.
     """
     if found and kind == "stop":
         return f"{found}; run.on_nonfinite: stop"
@@ -113,11 +114,11 @@ def flat(value: Any) -> Any:
 
 
 def count_nonfinite(value: Any) -> Any:
-    """Return the number of NaN and infinite entries of a tensor or a (nested) array, as a width-1 array."""
+    """Return the number of NaN and infinite entries of a tensor or a (nested) array, as an array of width 1."""
     return dr.count(~dr.isfinite(flat(value)))
 
 
 def finite_square_norm(value: Any) -> Any:
-    """Return the sum of squares of the finite entries, as a width-1 array."""
+    """Return the sum of squares of the finite entries, as an array of width 1."""
     entries = flat(value)
     return dr.sum(dr.select(dr.isfinite(entries), dr.square(entries), 0.0))

@@ -1,17 +1,16 @@
-"""Optimisers behind one interface: Dr.Jit's, one for each parameter, with reparameterisations, bounds and a clamp.
+"""Optimisers behind one interface: Dr.Jit's optimisers, one for each parameter, with transforms, bounds and a clamp.
 
-Reparameterisations (`Transform`, `Variable`): the optimiser moves an unconstrained variable u, and the scene gets x =
-T(u).
+Transforms (`Transform`, `Variable`): the optimiser moves an unconstrained variable u, and the scene gets x = T(u).
 
     none      x = u
     sigmoid   x = low + (high - low) / (1 + exp(-u))     between the bounds, which it never reaches
     log       x = exp(u)                                 positive; a step is a relative change
     softplus  x = log(1 + exp(u))                        positive; relative well below 1, absolute well above
 
-By the chain rule dL/du = dL/dx T'(u). The factor is applied to the accumulated gradient, so the kernels of a step do
-not depend on it. T is increasing, entry by entry. Smooth steps (`precondition`) come before it: x = T(S v).
+By the chain rule, dL/du = dL/dx T'(u). The factor is applied to the accumulated gradient, so the kernels of a step do
+not depend on it. T is increasing in each entry. Smooth steps (`precondition`) come before the transform: x = T(S v).
 
-Updates (`Optimizer`): each parameter has its own optimiser, so that a parameter whose gradient is not finite can keep
+Updates (`Optimizer`): each parameter has its own optimiser. A parameter whose gradient is not finite can therefore keep
 its moments and its number of steps.
 
     adam      m, v running means of g and g²; p -= lr · √(1-β₂ᵗ)/(1-β₁ᵗ) · m / (√v + ε)    Kingma and Ba 2015
@@ -25,13 +24,13 @@ A clamp for outliers in gradients (`clamp_gradients`) reduces variance, and adds
     r_e = max(m_e, mean of m over the parameter's entries)
     g_e  is clamped to [-k r_e, k r_e]
 
-Rare large values of a Monte Carlo gradient belong to its mean. The removed part R = g - clamped g is a bias unless it
-cancels over iterations:
+Rare large values of a Monte Carlo gradient belong to its mean. The removed part R = g - clamped g is therefore a bias,
+unless it cancels over iterations. Its relative size is measured over the iterations so far.
 
     bias = sum_e |sum of R_e| / sum_e |sum of g_e|      inner sums over the iterations so far
 
-r_e includes the mean over the entries, because an entry that few paths reach may have had only zeros. Absolute values
-are used, because squares of large gradients overflow.
+The mean over the entries is part of r_e, because an entry on few paths may have had only zeros. Absolute values are
+used, because squares of large gradients overflow.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ SIGMOID_END, EXPONENT_END = 16.0, 80.0
 
 @dataclass(frozen=True)
 class Transform:
-    """T, its inverse and its derivative T'(u), on arrays of any Dr.Jit type, and the smallest and largest u."""
+    """T, its inverse and its derivative T'(u), on arrays of any Dr.Jit type, with the smallest and largest u."""
 
     forward: Callable[[Any], Any]
     inverse: Callable[[Any], Any]
@@ -68,8 +67,8 @@ class Transform:
 
 
 def make_transform(name: str, bounds: Bounds) -> Transform | None:
-    """Return the transform of this name; None for `none`. `bounds` are those of x. Raises KeyError for an
-    unknown name.
+    """Return the transform of this name, or None for `none`. `bounds` are those of x. Raises KeyError for an unknown
+    name.
     """
     low, high = bounds or (-math.inf, math.inf)
     if name == "none":
@@ -108,8 +107,8 @@ def _inverse_softplus(x: Any) -> Any:
 class Variable:
     """Variable v of the optimiser for a parameter x: x = T(length * S v), with x within its bounds.
 
-    S is 1, or a `Smoother`. The optimiser receives the gradient `gain` times dL/dv. Both numbers are 1 until they are
-    measured (`sensitivity.py`), and reach kernels as data, so that their values compile nothing.
+    S is 1 or a `Smoother`. The optimiser receives the gradient `gain` times dL/dv. `length` and `gain` are 1 until they
+    are measured (`sensitivity.py`). They reach kernels as data, so new values compile nothing.
     """
 
     transform: Transform | None
@@ -144,7 +143,7 @@ class Variable:
         return self.smoother.roughen(dr.clip(u, *ends)) * _opaque(v, 1 / self.length)
 
     def chain(self, v: Any, gradient: Any) -> Any:
-        """Return `gain` times dL/dv from dL/dx."""
+        """Return `gain` times dL/dv, given dL/dx."""
         result = gradient * _opaque(v, self.length) * _opaque(v, self.gain)
         if self.transform is not None:
             result = result * self.transform.derivative(self._u(v))
@@ -166,11 +165,11 @@ OPTIMIZERS: dict[str, Callable[..., Any]] = {
 
 
 class Optimizer:
-    """Optimiser that holds and updates the parameters; the values that it returns receive gradients.
+    """Optimiser that holds and updates the parameters. The values that it returns receive gradients.
 
-    `rates`, `bounds`, `transforms` and `smoothers` are by key: a rate of None is `learning_rate`, bounds of None are no
-    bounds, and transforms and smoothers may be missing. Values and gradients are those of the scene; a parameter with a
-    `Variable` is moved through it. Raises KeyError for an unknown `type`.
+    `rates`, `bounds`, `transforms` and `smoothers` have the parameters' keys. A rate of None is `learning_rate`, and
+    bounds of None are no bounds. Transforms and smoothers may be missing. Values and gradients are those of the scene.
+    A parameter with a `Variable` is moved through it. Raises KeyError for an unknown `type`.
     """
 
     def __init__(
@@ -212,12 +211,12 @@ class Optimizer:
         return self._variables.get(key) or Variable(None, self._bounds[key])
 
     def set_value(self, key: str, value: Any) -> None:
-        """Set another initial value of the scene; call before the first step."""
+        """Set another initial value of the scene. Call this before the first step."""
         self.stands_at = None
         self.move(key, value)
 
     def move(self, key: str, value: Any) -> None:
-        """Set another value of the scene between two steps; moments stay."""
+        """Set another value of the scene between two steps. The moments do not change."""
         variable = self._variables.get(key)
         if variable is None:
             self._own[key][key] = value
@@ -226,7 +225,7 @@ class Optimizer:
             self._own[key][key] = variable.from_scene(value)
 
     def set_variable(self, key: str, variable: Variable) -> None:
-        """Move a parameter through `variable` from now on; call before the first step."""
+        """Move a parameter through `variable` from now on. Call this before the first step."""
         self.stands_at, value = None, dr.detach(self[key])
         self._variables[key], self._scene[key] = variable, _leaf(value)
         self._own[key][key] = variable.from_scene(value)
@@ -242,8 +241,8 @@ class Optimizer:
     def step(self, factor: float, skip: Collection[str] = ()) -> dict[str, int]:
         """Update all parameters except those in `skip`, with learning rates times `factor`, and clamp them.
 
-        Returns the number of non-finite entries of the update by key, if there are any: even a finite gradient can
-        overflow. Such a parameter keeps its old value and state.
+        Even a finite gradient can make an update overflow. Such a parameter keeps its old value and state. Returns the
+        number of non-finite entries of updates by key.
         """
         self.stands_at = None
         # Dr.Jit makes the rate opaque, so a changing rate compiles no new kernel.
@@ -278,11 +277,11 @@ class Optimizer:
         self._scene[key] = _leaf(variable.to_scene(dr.detach(own[key])))
 
     def response(self, key: str) -> np.ndarray[Any, Any]:
-        """Return the movement of each entry of the scene's value per unit of its gradient, for a step with a rate of 1,
-        flat.
+        """Return the movement of each entry of the scene's value per unit of its gradient, as a flat array.
 
-        It uses the current moments, over many steps, so that momentum counts with its sum. The next step is this, times
-        the schedule's factor and the parameter's rate (`rate`). 0 if no step was taken.
+        The movement is that of a step with a rate of 1 and the current moments. It is the sum over many steps, which
+        includes momentum. The next step is this movement times the schedule's factor and the parameter's rate (`rate`).
+        It is 0 if no step was taken.
         """
         own, extra = self._own[key], self._own[key].state[key][3]
         value = np.array(dr.detach(own[key]), dtype=np.float64).ravel()
@@ -299,14 +298,14 @@ class Optimizer:
         return result if variable.smoother is None else result * variable.smoother.gain
 
     def squares(self, key: str) -> tuple[Any, float] | None:
-        """Return the running mean of the squared gradients, as the optimiser stores it, and its decay; None if it has
-        none.
+        """Return the running mean of the squared gradients, as the optimiser stores it, and its decay, or None if it
+        has none.
         """
         own, extra = self._own[key], self._own[key].state[key][3]
         return (extra[2], own.beta_2) if isinstance(own, dropt.Adam) else None
 
     def slope(self, key: str) -> np.ndarray[Any, Any]:
-        """Return the optimiser's gradient per unit of gradient of the scene's value, flat."""
+        """Return the optimiser's gradient per unit of gradient of the scene's value, as a flat array."""
         variable, moved = self.variable(key), dr.detach(self._own[key][key])
         if key not in self._variables:
             return np.ones(int(np.array(moved).size))
@@ -317,9 +316,9 @@ class Optimizer:
         return self._rates[key]
 
     def first_step(self, key: str) -> float | None:
-        """Return the root mean square movement of the scene's current value by a step of the parameter's rate.
+        """Return the root mean square movement of the scene's current value by a step with the parameter's rate.
 
-        The larger of the movements upwards and downwards counts. None if it depends on the gradient.
+        The larger of the movements upwards and downwards counts. Returns None if it depends on the gradient.
         """
         if isinstance(self._own[key], dropt.SGD):
             return None
@@ -331,14 +330,14 @@ class Optimizer:
         return float(np.sqrt(np.mean(np.square(np.maximum(*map(np.abs, ways)), dtype=np.float64))))
 
     def units(self) -> dict[str, tuple[float, float]]:
-        """Return length and gain of each parameter that is moved through a `Variable`."""
+        """Return length and gain of each parameter that moves through a `Variable`."""
         return {key: (variable.length, variable.gain) for key, variable in self._variables.items()}
 
     def moments(self) -> dict[str, dict[str, Any]]:
         """Return the optimiser's data for each parameter besides its value.
 
-        They are arrays in Dr.Jit's order, and the variable as `variable` if there is one. No step changes these arrays,
-        so they are not copied.
+        The data are arrays in Dr.Jit's order. If there is a variable, they include it as `variable`. No step changes
+        these arrays, so they are not copied.
         """
         found = {}
         for key, own in self._own.items():
@@ -350,7 +349,7 @@ class Optimizer:
     def restore(
         self, values: Mapping[str, Any], units: Mapping[str, tuple[float, float]], moments: Mapping[str, Any]
     ) -> None:
-        """Continue from the scene's `values`, and from the results of `units` and `moments`."""
+        """Continue from values of the scene, and from the results of `units` and `moments`."""
         for key, own in self._own.items():
             kept = moments[key]
             if key in units:
@@ -380,7 +379,7 @@ def _leaf(value: Any) -> Any:
 
 
 def clamp(value: Any, bounds: tuple[float, float] | None) -> Any:
-    """Project `value` onto `bounds` (low, high), after an update. None, or an infinite side, is no bound."""
+    """Project `value` onto `bounds` (low, high) after an update. None, or an infinite side, sets no bound."""
     return value if bounds is None else dr.clip(value, bounds[0], bounds[1])
 
 
@@ -397,8 +396,8 @@ def clamp_gradients(
 ) -> tuple[Clamped, dict[str, int], dict[str, dict[str, Any]]]:
     """Clamp the finite gradients of these parameters in place at `factor` (k) times their usual size.
 
-    `iterations` and `known` (SUMS) are those of each parameter before; `iterations` is only read. Returns the effect
-    with its bias so far, and both updated.
+    `iterations` and `known` (SUMS) are the earlier iterations and sums of each parameter. Returns the effect with its
+    bias so far, and both of them updated. `iterations` itself is not changed.
     """
     after, sums = dict(iterations), {key: dict(each) for key, each in known.items()}
     counts, sizes = {}, {}

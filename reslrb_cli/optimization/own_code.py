@@ -22,10 +22,10 @@ from reslrb_cli.errors import ConfigError
 class OwnLoss:
     """A user's loss: `loss(image, target)`, or `loss(image, target, weights)`.
 
-    Both images are (H, W, C); `weights` is None or of that shape with a mean of 1. Without a parameter `weights`,
+    Both images are (H, W, C). `weights` is None or has the same shape with a mean of 1. Without a parameter `weights`,
     masked pixels are the same in both images, and the other weights must be equal. The function returns an array of
-    width 1, or a tensor of one entry. The file is loaded when the loss is first called or tried. Errors of a function
-    that was passed in Python are located by its name.
+    width 1, or a tensor of one entry. The file is loaded when the loss is first called or tried. For a function that
+    was passed in Python, errors are located by its name.
     """
 
     def __init__(self, config: Config, key: str, spec: Custom) -> None:
@@ -75,7 +75,7 @@ class OwnLoss:
         return value
 
     def attempt(self, target: mi.TensorXf, weights: mi.TensorXf | None) -> None:
-        """Call the loss once, with an image other than the target; raise ConfigError if loss or derivative are not
+        """Call the loss once, with an image other than the target. Raises ConfigError if loss or derivative are not
         finite.
 
         `run.on_nonfinite` handles later values.

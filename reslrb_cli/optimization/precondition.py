@@ -2,10 +2,10 @@
 
     x = S v,   S = (1 - l^2 Δ)^-1,   dL/dv = S dL/dx            Nicolet, Jacobson and Jakob 2021, eq. 9 to 12
 
-S is symmetric. A step of gradient descent is S^2 dL/dx: details finer than l move less by the fourth power of their
-fineness. Refracting surfaces need this: their light changes with the surface's second derivatives, so that the
-curvature of a loss grows with the fourth power, and without S the finest ripple of the map limits the step. l is a
-share of the longer side, so that it is independent of the resolution.
+S is symmetric, and a step of gradient descent is S^2 dL/dx. Details finer than l therefore move less, by the fourth
+power of their size over l. Refracting surfaces need this. Their light depends on the surface's second derivatives, so
+the curvature of a loss grows with the fourth power of the frequency. Without S, the finest ripple of the map limits the
+step. l is a fraction of the longer side, so it does not depend on the resolution.
 
     maps, textures      Δ by differences of neighbours, no flow through the edges: diagonal in the cosine transform
     vertices of a mesh  Δ of its graph, in units of its mean edge: a sparse LU decomposition, made once
@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 class Smoother:
     """S of one parameter and its inverse, on Dr.Jit arrays of the parameter's type.
 
-    `gain` is the mean over the entries of the response of S^2 to a gradient of one entry, at this entry.
+    S^2 responds to a gradient of one entry, also at this entry. `gain` is the mean of this response over the entries.
     """
 
     operator: MapOperator | MeshOperator
@@ -49,7 +49,7 @@ class Smoother:
         return self._through(self.operator.roughen, value)
 
     def adjoint(self, gradient: Any) -> Any:
-        """Return the gradient with respect to v from that with respect to S v."""
+        """Return the gradient with respect to v, given the gradient with respect to S v."""
         return self._through(self.operator.adjoint, gradient)
 
     def _through(self, function: Any, value: Any) -> Any:
@@ -58,7 +58,7 @@ class Smoother:
 
 
 class MapOperator:
-    """S on textures and heightmaps (height, width, channels) of at least two texels; `length` is l."""
+    """S on textures and heightmaps (height, width, channels) with at least two texels. `length` is l."""
 
     def __init__(self, shape: tuple[int, ...], length: float) -> None:
         texels = length * max(shape[:2])  # l in texels, which are square
@@ -83,7 +83,7 @@ class MapOperator:
 
 
 class MeshOperator:
-    """S on the vertices' positions (3 n) of a mesh with `faces` (3 m indices), by its graph; `length` is l.
+    """S on the vertices' positions (3 n) of a mesh with `faces` (3 m indices), by its graph. `length` is l.
 
     Vertices with the same position but different indices, as along the seams of textures, count as one.
     """
@@ -137,5 +137,5 @@ class MeshOperator:
 
 
 def make_smoother(value: NDArray[Any], faces: NDArray[Any] | None, length: float) -> Smoother:
-    """Return S for a map (height, width, channels), or for vertices' positions (3 n) of a mesh with `faces`."""
+    """Return S for a map (height, width, channels), or for vertex positions (3 n) of a mesh with `faces`."""
     return Smoother(MapOperator(value.shape, length) if faces is None else MeshOperator(value, faces, length))

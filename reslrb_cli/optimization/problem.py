@@ -34,10 +34,10 @@ from reslrb_cli.seeds import seed
 
 
 def saved_spp(problem: Problem, between: bool) -> int:
-    """Return the samples per pixel of the initial and the final image: `run.final_spp`, or the next number that passes
-    divide.
+    """Return the samples per pixel of the initial and the final image.
 
-    For images `between`, which only show progress, a multiple of the run's own number.
+    It is `run.final_spp`, or the next larger number that passes divide. Images `between` only show progress, and have a
+    multiple of the run's own number.
     """
     run, unit = problem.config.run, problem.samples_per_pass or 1
     if between:
@@ -52,9 +52,9 @@ Array = np.ndarray[Any, Any]
 class Problem:
     """Complete problem of `optimize`, as `assemble` makes it.
 
-    `truth` has the known true values, textures in the resolution of the scene file. `masks` has the entries of these
-    parameters that light and sensor reach (boolean; (H, W) for textures, else of the parameter's shape). `quantities`
-    are those of the parameters (`errors.quantity`).
+    `truth` has the known true values, with textures in the resolution of the scene file. `masks` has the entries of
+    these parameters that light and sensor reach, as booleans. A mask is (H, W) for textures, and otherwise has the
+    parameter's shape. `quantities` are those of the parameters (`errors.quantity`).
     """
 
     config: Config
@@ -93,8 +93,8 @@ class Problem:
         return {name: None if each is None else each.to_json() for name, each in made.items()}
 
     def apply(self, others: Mapping[str, Any] | None = None) -> None:
-        """Write the optimiser's values to the scene, or only those of the keys in `others`; update masks of moving
-        shapes.
+        """Write the optimiser's values to the scene, and update the masks of moving shapes. `others` limits the
+        keys.
         """
         values = {key: self.optimizer[key] for key in self.selection.keys}
         self.selection.hand_over({**values, **(others or {})})
@@ -102,10 +102,10 @@ class Problem:
             view.follow(self.scene)
 
     def afresh(self, values: Mapping[str, Array]) -> Problem:
-        """Return the problem before its first iteration with these values, in the form of `values`; what was learned is
-        cleared.
+        """Return the problem before its first iteration with these values, in the form of `values`, and without learned
+        state.
 
-        Both share a scene, which now has these values.
+        Both problems share a scene, which then has these values.
         """
         self.selection.set_arrays(values)
         integrator = self.integrator
@@ -123,7 +123,7 @@ class Problem:
         return {key: self.optimizer.gradient(key) for key in self.selection.keys}
 
     def regularize(self) -> dict[str, dict[str, float]]:
-        """Add the gradients of regularizers, once per step; return their costs by key and type."""
+        """Add the gradients of regularizers, once per step. Returns their costs by key and type."""
         told, gradients = self.costs(self._heights())
         for key, gradient in gradients.items():
             value = self.optimizer[key]
@@ -149,10 +149,10 @@ class Problem:
         return told, gradients
 
     def stiffness(self, key: str, direction: Array) -> Array:
-        """Return the change of the regularizers' gradient for `key` along a direction, both flat: curvature times
+        """Return the change of the regularizers' gradient for `key` along a direction, as flat arrays: curvature times
         direction.
 
-        Zeros if there are no regularizers for `key`.
+        The result is zero if there are no regularizers for `key`.
         """
         values, size = self._heights(), float(np.abs(direction).max(initial=0.0))
         if key not in values or size == 0:
@@ -177,7 +177,7 @@ class Problem:
         return {key: each for key, each in found.items() if isinstance(each, Plate)}
 
     def hold_apart(self) -> None:
-        """Hold free faces apart, at a tenth of the minimum thickness; bounds do this for a flat back."""
+        """Keep free faces apart by at least a tenth of the minimum thickness. For a flat back, bounds do this."""
         for key, plate in self.plates.items():
             before = {each: np.array(dr.detach(self.optimizer[each])) for each in (key, plate.other)}
             after = plate.held(*(each.astype(np.float64) for each in before.values()))
@@ -213,7 +213,7 @@ class Problem:
 
     @property
     def limit_s(self) -> float | None:
-        """Seconds that the iterations may take, by `run.max_seconds`; None without a limit."""
+        """Seconds that the iterations may take, by `run.max_seconds`, or None without a limit."""
         limit = self.config.run.max_seconds
         return None if limit is None else limit - self.measured_s
 
@@ -237,7 +237,7 @@ class Problem:
         return [(trained[number], len(trained) / count) for number in chosen]
 
     def held_out_loss(self) -> float | None:
-        """Return the mean loss of the held-out views, always with the same samples; None without such views."""
+        """Return the mean loss of the held-out views, always with the same samples, or None without such views."""
         views = [view for view in self.views if view.held_out]
         if not views:
             return None
@@ -247,15 +247,15 @@ class Problem:
         return float(np.mean(losses))
 
     def on_samples(self, view: View) -> OnSamples | None:
-        """Return a callback for the samples of a view's step: a recovered exposure gets its gradient from them."""
+        """Return a callback for the samples of a view's step. A recovered exposure gets its gradient from them."""
         key = view.exposure.key
         if not key:
             return None
         return functools.partial(view.exposure.add_gradient, self.optimizer[key], view.target.shape[2])
 
     def image_gradient(self, view: View, image: Array) -> Array:
-        """Return the derivative dL/dI of a view's loss at an image (H, W, C), in the target's channels; finite
-        or not.
+        """Return dL/dI of a view's loss at an image (H, W, C), in the target's channels. It may contain non-finite
+        values.
         """
         return slope(view.compare, image[:, :, : view.target.shape[2]])
 
@@ -264,16 +264,14 @@ class Problem:
         return {key: self.selection.array(key) for key in self.selection.keys}
 
     def render(self, sensor: int, spp: int, iteration: int, purpose: str) -> Array:
-        """Render the current scene with the experiment's integrator; (H, W, C) float32."""
+        """Render the current scene with the experiment's integrator; returns (H, W, C) float32."""
         config = self.config
         return render_in_passes(
             self.integrator, self.scene, sensor, spp, config.run.seed, iteration, purpose, self.samples_per_pass
         )
 
     def see(self, view: View, spp: int, iteration: int, purpose: str) -> mi.TensorXf:
-        """Render a view as its loss needs it: (H, W, C), or two halves of the samples (2, H, W, C) if the loss fits a
-        scale.
-        """
+        """Render a view as its loss needs it: (H, W, C), or two halves (2, H, W, C) if the loss fits a scale."""
         if not view.fits:
             return to_tensor(self.render(view.sensor, spp, iteration, purpose))
         unit = self.samples_per_pass or 1
@@ -307,7 +305,7 @@ def make_optimizer(config: Config, selection: Selection) -> Optimizer:
 
 
 def _handed(value: Any, array: Array) -> Any:
-    """Return an array as a Dr.Jit array like `value`: a sum, because kernels depend on the alignment of NumPy's
+    """Return an array as a Dr.Jit array like `value`. It is a sum, because kernels depend on the alignment of NumPy's
     memory.
     """
     return type(value)(np.ascontiguousarray(array, dtype=np.float32)) + dr.opaque(mi.Float, 0)

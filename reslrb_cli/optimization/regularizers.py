@@ -1,8 +1,8 @@
 """Regularizers: costs of a parameter's value, and their gradients, in double precision.
 
-They are integrals over the surface, in the scene's unit, so that they hardly depend on the resolution. A map h (H, W,
-C) has texels of dx by dy; its mesh covers a range of texture coordinates, independent of the texels. Differences are
-between neighbours, and weights are chosen so that they sum to the whole surface:
+Regularizers are integrals over the surface, in the scene's unit, so they hardly depend on the resolution. A map h (H,
+W, C) has texels of dx by dy. Its mesh covers a range of texture coordinates, independent of the texels. Differences are
+between neighbours, and weights sum to the whole surface.
 
     curvature        k = Hm + sqrt(Hm² - K) in the inner texels, by central differences; positive in hollows
                      2 Hm = ((1 + hy²) hxx - 2 hx hy hxy + (1 + hx²) hyy) / w³,  K = (hxx hyy - hxy²) / w⁴,
@@ -37,22 +37,20 @@ Map = tuple[Array, Array, tuple[int, ...]]
 
 @dataclass(frozen=True)
 class Span:
-    """One axis of a map: the length of a unit of its texture coordinate, and the range of coordinates of the
-    surface.
-    """
+    """One axis of a map: the length of a unit of its texture coordinate, and the surface's range of coordinates."""
 
     unit: float = 1.0
     low: float = 0.0
     high: float = 1.0
 
     def pitch(self, count: int) -> float:
-        """Return the distance of two of `count` texels."""
+        """Return the distance between two neighbours of `count` texels."""
         return self.unit / count
 
     def weights(self, count: int, first: float, last: float) -> Array:
         """Return the length that each of the nodes first, first + 1, ..., last (in texels of `count`) represents.
 
-        Neighbouring nodes share the distance between them evenly; the outermost nodes have the rest. The sum is the
+        Neighbouring nodes share the distance between them evenly, and the outermost nodes get the rest. The sum is the
         length of the surface.
         """
         nodes = np.arange(first, last + 0.5) / count
@@ -66,7 +64,7 @@ Spans = tuple[Span, Span]
 
 
 def make_cost(regularizer: Regularizer, spans: Spans) -> Cost:
-    """Return the cost of a map (H, W, C), `weight` times the integral. Raises TypeError for a regularizer of other
+    """Return the cost of a map (H, W, C): `weight` times the integral. Raises TypeError for a regularizer of other
     parameters.
     """
     if isinstance(regularizer, Curvature):
@@ -88,9 +86,9 @@ def make_cost(regularizer: Regularizer, spans: Spans) -> Cost:
 
 @dataclass(frozen=True)
 class Plate:
-    """Plate between two free faces: maps h and g of heights outwards, g that of the parameter `other`.
+    """Plate between two free faces, given by maps h and g of heights outwards. g belongs to the parameter `other`.
 
-    `across` (texels of h, texels of g) interpolates g at the texels of h, and `back` interpolates h at those of g.
+    `across` (texels of h, texels of g) interpolates g at the texels of h, and `back` interpolates h at the texels of g.
     """
 
     settings: Thickness
@@ -100,9 +98,7 @@ class Plate:
     back: csr_matrix
 
     def cost(self, h: Array, g: Array) -> tuple[float, Array, Array]:
-        """Return the cost of h and g, including the weight, and the derivatives with respect to both, of their
-        shapes.
-        """
+        """Return the cost of h and g, including the weight, and the derivatives with respect to h and to g."""
         value, slope = _hinge(-self.thickness(h, g), -self.settings.least)
         area = self.settings.weight * _area(self.spans, h.shape, 0.5)
         by_h = -area * slope
@@ -114,7 +110,7 @@ class Plate:
         return np.asarray(self.settings.thickness + h + there.reshape(h.shape))
 
     def held(self, h: Array, g: Array) -> tuple[Array, Array]:
-        """Return h and g, raised equally where the plate is thinner than `thinnest`, at the texels of both."""
+        """Return h and g, raised equally where the plate is thinner than `thinnest`, at the texels of both maps."""
         least, thickness = self.settings.thinnest, self.settings.thickness
         h = h + np.maximum(least - self.thickness(h, g), 0) / 2
         between = thickness + g + (self.back @ h.ravel()).reshape(g.shape)
@@ -123,7 +119,7 @@ class Plate:
 
 
 def make_plate(settings: Thickness, own: Map, other: Map, key: str) -> Plate:
-    """Return the plate between two maps, of which `other` belongs to the parameter `key`."""
+    """Return the plate between two maps. The map `other` belongs to the parameter `key`."""
     return Plate(settings, spans_of(*own[:2]), key, _sampling(own, other), _sampling(other, own))
 
 
@@ -177,13 +173,15 @@ def _thin(lowest: float, spans: Spans) -> Cost:
 
 
 def _area(spans: Spans, shape: tuple[int, ...], first: float) -> Array:
-    """Return the area of each node of a map of this shape, (h, w, 1); nodes start at `first` texels from its edge."""
+    """Return the area of each node of a map of this shape, (h, w, 1). The first node is `first` texels from the
+    edge.
+    """
     wide, high = (span.weights(n, first, n - first) for span, n in zip(spans, (shape[1], shape[0]), strict=True))
     return np.asarray(high[:, None, None] * wide[None, :, None])
 
 
 def _between(of_norm: Callable[[Array], tuple[Array, Array]], spans: Spans) -> Cost:
-    """Return the integral of a function of the gradient's norm, all channels together."""
+    """Return the integral of a function of the gradient's norm, over all channels together."""
 
     def cost(h: Array) -> tuple[float, Array]:
         dx, dy = spans[0].pitch(h.shape[1]), spans[1].pitch(h.shape[0])
@@ -278,11 +276,11 @@ def _hollow(d: list[Array], limit: float) -> tuple[Array, list[Array]]:
 
 
 def mesh_laplacian(positions: Array, faces: Array) -> tuple[csr_matrix, Array]:
-    """Return L and 1/A of a mesh with these positions (N, 3) and faces (M, 3); 1/A is 0 at its rim, and without an
-    area.
+    """Return L and 1/A of a mesh with these positions (N, 3) and faces (M, 3). At the rim, and without an area, 1/A is
+    0.
 
-    Vertices at the same position count as one, so a mesh that is cut open along texture seams has no rim there; rows
-    and columns are those of the first vertex.
+    Vertices at the same position count as one. A mesh that is cut open along texture seams therefore has no rim there.
+    Rows and columns are those of the first of these vertices.
     """
     _, first, same = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     joined = first[same.ravel()][faces]
@@ -308,7 +306,7 @@ def mesh_laplacian(positions: Array, faces: Array) -> tuple[csr_matrix, Array]:
 
 
 def mesh_cost(weight: float, positions: Array, faces: Array) -> Cost:
-    """Return the cost of vertex positions, a buffer (3 N,): `weight` times the integral of |L p / A|²."""
+    """Return the cost of vertex positions (3 N,): `weight` times the integral of |L p / A|²."""
     laplacian, inverse = mesh_laplacian(np.asarray(positions, np.float64).reshape(-1, 3), faces.reshape(-1, 3))
 
     def cost(value: Array) -> tuple[float, Array]:
@@ -322,7 +320,7 @@ def mesh_cost(weight: float, positions: Array, faces: Array) -> Cost:
 def spans_of(positions: Array, texcoords: Array) -> Spans:
     """Return the axes of a map over a mesh with these vertex positions (N, 3) and texture coordinates (N, 2).
 
-    Units are those of the plane map from texture coordinates to positions that fits best.
+    Units are those of the best plane map from texture coordinates to positions.
     """
     slopes, _ = _laid(positions, texcoords)
     low, high = np.clip(texcoords.min(axis=0), 0, 1), np.clip(texcoords.max(axis=0), 0, 1)
@@ -331,7 +329,7 @@ def spans_of(positions: Array, texcoords: Array) -> Spans:
 
 
 def _laid(positions: Array, texcoords: Array) -> tuple[Array, Array]:
-    """Return the plane map from texture coordinates to positions that fits best: uv @ slopes (2, 3) + origin (3,)."""
+    """Return the best plane map from texture coordinates to positions: uv @ slopes (2, 3) + origin (3,)."""
     matrix = np.column_stack([texcoords, np.ones(len(texcoords))]).astype(np.float64)
     found = np.linalg.lstsq(matrix, positions.astype(np.float64), rcond=None)[0]
     return found[:2], found[2]

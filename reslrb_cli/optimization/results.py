@@ -1,10 +1,10 @@
 """Results of a run: its best parameters, whether its loss fell, and values and errors at start and end.
 
-`Best` has the best parameters besides the last. The loss of an iteration is mostly noise, so the smallest loss would be
-the luckiest. If views are held out, the best parameters are those with the smallest held-out loss, which always uses
-the same samples. Otherwise they are those at the end of the WINDOW iterations whose losses have the smallest mean.
+`Best` has the best parameters so far. The loss of an iteration is mostly noise, so the smallest loss would be the
+luckiest one. If views are held out, the best parameters have the smallest held-out loss, which always uses the same
+samples. Otherwise they are the parameters at the end of WINDOW iterations, namely those with the smallest mean loss.
 
-`got_worse` says whether an error, which is known exactly, ended above its start. `find_trend` does the same for the
+`got_worse` tells whether an error, which is known exactly, ended above its start. `find_trend` does the same for the
 loss.
 
 `Results` combines these with the parameters' values and errors.
@@ -40,8 +40,8 @@ class Least:
 
 
 class Best:
-    """Best parameters so far: their loss (None if there is none yet), the values, and the last WINDOW losses
-    (`recent`).
+    """Best parameters so far: their loss, the values, and the last WINDOW losses (`recent`). Without any loss, they are
+    None.
     """
 
     def __init__(self, held_out: bool) -> None:
@@ -51,7 +51,7 @@ class Best:
         self.recent: deque[float] = deque(maxlen=WINDOW)
 
     def see(self, record: Record, values: Mapping[str, Any]) -> None:
-        """Record one iteration, and the values that it started with, by key; they are stored, not copied."""
+        """Record one iteration, and the values that it started with, by key. The values are stored without a copy."""
         self.recent.append(record.loss)
         if self.held_out:
             loss = math.inf if record.held_out is None else record.held_out
@@ -73,10 +73,10 @@ WORSE, WORSE_IF_SHORT = 0.01, 0.1
 
 
 def got_worse(errors: Sequence[float], final: float) -> bool:
-    """Whether an error ended above its start: the last one, `final`, and all of the last tenth before it.
+    """Whether an error ended above its start: both the last error, `final`, and all errors of the last tenth before it.
 
-    Errors are known exactly, but fluctuate with the noise of the gradients, so a short run must end well above its
-    start.
+    Errors are known exactly, but fluctuate with the noise of the gradients. A short run must therefore end well above
+    its start.
     """
     if not errors:
         return False
@@ -101,7 +101,7 @@ class Images:
 class Results:
     """Results of one run of `problem`, whose parameters must have their initial values at construction.
 
-    Call `add` for each iteration, and `end` afterwards. `to_json` works at any time, with null for unknown values.
+    Call `add` for each iteration, and `end` afterwards. `to_json` works at any time. Unknown values are null.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -134,10 +134,10 @@ class Results:
         self._take("final")
 
     def see(self, moment: str, view: View, image: Array, scale: float = 1.0) -> None:
-        """Record the saved image of a view at `initial` or `final`, as its loss takes it (`Problem.see`), and its
-        fitted `scale`.
+        """Record the saved image of a view at `initial` or `final`, and its fitted `scale`. The image is as in
+        `Problem.see`.
 
-        Call for every view in order.
+        Call this for every view in order.
         """
         if (images := self.images.get(moment)) is not None:
             loss = view.objective(mi.TensorXf(np.ascontiguousarray(image, dtype=np.float32)))
@@ -152,17 +152,17 @@ class Results:
     def to_json(self) -> dict[str, Any]:
         """Return the content for the manifest.
 
-        - `parameter_rmse` and `relative_error` (divided by the root mean square of the true value): errors by key,
-          initial and final.
-        - `rmse`: the error of all parameters together, null if their units differ.
-        - `parameters`, by key: quantity and shape, the share of entries that light and sensor reach, the root mean
-          square of the true value over those (`scale`), and `initial`, `final` and `true` values (`summary`).
-        - `loss_trend`: loss and noise at the start and the end, null for a short run.
-        - `image_loss`: the loss of the saved images of training views, which have less noise. `fitted_scale`: the
-          factor of the final images by sensor, only with `loss.scale: fitted`.
-        - `held_out`: the mean loss of the held-out views.
-        - `worse`: the keys whose error ended above its start.
-        - `samples`: those of a step and of a rendered target, null without one.
+        - `parameter_rmse` and `relative_error` are initial and final errors by key. The latter are divided by the root
+            mean square of the true value.
+        - `rmse` is the error of all parameters together, or null if their units differ.
+        - `parameters` has, by key, quantity and shape, the share of entries that light and sensor reach, the root mean
+            square of the true value over these entries (`scale`), and `initial`, `final` and `true` values (`summary`).
+        - `loss_trend` has loss and noise at the start and the end, or null for a short run.
+        - `image_loss` is the loss of the saved images of training views, which have less noise. `fitted_scale` is the
+            factor of the final images by sensor, only with `loss.scale: fitted`.
+        - `held_out` is the mean loss of the held-out views.
+        - `worse` has the keys whose error ended above its start.
+        - `samples` has the samples of a step and of a rendered target, or null without one.
         """
         trend = find_trend(self._losses)
         run, render = self.problem.config.run, self.problem.config.target.render
@@ -203,11 +203,11 @@ class Results:
 
 
 def summary(value: Array, mask: Array | None = None) -> dict[str, Any]:
-    """Return a parameter in a few numbers: all of them as `value`, or, over the entries in `mask`, `mean`, `min` and
-    `max`.
+    """Return a parameter in a few numbers: all numbers as `value`, or `mean`, `min` and `max` over the entries in
+    `mask`.
 
     The mean of a texture (H, W, C) has a number for each channel. A mask of another resolution is read at the centres
-    of the texels; an empty mask is ignored.
+    of the texels. An empty mask is ignored.
     """
     if value.ndim < 3 and value.size <= MOST_NUMBERS:
         return {"value": value.tolist()}

@@ -2,31 +2,31 @@
 
 Gradient samples are steps that leave the parameters unchanged (`sample_gradient`).
 
-Sensitivities (`measure_sensitivities`): let g be the mean of some gradient samples, and z = -sign(g), the direction of
-Adam's first step, in one parameter x alone, all its entries together. With the image I(x) at common random numbers and
-the target T,
+Sensitivities (`measure_sensitivities`): g is the mean of some gradient samples. z = -sign(g) is the direction of Adam's
+first step, for all entries of one parameter x. I(x) is the image at common random numbers, and T the target.
 
     D = I(x + h z) - I(x)
     change = |D| / (h |M|),   length = h sum |D| M / sum D²,   M = max(|I|, |T|)
     curvature = (L(I + D) - 2 L(I) + L(I - D)) / h²,           L the loss of an image
 
-`change` is the relative change of the image per unit of the parameter, and `curvature` the Gauss-Newton curvature (with
-D scaled up to the resolution of single precision). `length` is the movement of the parameter that would explain image
-or target, by least squares over the pixels that it changes: its intensity for the only light of a scene, its albedo for
-a wall, independent of their share of the picture. h is chosen so that the image changes by about 3 %, so that neither
-rounding nor curvature dominates.
+`change` is the relative change of the image per unit of the parameter. `curvature` is the Gauss-Newton curvature, where
+D is scaled up to the resolution of single precision. `length` is the movement of the parameter that would explain image
+or target, by least squares over the pixels that it changes. For the only light of a scene, this is its intensity. For a
+wall, it is the albedo, independent of the wall's share of the picture. h is chosen so that the image changes by about 3
+%. Then neither rounding nor curvature dominates.
 
 Units for one common learning rate (`rescale`): step lengths from `Sensitivity.length` make all parameters equally fast.
-Gradients are divided by the root mean square of a sample, so that Adam's absolute epsilon has no effect.
+Gradients are divided by the root mean square of a sample, so Adam's absolute epsilon has no effect.
 
-Units for gradient descent (`measure_curvatures`, `scale: curvature`): the largest curvature lambda of the loss in the
-optimiser's variable v, by power iteration on differences of gradients at common random numbers,
+Units for gradient descent (`measure_curvatures`, `scale: curvature`): lambda is the largest curvature of the loss in
+the optimiser's variable v. Power iteration computes it from differences of gradients at common random numbers. h
+changes the image by about 3 %.
 
-    H d = (g(v + h d) - g(v - h d)) / (2 h),   d <- H d / |H d|,   lambda = |H d|,
+    H d = (g(v + h d) - g(v - h d)) / (2 h),   d <- H d / |H d|,   lambda = |H d|
 
-with h such that the image changes by about 3 %. The gradient is then divided by lambda, and by the number of
-parameters: if blocks have norm 1, the norm of a positive matrix is at most their number. A rate of 1 is Newton's step
-along the steepest direction; descent converges below a rate of 2, as long as the curvature is that of the start.
+The gradient is divided by lambda and by the number of parameters. If the blocks of a positive matrix have norm 1, its
+norm is at most their number. A rate of 1 is Newton's step along the steepest direction. Descent converges below a rate
+of 2, while the curvature is that of the start.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from reslrb_cli.statistics import Array, rms
 def sample_gradient(problem: Problem, integrator: Any, round: int, purpose: str, spp: int) -> dict[str, Any]:
     """Take one step of all views, evaluated, with the seeds of `round` and `purpose`.
 
-    The gradients are accumulated in `problem.optimizer`; `take_gradient` must follow.
+    The gradients are accumulated in `problem.optimizer`. Call `take_gradient` afterwards.
     """
     run = problem.config.run
     for view in problem.trained:
@@ -68,7 +68,7 @@ def sample_gradient(problem: Problem, integrator: Any, round: int, purpose: str,
 
 
 def take_gradient(problem: Problem) -> dict[str, Array]:
-    """Return the accumulated gradients, flat, 0 where they are not finite, and clear them."""
+    """Return the accumulated gradients as flat arrays, with 0 for values that are not finite, and clear them."""
     taken = {}
     for key, value in problem.gradients().items():
         taken[key] = finite(np.array(value, dtype=np.float32)).ravel()
@@ -77,12 +77,12 @@ def take_gradient(problem: Problem) -> dict[str, Array]:
 
 
 def finite(values: Array) -> Array:
-    """Return the values, 0 where they are not finite."""
+    """Return the values, with 0 for those that are not finite."""
     return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def unrecorded(integrator: Any) -> Any:
-    """Return the integrator without recordings of its steps, which do not pay for a few steps."""
+    """Return the integrator without recordings. For a few steps, a recording does not pay."""
     if not isinstance(integrator, LightTracer):
         return integrator
     return integrator.with_options(samples_per_pass=integrator.samples_per_pass, freeze=False)
@@ -111,8 +111,8 @@ QUANTITIES = ("gradient", "change", "curvature", "length")
 
 @dataclass(frozen=True)
 class Conditioning:
-    """Measured sensitivities of all parameters, from `samples` gradients of `spp` samples per pixel, with the run's
-    `seed`.
+    """Measured sensitivities of all parameters. They come from `samples` gradients of `spp` samples per pixel, with the
+    run's `seed`.
     """
 
     rows: list[Sensitivity]
@@ -121,8 +121,8 @@ class Conditioning:
     seed: int
 
     def spread(self, quantity: str) -> float | None:
-        """Return the largest value of one of QUANTITIES divided by its smallest, of those above 0; None for fewer than
-        two.
+        """Return the largest value of one of QUANTITIES divided by its smallest. Returns None for fewer than two
+        positive values.
 
         For `curvature`, this is the condition number of the diagonal of the Gauss-Newton matrix, by parameters.
         """
@@ -138,7 +138,7 @@ class Conditioning:
 
 
 def measure_conditioning(problem: Problem, samples: int) -> Conditioning:
-    """Measure every parameter of `problem` at its current value; the problem needs its targets, and `samples` is at
+    """Measure every parameter of `problem` at its current value. The problem needs its targets, and `samples` is at
     least 2.
     """
     run = problem.config.run
@@ -146,9 +146,10 @@ def measure_conditioning(problem: Problem, samples: int) -> Conditioning:
 
 
 def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
-    """Measure every parameter of `problem` at its current value, by `samples` gradients (at least 2) and a few images.
+    """Measure every parameter of `problem` at its current value, by at least two gradients (`samples`) and a few
+    images.
 
-    Each has the run's samples per pixel.
+    Each gradient and image has the run's samples per pixel.
     """
     problem.apply()
     rows: dict[str, list[Array]] = {key: [] for key in problem.selection.keys}
@@ -210,7 +211,7 @@ def _probe(
 
 
 def _second_difference(problem: Problem, base: Sequence[Array], difference: Sequence[Array], factor: float) -> float:
-    """Return L(I + D) - 2 L(I) + L(I - D), over the views by their shares; D is `factor` times the difference."""
+    """Return L(I + D) - 2 L(I) + L(I - D), over the views by their shares. D is `factor` times the difference."""
     total = 0.0
     for image, change, view in zip(base, difference, problem.trained, strict=True):
         for side, times in ((1, 1), (0, -2), (-1, 1)):
@@ -220,9 +221,9 @@ def _second_difference(problem: Problem, base: Sequence[Array], difference: Sequ
 
 
 def see_images(problem: Problem, spp: int | None = None, round: int = 0, purpose: str = _PURPOSE) -> list[Array]:
-    """Render every training view, exposed, without alpha, 0 in masked pixels, always from the same seeds.
+    """Render every training view, exposed and without alpha, always from the same seeds. Masked pixels are 0.
 
-    With `spp` samples per pixel, or the run's.
+    `spp` replaces the run's samples per pixel.
     """
     run, images = problem.config.run, []
     for view in problem.trained:
@@ -234,7 +235,7 @@ def see_images(problem: Problem, spp: int | None = None, round: int = 0, purpose
 
 
 def rescale(problem: Problem) -> list[Scaled]:
-    """Measure, let the optimiser move each parameter in units of the result, and return it.
+    """Measure all parameters and return the result. The optimiser then moves each parameter in units of it.
 
     A parameter without an effect on the image keeps its units.
     """
@@ -264,7 +265,8 @@ POWER_ITERATIONS = 8
 
 
 def measure_curvatures(problem: Problem) -> list[Scaled]:
-    """Measure, let gradient descent move each parameter in units of its steepest curvature, and return the result.
+    """Measure the steepest curvature of all parameters and return it. Gradient descent then moves each parameter in
+    units of it.
 
     A parameter without an effect on the image keeps its units.
     """
@@ -292,7 +294,9 @@ def measure_curvatures(problem: Problem) -> list[Scaled]:
 
 
 def _steepest(problem: Problem, key: str, v: Any, gradient: Array, base: Sequence[Array]) -> float:
-    """Return the largest curvature of the loss in `v`, the optimiser's variable of `key`; 0 if it is not visible."""
+    """Return the largest curvature of the loss in `v`, the optimiser's variable of `key`, or 0 if it has no visible
+    effect.
+    """
     size = math.sqrt(sum(float(np.square(image).sum()) for image in base))
     direction = gradient / (np.linalg.norm(gradient) or 1.0)
     step = 0.01 * (rms(np.array(v)) or 1.0) * math.sqrt(gradient.size)
@@ -323,7 +327,7 @@ def _steepest(problem: Problem, key: str, v: Any, gradient: Array, base: Sequenc
 
 
 def _gradient_at(problem: Problem, key: str, v: Any) -> Array:
-    """Return dL/dv, flat, with the optimiser's variable `v` of `key`, always from the same samples."""
+    """Return dL/dv as a flat array, for the optimiser's variable `v` of `key`, always from the same samples."""
     optimizer = problem.optimizer
     variable = optimizer.variable(key)
     optimizer.set_value(key, variable.to_scene(v))
@@ -341,7 +345,7 @@ def _like(value: Any, row: Array) -> Any:
 
 
 def own_length(transform: Transform | None, bounds: Bounds, value: Any, length: float) -> float:
-    """Return `length`, of the scene's `value`, in the optimiser's variable: a mean over the entries."""
+    """Convert `length`, a length of the scene's `value`, to the optimiser's variable, as a mean over the entries."""
     if transform is None:
         return length
     low, high = bounds or (-math.inf, math.inf)
@@ -355,9 +359,9 @@ def own_length(transform: Transform | None, bounds: Bounds, value: Any, length: 
 
 
 def step_line(row: Scaled, transform: str, learning_rate: float) -> str:
-    """Return a line for the user about one parameter; `transform` and `learning_rate` are those of its configuration.
+    """Return a line for the user about one parameter. `transform` and `learning_rate` are those of its configuration.
 
-    A step is in units of the optimiser's variable; for the first step, the line also has the movement of the parameter.
+    A step is in units of the optimiser's variable. For the first step, the line also has the movement of the parameter.
     """
     if row.own_length is None:
         lacks = "no effect on the image" if row.length is None else "no gradient"
@@ -370,7 +374,7 @@ def step_line(row: Scaled, transform: str, learning_rate: float) -> str:
 
 
 def curvature_line(row: Scaled, learning_rate: float) -> str:
-    """Return a line for the user about one parameter in units of its curvature."""
+    """Return a line for the user about one parameter with a scale from its curvature."""
     if row.own_length is None:
         return f"{row.key} has no effect on the image at its start; it is not scaled"
     return f"{row.key} moves by {row.first_step or 0.0:.3g} at first, {learning_rate:g} of the largest stable step"

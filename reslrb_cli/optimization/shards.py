@@ -1,23 +1,21 @@
 """Step in shards: sets of whole views, or shares of the samples of one view, computed separately.
 
-A `Task` is all data that a shard needs besides the problem. `shard_image` and `shard_gradient` are functions of both
-that return NumPy arrays and leave no changes, so the sums do not depend on where and in which order shards are
-computed.
+A `Task` has all data that a shard needs besides the problem. `shard_image` and `shard_gradient` depend only on task and
+problem, return NumPy arrays and leave no changes. The sums therefore do not depend on the place and order of
+computation.
 
-With S shares of a view, I_s the image of share s and w_s its part of the samples (1 / S),
+A view has S shares. I_s is the image of share s, w_s its part of the samples (1 / S), and J_s the derivative of I_s
+with respect to the parameters.
 
-    I = sum of w_s I_s,    gradient = sum over s of w_s J_s^T dL/dI      J_s: the derivative of I_s by the parameters
+    I = sum of w_s I_s,    gradient = sum over s of w_s J_s^T dL/dI
 
-In one round, each share takes dL/dI from its own samples, as `run.adjoint` says. In two rounds (`others`), dL/dI is
-that at
+With one round, each share takes dL/dI from its own samples, as `run.adjoint` says. With two rounds (`others`), each
+share takes dL/dI at the mean image of the other shares, (I - w_s I_s) / (1 - w_s). No path then uses a delta that
+contains it. For an L2 loss, this is the sum over all pairs of different shares, and unbiased. Images and gradients are
+added in the order of the shards, in double precision.
 
-    (I - w_s I_s) / (1 - w_s),    the mean image of the other shares
-
-so that no path uses a delta that contains it. For an L2 loss, this is the sum over all pairs of different shares, and
-unbiased. Images and gradients are added in the order of the shards, in double precision.
-
-Tables of guided emission do not change while shards are computed. They learn once per step if due, from separate
-samples, with dL/dI at the mean image of all shards.
+Tables of guided emission do not change while shards are computed. If an update is due, they learn once per step from
+separate samples, with dL/dI at the mean image of all shards.
 """
 
 from __future__ import annotations
@@ -61,9 +59,9 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Task:
-    """Shard of a step, of `spp` samples per pixel: whole views, or a part `weight` of the samples of one view.
+    """Shard of a step with `spp` samples per pixel: whole views, or a part `weight` of the samples of one view.
 
-    With `images`, the images of the samples are returned with the gradient.
+    With `images`, the result includes the images of the samples.
     """
 
     iteration: int
@@ -78,8 +76,8 @@ class Task:
 class ShardGradient:
     """Result of a shard.
 
-    It has the gradient of each parameter (float32), and for each part its loss, the refused entries of dL/dI (count,
-    flat index of the first, shape), and, if requested, the image, (H, W, C) or (2, H, W, C) with halves.
+    `gradients` has the gradient of each parameter (float32). For each part there are its loss, the refused entries of
+    dL/dI (count, flat index of the first, shape) and, if requested, the image, (H, W, C) or (2, H, W, C) with halves.
     """
 
     gradients: dict[str, Array]
@@ -92,7 +90,7 @@ class ShardGradient:
 
 
 def make_tasks(problem: Problem, iteration: int, images: bool = False) -> list[Task]:
-    """Return the shards of an iteration in order; with `images`, whole views return images, too."""
+    """Return the shards of an iteration in order. With `images`, shards of whole views return images, too."""
     config, drawn = problem.config, problem.drawn(iteration)
     shares, count = config.shares, min(config.shards, len(drawn))
     if shares > 1:
@@ -119,7 +117,7 @@ def shard_seed(config: Config, iteration: int, sensor: int, shard: int) -> int:
 
 
 def shard_image(problem: Problem, task: Task) -> Array:
-    """Return the image of a shard of one view, (H, W, C) or (2, H, W, C) with halves, float32."""
+    """Return the image of a shard of one view as float32, (H, W, C) or (2, H, W, C) with halves."""
     [part] = task.parts
     with _held(problem):
         image = render_image(
@@ -129,7 +127,7 @@ def shard_image(problem: Problem, task: Task) -> Array:
 
 
 def shard_gradient(problem: Problem, task: Task, delta: Array | None = None) -> ShardGradient:
-    """Return the gradient of a shard: with its own dL/dI, or, for one view, with `delta` in the shape of `shard_image`.
+    """Return the gradient of a shard, with its own dL/dI or, for one view, with `delta` in the shape of `shard_image`.
 
     Previously accumulated gradients are lost.
     """
@@ -196,7 +194,7 @@ def serially(state: S, function: Callable[..., T], work: Sequence[tuple[Any, ...
 
 
 def in_order(found: Iterable[tuple[int, T]]) -> Iterator[T]:
-    """Yield results in the order of their places, from 0 on; early results wait for their turn."""
+    """Yield results in the order of their positions. Early results wait for their turn."""
     early: dict[int, T] = {}
     place = 0
     for at, result in found:
@@ -213,13 +211,13 @@ class Sum:
         self.total: Array | None = None
 
     def add(self, array: Array, weight: float) -> None:
-        """Add `weight` times an array; values that are not finite remain so in the sum."""
+        """Add `weight` times an array. Values that are not finite stay in the sum."""
         with np.errstate(invalid="ignore", over="ignore"):
             own = array.astype(np.float64) * weight
             self.total = own if self.total is None else self.total + own
 
     def without(self, array: Array, weight: float) -> Array:
-        """Return the mean without one of the arrays, whose weight is `weight`, of a total weight of 1; float32."""
+        """Return the mean of all arrays except one, float32. `weight` is the weight of this array in a total of 1."""
         assert self.total is not None
         with np.errstate(invalid="ignore", over="ignore"):
             return np.asarray((self.total - array.astype(np.float64) * weight) / (1 - weight), dtype=np.float32)
@@ -230,8 +228,8 @@ def add_gradient(
 ) -> tuple[float, list[tuple[int, Refused]]]:
     """Set the parameters' gradients to the sum over an iteration's shards.
 
-    Returns the loss, and the refused entries of dL/dI by sensor. `on_start` is called when a step of two rounds starts,
-    and `on_image` when its images and losses are known.
+    Returns the loss, and the refused entries of dL/dI by sensor. `on_start` is called when a step of two rounds starts.
+    `on_image` is called when its images and losses are known.
     """
     engine, guiding = problem.engine or serially, guiding_of(problem)
     due = [] if guiding is None else _due(problem, guiding, iteration)
@@ -278,7 +276,7 @@ def _mean(found: Sum) -> mi.TensorXf:
 
 
 def _delta(problem: Problem, task: Task, image: Array, means: dict[int, Sum], refused: dict[int, Refused]) -> Array:
-    """Return dL/dI for a share of a view, at the mean image of the others."""
+    """Return dL/dI for a share of a view, at the mean image of the other shares."""
     [part] = task.parts
     view = next(view for view in problem.views if view.sensor == part.sensor)
     others = _tensor(means[part.sensor].without(image, task.weight))
@@ -287,7 +285,7 @@ def _delta(problem: Problem, task: Task, image: Array, means: dict[int, Sum], re
 
 
 def _count(refused: Refused, count: int, first: int, shape: tuple[int, ...]) -> None:
-    """Add the refused entries of a shard; the first entry is that of the first shard that has any."""
+    """Add the refused entries of a shard. The first entry is that of the first shard with refused entries."""
     if count and int(refused.first[0]) == NONE:
         refused.first, refused.shape = dr.opaque(mi.UInt32, first), shape
     refused.count = dr.opaque(mi.UInt32, int(refused.count[0]) + count)
@@ -304,7 +302,7 @@ def _due(problem: Problem, guiding: Guiding, iteration: int) -> list[int]:
 
 
 def _teach(problem: Problem, iteration: int, view: View, image: Sum) -> None:
-    """Let the tables of a view learn, with dL/dI at its mean image."""
+    """Update the tables of a view, with dL/dI at its mean image."""
     config = problem.config
     _, gradient = derivative_of(view.objective, _mean(image), Refused())
     sensor, own = problem.scene.sensors()[view.sensor], seed(config.run.seed, iteration, view.sensor, "image")

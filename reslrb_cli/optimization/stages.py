@@ -1,14 +1,15 @@
 """Stages of a run (`run.stages`): the problem of each iteration, and the transition from one stage to the next.
 
-A stage with its own resolution or film has its own problem, made from that of the run (`at_stage`), with the run's
-values resampled. The last stage is the run as configured, with the run's own problem. When the problem changes, the
-optimiser starts anew, because its moments belong to other maps, and the suitable step length depends on the resolution.
+A stage with its own resolution or film has its own problem. It is made from the run's problem (`at_stage`), with
+resampled values. The last stage is the run as configured, with the run's own problem. When the problem changes, the
+optimiser restarts, because its moments belong to other maps, and the suitable step length depends on the resolution.
 
-A coarse stage changes the run's values x by the change of its own values c, with R and P between the two maps:
+A coarse stage adds the change of its own values c to the run's values x. R and P convert between the two resolutions,
+and x0 are the run's values at the start of the stage.
 
-    x = x0 + P (c - R x0)      x0 the run's values when the stage began
+    x = x0 + P (c - R x0)
 
-so that details too fine for the stage stay as they were (Brandt 1977, the full approximation scheme).
+Details too fine for the stage therefore stay unchanged (Brandt 1977, the full approximation scheme).
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ Array = np.ndarray[Any, Any]
 
 
 class Stages:
-    """Problems of one run's stages; besides the run's own problem `whole`, one is kept at a time.
+    """Problems of one run's stages. Besides the run's own problem `whole`, only one is kept at a time.
 
     `State.stage` is the stage of a state. Before the first iteration, a state belongs to the run's own problem.
     """
@@ -63,7 +64,7 @@ class Stages:
         return self.whole.config.stage(number).grain == self.whole.config.stage(self.last).grain
 
     def at(self, number: int) -> Problem:
-        """Return the problem of a stage; if it was not the current one, it has the values of `whole`."""
+        """Return the problem of a stage. If it was not the current one, it gets the values of `whole`."""
         if number == self._number:
             return self._now
         if self.is_whole(number):

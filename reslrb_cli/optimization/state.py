@@ -1,13 +1,13 @@
 """State of a run's iterations, and the decisions before the first iteration.
 
-- `State`: everything that determines the next iteration; equal states lead to equal states.
-- `standing`, `put`: the current state of a problem, and a problem set to a state.
-- `load`: a stored state, if it fits the problem.
-- `Settled`: the data common to all processes of a run: initial values, estimator, passes, masks, ways of sampling;
-  `begin_as`, `decide_as` and `reach_as` assemble a problem from it.
+- `State` has everything that determines the next iteration. Equal states lead to equal states.
+- `standing` returns the current state of a problem, and `put` sets a problem to a state.
+- `load` reads a stored state if it fits the problem.
+- `Settled` has the data common to all processes of a run: initial values, estimator, passes, masks, ways of sampling.
+    `begin_as`, `decide_as` and `reach_as` assemble a problem from it.
 
-Dr.Jit and Mitsuba change some data in place: the parameters of the scene, the optimiser's leaves, which receive
-gradients, and the tables of guided emission. They follow from a state, and `put` writes them.
+Dr.Jit and Mitsuba change some data in place: the parameters of the scene, the optimiser's leaves, and the tables of
+guided emission. These data follow from a state, and `put` writes them.
 """
 
 from __future__ import annotations
@@ -34,23 +34,24 @@ from reslrb_cli.records.tree import PASSING, Array, Arrays, Stored, entry, expec
 
 @dataclass(frozen=True)
 class State:
-    """State at the start of an iteration; for a new run, the default with `standing`.
+    """State at the start of an iteration. For a new run, it is the default with `standing`.
 
-    - `iteration` is the number of finished iterations, and `standstill` the number of the last ones in a row in which
-      something was skipped.
+    - `iteration` is the number of finished iterations. `standstill` is the number of the last consecutive iterations in
+        which something was skipped.
     - `peak_mib` is the allocator's maximum, and `scaling` the result of `scale: auto`.
-    - `units` are length and gain of variables by parameter (`Variable`), `moments` are the optimiser's, `clamp` the
-      iterations that the clamp knows, and `clamp_sums` its sums.
+    - `units` are length and gain of variables by parameter (`Variable`), and `moments` are the optimiser's. `clamp` has
+        the iterations of the clamp, and `clamp_sums` its sums.
     - `guiding` are the numbers of gradients of guided emission by sensor, and `learned` its arrays by
-      `<sensor>/<what>`.
-    - `values` are the scene's, in the optimiser's form; in a file, they are in their displayed form, with `halo` for
-      the rest.
-    - `stage` is the number of the state's stage, and `base` the run's values at its start, for a stage with its own
-      problem (`stages`).
-    - `drops` are the reductions of the rate by a plateau, and `since` the iterations before the last of them.
-    - `stopped` says why the run ends as finished, and `end` why it fails; "" otherwise.
+        `<sensor>/<what>`.
+    - `values` are the scene's, in the optimiser's form. In a file they are in their displayed form, and `halo` has the
+        rest.
+    - `stage` is the number of the state's stage. `base` has the run's values at its start, for a stage with its own
+        problem (`stages`).
+    - `drops` is the number of reductions of the rate by a plateau, and `since` the number of iterations before the last
+        of them.
+    - `stopped` tells why the run ends as finished, and `end` why it fails. Both are "" otherwise.
     - `first_s` is `elapsed_s` after the first iteration.
-    - `gradients` are those of the step before, in the form of `values`.
+    - `gradients` are those of the previous step, in the form of `values`.
     """
 
     iteration: int
@@ -76,16 +77,16 @@ class State:
     gradients: dict[str, Any] = field(default_factory=dict, metadata=PASSING)
 
     def on_file(self, problem: Problem) -> State:
-        """Return the state with the values in the form of a file."""
+        """Return the state with the values in their displayed form, for a file."""
         values, halo = on_file(problem, self.values)
         return replace(self, values=values, halo=halo)
 
 
 def standing(problem: Problem, state: State | None = None) -> State:
-    """Return the current state of `problem`, with the plain values of `state`; without `state`, the problem has done
-    nothing.
+    """Return the current state of `problem`, with the plain values of `state`. Without `state`, no iteration has been
+    made.
 
-    It copies nothing, because no iteration changes the arrays of an earlier one.
+    Nothing is copied, because no iteration changes the arrays of an earlier one.
     """
     state = State(0, 0.0, 0.0, 0, {}, {}, stage=len(problem.config.run.stages)) if state is None else state
     optimizer, guiding = problem.optimizer, guiding_of(problem)
@@ -98,7 +99,7 @@ def standing(problem: Problem, state: State | None = None) -> State:
 
 
 def put(problem: Problem, state: State) -> str | None:
-    """Set optimiser, guided emission and scene to `state`; return the name of a table that does not fit
+    """Set optimiser, guided emission and scene to `state`. Returns the name of a table that does not fit
     (`restore_tables`).
     """
     problem.optimizer.restore(state.values, state.units, state.moments)
@@ -109,9 +110,9 @@ def put(problem: Problem, state: State) -> str | None:
 
 
 def load(problem: Problem, stored: Stored, whole: Problem) -> State:
-    """Return the stored state, after setting `problem`, that of its stage, to it; `whole` is the run's own problem.
+    """Set `problem` to the stored state and return the state. `whole` is the run's own problem.
 
-    Raises ConfigError if it belongs to another experiment.
+    `problem` is the problem of the state's stage. Raises ConfigError if the state belongs to another experiment.
     """
     told, optimizer, keys = stored.read(State), problem.optimizer, problem.selection.keys
     for key, (length, _) in told.units.items():
@@ -134,7 +135,7 @@ def guiding_of(problem: Problem) -> Guiding | None:
 
 
 def noted_of(problem: Problem) -> dict[str, Array]:
-    """Return the recorded densities of camera paths over the pixels, (H, W), by the number of the sensor.
+    """Return the recorded densities of camera paths over the pixels (H, W), by the number of the sensor.
 
     They are the argument of `LightTracer.shared_out`.
     """
@@ -145,7 +146,7 @@ def noted_of(problem: Problem) -> dict[str, Array]:
 def restore_tables(problem: Problem, calls: Mapping[str, int], learned: Mapping[str, Array]) -> str | None:
     """Restore the tables of the run's integrator, if it has any, from stored data (`State`).
 
-    Returns the name of an array that does not fit this scene; then nothing has changed.
+    If an array does not fit this scene, its name is returned and nothing has changed.
     """
     guiding = guiding_of(problem)
     if guiding is None:
@@ -162,17 +163,16 @@ def restore_tables(problem: Problem, calls: Mapping[str, int], learned: Mapping[
 
 
 def on_file(problem: Problem, values: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Return values of parameters from the optimiser's form in their displayed form, and the complete arrays of those
-    that lose data.
+    """Convert values of parameters from the optimiser's form to their displayed form.
 
-    An environment map loses its halo.
+    Also returns the complete arrays of parameters that lose data. For example, an environment map loses its halo.
     """
     shown = {key: problem.selection.shown(key, value) for key, value in values.items()}
     return shown, {key: own for key, value in values.items() if (own := to_array(value)).size != shown[key].size}
 
 
 def _stored_values(problem: Problem, stored: Stored, prefix: str) -> dict[str, Any]:
-    """Return values in the optimiser's form from the result of `on_file`; `prefix` is that of their entries."""
+    """Return values in the optimiser's form from the result of `on_file`. `prefix` is the prefix of their names."""
     found = {}
     for key in problem.selection.keys:
         now, name, shape = dr.detach(problem.optimizer[key]), f"{prefix}/{key}", problem.selection.array(key).shape
@@ -189,8 +189,8 @@ def _stored_values(problem: Problem, stored: Stored, prefix: str) -> dict[str, A
 class Settled:
     """Data common to all processes of a run.
 
-    They are its settings in the form of a file, `variant`, the digests of the `files`, the decisions by measurement,
-    the initial values of the parameters, and the `masks` of a `Problem`.
+    It has the settings in the form of a file, `variant`, the digests of the `files`, the decisions by measurement, the
+    initial values of the parameters, and the `masks` of a `Problem`.
     """
 
     config: str

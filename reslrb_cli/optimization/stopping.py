@@ -1,9 +1,9 @@
-"""Detection of a loss that stands, which ends a run early (`run.stop`) or lowers its rate (`optimizer.schedule:
-plateau`); and the time of a run (`run.max_seconds`).
+"""Detection of a flat loss, and the time limit of a run (`run.max_seconds`).
 
-The losses are divided into windows of `patience` iterations, and tested at the end of each. A loss stands if the test
-shows that it falls by less than `relative` per window (`trend.stands`). If views are held out, their loss is tested,
-which has fewer values, always of the same samples. Windows start after the stages of `run.stages`, and again after the
+A flat loss ends a run early (`run.stop`) or lowers its learning rate (`optimizer.schedule: plateau`). The losses are
+divided into windows of `patience` iterations, and tested at the end of each window. A loss is flat if the test shows
+that it falls by less than `relative` per window (`trend.stands`). If views are held out, the held-out loss is tested.
+It has fewer values, always from the same samples. Windows start after the stages of `run.stages`, and again after the
 rate has been lowered. A run with a plateau ends only at its lowest rate.
 """
 
@@ -36,14 +36,16 @@ OUT_OF_TIME = "the time is up"
 
 
 def time_share(limit_s: float | None, state: State) -> float:
-    """Return the share of a run's time that has passed since its first iteration, which compiles; 0 without a limit."""
+    """Return the share of a run's time that has passed since its first iteration, which compiles, or 0 without a
+    limit.
+    """
     if limit_s is None or not state.iteration:
         return 0.0
     return min((state.elapsed_s - state.first_s) / max(limit_s - state.first_s, 1e-9), 1.0)
 
 
 def out_of_time(limit_s: float | None, state: State) -> str:
-    """Return a message if an iteration of the mean duration (without the first) would exceed the limit;
+    """Return a message if one more iteration of mean duration (without the first) would exceed the limit,
     otherwise "".
     """
     mean_s = (state.elapsed_s - state.first_s) / max(state.iteration - 1, 1)
@@ -53,20 +55,20 @@ def out_of_time(limit_s: float | None, state: State) -> str:
 
 
 class Watch:
-    """Losses of a run so far, iteration by iteration; equal losses lead to equal decisions."""
+    """Losses of a run so far, iteration by iteration. Equal losses lead to equal decisions."""
 
     def __init__(self, config: Config) -> None:
         self.config, self.held_out = config, bool(config.run.held_out)
         self._values: dict[int, float] = {}
 
     def add(self, record: Record) -> None:
-        """Add an iteration, also that of a resumed run."""
+        """Add an iteration, including those of a resumed run."""
         loss = record.held_out if self.held_out else record.loss
         if loss is not None and math.isfinite(loss):
             self._values[record.iteration] = loss
 
     def after(self, state: State, record: Record) -> State:
-        """Add the record, and return the state after the iteration with the decisions made now."""
+        """Add the record, and return the state after the iteration with the current decisions."""
         self.add(record)
         stop, optimizer, done = self.config.run.stop, self.config.optimizer, state.iteration
         began = max(self._first, state.since)
@@ -84,7 +86,7 @@ class Watch:
         return math.ceil(stages[-1].until * iterations) + 1 if stages else 0
 
     def _stands(self, asked: StopRule, began: int, done: int) -> str:
-        """Return a message about how the loss stands after `done` iterations; "" if this is not shown, or no window
+        """Return a message about a flat loss after `done` iterations. It is "" if the loss is not flat, or if no window
         ends.
         """
         span = asked.patience

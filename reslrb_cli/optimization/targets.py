@@ -52,8 +52,8 @@ WORDS = {
 def mask_of(config: Config, wanted: Wanted, scene: mi.Scene, photo: Photo | None, lacking: bool) -> Masked:
     """Find the pixels of a view that its mask excludes.
 
-    `photo` is the file of the target, None for a rendered one. `lacking` says whether target and image differ by the
-    light that light paths cannot find. Raises ConfigError for a wrong file of weights.
+    `photo` is the file of the target, or None for a rendered target. `lacking` is true if only one of target and image
+    contains the light that light paths cannot find. Raises ConfigError for a wrong file of weights.
     """
     mask, sensor, found = wanted.mask, scene.sensors()[wanted.sensor], Masked()
     width, height = (int(n) for n in sensor.film().crop_size())
@@ -84,7 +84,7 @@ def mask_of(config: Config, wanted: Wanted, scene: mi.Scene, photo: Photo | None
 
 
 def mask_line(name: str, masked: Masked, weights: Array) -> str | None:
-    """Return a line for the user about a view's mask; None if nothing is excluded, weighted or counted."""
+    """Return a line for the user about a view's mask, or None if nothing is excluded, weighted or counted."""
     counts = masked.counts()
     stay = [f"{count} {WORDS[kind]} and are kept" for kind, count in masked.stay.items()]
     if not counts and not stay and masked.weights is None:
@@ -96,7 +96,7 @@ def mask_line(name: str, masked: Masked, weights: Array) -> str | None:
 
 
 def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
-    """Read or render every view's target; return the problem with the true values of rendered targets as its `truth`.
+    """Read or render every view's target. Returns the problem with the true values of rendered targets as its `truth`.
 
     `say` is called with lines about slow work and excluded pixels. Raises ConfigError.
     """
@@ -131,7 +131,7 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
 
 
 def _say_few(remarks: Sequence[str], say: Callable[[str], None]) -> None:
-    """Say remarks on views; if there are many, the first ones and how many more there are."""
+    """Pass remarks on views to `say`: if there are many, only the first ones and the number of the others."""
     for line in remarks[:FEW_REMARKS]:
         say(line)
     if len(remarks) > FEW_REMARKS:
@@ -139,7 +139,7 @@ def _say_few(remarks: Sequence[str], say: Callable[[str], None]) -> None:
 
 
 def _check_light(problem: Problem, say: Callable[[str], None]) -> None:
-    """Raise ConfigError if all targets are black; if only some are, `say` which."""
+    """Raise ConfigError if all targets are black. If only some are black, name them by `say`."""
     black = [view.sensor for view in problem.views if not np.any(np.array(view.target))]
     if not black:
         return
@@ -153,7 +153,7 @@ def _check_light(problem: Problem, say: Callable[[str], None]) -> None:
 
 
 def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: Callable[[str], None]) -> None:
-    """Set the target of a view, (H, W, C), and its mask; `photo` is the file that was read, if any."""
+    """Set the target of a view (H, W, C) and its mask. `photo` is the file that was read, if any."""
     wanted, config = view.wanted, problem.config
     colors = color_channels(problem.scene.sensors()[view.sensor].film())
     if colors == 1 and image.shape[2] >= 3:
@@ -181,7 +181,7 @@ def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: C
 
 
 def _render_targets(problem: Problem, say: Callable[[str], None]) -> dict[str, Array]:
-    """Render the targets of views without a file; return the parameters' true values."""
+    """Render the targets of views without a file. Returns the parameters' true values."""
     config, render = problem.config, problem.config.target.render
     assert render is not None, "requires rendered targets"
     true_scene = load_configured(config, warn=False)
@@ -218,9 +218,9 @@ def _truth(problem: Problem, true_values: Selection, say: Callable[[str], None])
 
 
 def set_true_values(config: Config, scene: mi.Scene) -> Selection:
-    """Set the values of `target.render.parameters` in `scene`; return them as a selection.
+    """Set the values of `target.render.parameters` in `scene`, and return them as a selection.
 
-    They are checked like initial values; errors are located in the target.
+    They are checked like initial values. Errors are located in the target.
     """
     render = config.target.render
     assert render is not None, "requires rendered targets"

@@ -1,25 +1,25 @@
-"""Tests of a noisy series of losses: whether it stands, and whether it fell or rose over a run.
+"""Tests of a noisy series of losses: whether it is flat, and whether it fell or rose over a run.
 
 Losses of iterations have heavy tails: one bright path can multiply a loss by ten. No test therefore uses a plain mean.
 
-`stands` shows a standstill; it is not enough that no fall was seen. A window of iterations has one level, its
+`stands` proves that a loss is flat, which is more than not detecting a fall. A window of iterations has one level, its
 interquartile mean (`levels_of`). A line through the levels of the last k windows has a slope, whose standard error has
-k - 2 degrees of freedom. The loss stands if the upper bound for the fall per window is below `relative`. The standard
+k - 2 degrees of freedom. The loss is flat if the upper bound for the fall per window is below `relative`. The standard
 error comes from the spread of the levels, so losses may be correlated over less than a window.
 
 The test is repeated after every window, for several k, and a run stops at the first success. The j-th test therefore
-has the share 2 / (j (j - 1)) of `CHANCE`, in equal parts for its k. The shares sum to 1 from j = 3 on. A loss that
-falls by `relative` per window is stopped in at most 5 % of runs, however long they are.
+has the share 2 / (j (j - 1)) of `CHANCE`, in equal parts for its k. The shares sum to 1 from j = 3 on. At most 5 % of
+runs stop although their loss falls by `relative` per window, however long they are.
 
 `find_trend` tests the ranks of all losses, in ten parts (Conover and Iman 1981), by the same line.
 
 - It rose, or fell, if the line does, or if the last tenth of the iterations is significantly on that side of the first
-  tenth. Both need the levels of these tenths to agree.
+    tenth. Both need the levels of these tenths to agree.
 - It also fell if the first three losses are above the second half, because many falls end within a few iterations.
-- It also rose if the first loss is below all others, and significantly below the last tenth. Some runs leap at their
-  first step, and come down again to a level above their start.
-- It was flat if it did neither, and if it significantly fell by less than `MOST_FALL`: raised by as much, the line
-  rises.
+- It also rose if the first loss is below all others, and significantly below the last tenth. Some runs jump at their
+    first step, and come down again to a level above their start.
+- Otherwise it was flat if it significantly fell by less than `MOST_FALL`. The test adds this fall to the series, and
+    requires the line to rise.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Level:
 
 
 class Change(str, enum.Enum):
-    """Change of a series, as far as its noise shows."""
+    """Significance of the change of a series."""
 
     FELL = "fell"
     ROSE = "rose"
@@ -78,7 +78,9 @@ class Change(str, enum.Enum):
 
 @dataclass(frozen=True)
 class Trend:
-    """Series at its start and at its end, and the change in its second half alone (None: too short)."""
+    """Level of a series at its start and at its end, and the change in its second half alone (None if it is too
+    short).
+    """
 
     start: Level
     end: Level
@@ -91,7 +93,9 @@ class Trend:
 
 
 def find_trend(values: Sequence[float]) -> Trend | None:
-    """Return the trend of a value per iteration, None for too few values; values that are not finite are left out."""
+    """Return the trend of a value per iteration, or None for too few values. Values that are not finite are left
+    out.
+    """
     series = np.array([value for value in values if math.isfinite(value)], dtype=np.float64)
     count, width = series.size, window(series.size)
     if count < LEAST_ITERATIONS:
@@ -116,11 +120,10 @@ def find_trend(values: Sequence[float]) -> Trend | None:
 
 
 def stands(levels: Array, relative: float, number: int) -> Array:
-    """Return for each series of levels (..., J), one per window, the number of last windows over which it stands; 0:
-    none.
+    """Return for each series of levels (..., J) the number of last windows over which it is flat, or 0.
 
-    It stands if it significantly falls by less than the share `relative` from one window to the next. `number` is the
-    number of windows of the run so far, each of which was tested.
+    There is one level per window. A series is flat if its fall from one window to the next is significantly less than
+    the share `relative`. `number` is the number of windows of the run so far, each of which was tested.
     """
     spans = [k for k in SPANS if k <= levels.shape[-1]]
     found = np.zeros(levels.shape[:-1], dtype=int)
@@ -150,7 +153,7 @@ def line(values: Array, at: Array | None = None) -> tuple[Array, Array]:
 
 
 def window(iterations: int) -> int:
-    """Return the number of first and of last iterations that are averaged."""
+    """Return the number of iterations that are averaged at the start and at the end."""
     return max(iterations // 10, LEAST_WINDOW)
 
 

@@ -1,11 +1,11 @@
 """View: one sensor, its target image, and their comparison.
 
-- `Exposure`: factor of a view's image before the comparison: a number, or a recovered parameter. The model is  target =
-  exposure * image,  with one exposure E for all channels or one for each. The derivative of a loss L(E I) with respect
-  to E is the sum over pixels of dL/dI I / E. It uses the samples of the other derivatives. If dL/dI comes from other
-  samples than I, it is as unbiased as these.
-- `Wanted`: settings of the views, from `views` or, for a single view, from `target`.
-- `Masked`, the masked pixels of a view, and `View` itself.
+- `Exposure` is the factor of a view's image before the comparison: a number, or a recovered parameter. The model is
+    target = exposure * image, with one exposure E for all channels or one for each. The derivative of a loss L(E I)
+    with respect to E is the sum over pixels of dL/dI I / E. It uses the samples of the other derivatives. If dL/dI
+    comes from other samples than I, it is as unbiased as these.
+- `Wanted` has the settings of the views, from `views` or, for a single view, from `target`.
+- `Masked` has the masked pixels of a view, and `View` is the view itself.
 """
 
 from __future__ import annotations
@@ -51,11 +51,13 @@ class Exposure:
     values: Mapping[str, Any] = field(default_factory=dict)
 
     def now(self) -> mi.Float | mi.Color3f | float:
-        """Return the current exposure, without derivatives: of width 1, one per channel, or the fixed number."""
+        """Return the current exposure, without derivatives: an array of width 1, one number per channel, or the fixed
+        number.
+        """
         return dr.detach(self.values[self.key]) if self.key else self.fixed
 
     def applied(self, image: mi.TensorXf) -> mi.TensorXf:
-        """Return E I for an image (H, W, C), attached as the image is."""
+        """Return E I for an image (H, W, C). The result is attached if the image is."""
         value = self.now()
         if isinstance(value, (int, float)):
             return image if value == 1 else image * value
@@ -89,7 +91,7 @@ class Wanted:
     """Settings of the view through `sensor`: the file of its target (None for a rendered one), and its mask.
 
     `file_key` and `mask_key` are their places in the configuration. `exposure` is a number, or the settings of its
-    recovery, with its key; `part` is the view's weight in the loss, relative to the others.
+    recovery, with its key. `part` is the view's weight in the loss, relative to the others.
     """
 
     sensor: int = 0
@@ -168,9 +170,10 @@ def _view_specs(config: Config, sensors: list[int]) -> list[ViewSpec]:
 
 @dataclass
 class Masked:
-    """Masked pixels of one view, boolean (H, W) by kind, that `left_out` excludes; a pixel may have several kinds.
+    """Masked pixels of one view, boolean (H, W) by kind. `left_out` has the excluded pixels. A pixel may have several
+    kinds.
 
-    `weights` (H, W) come from a file, None without one; `stay` are the pixels of a kind that is only counted.
+    `weights` (H, W) come from a file, or are None without one. `stay` has the pixels of kinds that are only counted.
     """
 
     left_out: dict[str, Array] = field(default_factory=dict)
@@ -178,28 +181,32 @@ class Masked:
     weights: Array | None = None
 
     def total(self, shape: tuple[int, int]) -> Array:
-        """Return the weight of each pixel, float32 (H, W): 0 if it is excluded, and 1 elsewhere without a file."""
+        """Return the weight of each pixel, float32 (H, W). Excluded pixels have 0. Without a file, the others
+        have 1.
+        """
         total = np.ones(shape, np.float32) if self.weights is None else self.weights.astype(np.float32)
         for pixels in self.left_out.values():
             total = np.where(pixels, np.float32(0), total)
         return total
 
     def counts(self) -> dict[str, int]:
-        """Return the number of pixels that each kind excludes, without zeros."""
+        """Return the number of pixels that each kind excludes. Kinds without pixels are left out."""
         return {kind: count for kind, pixels in self.left_out.items() if (count := int(pixels.sum()))}
 
 
 @dataclass
 class View:
-    """View through the scene's sensor of index `sensor`; `share` is its weight in the loss (those of training views sum
-    to 1).
+    """View through the scene's sensor of index `sensor`. `share` is its weight in the loss. The shares of training
+    views sum to 1.
 
-    - `made` is the target (H, W, C), without alpha; None until it exists, and `target` then raises LookupError.
-    - `weights`, of the same shape with a mean of 1, are 0 for entries that `masked` excludes; None if all are equal.
-    - `fits`: the image is scaled to fit the target (`fitted`, with `across`).
+    - `made` is the target (H, W, C) without alpha. Until it exists, it is None, and `target` raises LookupError.
+    - `weights` have the same shape and a mean of 1. They are 0 for entries that `masked` excludes, and None if all are
+        equal.
+    - `fits` tells whether the image is scaled to fit the target (`fitted`, with `across`).
     - A `held_out` view is not trained on, and has its own loss.
     - `codes` are the user's losses.
-    - `fixed` are the weights (H, W) without the mask of moving glass and mirrors (`follow`); None without one.
+    - `fixed` are the weights (H, W) without the mask of moving glass and mirrors (`follow`), or None without such a
+        mask.
     """
 
     sensor: int
@@ -224,14 +231,14 @@ class View:
         return self.made
 
     def see(self, target: Array, weights: Array | None = None) -> None:
-        """Set a target (H, W, C), finite where its weights (H, W) are not 0; excluded entries become 0."""
+        """Set a target (H, W, C). It must be finite where its weights (H, W) are not 0. Excluded entries become 0."""
         if weights is not None and not np.all(weights == 1):
             target = np.where(np.isfinite(target), target, 0)
         self.made = to_tensor(target)
         self.weigh(weights)
 
     def weigh(self, weights: Array | None) -> None:
-        """Set weights (H, W) for the current target; None weights all pixels equally."""
+        """Set weights (H, W) for the current target. None weights all pixels equally."""
         self.weights = None
         if weights is not None and not np.all(weights == 1):
             share = weights / weights.mean(dtype=np.float64)
@@ -247,7 +254,7 @@ class View:
             self.weigh(weights)
 
     def compare(self, image: mi.TensorXf) -> mi.Float:
-        """Return the loss of an image, of width 1, attached; without alpha, with the view's exposure.
+        """Return the loss of an image, of width 1, attached. Alpha is dropped, and the view's exposure is applied.
 
         The image is (H, W, C), or (2, H, W, C) with two halves of its samples, which `fitted` uses.
         """
@@ -265,7 +272,8 @@ class View:
         return loss(dr.select(self.weights > 0, image, target), target, self.weights)
 
     def curvature(self, known: bool) -> Array:
-        """Return the curvature (H, W) of the loss in each pixel, with a mean of 1; that of l2 if it is not `known`.
+        """Return the curvature (H, W) of the loss in each pixel, with a mean of 1. If it is not `known`, return that of
+        l2.
 
         Excluded pixels have 0. The noise of each channel is assumed to be proportional to the target.
         """
@@ -276,7 +284,7 @@ class View:
         return np.asarray(curvature / curvature.mean())
 
     def scale(self, image: mi.TensorXf) -> float:
-        """Return the factor of an image as in `compare`, besides the exposure: 1 unless it is `fitted`."""
+        """Return the factor on an image in `compare`, besides the exposure. It is 1 unless the loss is `fitted`."""
         if not self.fits:
             return 1.0
         exposed = self.exposure.applied(first_channels(image, self.target.shape[2]))
@@ -285,13 +293,15 @@ class View:
         return float(best_scale(halves_of(exposed), self.target, self.weights)[0])
 
     def exposed(self, seen: mi.TensorXf) -> tuple[Array, Array, float]:
-        """Return an image as in `compare` (H, W, C), the same with the exposure of its target, and its `scale`."""
+        """Return an image as in `compare` (H, W, C), the same image with the exposure of its target, and its
+        `scale`.
+        """
         image, scale = np.array(whole_of(seen)), self.scale(seen)
         exposure = Exposure(self.exposure.fixed * scale) if self.fits else self.exposure
         return image, exposure.of_array(image), scale
 
     def kept(self, image: Array) -> Array:
-        """Return an image of the target's shape, 0 in excluded pixels."""
+        """Return an image with the target's shape, and 0 in excluded pixels."""
         return image if self.weights is None else np.where(np.array(self.weights) > 0, image, 0)
 
     def objective(self, image: mi.TensorXf) -> mi.Float:
@@ -300,7 +310,7 @@ class View:
 
 
 def slope(loss: Callable[[mi.TensorXf], mi.Float], image: Array) -> Array:
-    """Return the derivative of a loss of images, of width 1, at an image (H, W, C); finite or not."""
+    """Return the derivative of a loss at an image (H, W, C). The loss has width 1. The derivative may be non-finite."""
     leaf = mi.TensorXf(np.ascontiguousarray(image, dtype=np.float32))
     dr.enable_grad(leaf)
     dr.backward(loss(leaf))
@@ -327,7 +337,7 @@ def view_records(views: list[View]) -> list[dict[str, Any]]:
 def make_views(config: Config, scene: mi.Scene) -> list[View]:
     """Return the views of an experiment, without their targets.
 
-    Raises ConfigError as `wanted_views`, and for images that are too small for a loss.
+    Raises the errors of `wanted_views`, and ConfigError for images that are too small for a loss.
     """
     wanted = wanted_views(config, scene)
     views: list[View] = []

@@ -1,7 +1,7 @@
 """Files that are either complete or absent, however the process ends.
 
-Unfinished files are named `.NAME.PID.part`, unfinished folders `.reslrb-*`. A process that fails removes its own. A
-process that exits at once calls `remove_unfinished`. The rest of a killed process is recognised by its name.
+Unfinished files are named `.NAME.PID.part`, unfinished folders `.reslrb-*`. A process that fails removes its own files.
+A process that exits at once calls `remove_unfinished`. Files of killed processes are recognised by their names.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object], durable: 
 
 @contextmanager
 def unfinished_folder(parent: Path, lock: bool = True) -> Iterator[Path]:
-    """Yield a new folder in `parent`; unless the block renames it, remove it with its content at the end.
+    """Yield a new folder in `parent`. Unless the block renames it, the folder is removed at the end.
 
     The folder is locked, because other processes remove old unlocked folders. With `lock=False`, the block must lock
     it.
@@ -73,7 +73,7 @@ def unfinished_folder(parent: Path, lock: bool = True) -> Iterator[Path]:
 
 
 def remove_unfinished() -> None:
-    """Remove the unfinished files and folders of this process; call it before an immediate exit."""
+    """Remove the unfinished files and folders of this process. Call this before an immediate exit."""
     for path in list(unfinished):
         with contextlib.suppress(OSError):
             if path.is_dir():

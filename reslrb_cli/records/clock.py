@@ -20,7 +20,7 @@ class StepTimes:
 
     `wall_ms` is the wall time. `kernel_ms` is the execution time of kernels and `codegen_ms` the time of their
     generation and compilation, both from `dr.kernel_history`. `new_kernels` counts kernels that no earlier step of the
-    same clock launched; `cache_hit` is also true for kernels from the disk cache, so it cannot serve for that.
+    same clock launched. `cache_hit` does not tell this, because it is also true for kernels from the disk cache.
     """
 
     wall_ms: float = 0.0
@@ -30,7 +30,7 @@ class StepTimes:
 
 
 class StepClock:
-    """Clock for steps; it also sums up the time of an optimisation, without the time for writing files."""
+    """Clock for steps. It also sums up the time of an optimisation, without the time for writing files."""
 
     def __init__(self, elapsed_s: float = 0.0) -> None:
         self.elapsed_s = elapsed_s
@@ -84,9 +84,9 @@ class WorkerTime:
 class SharedTime:
     """Seconds of the computation shared by workers, by part, and the work of each worker, by name.
 
-    `wall_s` is the time from the first call of a round to its last answer. The mean worker computes for `computing_s`
-    and waits for `waiting_s` for the slowest one. The rest is `sending_s`, which includes distributing the calls.
-    `places` are the places of the workers, as given to `--cluster`.
+    `wall_s` is the time from the first call of a round to its last answer. `computing_s` is the mean time in which a
+    worker computes, and `waiting_s` the mean time in which it waits for the slowest worker. The rest is `sending_s`,
+    which includes distributing the calls. `places` are the places of the workers, as given to `--cluster`.
     """
 
     places: tuple[str, ...] = ()

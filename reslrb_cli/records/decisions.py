@@ -83,10 +83,10 @@ def _times(gain: float | None, low: float | None, high: float | None, note: str)
 class PaidRecord(Finding):
     """Measured gain of an alternative sampling method.
 
-    `gain` is the ratio of the gradient's efficiency 1 / (variance * time) with and without the method; its 95 %
-    interval is `low` to `high`. `image_gain`, `image_low` and `image_high` are the same for the image, if the
-    gradient's samples serve both. Values that were not measured are None. `note` gives the reason if the method is off
-    despite its gain. `rounds` steps of each kind took `share` of the time of 200 iterations.
+    The gradient's efficiency is 1 / (variance * time). `gain` is its ratio with and without the method, with a 95 %
+    interval from `low` to `high`. `image_gain`, `image_low` and `image_high` are the same for the image, if the
+    gradient's samples serve both. Values that were not measured are None. If the method is off despite its gain, `note`
+    gives the reason. `rounds` steps of each kind took `share` of the time of 200 iterations.
     """
 
     gain: float | None = None
@@ -109,10 +109,10 @@ class PaidRecord(Finding):
 
 @dataclass(frozen=True, kw_only=True)
 class PathsRecord(PaidRecord):
-    """Choice of `paths` (light, camera, both); with both, `light_share` is the share of light paths.
+    """Choice of `paths` (light, camera, both). With both, `light_share` is the share of light paths.
 
-    The gain is relative to the best share tried before, or it is that of the next share, which was no better; `note`
-    says which.
+    The gain compares the choice with the best other share. `note` tells whether this share was tried before or after
+    it.
     """
 
     paths: str

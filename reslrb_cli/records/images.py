@@ -38,7 +38,7 @@ MOST_BYTES = 180
 def file_stem(key: str) -> str:
     """Return a unique file name of limited length for the parameter `key`.
 
-    Characters that file systems do not accept become `_`, and a hash is then added to keep the name unique.
+    Characters that file systems do not accept become `_`. A hash is then added to keep the name unique.
     """
     stem = re.sub(r"[^\w.\-]", "_", key)
     return bounded(stem) if stem == key else _numbered(stem, key)
@@ -60,7 +60,7 @@ FORMATS = {".exr": "OpenEXR", ".hdr": "RGBE", ".pfm": "PFM", ".png": "PNG", ".jp
 
 
 def write_image(stem: Path, image: Array, shown: Array | None = None) -> None:
-    """Write an (H, W, C) image of linear values as `<stem>.exr`, and it or `shown` as `<stem>.png`.
+    """Write an (H, W, C) image of linear values as `<stem>.exr`, and the image or `shown` as `<stem>.png`.
 
     The suffix is appended to `stem` and replaces nothing, because parameter keys contain dots.
     """

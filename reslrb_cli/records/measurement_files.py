@@ -214,9 +214,9 @@ PAGE_SECONDS, PAGE_SHARE = 5.0, 20.0
 
 
 class LivePage:
-    """Page, or another file named by `what`, that `write` rewrites at once and then now and then, between iterations.
+    """Page, or another file named by `what`, that is rewritten from time to time, between iterations.
 
-    If the page cannot be written, the run continues without it; writing the last page at the end reports the reason.
+    If the page cannot be written, the run continues without it. Writing the last page at the end reports the reason.
     """
 
     def __init__(

@@ -43,16 +43,17 @@ class Spread:
 class BenchRecord(Line):
     """Cost of a step of one integrator at one depth, sample count, film size and texture size.
 
-    - `estimator`: None if the integrator has none. Options other than the defaults follow the name, except `capacity`:
-      `reservoir(weight=adjoint)`.
-    - `step_ms`, `kernel_ms`, `codegen_ms`, `tracing_ms`: wall time of warm steps, and its parts: execution of kernels,
-      their generation (with the lookup in the kernel cache), and the rest (Python and the functions that it calls).
-    - `cold_ms`, `cold_codegen_ms`: wall time of the first step in a new process with an empty kernel cache, and the
-      part for generating and compiling kernels.
-    - `peak_mib`: peak memory of the allocator in that step, including the scene.
-    - `scratch_bytes`: thread-local memory of a path.
-    - `texels`: texel count of all textures that are parameters.
-    - `paths`, `light_share`: paths of the integrator (`light`, `camera`, `both`); with both, the share of light paths.
+    - `estimator` is None if the integrator has none. Its name is followed by options other than the defaults, except
+        `capacity`: `reservoir(weight=adjoint)`.
+    - `step_ms` is the wall time of warm steps. Its parts are `kernel_ms` (execution of kernels), `codegen_ms` (their
+        generation, with the lookup in the kernel cache) and `tracing_ms` (the rest, mostly Python).
+    - `cold_ms` is the wall time of the first step in a new process with an empty kernel cache. `cold_codegen_ms` is the
+        part for generating and compiling kernels.
+    - `peak_mib` is the peak memory of the allocator in that step, including the scene.
+    - `scratch_bytes` is the thread-local memory of a path.
+    - `texels` is the texel count of all textures that are parameters.
+    - `paths` are the paths of the integrator (`light`, `camera`, `both`). With both, `light_share` is the share of
+        light paths.
 
     Values that were not measured are None. If `status` is not ok, this holds for all of them.
     """
@@ -99,7 +100,7 @@ class Method:
 
     `estimator` and `capacity` are None if they do not apply. `adjoint` is `run.adjoint`, or None if dL/dI is fixed or
     nothing is differentiated. `label` is the method as the user wrote it, and `spp` the samples per pixel of a step.
-    `paths` and `light_share` are as in a `BenchRecord`; with `auto` and None, the run decides.
+    `paths` and `light_share` are as in a `BenchRecord`. With `auto` and None, the run decides.
     """
 
     label: str
@@ -117,8 +118,8 @@ class PointRecord(Line):
     """Error of the average of `steps` steps, which take `elapsed_s` seconds.
 
     `parameter` is a parameter key, `all` (all parameters together) or `image`. Errors are in L2 over all entries,
-    relative to the norm of the estimated quantity. `relative_rmse` is the root mean square over `repeats` such
-    averages, with the error of the reference, `reference_rmse`, subtracted; None if the latter dominates.
+    relative to the norm of the estimated quantity. `relative_rmse` is the root mean square over `repeats` averages. The
+    error of the reference, `reference_rmse`, is subtracted. If it is larger, `relative_rmse` is None.
     """
 
     KIND: ClassVar[str] = "point"
@@ -134,18 +135,18 @@ class PointRecord(Line):
 
 @dataclass(frozen=True)
 class MethodRecord(Line):
-    """Summary of the points of one method and parameter; `repeats` is the number of steps.
+    """Summary of the points of one method and parameter. `repeats` is the number of steps.
 
-    - `relative_rmse`, `step_s`: error of one step, from the variance of the steps, and seconds per step.
-    - `cold_s`: seconds of the first step in a new process, including compilation.
-    - `slope`: d log error / d log seconds.
-    - `efficiency`: 1 / (relative variance * seconds); for a `biased` method with squared bias + variance.
-    - `bias_z`, `bias_z_limit`: largest deviation from `bias_reference` in standard errors, and the limit that it
-      exceeds by chance anywhere in the table with probability 1e-4.
-    - `bias`, `biased`: relative bias, if there is one; `biased` is None if undecided, with the reason in `message`.
-    - `independent`: whether the reference shares no code with the method.
-    - `seconds_to`: time until averages reach each error (`0.1`, `0.03`, `0.01`); None if a bias prevents it.
-    - `extrapolated`: the errors whose time lies beyond the measured steps or below the reference's error.
+    - `relative_rmse` is the error of one step, from the variance of the steps, and `step_s` the seconds per step.
+    - `cold_s` are the seconds of the first step in a new process, including compilation.
+    - `slope` is d log error / d log seconds.
+    - `efficiency` is 1 / (relative variance * seconds). For a `biased` method, it uses squared bias + variance.
+    - `bias_z` is the largest deviation from `bias_reference` in standard errors. `bias_z_limit` is a limit for it,
+        which chance exceeds anywhere in the table with probability 1e-4.
+    - `bias` is the relative bias, if there is one. `biased` is None if undecided, with the reason in `message`.
+    - `independent` tells whether the reference shares no code with the method.
+    - `seconds_to` has the time until averages reach each error (`0.1`, `0.03`, `0.01`), or None if a bias prevents it.
+    - `extrapolated` has the errors whose time lies beyond the measured steps or below the reference's error.
 
     Values that were not measured are None.
     """
@@ -177,7 +178,7 @@ class MethodRecord(Line):
 class ReferenceRecord(Line):
     """Reference for the errors: the mean of `repeats` steps, with the relative standard error `reference_rmse`.
 
-    `bias_z` is its largest deviation from an independent reference, as in a `MethodRecord`; None without one.
+    `bias_z` is its largest deviation from an independent reference, as in a `MethodRecord`, or None without one.
     """
 
     KIND: ClassVar[str] = "reference"
@@ -271,13 +272,13 @@ class Compared:
 class Comparison:
     """Outcome of a comparison of estimates with a reference.
 
-    - `relative_l2`: distance from the reference divided by its norm, of the samples at equal seeds, otherwise of the
-      means.
-    - `z_rms`, `z_max`: in standard errors, with limits corrected for the number of comparisons.
-    - `cosine`: cosine of the angle between the means.
-    - `variance_ratio`: variance divided by that of the reference.
-    - `detectable`: smallest detectable deviation, as a fraction of the reference.
-    - `message`: remarks.
+    - `relative_l2` is the distance from the reference divided by its norm. At equal seeds it compares samples,
+        otherwise means.
+    - `z_rms` and `z_max` are in standard errors. Their limits are corrected for the number of comparisons.
+    - `cosine` is the cosine of the angle between the means.
+    - `variance_ratio` is the variance divided by that of the reference.
+    - `detectable` is the smallest detectable deviation, as a fraction of the reference.
+    - `message` has remarks.
 
     Values that do not apply are None.
     """

@@ -1,7 +1,7 @@
 """The metrics of a run, `metrics.jsonl`: one JSON object per line, one line per iteration.
 
-A resumed run keeps the lines of the iterations in its checkpoint and drops the others. The tallies sum up, over a whole
-run, values that were not finite, clamped gradients and regularizers.
+A resumed run keeps the lines of the iterations in its checkpoint and drops the others. The tallies sum over a whole
+run: non-finite values, clamped gradients, and regularizers.
 """
 
 from __future__ import annotations
@@ -89,20 +89,22 @@ class Regularized:
 class Record(Line):
     """Record of one iteration: its step, and the parameters before its update.
 
-    - `step_ms`: wall time of the step (image, loss and gradient of every sensor, without the optimiser's update).
-    - `codegen_ms`: the part of `step_ms` for generating and compiling kernels.
-    - `primal_ms`, `adjoint_ms`: times of image and gradient; None if one kernel computes both.
-    - `elapsed_s`: time in steps and updates since the start, without writing files and computing `parameter_errors`.
-    - `peak_mib`: peak memory of the allocator since the start.
-    - `nonfinite`: number of entries that are not finite in the loss, its derivative by the image, and the gradients.
-    - `nonfinite_by_parameter`: the same in gradients and updates, for parameters that have any.
-    - `grad_norm`: norm of the gradient before clamping, without entries that are not finite.
-    - `clamped`: None if gradients are not clamped.
-    - `held_out`: loss of the views that are held out; None if there are none or the iteration did not compute it.
-    - `regularized`: None without regularizers.
-    - `parameter_errors`: root mean square error of each parameter whose true value is known, by key, in the unit of the
-      parameter, over the entries that light and sensor reach.
-    - `parameter_rmse`: the same over all these parameters; None if they have no common unit or no true value is known.
+    - `step_ms` is the wall time of the step: image, loss and gradient of every sensor, without the optimiser's update.
+    - `codegen_ms` is the part of `step_ms` for generating and compiling kernels.
+    - `primal_ms` and `adjoint_ms` are the times of image and gradient, or None if one kernel computes both.
+    - `elapsed_s` is the time in steps and updates since the start. Writing files and computing `parameter_errors` do
+        not count.
+    - `peak_mib` is the peak memory of the allocator since the start.
+    - `nonfinite` is the number of non-finite entries in the loss, its derivative by the image, and the gradients.
+    - `nonfinite_by_parameter` is the number in gradients and updates, for parameters with such entries.
+    - `grad_norm` is the norm of the gradient before clamping, without non-finite entries.
+    - `clamped` is None if gradients are not clamped.
+    - `held_out` is the loss of the held-out views, or None if there are none or the iteration did not compute it.
+    - `regularized` is None without regularizers.
+    - `parameter_errors` has the root mean square error of each parameter with a known true value. It is in the unit of
+        the parameter, over the entries that light and sensor reach.
+    - `parameter_rmse` is the same over all these parameters. It is None if they have no common unit or no true value is
+        known.
     """
 
     __pydantic_config__ = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
@@ -182,7 +184,7 @@ def mend(folder: Path) -> None:
 def read_records(folder: Path, count: int, last: Record | None) -> tuple[list[Record], int]:
     """Return the first `count` records in `folder`, which are those of a checkpoint, and their size in bytes.
 
-    `last` is the last of them, stored in the checkpoint; it replaces a line lost to a full disk. Raises ConfigError,
+    `last` is the last record, stored in the checkpoint. It replaces a line lost to a full disk. Raises ConfigError,
     located by file and line, if other records are missing or damaged.
     """
     path = folder / METRICS_FILE
@@ -236,7 +238,7 @@ class _Tally:
 
 @dataclass
 class NonFiniteTally(_Tally):
-    """Number of iterations with values that were not finite, and of these values, in total and by parameter."""
+    """Number of iterations with non-finite values, and the number of these values, in total and by parameter."""
 
     iterations: int = 0
     values: int = 0
@@ -260,7 +262,9 @@ class NonFiniteTally(_Tally):
 
 @dataclass
 class ClampTally(_Tally):
-    """Number of iterations with clamped gradients, of clamped entries, and the bias over the run by parameter."""
+    """Number of iterations with clamped gradients, number of clamped entries, and the bias over the run by
+    parameter.
+    """
 
     iterations: int = 0
     entries: int = 0

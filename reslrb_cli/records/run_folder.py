@@ -45,7 +45,7 @@ FABRICATION_FILE = "fabrication.json"
 
 
 def workshop_file(name: str) -> str:
-    """Return the name in `images`, without suffix, of a picture of the sheet for the workshop."""
+    """Return the file name, without suffix, of a picture of the workshop's sheet. The picture is in `images`."""
     return "sheet-" + re.sub(r"[^a-z0-9.+-]+", "-", name.lower())
 
 

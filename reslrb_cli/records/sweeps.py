@@ -165,12 +165,12 @@ def read_sweep(folder: Path) -> Sweep:
 class SweepRunRecord(Line):
     """Result of one run.
 
-    - `status`: as in a manifest, or `waiting`; `message` is the error if the run failed.
-    - `loss`: loss of the final image.
-    - `error`: root mean square error over all parameters whose true value is known; if they have no common unit
-      (`relative`), the root mean square of their relative errors.
-    - `elapsed_s`: seconds in steps and updates.
-    - `peak_mib`: peak memory of the allocator.
+    - `status` is as in a manifest, or `waiting`. `message` is the error if the run failed.
+    - `loss` is the loss of the final image.
+    - `error` is the root mean square error over all parameters with a known true value. If they have no common unit
+        (`relative`), it is the root mean square of their relative errors.
+    - `elapsed_s` are the seconds in steps and updates.
+    - `peak_mib` is the peak memory of the allocator.
 
     Unknown values are None.
     """
@@ -197,11 +197,12 @@ class SweepRunRecord(Line):
 
 @dataclass(frozen=True)
 class SweepRowRecord(Line):
-    """Result of one combination: median, minimum and maximum over its finished runs, `runs` of `of`.
+    """Result of one combination: median, minimum and maximum over its finished runs. `runs` of its `of` runs are
+    finished.
 
-    `loss_ratio` and `error_ratio` are the median divided by that of the first comparable combination, with the 95 %
-    interval of a bootstrap over the seeds. Combinations that differ only in learning rates are compared at their best
-    rate, and only that one has a ratio. Ratios are None for fewer than 5 seeds.
+    `loss_ratio` and `error_ratio` are the median divided by that of the first comparable combination. Their 95 %
+    interval comes from a bootstrap over the seeds. Combinations that differ only in learning rates are compared at
+    their best rate, and only that one has a ratio. Ratios are None for fewer than 5 seeds.
     """
 
     KIND: ClassVar[str] = "sweep_row"
@@ -226,9 +227,9 @@ class SweepBestRecord(Line):
     """Combination with the lowest median of `of` (`loss` or `error`), over the `seeds` seeds common to all.
 
     Combinations that differ only in learning rates are compared at their best rate. Wilcoxon's signed-rank test on
-    pairs of the same seed finds a difference from those in `beats`, and none from those in `tied`. `second` has the
-    next median. `ratio` is the best median divided by that of `second`, with the 95 % interval of a bootstrap over the
-    seeds; None for fewer than 5 seeds. `line` is the record in words.
+    pairs of the same seed finds a difference from the combinations in `beats`, and none from those in `tied`. `second`
+    has the next median. `ratio` is the best median divided by that of `second`, with the 95 % interval of a bootstrap
+    over the seeds. It is None for fewer than 5 seeds. `line` is the record in words.
     """
 
     KIND: ClassVar[str] = "sweep_best"

@@ -1,6 +1,6 @@
 """Serialisation of dataclass trees as named arrays and JSON.
 
-The fields of a tree are plain values, checked by their types, or, with the metadata `entry`, mappings of names to
+The fields of a tree are plain values, which are checked by their types. Fields with the metadata `entry` map names to
 arrays. `entries` converts a tree to the entries of an archive, and `Stored` reads them back.
 """
 

@@ -103,7 +103,7 @@ def _mark_decades(axis: Any, span: float) -> None:
 
 
 def _thinned(points: Array, together: int) -> tuple[Any, Any]:
-    """Return the means of `together` points each; the last mean is over the rest."""
+    """Return the means of groups of `together` points. The last group has the remaining points."""
     starts = np.arange(0, len(points), together)
     sums = np.add.reduceat(points, starts, axis=0)
     counts = np.diff([*starts, len(points)])

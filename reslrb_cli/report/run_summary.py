@@ -225,7 +225,7 @@ KEY_WIDTH = 60
 def last_line(status: str, results: Mapping[str, Any], tallies: Sequence[str], report: str) -> str:
     """Return the last line on the terminal: how the run ended, its results, warnings, and the path of its page.
 
-    `results` is that of the manifest.
+    `results` are those of the manifest.
     """
     parts = [f"{status} after {count(results['iterations'], 'iteration')}"]
     parts += [] if results["loss"] is None else [f"loss {number(results['loss'])}"]
@@ -386,7 +386,7 @@ def _value(about: Mapping[str, Any] | None) -> str:
 
 
 def _table(keys: Sequence[str], titles: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[str]:
-    """Return one line per parameter; empty if they do not fit."""
+    """Return one line per parameter, or an empty list if the lines do not fit."""
     widths = [max(len(title), *(len(row[column]) for row in rows)) for column, title in enumerate(titles)]
     left = width - sum(widths) - len(GAP) * len(widths)
     first = min(max(map(len, (HEAD, *keys))), WIDEST_KEY, left)

@@ -211,11 +211,12 @@ CONFIDENCE = 0.95
 
 
 def ratio(own: Sequence[Sequence[float]], base: Sequence[Sequence[float]]) -> Range | None:
-    """Return the minimum over the rows of `own` of the median over seeds, divided by that of `base`, with its interval.
+    """Return the ratio of `own` to `base` with its interval. Both sides use the median over seeds, and the best of
+    their rows.
 
-    Rows are learning rates, and columns are seeds, the same for all rows. The 95 % interval comes from a bootstrap that
-    resamples the seeds for all rows together and selects the best rates each time, so that it includes the selection
-    effect. None for fewer than LEAST_SEEDS seeds, and if a median is 0 or not finite.
+    Rows are learning rates, and columns are seeds, the same for all rows. The 95 % interval comes from a bootstrap. It
+    resamples the seeds for all rows together and selects the best rates each time, so it includes the selection effect.
+    Returns None for fewer than LEAST_SEEDS seeds, and if a median is 0 or not finite.
     """
     seeds = min((len(values) for values in (*own, *base)), default=0)
     if seeds < LEAST_SEEDS or not (own and base):
@@ -301,7 +302,7 @@ def notes(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
 
 
 def _outermost(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
-    """Return a line for each best learning rate at the end of the tried range, because a better one may lie beyond."""
+    """Return a line for each best learning rate at the end of the tried range. A better rate may lie beyond."""
     found: dict[str, None] = {}
     rates = [key for key in sweep.keys if is_rate(key)]
     for of in OTHERS if rates else ():
@@ -320,7 +321,9 @@ def _outermost(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
 
 
 def figures_of(runs: Sequence[SweepRunRecord]) -> dict[str, str]:
-    """Return the titles of the columns of results, by field name; without errors if none is known."""
+    """Return the titles of the columns of results, by field name. If no error is known, there is no column for
+    errors.
+    """
     found = {
         name: title for name, title in FIGURES.items() if name != "error" or any(run.error is not None for run in runs)
     }
@@ -335,7 +338,9 @@ RATIOS_LINE = "ratios: medians over that of the first line that can be compared,
 
 
 def row_figures(records: Sequence[SweepRowRecord], runs: Sequence[SweepRunRecord]) -> dict[str, str]:
-    """Return the titles of the columns for combinations, with iterations if they differ, and with known ratios."""
+    """Return the titles of the columns for combinations. Iterations and ratios have columns only if they differ or are
+    known.
+    """
     found = {"iterations": "iterations"} if len({run.iterations for run in runs if run.is_done}) > 1 else {}
     ratios = {name: title for name, title in RATIOS.items() if any(getattr(record, name) for record in records)}
     return found | figures_of(runs) | ratios

@@ -11,7 +11,9 @@ from reslrb_cli.report.format import Columns, interval, number, table
 
 
 def bench_columns(labels: Sequence[str], swept: str = "depth") -> Columns:
-    """Return the columns of a bench: the first shows the `swept` quantity, the second fits all `labels`."""
+    """Return the columns of a bench. The first column shows the `swept` quantity, and the second is wide enough for all
+    `labels`.
+    """
     titles = (swept, "", "step ms", "over baseline", "kernel ms", "over baseline", "codegen", "tracing", "cold ms",
               "peak MiB", "scratch B", "n")  # fmt: skip
     return Columns(titles, (7, max(map(len, labels)), 9, 19, 9, 19, 7, 7, 8, 9, 9, 3), "><>")
@@ -85,7 +87,7 @@ def parameter_name(record: GradcheckRecord) -> str:
 
 
 def integrator_name(record: GradcheckRecord) -> str:
-    """Return `reslrb:stack`, or only the type, with its paths if they are not light paths."""
+    """Return the name of the integrator, such as `reslrb:stack`. The paths are added if they are not light paths."""
     if record.estimator is None and record.paths != "light":
         return f"{record.integrator}(paths={record.paths})"
     return record.integrator if record.estimator is None else f"{record.integrator}:{record.estimator}"

@@ -36,12 +36,12 @@ LEAST_CLIPPED = 0.005
 
 
 def exposure_for(image: Array | None, lamps: Array | None = None) -> float:
-    """Return the exposure, rounded to two digits, that makes an image (H, W, C) visible; 1 if none is needed.
+    """Return the exposure, rounded to two digits, that makes an image (H, W, C) visible, or 1 if none is needed.
 
-    `lamps` (H, W), boolean, marks the pixels that see a lamp. They can be thousands of times brighter than the rest and
-    are clipped, because the rest would otherwise be nearly black. The level has two criteria: the share of pixels alone
-    would clip a caustic, which holds much of the light in few pixels; the share of light alone, if it included
-    fireflies, would darken a noisy image.
+    `lamps` (H, W), boolean, marks the pixels that see a lamp. They can be thousands of times brighter than the rest,
+    and are clipped. Otherwise the rest would be nearly black. The level has two criteria. The share of pixels alone
+    would clip a caustic, which holds much of the light in few pixels. The share of light alone, including fireflies,
+    would darken a noisy image.
     """
     level = 0.0 if image is None else _level(image)
     if image is not None and lamps is not None and lamps.shape == image.shape[:2] and (~lamps).mean() >= LEAST_OTHERS:
@@ -111,9 +111,9 @@ def write_error_map(folder: Path, suffix: str, image: Array, target: Array, grad
     """Write an image and its target (H, W, C) as layers, and the channel mean of |I - T| as a picture.
 
     `comparison<suffix>.exr` holds the layers `image`, `target`, `difference` (I - T) and, if given, `gradient` (dL/dI).
-    `error<suffix>.png` is the picture. Channels that the target lacks are left out. Returns the `end` of the colour
-    scale (larger values have the last colour) and the `mean` of |I - T|. Differences that are not finite count as the
-    largest float32 number.
+    `error<suffix>.png` is the picture. Channels that the target lacks are left out. The function returns the `end` of
+    the colour scale and the `mean` of |I - T|. Values above `end` have the last colour. Differences that are not finite
+    count as the largest float32 number.
     """
     image, most = image[:, :, : target.shape[2]], float(np.finfo(np.float32).max)
     difference = np.clip(np.nan_to_num(image.astype(np.float64) - target, nan=np.inf), -most, most)
@@ -136,7 +136,7 @@ def read_comparison(folder: Path, suffix: str) -> dict[str, Array]:
 
 
 def scale_end(values: Array) -> float:
-    """Return a number with one digit that is above 99 % of the values; 1 if all values are 0."""
+    """Return a number with one digit that is above 99 % of the values, or 1 if all values are 0."""
     most = float(np.quantile(values, WITHIN)) or float(values.max())
     if most <= 0:
         return 1.0

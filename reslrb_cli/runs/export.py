@@ -203,7 +203,9 @@ def _write_pictures(run: Path, pictures: dict[str, Array]) -> None:
 
 
 def pictures_of(solid: Solid) -> dict[str, Array]:
-    """Render views of the solid like plaster in grazing light, (H, W, 3), by the names of the workshop's sheet."""
+    """Render views of the solid in grazing light, as if it were plaster. Returns images (H, W, 3) by their names on the
+    workshop's sheet.
+    """
     low, high = solid.points.min(axis=0), solid.points.max(axis=0)
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     found = {}
@@ -324,7 +326,8 @@ def solid_files(
     numbers: dict[str, Any],
     pictures: dict[str, Array],
 ) -> dict[str, Callable[[Path], object]]:
-    """Return a writer for each file of a solid in an exported folder, by file name; no 3MF if lib3mf is missing.
+    """Return a writer for each file of a solid in an exported folder, by file name. If lib3mf is missing, there is no
+    3MF file.
 
     `numbers` and `pictures` are the content of the sheet for the workshop.
     """
@@ -367,10 +370,10 @@ def tell_solid(path: Path, numbers: dict[str, Any], say: Say) -> None:
 def choose_integrator(
     config: Config, scene: mi.Scene, params: mi.SceneParameters, paths: str
 ) -> tuple[dict[str, object], str]:
-    """Choose the Mitsuba integrator that reproduces the image of the run's `paths` (`loading.paths_of`) best.
+    """Choose the Mitsuba integrator that best reproduces the image of the run's `paths` (`loading.paths_of`).
 
-    Also returns the reason if it is not the usual one. Light paths are traced by `ptracer`, or by `path` where
-    `ptracer` is wrong; `path` also sees glass and mirrors.
+    If the choice is not the usual one, the function also returns the reason. `ptracer` traces light paths. Where
+    `ptracer` is wrong, `path` is chosen, which also sees glass and mirrors.
     """
 
     own = config.integrator.options()

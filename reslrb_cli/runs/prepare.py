@@ -1,10 +1,10 @@
 """Preparation of a run, and its progress: the state of the iterations, the results so far, and their checkpoints.
 
-- `plan_record`: the entry about the plan of a step in a run's manifest.
-- `changes`, `check_changes`: which settings of an experiment may change when its run is resumed.
-- `prepare`, `manifest_of`: make a problem that is ready to run from a configuration, and its manifest.
-- `PreparedRun`: a run that is ready to start or to resume; `begin` makes a new one.
-- `RunProgress`: the state and the results of a run.
+- `plan_record` is the entry about the plan of a step in a run's manifest.
+- `changes` and `check_changes` tell which settings of an experiment may change when its run is resumed.
+- `prepare` makes a problem that is ready to run from a configuration, and `manifest_of` its manifest.
+- `PreparedRun` is a run that is ready to start or to resume. `begin` makes a new one.
+- `RunProgress` has the state and the results of a run.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ Change = tuple[Any, Any]
 
 
 def changes(before: Config, now: Config) -> dict[str, Change]:
-    """Return the old and the new value of each setting that differs, by key; None for a missing value."""
+    """Return the old and the new value of each setting that differs, by key. A missing value is None."""
     first, second = flat(before), flat(now)
     return {
         key: (first.get(key), second.get(key))
@@ -97,10 +97,10 @@ def changes(before: Config, now: Config) -> dict[str, Change]:
 
 
 def check_changes(found: Mapping[str, Change], blame: Callable[[str], object], run: Path) -> dict[str, Change]:
-    """Return the changed settings, without those for the place of the run.
+    """Return the changed settings. Settings for the place of the run do not count.
 
-    Raises ConfigError if a setting must not change. The error names the first few such settings and is located by the
-    first one, in the source that `blame` returns for it.
+    Raises ConfigError if a setting must not change. The error names the first few such settings. Its location is that
+    of the first one, in the source that `blame` returns for it.
     """
     wrong = [key for key in found if not MAY_CHANGE.fullmatch(key)]
     if wrong:
@@ -143,7 +143,7 @@ Say = Callable[[str], None]
 
 
 def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[RunProgress, Manifest]:
-    """Assemble a new run and make the measurements before its first iteration; a variant must be set.
+    """Assemble a new run and make the measurements before its first iteration. A variant must be set.
 
     `say` is called with lines about slow steps, `warn` with warnings. Raises ConfigError and UnsupportedScene.
     """
@@ -187,7 +187,9 @@ def settled_of(problem: Problem, variant: str) -> Settled:
 
 
 def digests(config: Config) -> dict[str, str]:
-    """Return digests of the files that a run needs to resume; initial values are part of its state instead."""
+    """Return digests of the files that a run needs to resume. Files of initial values are left out, because the values
+    are part of the state.
+    """
     return file_digests({key: path for key, path in files_of(config).items() if ".initial." not in key})
 
 
@@ -237,7 +239,9 @@ class RunProgress:
 
     @property
     def shared(self) -> SharedTime | None:
-        """Time spent on shards that workers computed, including before the run was resumed; None without workers."""
+        """Time of shards that workers computed, including the time before the run was resumed, or None without
+        workers.
+        """
         if self._spent is None:
             return self._shared
         return self._spent() if self._shared is None else self._shared + self._spent()
@@ -365,9 +369,9 @@ class PreparedRun:
 
 
 def begin(config: Config, variant: str, force: bool, say: Say, warn: Say) -> PreparedRun:
-    """Prepare a new run in its own folder; a variant must be set.
+    """Prepare a new run in its own folder. A variant must be set.
 
-    Call `check_output` before, to check that the folder can be made. Raises ConfigError and UnsupportedScene.
+    Call `check_output` first, to check that the folder can be made. Raises ConfigError and UnsupportedScene.
     """
     course, manifest = prepare(config, variant, say, warn)
     run = config.run

@@ -49,7 +49,7 @@ MANY_PIXELS = 5e5
 
 @dataclass
 class Recording:
-    """Recording of one run; `course` holds its progress."""
+    """Recording of one run. `course` holds its progress."""
 
     course: RunProgress
     folder: RunFolder
@@ -80,7 +80,7 @@ class Recording:
         return self.course.done
 
     def run(self, show: Callable[[Record], None], stop: Callable[[], bool]) -> Status:
-        """Iterate until the end or until `stop()` is true, complete the folder, and return how the run ended.
+        """Iterate until the end or until `stop()` is true, and complete the folder. Returns how the run ended.
 
         See `records`. An exception in `show` ends the run with that exception.
         """
@@ -96,10 +96,10 @@ class Recording:
     def records(self, stop: Callable[[], bool] = lambda: False) -> Generator[Record, None, None]:
         """Yield the record of each iteration, then complete the folder and set `status`.
 
-        Stops at the last iteration, when `stop()` is true, or when the generator is closed. In all cases the folder
-        then has a checkpoint, the parameters, the report, and a manifest with the outcome; if the run did not fail, it
-        also has the final images. Raises the error that ended the run, as MachineError if the folder could not be
-        written to.
+        Iteration stops at the last iteration, when `stop()` is true, or when the generator is closed. In all cases the
+        folder then has a checkpoint, the parameters, the report, and a manifest with the outcome. If the run did not
+        fail, it also has the final images. Raises the error that ended the run. If the folder could not be written to,
+        this is a MachineError.
         """
         self._stop = stop
         status: Status = Status.FAILED
@@ -199,7 +199,7 @@ class Recording:
             self.manifest.memory = plan.to_json()
 
     def _on_nonfinite(self, found: Findings) -> None:
-        """Save the state before the first step with a value that is not finite, and say how to inspect it."""
+        """Save the state before the first step with a non-finite value, and explain how to inspect it."""
         if self._saved_nonfinite:
             return
         self.course.save_begun(self.folder.checkpoint)
@@ -214,7 +214,7 @@ class Recording:
         return f"where: reslrb inspect {shlex.quote(os.path.relpath(self.folder.path / 'config.yaml'))} --nonfinite"
 
     def _end(self, status: Status, failure: BaseException | None) -> Status:
-        """Complete the folder, beginning with the state, and return how the run ended; raise the first error."""
+        """Complete the folder, starting with the state, and return how the run ended. Raises the first error."""
         if (fault := self.folder.fault) is not None:
             failure = failure or fault
             raise MachineError(describe(failure)) if isinstance(failure, OSError) else failure
@@ -266,7 +266,7 @@ class Recording:
             write_report(self.folder.path, self.manifest.content() | {"results": found}, self.problem.values())
 
     def _add(self, failed: str, measure: Callable[[], None]) -> None:
-        """Add the results of `measure`. An error does not fail the run; it is logged, starting with `failed`."""
+        """Add the results of `measure`. An error does not fail the run. It is logged after the text `failed`."""
         try:
             measure()
         except Exception as error:
@@ -384,7 +384,7 @@ class Recording:
                 self.error_maps[f"error{suffix}"] = about
 
     def _write_image(self, name: str, sensor: int, image: np.ndarray[Any, Any]) -> None:
-        """Write an image of a sensor; its PNG uses the exposure that suits the target."""
+        """Write an image of a sensor. Its PNG uses the exposure that suits the target."""
         exposure = shown_exposures(self.manifest.views).get(self._image_name("", sensor), 1.0)
         write_image(self.folder.images / self._image_name(name, sensor), image, image * np.float32(exposure))
 

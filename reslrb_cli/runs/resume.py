@@ -95,9 +95,9 @@ class OpenedRun:
         return f"{self.folder.path}: is finished, after {done}; {option} {more} continues it"
 
     def begin(self, variant: str, say: Say, warn: Say) -> PreparedRun:
-        """Assemble the problem of the run and restore its state; a variant must be set.
+        """Assemble the problem of the run and restore its state. A variant must be set.
 
-        Raises ConfigError, UnsupportedScene.
+        Raises ConfigError and UnsupportedScene.
         """
         problem = assemble(self.config, say, to_run=True, settled=self.stored)
         manifest = self._manifest(manifest_of(problem, variant, self.config.source))
@@ -163,9 +163,9 @@ class OpenedRun:
 def open_earlier(run: Path, wanted: Path | Config | None, overrides: Sequence[str | Override]) -> Iterator[OpenedRun]:
     """Open the run in the folder `run` to resume it, and lock it while the block runs.
 
-    `wanted` is a configuration that must agree with the run; by default the `config.yaml` in its folder. Raises
-    ConfigError if the folder holds no run, the run is in use, the last two states are both damaged, or a setting
-    differs that must not change.
+    `wanted` is a configuration that must agree with the run. By default, it is the `config.yaml` in its folder. Raises
+    ConfigError if the folder holds no run, the run is in use, or the last two states are both damaged. Also raises it
+    if a setting differs that must not change.
     """
     with opened(run) as (folder, manifest):
         said: list[str] = []
@@ -193,9 +193,11 @@ def open_earlier(run: Path, wanted: Path | Config | None, overrides: Sequence[st
 
 
 def problem_before_nonfinite(run: Path, say: Say) -> tuple[Problem, int]:
-    """Return the problem at the start of the first iteration with a value that is not finite, and its index from 0.
+    """Return the problem at the start of the first iteration with a non-finite value, and the index of the iteration
+    from 0.
 
-    Sets the run's variant. Locks nothing, so the run may be in progress. Raises ConfigError and UnsupportedScene.
+    The function sets the run's variant. It locks nothing, so the run may be in progress. Raises ConfigError and
+    UnsupportedScene.
     """
     stored = Stored(RunFolder(run).checkpoint / NONFINITE_FILE_NAME)
     settled = stored.read(Settled)
@@ -232,7 +234,7 @@ def _read_state(folder: RunFolder, said: list[str]) -> Stored:
 def _read_config(
     run: Path, wanted: Path | Config | None, overrides: Sequence[str | Override], text: str
 ) -> tuple[Config, Config]:
-    """Return the configuration to resume with, and the same without overrides; `text` is the one in the state."""
+    """Return the configuration for resuming, with and without overrides. `text` is the configuration in the state."""
     if isinstance(wanted, Config):
         return changed(wanted, overrides), wanted
     own = run / "config.yaml"

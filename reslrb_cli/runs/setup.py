@@ -23,17 +23,17 @@ RAYS, FAR = 2**14, 500.0
 def setup_of(
     scene: mi.Scene, sensor: mi.Sensor, plan: Fabrication, sheet: Sheet, target: Array
 ) -> dict[str, Any] | None:
-    """Return the set-up of the solid in `scene`; None if no light reaches the solid, or `sensor` sees no receiver.
+    """Return the set-up of the solid in `scene`, or None if no light reaches the solid, or `sensor` sees no receiver.
 
-    `sheet` is the front face, and `target` (H, W) the luminance that `sensor` should see. The result has:
+    `sheet` is the front face, and `target` (H, W) the luminance that `sensor` should see. The result has these entries.
 
-    - `kind`; `face_size` and `picture_size`: width and height;
-    - `receiver_distance`: from the centre of the face (x = y = z = 0) to the centre of the receiver;
-    - `light_distance`: from the side that faces the lamp to a point lamp, or `parallel`;
-    - `lit_side`: `front` or `back`, the side of the solid that faces the lamp;
-    - `light_direction`: direction in which the light travels; `receiver`: centre of the receiver;
-      `receiver_normal`: its normal towards the solid; `picture_up` and `picture_right`: directions on the receiver;
-    - `through`: whether the picture reads correctly for a viewer behind the receiver.
+    - `kind` is `lens` or `mirror`. `face_size` and `picture_size` are widths and heights.
+    - `receiver_distance` is the distance from the centre of the face (x = y = z = 0) to the centre of the receiver.
+    - `light_distance` is the distance from the side that faces the lamp to a point lamp, or `parallel`.
+    - `lit_side` is `front` or `back`, the side of the solid that faces the lamp.
+    - `light_direction` is the direction in which the light travels. `receiver` is the centre of the receiver, and
+        `receiver_normal` its normal towards the solid. `picture_up` and `picture_right` are directions on the receiver.
+    - `through` tells whether the picture reads correctly for a viewer behind the receiver.
     """
     shapes = {shape.id(): shape for shape in scene.shapes()}
     if plan.receiver not in shapes:
@@ -72,7 +72,9 @@ def _unit(vector: Array) -> list[float]:
 
 
 def _normal(scene: mi.Scene, sensor: mi.Sensor, receiver: mi.Shape) -> Array | None:
-    """Return the normal (3,) of the receiver in the middle of the film; None if `sensor` sees something else there."""
+    """Return the normal (3,) of the receiver in the middle of the film, or None if `sensor` sees another object
+    there.
+    """
     ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
     si = scene.ray_intersect(mi.Ray3f(ray))
     if not bool(np.all(np.array(si.is_valid() & (si.shape == mi.ShapePtr(receiver))))):
@@ -81,9 +83,10 @@ def _normal(scene: mi.Scene, sensor: mi.Sensor, receiver: mi.Shape) -> Array | N
 
 
 def _middles(sensor: mi.Sensor, target: Array, center: Array, normal: Array) -> list[Array]:
-    """Return the places (3,) on the plane of the receiver that show the middles of the picture's four edges.
+    """Return the points (3,) on the plane of the receiver that show the middles of the picture's four edges.
 
-    The order is left, top, right, bottom, as on the film. `target` (H, W) is not black in the picture.
+    The order is left, top, right, bottom, as on the film. The picture consists of the nonzero pixels of `target` (H,
+    W).
     """
     rows, columns = picture_within(target)
     height, width = target.shape
@@ -97,9 +100,9 @@ def _middles(sensor: mi.Sensor, target: Array, center: Array, normal: Array) -> 
 
 
 def _light(scene: mi.Scene, solid: list[mi.Shape]) -> tuple[Array, Array] | None:
-    """Return the places (n, 3) where light of the lamps first meets the shapes of the solid, and its directions (n, 3).
+    """Return the points (n, 3) where light of the lamps first meets the shapes of the solid, and its directions (n, 3).
 
-    None if no ray meets them.
+    Returns None if no ray meets them.
     """
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, RAYS)
@@ -115,10 +118,12 @@ def _light(scene: mi.Scene, solid: list[mi.Shape]) -> tuple[Array, Array] | None
 
 
 def beam(points: Array, directions: Array, size: float) -> tuple[Array, Array | None]:
-    """Return the mean direction (3,) of rays, and the place (3,) of the lamp that they leave; None for parallel light.
+    """Return the mean direction (3,) of rays, and the position (3,) of the lamp that they leave, or None for parallel
+    light.
 
-    Rays go through `points` (n, 3) along unit `directions` (n, 3). `size` (mm) is that of the face. The light of a wide
-    and distant lamp, such as the sun, counts as parallel: the mean direction is the same all over the face.
+    Rays go through `points` (n, 3) along unit `directions` (n, 3). `size` (mm) is the size of the face. The light of a
+    wide and distant lamp, such as the sun, counts as parallel, because the mean direction is the same all over the
+    face.
     """
     toward = directions.mean(axis=0)
     toward /= np.linalg.norm(toward)

@@ -1,6 +1,7 @@
-"""Planning of a sweep: make and check every combination of settings before any run, and find the runs still to be done.
+"""Planning of a sweep: every combination of settings is made and checked before any run starts.
 
-Each run is a separate process that the caller starts; `command` returns the arguments for `reslrb`.
+The module also finds the runs that are still to be done. Each run is a separate process that the caller starts.
+`command` returns the arguments for `reslrb`.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ class Varied:
 
 @dataclass(frozen=True)
 class Plan:
-    """Checked sweep; `configs` maps the names of the combinations to their configurations with the first seed."""
+    """Checked sweep. `configs` maps the names of the combinations to their configurations with the first seed."""
 
     sweep: Sweep
     configs: dict[str, Config]
@@ -97,8 +98,8 @@ def parse_vary(text: str) -> Varied:
 def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[str], allow_code: bool = False) -> Plan:
     """Make every combination of the varied settings, check its configuration, and plan `seeds` seeds for each.
 
-    The seeds start at the configuration's `run.seed`. Raises ConfigError, located by the first setting that is wrong or
-    that names code that must not run, or by a missing scene file.
+    The seeds start at the configuration's `run.seed`. Raises ConfigError, located by the first wrong setting, or by the
+    first setting with code that is not allowed. Also raises it for a missing scene file.
     """
     varied = [parse_vary(text) for text in vary]
     for place, each in enumerate(varied):
@@ -140,7 +141,7 @@ def _with_chosen(
 ) -> Config:
     """Return the experiment with one value of each varied setting. Raises ConfigError.
 
-    A string as the value of `integrator` is a method as in `convergence --integrators`: it keeps the depth and the
+    A string as the value of `integrator` is a method as in `convergence --integrators`. It keeps the depth and the
     shared options of the experiment's own integrator.
     """
     methods = [each for each in chosen if each.location == ("integrator",) and isinstance(each.value, str)]
@@ -155,7 +156,7 @@ def _with_chosen(
 
 
 def _names(varied: Sequence[Varied]) -> list[str]:
-    """Return the name of each combination, in the order of the product; names are unique regardless of case."""
+    """Return the name of each combination, in the order of the product. Names are unique regardless of case."""
     short = short_keys([each.key for each in varied])
     names: list[str] = []
     taken: set[str] = set()
@@ -172,7 +173,7 @@ def _names(varied: Sequence[Varied]) -> list[str]:
 
 
 def _named(value: Any) -> str:
-    """Return a value as part of a folder name; a section starts with the value of its `type`."""
+    """Return a value as part of a folder name. For a section, it starts with the value of its `type`."""
     if isinstance(value, Mapping):
         first = [str(value["type"])] if "type" in value else []
         return "-".join(first + [f"{key}={_named(each)}" for key, each in value.items() if key != "type"])
@@ -194,13 +195,13 @@ def _bounded(name: str) -> str:
 def opened(
     folder: Path, plan: Plan | None, seeds: int | None = None, retry: bool = False, allow_code: bool = False
 ) -> Iterator[Sweep]:
-    """Yield the sweep in `folder`, which is locked while the block runs.
+    """Open the sweep in `folder`, and lock it while the block runs.
 
     With a `plan`, this is its sweep, which is started if the folder has none yet. Without a plan, it is the sweep in
-    the folder, extended to `seeds` seeds if that is more. With `retry`, failed runs count as not done.
+    the folder. `seeds` may add more seeds to it. With `retry`, failed runs count as not done.
 
-    Raises ConfigError if the folder holds another sweep or anything else, or if user code is not allowed to run or has
-    changed since the sweep started.
+    Raises ConfigError if the folder holds another sweep or anything else. Also raises it if user code is not allowed to
+    run, or has changed since the sweep started.
     """
     if plan is not None:
         _make(folder)
@@ -248,7 +249,7 @@ def _unwritable(folder: Path, error: OSError) -> ConfigError | MachineError:
 
 
 def _begin(folder: Path, plan: Plan) -> None:
-    """Write the configurations; the plan is written after them, so it exists only if all of them do."""
+    """Write the configurations, then the plan. The plan therefore exists only if all configurations do."""
     # a sweep that was killed at its start has written only configurations
     if others := sorted(path.name for path in folder.iterdir() if path.name != "configs"):
         reason = f"{folder} contains {one_line(others[0], 60)!r}, but no sweep; give a new or empty folder"
@@ -304,7 +305,7 @@ def _check_files(folder: Path, kept: Sweep, allowed: bool) -> None:
 
 
 def _grown(kept: Sweep, planned: Sequence[int] | None, seeds: int | None) -> Sweep:
-    """Return the sweep extended to more seeds if requested; raise ConfigError for fewer seeds than there are."""
+    """Return the sweep extended to more seeds if requested. Raises ConfigError for fewer seeds than there are."""
     wanted = len(planned) if planned is not None else seeds
     if wanted is None or wanted == len(kept.seeds):
         return kept

@@ -37,7 +37,7 @@ def add_sheet(
     thrown: Array,
     wanted: Array,
 ) -> dict[str, Array]:
-    """Add quality, light, set-up and warnings of a solid to `numbers`; return the original picture and the caustic.
+    """Add quality, light, set-up and warnings of a solid to `numbers`. Returns the original picture and the caustic.
 
     `thrown` and `wanted` (H, W) are the luminances of the image of sensor number `sensor` and of its target.
     """
@@ -65,7 +65,7 @@ def add_tolerances(
     spp: int,
     say: Callable[[str], None],
 ) -> dict[str, Array]:
-    """Add measured tolerances and allowed errors to `numbers`; return the picture of each deviation by name."""
+    """Add measured tolerances and allowed errors to `numbers`. Returns the picture of each deviation by name."""
     original, inside = original_of(bench.plan, wanted), picture_within(wanted)
     shown = wanted if original is None else original
     pictures: dict[str, Array] = {}
@@ -84,7 +84,7 @@ def add_tolerances(
 
 
 def original_of(plan: Fabrication, wanted: Array) -> Array | None:
-    """Return the luminance (H, W) of the picture before its dark parts were lifted; None if it is not known."""
+    """Return the luminance (H, W) of the picture before its dark parts were raised, or None if it is unknown."""
     if plan.picture is None:
         return None
     picture = luminance(read_image(plan.picture))
@@ -95,7 +95,7 @@ def original_of(plan: Fabrication, wanted: Array) -> Array | None:
 def as_picture(image: Array, original: Array, inside: tuple[slice, slice]) -> Array:
     """Return an image (H, W) cropped to the picture, as (H, W, 1), with the mean brightness of the `original`.
 
-    1 is the brightest part of the original.
+    A value of 1 is the brightest part of the original.
     """
     seen, wanted = image[inside], original[inside]
     scaled = seen / max(float(seen.mean()), 1e-30) * (wanted.mean() / max(float(wanted.max()), 1e-30))

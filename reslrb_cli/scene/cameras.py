@@ -223,7 +223,7 @@ def _models(file: Path) -> Iterator[tuple[int, tuple[tuple[int, int], float, tup
 
 
 def _lines(file: Path) -> Iterator[tuple[str, list[str]]]:
-    """Yield the location and the words of each line that is no comment; a line of points may be empty."""
+    """Yield the location and the words of each line that is no comment. A line of points may be empty."""
     text = read_file(file).decode("utf-8", errors="replace")
     for number, line in enumerate(text.splitlines(), 1):
         if not line.startswith("#"):

@@ -36,7 +36,7 @@ _FEW = 4
 
 @dataclass(frozen=True)
 class Value:
-    """Current value of a parameter: its `numbers`, if they are few, and their `mean`, minimum and maximum."""
+    """Current value of a parameter: its `numbers`, if there are few, and their `mean`, minimum and maximum."""
 
     numbers: list[float] | None
     mean: float
@@ -49,12 +49,12 @@ class ParameterInfo:
     """Entry of `mi.traverse`.
 
     - `kind` is the type of its owner: `bsdf`, `emitter`, `attribute` (of a mesh, such as `vertex_color`), `shape`,
-      `sensor`, `film`, `medium`, `integrator` or `scene`.
-    - `type` and `shape` describe the value: (height, width, channels) for textures.
-    - `obstacle` says why it cannot be recovered; None if it can.
+        `sensor`, `film`, `medium`, `integrator` or `scene`.
+    - `type` and `shape` describe the value. The shape of a texture is (height, width, channels).
+    - `obstacle` is the reason why it cannot be recovered, or None if it can be.
     - `value` is None if it is no number.
-    - `bits` are those of a texel if Mitsuba's precision is too low for gradients, so that the texture must be read as
-      floating point (`load.read_as_floats`); otherwise None.
+    - `bits` are the bits of a texel if Mitsuba's precision is too low for gradients. Such a texture must be read as
+        floating point (`load.read_as_floats`). Otherwise it is None.
     """
 
     key: str
@@ -97,7 +97,7 @@ def describe(params: Any, key: str, values: bool = False) -> ParameterInfo:
 
 
 def coarse_bits(params: Any, key: str) -> int | None:
-    """Return the bits of a texel of the bitmap `key` if they are fewer than 32; otherwise None."""
+    """Return the bits of a texel of the bitmap `key` if there are fewer than 32, otherwise None."""
     if not key.endswith("data") or not params.properties[key][2].class_name().startswith("BitmapTexture"):
         return None
     bits = _storage_bits(entry_value(params, key))
@@ -105,15 +105,18 @@ def coarse_bits(params: Any, key: str) -> int | None:
 
 
 def halo(node: Any, value: Any) -> int:
-    """Return the number of columns that Mitsuba adds at either side of a texture, copies of the opposite ones: one to
-    an `envmap`.
+    """Return the number of columns that Mitsuba adds at each side of a texture. An `envmap` gets one.
+
+    These columns are copies of the columns at the opposite side.
     """
     is_texture = value is not None and dr.is_tensor_v(value) and len(value.shape) == 3
     return 1 if is_texture and node.class_name() == "EnvironmentMapEmitter" else 0
 
 
 def value_shape(value: Any, halo: int = 0) -> tuple[int, ...]:
-    """Return the shape of a parameter as a NumPy array, without its `halo`; () for one number, or a missing value."""
+    """Return the shape of a parameter as a NumPy array, without its `halo`. A single number, or a missing value, has
+    shape ().
+    """
     if value is None or not dr.is_array_v(value):
         return ()
     shape = tuple(int(n) for n in dr.shape(value))
@@ -123,7 +126,7 @@ def value_shape(value: Any, halo: int = 0) -> tuple[int, ...]:
 
 
 def _current_value(params: Any, key: str) -> Value | None:
-    """Return the value of one entry of a `mi.traverse` result; None if it is no number."""
+    """Return the value of one entry of a `mi.traverse` result, or None if it is no number."""
     value = entry_value(params, key)
     array = as_numbers(value)
     if array is None or array.size == 0:
@@ -137,7 +140,7 @@ def _current_value(params: Any, key: str) -> Value | None:
 
 
 def as_numbers(value: Any) -> np.ndarray | None:
-    """Return a parameter's value as an array, a transform as its matrix; None if it is no number."""
+    """Return a parameter's value as an array, or None if it is no number. A transform becomes its matrix."""
     try:
         array = np.asarray(value.matrix if "AffineTransform" in type(value).__name__ else value)
     except (RuntimeError, TypeError):
@@ -146,7 +149,9 @@ def as_numbers(value: Any) -> np.ndarray | None:
 
 
 def _encoded_value(array: np.ndarray, texture: mi.Texture) -> Value:
-    """Return the value of an 8-bit texture as it is looked up: divided by 255, decoded from sRGB unless it is raw."""
+    """Return the value of an 8-bit texture as lookups return it: divided by 255, and decoded from sRGB unless it is
+    raw.
+    """
     table = np.arange(256, dtype=np.float32) / 255
     if not re.search(r"^ *raw = 1,$", str(texture), re.MULTILINE):
         table = np.array(dr.srgb_to_linear(mi.Float(table)))
@@ -158,9 +163,9 @@ def _encoded_value(array: np.ndarray, texture: mi.Texture) -> Value:
 
 
 def entry_value(params: Any, key: str) -> Any:
-    """Return the value of an entry of a `mi.traverse` result; None if there is none, as for an optional texture.
+    """Return the value of an entry of a `mi.traverse` result, or None if there is none, as for an optional texture.
 
-    params[key] would mark every entry as changed for update(), and fails for missing values.
+    `params[key]` would mark every entry as changed for `update()`, and fails for missing values.
     """
     value, value_type, node, _ = params.properties[key]
     return value if value_type is None else params.get_property(value, value_type, node)
@@ -208,7 +213,7 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
 
 
 def _storage_bits(value: Any) -> int | None:
-    """Return the bits of one entry of a numeric JIT array that a parameter could be; otherwise None."""
+    """Return the bits of one entry of a JIT array that could be a parameter. For other values, return None."""
     bits = {dr.VarType.UInt8: 8, dr.VarType.Float16: 16, dr.VarType.Float32: 32, dr.VarType.Float64: 64}
     is_number = dr.is_jit_v(value) and dr.is_arithmetic_v(value) and not dr.is_matrix_v(value)
     return bits.get(dr.type_v(value)) if is_number else None
@@ -218,8 +223,8 @@ def _storage_bits(value: Any) -> int | None:
 class SensorSummary:
     """Sensor: its film in pixels (`crop` is offset and size), its view, and the needs of light tracing.
 
-    `obstacle` is the reason why light tracing cannot render for it, or None, and `camera_obstacle` the same for camera
-    paths (`prb`). `view` is None if the reason is in the scene's parts and not in the view.
+    `obstacle` is the reason why light tracing cannot render for it, or None. `camera_obstacle` is the same for camera
+    paths (`prb`). `view` is None if the reason is a part of the scene instead of the view.
     """
 
     index: int
@@ -258,7 +263,7 @@ class SceneSummary:
 
 
 def summarise(scene: Any, hide_emitters: bool = False, sensors: Sequence[int] | None = None) -> SceneSummary:
-    """Summarise `scene`; `sensors` are the indices of those to describe, None for all."""
+    """Summarise `scene`. `sensors` are the indices of the described sensors, or None for all."""
     graph, params = SceneGraph.of(scene), mi.traverse(scene)
     shapes = graph.shapes()
     return SceneSummary(

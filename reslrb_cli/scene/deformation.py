@@ -1,20 +1,22 @@
 """Scene parameters as functions of recovered values: motions of shapes and emitters, and heightmaps on meshes.
 
-Obstacles and movables: which shapes and emitters have derivatives with respect to their place, and why others have
-none. Objects of a motion or a heightmap are found by id, with the scene parameter of their place.
+Obstacles and movables: some shapes and emitters have derivatives with respect to their position, and others have a
+reason against it. Objects of a motion or a heightmap are found by id, together with the scene parameter of their
+position.
 
-Surroundings: emitters without a place (a constant sky, parallel light) send their rays through a sphere around the
-scene. Mitsuba sets it when the scene is loaded, and shapes that leave it later would be dark. The sphere is therefore
+Surroundings: emitters without a position (a constant sky, parallel light) send their rays through a sphere around the
+scene. Mitsuba sets this sphere when the scene is loaded. Shapes that leave it later would be dark, so the sphere is
 kept around moving shapes.
 
-Deformation: a mesh has positions p = M(p0 + h n0), with its own positions p0 and normals n0, the heightmap h, if any,
-at the vertex's texture coordinates, and the motion M, if any,
+Deformation: a mesh has positions p = M(p0 + h n0). p0 and n0 are its own positions and normals, h is its heightmap at
+the vertex's texture coordinates, and M is its motion. c is the pivot, t the translation, R a rotation about each axis,
+and s the scale.
 
-    M(p) = c + t + Rz Ry Rx s (p - c)      c the pivot, t the translation, R the rotation about each axis, s the scale
+    M(p) = c + t + Rz Ry Rx s (p - c)
 
-An analytic shape, and an emitter without a surface, is placed by M after its own `to_world`; for emitters, s scales
-only the place. The scene gets values without a graph (leaves). A step adds its gradient to these, and `collect`
-propagates it to the recovered values once, for any number of views, batches and passes. In forward mode, `push`
+An analytic shape, and an emitter without a surface, is placed by M after its own `to_world`. For emitters, s scales
+only the position. The scene gets values without a graph (leaves). A step adds its gradient to the leaves. `collect`
+propagates the sum to the recovered values once, for any number of views, batches and passes. In forward mode, `push`
 propagates tangents the other way.
 """
 
@@ -53,10 +55,10 @@ _PLACED = ("to_world", "vertex_positions", "position")
 
 
 def moving_obstacle(node: mi.Shape | mi.Emitter, key: str) -> str | None:
-    """Return why the parameter `key` of a shape, or of an emitter without a surface, has no derivative; None if it has
-    one.
+    """Return why the parameter `key` of a shape, or of an emitter without a surface, has no derivative, or None if it
+    has one.
 
-    The parameter determines the place or the direction of the object.
+    The parameter determines the position or the direction of the object.
     """
     kind, name = node.class_name(), key.rpartition(".")[2]
     if not isinstance(node, mi.Shape):
@@ -78,9 +80,10 @@ def moving_obstacle(node: mi.Shape | mi.Emitter, key: str) -> str | None:
 
 @dataclass(frozen=True)
 class Movable:
-    """Object with this `id`, and the `key` of the scene parameter of its place.
+    """Object with this `id`, and the `key` of the scene parameter of its position.
 
-    This is a mesh's `vertex_positions`, an analytic shape's or an emitter's `to_world`, or a point light's `position`.
+    The parameter is a mesh's `vertex_positions`, the `to_world` of an analytic shape or an emitter, or a point light's
+    `position`.
     """
 
     id: str
@@ -103,7 +106,7 @@ class Movable:
         return isinstance(self.node, mi.Shape)
 
     def heightmap_obstacle(self) -> str | None:
-        """Return why no heightmap can displace it; None if one can."""
+        """Return why no heightmap can displace it, or None if one can."""
         if not self.by_vertices:
             why = f"`{self.id}` is a {self.node.class_name()}; a heightmap displaces the vertices of a mesh"
             return (
@@ -116,7 +119,7 @@ class Movable:
         return None
 
     def casts_edges(self, scene: mi.Scene) -> bool:
-        """Whether it can have a silhouette or cast a shadow: a shape that does not enclose all others."""
+        """Whether it can have a silhouette or cast a shadow. Every shape can, except one that encloses all others."""
         others = [shape.bbox() for shape in scene.shapes() if shape.ptr != self.node.ptr]
         return self.is_shape and not all(self.node.bbox().contains(box, strict=True) for box in others)
 
@@ -179,7 +182,7 @@ class Horizon:
 
 
 class Surroundings:
-    """Sphere around the shapes of one scene; always the same object."""
+    """Sphere around the shapes of one scene. There is one object for each scene."""
 
     def __init__(self) -> None:
         self._horizon: Horizon | None = None
@@ -187,7 +190,7 @@ class Surroundings:
     def follow(self, scene: mi.Scene) -> Horizon:
         """Return a sphere around all current shapes of the scene, and set it in the scene's emitters.
 
-        It does not change as long as it contains them.
+        The sphere does not change while it contains all shapes.
         """
         sphere, before = scene.bbox().bounding_sphere(), self._horizon
         if before is not None and before.holds(scene.bbox()) and before.radius < TOO_LARGE * sphere.radius:
@@ -208,13 +211,13 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion about the point `pivot`; `names` are those of its values, by word."""
+    """Motion about the point `pivot`. `names` are the names of its values, by part."""
 
     pivot: Sequence[float]
     names: Mapping[str, str]
 
     def matrix(self, values: Mapping[str, Any], scaled: bool = True) -> mi.AffineTransform4f:
-        """Return M, or its rotation alone if not `scaled`."""
+        """Return M, or only its rotation if not `scaled`."""
         transform = mi.AffineTransform4f
         pivot = mi.Vector3f(self.pivot)
         if "translation" in self.names:
@@ -235,7 +238,7 @@ class Motion:
 class _Moved:
     """Scene parameter that is a function: its initial value, its motion, and its value with and without graph.
 
-    `heightmap` is the name of the texture, (height, width, 1), that displaces a mesh along its own `normals`.
+    `heightmap` is the name of the texture (height, width, 1) that displaces a mesh along its own `normals`.
     """
 
     item: Movable
@@ -249,7 +252,7 @@ class _Moved:
 
 
 def _corners(uv: mi.Point2f, width: int, height: int) -> tuple[list[mi.UInt32], list[mi.Float]]:
-    """Return indices and weights of the four texels around each of `uv`; row 0 is at v = 0, as in Mitsuba's
+    """Return indices and weights of the four texels around each of `uv`. Row 0 is at v = 0, as in Mitsuba's
     textures.
     """
     x = dr.clip(uv.x * width - 0.5, 0, width - 1)
@@ -282,7 +285,10 @@ class Deformation:
 
     def add_motion(self, items: tuple[Movable, ...], pivot: Sequence[float] | None, words: Sequence[str]
                    ) -> None:  # fmt: skip
-        """Add a motion of `items`, which have none yet, about `pivot`; None: the centre of their bounding box."""
+        """Add a motion of `items` about `pivot`. Without a pivot, it is the centre of their bounding box.
+
+        The items must not have a motion yet.
+        """
         names = {word: f"{items[0].id}.{word}" for word in words}
         motion = Motion(pivot or _centre(self.params, items), names)
         for item in items:
@@ -293,7 +299,7 @@ class Deformation:
             self.quantities[name] = {"rotation": "degrees", "scale": "scale"}.get(word, "length")
 
     def add_heightmap(self, items: tuple[Movable, ...], resolution: tuple[int, int]) -> None:
-        """Add a heightmap to the meshes `items`, which have none yet."""
+        """Add a heightmap to the meshes `items`. They must not have one yet."""
         name = f"{items[0].id}.{HEIGHTMAP}"
         for item in items:
             moved, mesh = self._place(item), item.node
@@ -314,7 +320,8 @@ class Deformation:
     def displaced(self, name: str) -> tuple[mi.Mesh, np.ndarray, np.ndarray, np.ndarray]:
         """Return the first mesh of the heightmap `name`, with its current geometry.
 
-        It has positions (N, 3) float64, texture coordinates (N, 2), and directions (N, 3) of the heights.
+        The geometry consists of positions (N, 3) as float64, texture coordinates (N, 2), and directions (N, 3) of the
+        heights.
         """
         moved = next(each for each in self._moved.values() if each.heightmap == name)
         positions = np.array(self.params[moved.item.key], dtype=np.float64).reshape(-1, 3)
@@ -324,7 +331,9 @@ class Deformation:
         return moved.item.node, positions, texcoords, normals
 
     def place(self) -> list[Any]:
-        """Set the scene's parameters from the values; `params.update()` must follow. Returns the arrays to evaluate."""
+        """Set the scene's parameters from the values. Call `params.update()` afterwards. Returns the arrays to
+        evaluate.
+        """
         for key, moved in self._moved.items():
             moved.tracked = self._function(moved)
             moved.leaf = _opaque(type(moved.tracked)(dr.detach(moved.tracked)))
@@ -334,7 +343,7 @@ class Deformation:
         return [moved.leaf for moved in self._moved.values()]
 
     def collect(self) -> None:
-        """Add the gradient at the scene's parameters to that of the values, and clear it there."""
+        """Add the gradient at the scene's parameters to the gradient of the values, and clear it in the scene."""
         tracked = self._tracked()
         for moved in tracked:
             dr.set_grad(moved.tracked, dr.grad(moved.leaf))
@@ -389,9 +398,7 @@ class Deformation:
 
 
 class _Lookup(dr.CustomOp):
-    """Weighted sum of entries of a buffer whose derivative keeps values that are not finite, unlike that of a
-    gather.
-    """
+    """Weighted sum of entries of a buffer. Unlike that of a gather, its derivative keeps non-finite values."""
 
     def eval(self, buffer: mi.Float, indices: list[mi.UInt32], weights: list[mi.Float]) -> mi.Float:
         self.indices, self.weights, self.size = indices, weights, dr.width(buffer)
@@ -428,7 +435,7 @@ def _vertex_normals(mesh: mi.Mesh) -> mi.Normal3f:
 
 
 def _centre(params: mi.SceneParameters, items: tuple[Movable, ...]) -> tuple[float, float, float]:
-    """Return the centre of the bounding box of `items`; emitters without a surface are points."""
+    """Return the centre of the bounding box of `items`. Emitters without a surface count as points."""
     corners: list[np.ndarray] = []
     for item in items:
         if item.is_shape:

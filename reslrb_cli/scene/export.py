@@ -29,7 +29,7 @@ Array = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
 
 def replace(owner: Element, new: Element, *instead_of: str) -> None:
-    """Put `new` among the children of `owner`, in place of those with its name or with names in `instead_of`."""
+    """Put `new` among the children of `owner`, in place of children with its name or with names in `instead_of`."""
     owner.drop(new.name, *instead_of)
     owner.children.insert(0, new)
 
@@ -45,7 +45,7 @@ def number(owner: Element, name: str, value: float) -> Element:
 
 
 def colour(owner: Element, name: str, value: Array, bounded: bool) -> Element:
-    """Return an element for a colour (3,) or a grey; if `bounded`, Mitsuba's <rgb> must be from 0 to 1."""
+    """Return an element for a colour (3,) or a grey. If `bounded`, Mitsuba's <rgb> must be from 0 to 1."""
     if value.size == 1:
         return number(owner, name, float(value.ravel()[0]))
     if not bounded or bool(((value >= 0) & (value <= 1)).all()):
@@ -84,8 +84,8 @@ _CONDUCTORS = ("conductor", "roughconductor")
 class Replacing:
     """Description of a scene that gets the values of `params`.
 
-    `writers` map paths in the exported folder, with `/`, to functions that write the file to a new path. `source` is
-    named in errors.
+    `writers` map paths in the exported folder, with `/`, to functions that write the file to a new path. Errors name
+    `source`.
     """
 
     def __init__(self, description: Description, params: mi.SceneParameters, source: object) -> None:
@@ -122,7 +122,7 @@ class Replacing:
             self._put_number(owner, name, self._array(key), key)
 
     def _put_nested(self, owner: Element, below: list[str], name: str, key: str) -> None:
-        """Write a value of something below `owner` that is no object in the scene's files."""
+        """Write a value below `owner` that does not belong to an object in the scene's files."""
         if name == "value" and len(below) == 1:
             self._put_spectrum(owner, below[0], key)
         elif name == "value" and below[0] == "bsdf" and len(below) == 2 and owner.tag == "shape":
@@ -179,9 +179,9 @@ class Replacing:
         replace(owner, element)
 
     def copy_assets(self) -> None:
-        """Copy every file that elements name, and let them name the copies.
+        """Copy every file that elements name, and change the elements to name the copies.
 
-        A file in the folder of the scene keeps its relative path; other files go to a separate folder.
+        A file in the folder of the scene keeps its relative path. Other files go to a separate folder.
         """
         own = {name.casefold() for name in (SCENE, *self.writers)}
         home = self.description.root.source.file.absolute().parent.resolve()
@@ -204,8 +204,8 @@ class Replacing:
 def _free(source: Path, home: Path, taken: set[str]) -> str:
     """Return the path of a copy of `source` in the exported folder.
 
-    It is the path below `home`, or one in the folder for other files, with a number before its suffix if it is taken
-    (ignoring case).
+    It is the path below `home`, or one in the folder for other files. If the path is taken (ignoring case), a number is
+    added before its suffix.
     """
     inside = source.is_relative_to(home)
     path = PurePosixPath(*source.relative_to(home).parts) if inside else PurePosixPath(ELSEWHERE, source.name)
@@ -217,7 +217,7 @@ def _free(source: Path, home: Path, taken: set[str]) -> str:
 
 
 def same_values(a: object, b: object) -> bool:
-    """Whether two values of a parameter agree up to rounding; a grey agrees with the same number in each channel."""
+    """Whether two values of a parameter agree up to rounding. A grey agrees with the same number in each channel."""
     x, y = as_numbers(a), as_numbers(b)
     if x is None or y is None:
         return x is y
@@ -246,9 +246,9 @@ def export_scene(
     """Write `description`, with the values of `params` for `keys`, and an integrator, to `folder`.
 
     `params` belong to a scene that was built from the description, which is modified. `integrator` has its type and
-    options; `beside` maps names of further files to their writers; `note` is a comment at the top of the scene. The
-    folder appears once it is complete, and Mitsuba has read the same values back. Raises ConfigError, located in
-    `source` and the key, if a value cannot be expressed, and OSError.
+    options. `beside` maps names of further files to their writers. `note` is a comment at the top of the scene. The
+    folder appears once it is complete and Mitsuba has read the same values back. Raises ConfigError, located in
+    `source` and the key, if a value cannot be expressed. Raises OSError.
     """
     replacing, root = Replacing(description, params, source), description.root
     for key in keys:

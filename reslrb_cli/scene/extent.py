@@ -1,4 +1,4 @@
-"""Place and size of a scene and its parts, if single precision or a sensor's clip planes lose light because of them."""
+"""Position and size of a scene and its parts, which can cause a loss of light by single precision or clip planes."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ def doubts(scene: Any) -> list[str]:
 
 
 def _lost_light(scene: Any) -> str | None:
-    """Return the problem of a scene that is far from the origin, or tiny, and the remedy; None if there is none.
+    """Return the problem of a scene that is far from the origin or tiny, with a remedy, or None.
 
-    Mitsuba starts rays off their surface by RayEpsilon (1 + max |p|), in the scene's units, so that they jump over
-    nearer surfaces. Light is lost in corners, in all integrators.
+    Mitsuba offsets the origins of rays from their surface by RayEpsilon (1 + max |p|), in the scene's units. If
+    surfaces are closer than this, rays skip them. Light is then lost in corners, in all integrators.
     """
     low, high = bounds(scene)
     size = float(np.linalg.norm(high - low))
@@ -61,10 +61,10 @@ def _lost_light(scene: Any) -> str | None:
 
 
 def clipped(scene: Any, sensor: Any) -> tuple[bool, bool]:
-    """Return whether anything may be between a sensor and its near clip plane, and beyond its far clip plane.
+    """Return whether any object may be between a sensor and its near clip plane, and beyond its far clip plane.
 
-    The sensor is perspective or thin-lens. Between sensor and near plane, only its view counts. The test uses bounding
-    boxes, and triangles near the sensor: it may return true wrongly, but never false wrongly.
+    The sensor is perspective or thin-lens. Between sensor and near plane, only objects in its view count. The test uses
+    bounding boxes, and triangles near the sensor. A result of false is certain, and a result of true may be wrong.
     """
     params = mi.traverse(sensor)
     near, far, radius, focus = (
@@ -86,7 +86,7 @@ def clipped(scene: Any, sensor: Any) -> tuple[bool, bool]:
 
 
 def _touches(shape: Any, axes: np.ndarray, eye: np.ndarray, middle: np.ndarray, half: np.ndarray) -> bool:
-    """Whether a shape may touch a box, given by its middle and half sizes in the coordinates of `axes` (columns) and
+    """Whether a shape may touch a box. The box has its middle and half sizes in the coordinates of `axes` (columns) and
     `eye`.
     """
     low, high = bounds(shape)
@@ -106,12 +106,11 @@ def _touches(shape: Any, axes: np.ndarray, eye: np.ndarray, middle: np.ndarray, 
 
 
 def _coincident(scene: Any) -> str | None:
-    """Return the problem of a scene in which rays of a sensor or a light meet two coincident faces; None if there is
-    none.
+    """Return the problem of a scene in which rays of a sensor or a light meet two coincident faces, or None.
 
-    Rounding decides which face a ray meets. This does not matter if both face the same way, or both ways alike
-    (`twosided`), and have one BSDF. Otherwise, light paths and camera paths show different scenes. Detected are
-    triangles with three common corners, and equal disks and spheres.
+    Rounding decides which face a ray meets. This does not matter if both faces have one BSDF and face the same way or
+    are both `twosided`. Otherwise, light paths and camera paths show different scenes. The test detects triangles with
+    three common corners, and equal disks and spheres.
     """
     shapes = scene.shapes()
     twins = _twin_faces(shapes) | _twin_shapes(shapes)
@@ -135,7 +134,7 @@ _Twins = dict[tuple[int, int], tuple[int, int]]
 
 
 def _twin_faces(shapes: Sequence[Any]) -> _Twins:
-    """Return the coincident triangles of meshes that differ."""
+    """Return the coincident triangles of meshes for which the choice matters."""
     meshes = [index for index, shape in enumerate(shapes) if shape.is_mesh() and shape.face_count()]
     if not meshes:
         return {}
@@ -172,7 +171,7 @@ def _twin_faces(shapes: Sequence[Any]) -> _Twins:
 
 
 def _twin_shapes(shapes: Sequence[Any]) -> _Twins:
-    """Return the coincident disks and spheres that differ."""
+    """Return the coincident disks and spheres for which the choice matters."""
     before: dict[tuple[str, bytes], list[int]] = {}
     found: _Twins = {}
     for index, shape in enumerate(shapes):
@@ -196,7 +195,8 @@ def _twin_shapes(shapes: Sequence[Any]) -> _Twins:
 def _differ(one: Any, other: Any, turned: bool, bent: bool) -> bool:
     """Whether it matters which of two coincident faces a ray meets.
 
-    `turned`: their normals are opposite; `bent`: they have shading normals that differ from their normals.
+    `turned` tells whether their normals are opposite, and `bent` whether their shading normals differ from their
+    normals.
     """
     if one.is_emitter() or other.is_emitter() or one.bsdf() != other.bsdf():
         return True
@@ -236,7 +236,7 @@ _PATHS, _SURFACES = 4096, 8
 
 
 def _thin_glass(scene: mi.Scene) -> str | None:
-    """Return the problem of a scene in which light passes two surfaces that nearly touch; None if there is none.
+    """Return the problem of a scene in which light passes two surfaces that nearly touch, or None.
 
     Rays from the lights go straight through transparent surfaces. The distance of two surfaces is measured from both
     sides, because a ray that leaves the first may miss the second.

@@ -57,7 +57,7 @@ def files_of(config: Config) -> dict[str, Path]:
 
 
 def _paths(value: Any, key: str) -> Iterator[tuple[str, Path]]:
-    """Yield the paths among settings, each with its key as `--set` names it."""
+    """Yield the paths among settings, each with its key in the form of `--set`."""
     if isinstance(value, Path):
         yield key, value
     elif isinstance(value, Mapping):

@@ -65,7 +65,7 @@ class SceneGraph:
         return any(item.class_name() == "Instance" for item in self.objects)
 
     def is_shown(self, shape: Any) -> bool:
-        """Whether rays may meet a shape, which is not the case in a group without instances."""
+        """Whether rays may meet a shape. They never meet a shape in a group without instances."""
         return self.has_instances() or any(item.class_name() != "ShapeGroupPlugin" for item in self.parents[shape])
 
     def find_lamps(self, scene: mi.Scene) -> tuple[Lamp, ...]:
@@ -96,7 +96,7 @@ class SceneGraph:
         return list(found)
 
     def owning_bsdfs(self, item: Any) -> list[Any]:
-        """Return the outermost of these BSDFs, which have another user than a BSDF or a texture."""
+        """Return the outermost BSDFs that use this object. Other objects than BSDFs and textures use them."""
         found = ((bsdf, self.parents.get(bsdf, [])) for bsdf in self.bsdfs_above(item))
         return [bsdf for bsdf, parents in found if not all(isinstance(p, (mi.BSDF, mi.Texture)) for p in parents)]
 
@@ -110,10 +110,10 @@ class SceneGraph:
 
 @dataclass(frozen=True)
 class Lamp:
-    """Emitting shape; `emitter` is its emitter, and `index` the number of the emitter in `scene.emitters()`.
+    """Emitting shape. `emitter` is its emitter, and `index` the number of the emitter in `scene.emitters()`.
 
-    `parallel`: light leaves only along the normal (`directionalarea`). `texture`: the texture that its points are
-    sampled from; None: uniformly over its area.
+    `parallel` tells whether light leaves only along the normal (`directionalarea`). `texture` is the texture that its
+    points are sampled from, or None if they are uniform over its area.
     """
 
     shape: mi.Shape
@@ -129,16 +129,16 @@ class Lamp:
 
     @cached_property
     def surrounds(self) -> bool:
-        """Whether it is a sphere that emits inwards, evenly.
+        """Whether it is a sphere that emits inwards with constant radiance.
 
-        Mitsuba samples its points uniformly, but uses the density of a cone if rounding puts the vertex outside, which
-        happens for all vertices on it.
+        Mitsuba samples points of such a sphere uniformly. If rounding puts the vertex outside of the sphere, it uses
+        the density of a cone instead. This happens for all vertices on the sphere.
         """
         return self.is_sphere and self.texture is None and not self.parallel and self.shape.has_flipped_normals()
 
     @cached_property
     def faces_by_area(self) -> bool:
-        """Whether its faces are sampled in proportion to their current areas by Mitsuba."""
+        """Whether Mitsuba samples its faces in proportion to their current areas."""
         return self.has_faces and self.texture is None
 
     @cached_property
@@ -187,7 +187,7 @@ def sensor_rays(
 
 
 def failure(call: Callable[[], object]) -> str | None:
-    """Return Mitsuba's reason, in one line, why `call` fails; None if it succeeds."""
+    """Return Mitsuba's reason, in one line, why `call` fails, or None if it succeeds."""
     try:
         with dr.suspend_grad():
             call()
@@ -207,9 +207,9 @@ POINTS = 16
 
 
 def small_lamps(scene: mi.Scene, sensor: mi.Sensor, lamps: Iterable[Lamp]) -> tuple[Lamp, ...]:
-    """Return the lamps that `sensor` sees directly as less than a pixel; none if there are more than MOST.
+    """Return the lamps that `sensor` sees directly as less than a pixel. If there are more than MOST, return none.
 
-    Lamps that emit only along their normal are never seen.
+    Lamps that emit only along their normal are never visible.
     """
     found = [lamp for lamp in lamps if not lamp.parallel and _pixels(sensor, lamp.shape) < SMALL]
     if len(found) > MOST:
@@ -218,7 +218,7 @@ def small_lamps(scene: mi.Scene, sensor: mi.Sensor, lamps: Iterable[Lamp]) -> tu
 
 
 def _pixels(sensor: mi.Sensor, shape: mi.Shape) -> float:
-    """Return the diameter on the film, in pixels, of the sphere around the shape's bounding box, for any view
+    """Return the diameter on the film, in pixels, of the sphere around the shape's bounding box. It holds for any view
     direction.
     """
     low, high = bounds(shape)
@@ -262,12 +262,12 @@ def triangles(mesh: mi.Mesh) -> np.ndarray:
 
 
 def face_normals(corners: np.ndarray) -> np.ndarray:
-    """Return normals of triangles (F, 3, 3), (F, 3), with a length of twice their areas."""
+    """Return normals (F, 3) of triangles (F, 3, 3). Their length is twice the area of the triangle."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def bent_faces(mesh: mi.Mesh, cosine: float) -> np.ndarray:
-    """Return for each face of a mesh, (F,), whether the cosine between a vertex normal and the face normal is below
+    """Return for each face (F,) of a mesh whether the cosine between a vertex normal and the face normal is below
     `cosine`.
     """
     if not interpolates_normals(mesh):

@@ -18,8 +18,8 @@ from reslrb_cli.scene.xml.read import Description, Element
 def make_grid(description: Description, id: str, size: tuple[int, int], place: Place) -> None:
     """Replace the rectangle `id` of a description by a mesh with `size` vertices along its edges, before it is built.
 
-    The shape is a `rectangle`, a mesh of four vertices that form a parallelogram, or a mesh that is a flat grid over
-    one already. Its place and its material stay. Raises ConfigError at `place` for any other shape.
+    The shape is a `rectangle`, a mesh of four vertices that form a parallelogram, or a mesh that is a flat grid over a
+    parallelogram. Its position and its material do not change. Raises ConfigError at `place` for any other shape.
     """
     element = description.root.by_id().get(id)
     if element is None or element.tag != "shape":
@@ -54,10 +54,10 @@ Corners = tuple[np.ndarray, np.ndarray, np.ndarray, bool]
 
 
 def _corners_of(element: Element, description: Description) -> Corners | None:
-    """Return the parallelogram of a mesh's file; None for anything else.
+    """Return the parallelogram of a mesh's file, or None for other meshes.
 
     It is given by a corner, the ends of its edges along u and along v, and whether v is to the right of u, seen from
-    outside. For four vertices without texture coordinates, u has the mesh to its left.
+    outside. If four vertices have no texture coordinates, u is chosen so that the mesh is to its left.
     """
     name = element.find("filename")
     path = None if name is None else description.find_file(name.value)
@@ -84,9 +84,9 @@ def _corners_of(element: Element, description: Description) -> Corners | None:
 
 def _corners_of_grid(mesh: mi.Mesh) -> Corners | None:
     """Return the parallelogram of a mesh with more vertices, whose texture coordinates are proportional to their
-    places.
+    positions.
 
-    The mesh must cover all of it; otherwise None.
+    Returns None if the mesh does not cover all of it.
     """
     if mesh.vertex_count() < 4 or not mesh.has_vertex_texcoords():
         return None
@@ -109,8 +109,8 @@ def _corners_of_grid(mesh: mi.Mesh) -> Corners | None:
 
 @functools.cache
 def _grid_file(width: int, height: int, inside_out: bool) -> Path:
-    """Return a temporary file with a grid over [-1, 1] x [-1, 1], facing up or down, which exists as long as this
-    process.
+    """Return a temporary file with a grid over [-1, 1] x [-1, 1], facing up or down. It exists until the process
+    ends.
     """
     path = Path(_grid_folder().name) / f"grid_{width}x{height}{'_down' * inside_out}.ply"
     path.write_bytes(face_ply(Setting(size=(2.0, 2.0), thickness=0.0), width, height, back=inside_out))

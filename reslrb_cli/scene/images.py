@@ -1,10 +1,10 @@
 """Image files: checked before they are decoded, and read as images to compare with or as textures.
 
 The checks cover the stated size, the end of the file, and the orientation. A file of some kilobytes can claim to be an
-image of gigabytes, and Mitsuba's reader fills missing data of a JPEG with grey. Files that were truncated and padded
-are detected if their format is compressed, except for the last lines of an EXR, which has no checksums. Cameras and
-phones write the pixels as the sensor has them, and the rotation to an upright image as metadata (EXIF, in JPEG and
-PNG), which Mitsuba's reader ignores.
+image of gigabytes, and Mitsuba's reader fills missing data of a JPEG with grey. For compressed formats, the checks also
+detect files that were truncated and padded. An exception are the last lines of an EXR, which has no checksums. Cameras
+and phones store pixels as the sensor has them, and the rotation to an upright image as metadata (EXIF, in JPEG and
+PNG). Mitsuba's reader ignores this metadata.
 """
 
 from __future__ import annotations
@@ -63,10 +63,10 @@ class _Header:
 
 
 def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> mi.Bitmap:
-    """Decode the image file `path`; `size` is the required (width, height), None for any.
+    """Decode the image file `path`. `size` is the required (width, height), or None for any.
 
-    Pixels are as stored, or, if `upright`, rotated by EXIF (`TURNS`), and so is the size. Raises ConfigError, located
-    in the file, if it cannot be read, is no image, too large, of another size, damaged or truncated. The header is
+    Pixels are as stored. If `upright`, pixels and size are rotated by EXIF (`TURNS`). Raises ConfigError, located in
+    the file, if it cannot be read, or is no image, too large, of another size, damaged or truncated. The header is
     checked first.
     """
     header = _examine(path)
@@ -106,7 +106,7 @@ def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> 
 
 
 def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Return an image (H, W, ...) of this EXIF orientation upright; a view."""
+    """Return a view of an image (H, W, ...) with this EXIF orientation, rotated upright."""
     if orientation >= 5:  # rows of the file are columns of the view
         pixels = pixels.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
@@ -117,12 +117,12 @@ def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def orientation_of(path: Path) -> int:
-    """Return EXIF's orientation of an image file, 1 to 8; 1 without one. Raises ConfigError if it is no image."""
+    """Return EXIF's orientation of an image file (1 to 8), or 1 without one. Raises ConfigError if it is no image."""
     return _examine(path).orientation
 
 
 def image_size(path: Path) -> Size:
-    """Return the stored (width, height) of an image. Raises ConfigError, located in it, if it is none."""
+    """Return the stored (width, height) of an image. Raises ConfigError, located in the file, if it is no image."""
     width, height = _examine(path).size
     if min(width, height) < 1:
         raise DamagedImage(path, "", f"claims {width}x{height} pixels; save it again")
@@ -132,8 +132,8 @@ def image_size(path: Path) -> Size:
 def _examine(path: Path) -> _Header:
     """Return the header of an image.
 
-    Raises ConfigError, located in it, if it is no image, or a PNG or JPEG without its end; readers detect this for
-    other formats.
+    Raises ConfigError, located in the file, if it is no image. Also raises it for a PNG or JPEG without its end; for
+    other formats, readers detect this.
     """
     header: _Header | None = None
     with open_file(path) as file:
@@ -202,7 +202,7 @@ def _jpeg(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
 
 
 def _orientation(exif: bytes) -> int:
-    """Return the orientation in EXIF data, the head of a TIFF file: 1 to 8, and 1 if it cannot be read.
+    """Return the orientation (1 to 8) in EXIF data, which start like a TIFF file, or 1 if it cannot be read.
 
     Only the entries of the first directory are read, each once.
     """
@@ -248,8 +248,8 @@ def _hdr(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
 def _are_whole(data: bytes, width: int, height: int) -> bool:
     """Whether the lines of a Radiance image fit its header.
 
-    Runs must fill each of the four parts of a line exactly, in all lines or in none. Mitsuba's reader trusts the lines,
-    and would write out of bounds.
+    The four parts of a line must be filled exactly by runs, in all lines or in none. Mitsuba's reader does not check
+    the lines, and would write out of bounds.
     """
     start = bytes((2, 2, width >> 8, width & 255)) if 8 <= width <= 0x7FFF else b""
     if not start or data[:2] != start[:2] or data[2:3] >= b"\x80":
@@ -324,10 +324,10 @@ Image = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class Photo:
-    """Image file as linear Rec. 709, (H, W, 3) float32, with the defects of its pixels, each boolean (H, W).
+    """Image file as linear Rec. 709, (H, W, 3) float32, with the defects of its pixels as booleans (H, W).
 
-    `clipped`: at the maximum of a file of 8 or 16 bits in any channel; `transparent`: of alpha 0; `nonfinite`: not
-    finite in some channel.
+    `clipped` pixels are at the maximum of a file of 8 or 16 bits in any channel. `transparent` pixels have alpha 0.
+    `nonfinite` pixels have a non-finite channel.
     """
 
     image: Image
@@ -337,8 +337,8 @@ class Photo:
 
 
 def turned_line(path: Path, upright: bool = True) -> str | None:
-    """Return a line for the user about an image with an EXIF orientation, read `upright` or not; None for other
-    images.
+    """Return a line for the user about an image with an EXIF orientation, which is read `upright` or not. For other
+    images, return None.
     """
     turned = TURNS.get(orientation_of(path))
     if turned is None or upright:
@@ -350,10 +350,11 @@ def read_image(path: Path, color_space: str = "auto", size: Size | None = None, 
     """Read an EXR, PNG, JPG, HDR, PFM, PPM or BMP file as linear Rec. 709: (H, W, 3) float32.
 
     `color_space` is the encoding of the file's values: `linear`, `srgb`, or `auto` (integers srgb, floats linear).
-    Alpha is dropped; one channel becomes three. `size` is the required (width, height). Pixels are as stored, as
-    Mitsuba reads textures; a warning says if EXIF would rotate them. Raises ConfigError, located in the file, if it is
-    missing or no image, damaged, truncated, too large or of another size, or has a value that is not finite or, unless
-    `signed`, negative.
+    Alpha is dropped, and one channel becomes three. `size` is the required (width, height). Pixels are as stored, as in
+    Mitsuba's textures. If EXIF would rotate them, a warning is printed.
+
+    Raises ConfigError, located in the file, if it is missing, no image, damaged, truncated, too large or of another
+    size. Also raises it for values that are not finite and, unless `signed`, for negative values.
     """
     image = read_photo(path, color_space, size, upright=False, signed=signed).image
     orientation = orientation_of(path)
@@ -372,8 +373,8 @@ def read_photo(
 ) -> Photo:
     """Read an image file like `read_image`, and mark unreliable pixels.
 
-    `upright` rotates the image by its EXIF orientation; `size` then refers to the upright image. Values may be negative
-    if `signed`, and not finite with `nonfinite`. Raises ConfigError, located in the file.
+    `upright` rotates the image by its EXIF orientation. `size` then refers to the upright image. `signed` allows
+    negative values, and `nonfinite` allows non-finite values. Raises ConfigError, located in the file.
     """
     bitmap = read_bitmap(path, size, upright)
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
@@ -404,16 +405,16 @@ def read_photo(
 
 
 def read_weights(path: Path, size: Size, upright: bool = True) -> Image:
-    """Read an image of weights, float32 (H, W): the values in the file, the mean of several channels.
+    """Read an image of weights, float32 (H, W): the values in the file, or the mean of several channels.
 
-    Values of 8 and 16 bits are divided by their maximum; alpha is dropped. `upright` rotates the image by its own EXIF
+    Values of 8 and 16 bits are divided by their maximum. Alpha is dropped. `upright` rotates the image by its own EXIF
     orientation. Raises ConfigError, located in the file, like `read_image`.
     """
     return read_photo(path, "linear", size, upright=upright).image.mean(axis=2)
 
 
 def decode_srgb(encoded: Image) -> Image:
-    """Return the linear values of sRGB-encoded ones (IEC 61966-2-1), with the same precision."""
+    """Return the linear values of sRGB-encoded values (IEC 61966-2-1), with the same precision."""
     wide = encoded.astype(np.float64)
     curve = ((np.maximum(wide, 0) + 0.055) / 1.055) ** 2.4
     return np.where(wide <= 0.04045, wide / 12.92, curve).astype(encoded.dtype)

@@ -37,24 +37,24 @@ def load_scene(
     keys: Iterable[str] = (),
     warn: bool = True,
 ) -> mi.Scene:
-    """Load a Mitsuba scene (XML, versions 0.4 to 3); a variant must be set.
+    """Load a Mitsuba scene (XML, versions 0.4 to 3). A variant must be set.
 
     - `options` are the values of the file's `$name` variables.
     - `size` is the (width, height) of all films in pixels, instead of those in the files.
     - `cameras` is a file of cameras that replace the scene's sensors.
     - `look` is called with the description before anything is built, and may raise exceptions.
-    - `keys`, which may be globs, are parameters that need derivatives: their bitmaps of 8 or 16 bits are read as
-      floating point.
+    - `keys` are keys or globs of parameters that need derivatives. Their bitmaps of 8 or 16 bits are read as floating
+        point.
     - Without `warn`, the scene is not checked for doubtful parts.
 
-    Shapes are not merged, so that all parameters keep their names. An object without an id is named by its kind and its
-    number among all of this kind in the file, such as `Sphere_3`. Elements of other versions or exporters that
+    Shapes are not merged, so all parameters keep their names. An object without an id is named by its kind and its
+    number among all objects of this kind in the file, such as `Sphere_3`. Elements of other versions or exporters that
     Mitsuba's parser would refuse are repaired or left out, with a warning in the log. Mitsuba must use every remaining
     element. The scene's integrator is not loaded, because an experiment has its own. Plugins are loaded only from
     Mitsuba's own folder.
 
     Raises ConfigError, located in the scene file, if it is missing or wrong, or without shapes or light. Warns of a
-    scene that is too far from the origin, or too small, of glass that is too thin, and of coincident faces.
+    scene that is too far from the origin or too small, of glass that is too thin, and of coincident faces.
     """
     file = Path(file)
     description = read_description(file, option_texts(options or {}))
@@ -111,16 +111,17 @@ def load_for_script(file: str | os.PathLike[str], keys: Iterable[str] = (), /, *
 def read_as_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> mi.Scene:
     """Return the scene with bitmaps of 8 or 16 bits among `keys`, which may be globs, read as floating point.
 
-    This is `scene` itself if there are none; otherwise the scene is built again from `description`, which is modified.
+    If there are no such bitmaps, this is `scene` itself. Otherwise the scene is built again from `description`, which
+    is modified.
     """
     return build(description)[0] if _mark_floats(scene, description, keys) else scene
 
 
 def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> bool:
-    """Mark these bitmaps as floats in the description; return whether there are any.
+    """Mark these bitmaps as floats in the description. Returns whether there are any.
 
-    Other bitmaps do not change, because floats take four times the memory of bytes. Values are the same; they are
-    decoded from sRGB when they are read instead of when they are looked up.
+    Other bitmaps keep their format, because floats take four times the memory of bytes. The values stay the same. They
+    are decoded from sRGB when they are read instead of when they are looked up.
     """
     keys = list(keys)
     if not keys or not any(element.type == "bitmap" for element in description.root.walk()):

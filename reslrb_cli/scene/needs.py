@@ -60,11 +60,11 @@ LOOK = 128
 
 @dataclass(frozen=True)
 class SceneNeeds:
-    """Static facts of a scene for one sensor; features that are false or absent need not be compiled.
+    """Static facts of a scene for one sensor. Features that are false or absent need not be compiled.
 
-    `emitters` holds class names in the order of `scene.emitters()`; `environment` is the index of the surrounding
-    emitter, or None. `near_clip`: something may be between the sensor and its near clip plane. `lens_clip`: a thin lens
-    may see something outside of its clip planes, or focuses where Mitsuba lets it see nothing.
+    `emitters` holds class names in the order of `scene.emitters()`. `environment` is the index of the surrounding
+    emitter, or None. `near_clip` tells whether an object may be between the sensor and its near clip plane. `lens_clip`
+    tells whether a thin lens may see objects outside of its clip planes, or has a focus at which Mitsuba sees nothing.
     """
 
     emitters: tuple[str, ...]
@@ -89,11 +89,11 @@ class SceneNeeds:
 
 @dataclass(frozen=True)
 class PrimaryHits:
-    """Surfaces that primary rays meet behind see-through surfaces: fractions of the film, which sum to 1.
+    """Surfaces that primary rays meet behind see-through surfaces, as fractions of the film that sum to 1.
 
-    `smooth`: surfaces that light paths can connect to the sensor; `specular`: only smooth specular surfaces (glass,
-    mirrors), which stay black; `nothing`: no surface. `emission`: the fraction with a directly visible emitter, which
-    overlaps with the others.
+    `smooth` surfaces can be connected to the sensor by light paths. `specular` surfaces are only smooth specular
+    (glass, mirrors), and stay black. `nothing` is no surface. `emission` is the fraction with a directly visible
+    emitter, which overlaps with the others.
     """
 
     smooth: float
@@ -103,7 +103,7 @@ class PrimaryHits:
 
 
 def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
-    """Return the needs of light tracing of `scene` for `sensor`."""
+    """Return the features that light tracing of `scene` for `sensor` needs."""
     graph = SceneGraph.of(scene)
     flags = 0
     for bsdf in graph.surface_bsdfs():
@@ -151,7 +151,7 @@ def is_bent(mesh: Any) -> bool:
 def check_paths(scene: Any, sensor: Any, paths: str, hide_emitters: bool = False) -> None:
     """Raise UnsupportedScene, with the reason and the remedy, if these paths cannot render `scene`.
 
-    `paths` is one of those of `paths_obstacle`.
+    `paths` is as in `paths_obstacle`.
     """
     obstacle = paths_obstacle(scene, sensor, paths, hide_emitters)
     if obstacle is None:
@@ -169,9 +169,9 @@ def check_paths(scene: Any, sensor: Any, paths: str, hide_emitters: bool = False
 
 
 def paths_obstacle(scene: Any, sensor: Any, paths: str, hide_emitters: bool = False) -> str | None:
-    """Return the reason why `scene` cannot be rendered for `sensor`; None if it can.
+    """Return the reason why `scene` cannot be rendered for `sensor`, or None if it can be.
 
-    `paths`: `light`, `camera` or `both`, as in `reslrb`; `prb`: camera paths of Mitsuba's own integrators.
+    `paths` is `light`, `camera` or `both`, as in `reslrb`, or `prb` for camera paths of Mitsuba's own integrators.
     """
     if paths == "light":
         return _light_obstacle(scene, sensor, hide_emitters)
@@ -184,9 +184,9 @@ def paths_obstacle(scene: Any, sensor: Any, paths: str, hide_emitters: bool = Fa
 
 
 def scaled_emitter(scene: Any) -> str | None:
-    """Return the reason why both kinds of paths do not render the same light, in words; None if they do.
+    """Return in words why both kinds of paths do not render the same light, or None if they do.
 
-    For a `directional` or `projector` emitter with a scale in `to_world`, directions do not have length 1, and
+    A `directional` or `projector` emitter may have a scale in `to_world`. Its directions then do not have length 1, and
     Mitsuba's `sample_ray` and `sample_direction` treat them differently.
     """
     plugins = {"DirectionalEmitter": "directional", "Projector": "projector"}
@@ -205,9 +205,9 @@ DIRECT = 2
 
 
 def camera_finds_all(scene: Any, max_depth: int) -> bool:
-    """Whether camera paths of up to `max_depth` segments (-1: any number) find all light, and none of it rarely.
+    """Whether camera paths of up to `max_depth` segments (-1: any number) find all light with good probability.
 
-    This holds if no surface is specular or glossy, or if light comes straight from the emitters, and no emitter emits
+    They do if no surface is specular or glossy, or if all light comes straight from the emitters. No emitter may emit
     only along its normal.
     """
     if any(emitter.class_name() == "DirectionalArea" for emitter in scene.emitters()):
@@ -232,12 +232,12 @@ def light_finds_all(scene: Any, sensors: Sequence[Any], hide_emitters: bool) -> 
 
 
 def camera_finds_nothing(scene: Any) -> bool:
-    """Whether all light of `scene` is from emitters that emit only along their normal, which no camera path finds."""
+    """Whether all emitters of `scene` emit only along their normal. No camera path finds such light."""
     return all(emitter.class_name() == "DirectionalArea" for emitter in scene.emitters())
 
 
 def _light_obstacle(scene: Any, sensor: Any, hide_emitters: bool) -> str | None:
-    """Return the reason why light paths cannot render `scene` for `sensor`; None if they can."""
+    """Return the reason why light paths cannot render `scene` for `sensor`, or None if they can."""
     if (obstacle := unsupported_part(scene, sensor)) is not None:
         return obstacle
     if (obstacle := _unsampled(scene)) is not None:
@@ -252,7 +252,7 @@ def _light_obstacle(scene: Any, sensor: Any, hide_emitters: bool) -> str | None:
 
 
 def _unsampled(scene: Any) -> str | None:
-    """Return the reason why Mitsuba cannot sample rays of some emitter; None if it can."""
+    """Return the reason why Mitsuba cannot sample rays of some emitter, or None if it can."""
     try:
         emitted_rays(scene, mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
     except UnsupportedScene as error:
@@ -267,7 +267,9 @@ def _film_obstacle(sensor: Any) -> str | None:
 
 
 def stock_clip(needs: SceneNeeds) -> str | None:
-    """Return the error of Mitsuba's own light tracing with a sensor's clip planes, in words; None if there is none."""
+    """Return the error of Mitsuba's own light tracing with a sensor's clip planes in words, or None if there is
+    none.
+    """
     if needs.lens_clip:
         return "does not clip the view of a `thinlens`, and loses light if it focuses on a clip plane or beyond"
     if needs.near_clip:
@@ -276,9 +278,9 @@ def stock_clip(needs: SceneNeeds) -> str | None:
 
 
 def _camera_obstacle(scene: Any, sensor: Any, beside_light: bool = False) -> str | None:
-    """Return the reason why camera paths cannot render `scene` for `sensor`, without tracing a ray; None if they can.
+    """Return the reason why camera paths cannot render `scene` for `sensor`, or None if they can. Traces no ray.
 
-    `beside_light`: light paths add the light that camera paths cannot find.
+    With `beside_light`, light paths add the light that camera paths cannot find.
     """
     graph = SceneGraph.of(scene)
     if (obstacle := _unknown_part(scene, sensor, graph)) is not None:
@@ -296,7 +298,7 @@ def _camera_obstacle(scene: Any, sensor: Any, beside_light: bool = False) -> str
 
 
 def unsupported_part(scene: Any, sensor: Any) -> str | None:
-    """Return a part of the scene that light paths do not support, without tracing a ray; None if there is none."""
+    """Return a part of the scene that light paths do not support, or None. Traces no ray."""
     graph, name = SceneGraph.of(scene), sensor.id()
     if (obstacle := _unknown_part(scene, sensor, graph)) is not None:
         return obstacle
@@ -314,7 +316,7 @@ def unsupported_part(scene: Any, sensor: Any) -> str | None:
 
 
 def _unknown_part(scene: Any, sensor: Any, graph: SceneGraph) -> str | None:
-    """Return a part of the scene that no integrator supports, without tracing a ray; None if there is none."""
+    """Return a part of the scene that no integrator supports, or None. Traces no ray."""
     for shape in graph.shapes():
         if shape.is_medium_transition() and graph.is_shown(shape):
             return f"shape {shape.id() or 'of a group'} bounds{_MEDIUM}"
@@ -347,7 +349,7 @@ def _first_failure(calls: Iterable[tuple[str, Callable[[], object]]]) -> str | N
 
 
 def _lamp_on(graph: SceneGraph, plugins: dict[str, str]) -> str | None:
-    """Return the first emitter on a shape of one of these classes, and the shape; some emitters do not know their
+    """Return the first emitter on a shape of one of these classes, and the shape. Some emitters do not know their
     shape.
     """
     for shape in graph.shapes():
@@ -357,14 +359,16 @@ def _lamp_on(graph: SceneGraph, plugins: dict[str, str]) -> str | None:
 
 
 def _somewhere() -> Any:
-    """Return a point on a surface, of one entry, seen from straight above."""
+    """Return one surface point, seen from straight above."""
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.wi, si.n, si.sh_frame = mi.Vector3f(0, 0, 1), mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Vector3f(0, 0, 1))
     return si
 
 
 def _one_of_a_kind(graph: SceneGraph, items: Sequence[Any]) -> list[Any]:
-    """Return the first of each group of objects of equal structure; thousands may differ only in numbers."""
+    """Return the first of each group of objects with equal structure. Thousands of objects may differ only in
+    numbers.
+    """
     found: dict[tuple[Any, ...], Any] = {}
     for item in items:
         found.setdefault(_kind(item, graph), item)
@@ -388,10 +392,10 @@ def look(scene: Any, sensor: Any) -> PrimaryHits:
 
 
 def what_is_seen(scene: Any, sensor: Any, aperture: tuple[float, float] | None = None) -> tuple[Any, Any, Any]:
-    """Return which rays through a grid of LOOK^2 cells, row by row, meet smooth surfaces, specular surfaces, and
-    emission.
+    """Return which rays through a grid of LOOK^2 cells meet smooth surfaces, specular surfaces, and emission, row by
+    row.
 
-    `PrimaryHits` defines them. The rays start at a point of the `aperture`, by default its middle.
+    `PrimaryHits` defines the three kinds. The rays start at a point of the `aperture`, by default its middle.
     """
     lens = mi.Point2f(0.5) if aperture is None else mi.Point2f(*(dr.opaque(mi.Float, place) for place in aperture))
     ray, _ = sensor_rays(sensor, sensor.shutter_open(), grid(LOOK), lens)
@@ -409,11 +413,10 @@ def what_is_seen(scene: Any, sensor: Any, aperture: tuple[float, float] | None =
 
 
 def surfaces_met(scene: Any, ray: Any, active: Any, random: Any = None) -> Iterator[tuple[Any, Any]]:
-    """Follow rays through see-through surfaces; yield each interaction and the mask of its rays.
+    """Follow rays through see-through surfaces. Yields each interaction and the mask of its rays.
 
-    The last interaction of a ray that leaves the scene is invalid. With a generator of `random` numbers, rays also
-    follow mirrors and clear glass. Schedule the collected results, so that one kernel evaluates them with the next
-    rays.
+    If a ray leaves the scene, its last interaction is invalid. With a generator of `random` numbers, rays also follow
+    mirrors and clear glass. Schedule the collected results, so that one kernel evaluates them with the next rays.
     """
     for _ in range(CROSSINGS):
         si = scene.ray_intersect(ray, active)
@@ -434,7 +437,9 @@ def surfaces_met(scene: Any, ray: Any, active: Any, random: Any = None) -> Itera
 
 
 def _read_geometry(graph: SceneGraph) -> bool:
-    """Whether any BSDF, or texture of one, may read more of a surface than texture coordinates and local directions."""
+    """Whether any BSDF, or texture of a BSDF, may read more of a surface than texture coordinates and local
+    directions.
+    """
     textures = [texture.class_name() for texture in graph.of_type(mi.Texture) if graph.owning_bsdfs(texture)]
     is_plain = all(bsdf.class_name() in _PLAIN_BSDFS for bsdf in graph.of_type(mi.BSDF))
     return not is_plain or not all(map(_PLAIN_TEXTURES.fullmatch, textures))
@@ -443,8 +448,8 @@ def _read_geometry(graph: SceneGraph) -> bool:
 def _focuses_outside(params: mi.SceneParameters) -> bool:
     """Whether a thin lens with these `params` may see nothing in Mitsuba because of its focus.
 
-    It may focus so far out that `sample_direction`, in single precision, considers it outside of the clip planes. By
-    default it focuses on the far plane.
+    The focus may be so far away that `sample_direction`, in single precision, considers it outside of the clip planes.
+    By default, the lens focuses on the far plane.
     """
     near, far, focus = (float(np.ravel(params[key])[0]) for key in ("near_clip", "far_clip", "focus_distance"))
     depth = (1 - near / focus) * far / (far - near) if focus > 0 else -np.inf  # projected depth: 0 at near, 1 at far

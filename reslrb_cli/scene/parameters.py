@@ -27,7 +27,7 @@ from reslrb_cli.scene.values import ParameterValue, Place, check_bounds, check_t
 class Selection:
     """Recovered parameters, by the keys of their records.
 
-    `params` is all of the scene's `mi.traverse`; `specs` holds the settings of each key, in the order of the
+    `params` is all of the scene's `mi.traverse`. `specs` holds the settings of each key, in the order of the
     configuration and, for a glob, of the scene. A key is one of `params`, or a value of `deformation`: a motion's
     `ID.translation`, or a heightmap. `tied` maps such a key to other keys of `params` with the same value. `factors`
     are values outside of the scene that multiply its images (`add_factor`).
@@ -59,7 +59,7 @@ class Selection:
         return self.specs[key]
 
     def kind(self, key: str) -> str:
-        """Return the kind of `key` for regularizers: `heightmap`, `bitmap`, `mesh`; "" for anything else."""
+        """Return the kind of `key` for regularizers: `heightmap`, `bitmap`, `mesh`, or "" for other parameters."""
         slot = self.slot(key)
         if key in self.deformation.values:
             return HEIGHTMAP if key.endswith(f".{HEIGHTMAP}") else ""
@@ -97,24 +97,24 @@ class Selection:
                                  "each other; thickness is defined for a plate with opposite faces")  # fmt: skip
 
     def value(self, key: str) -> Any:
-        """Return the current value of `key`, in Dr.Jit's form."""
+        """Return the current value of `key` as a Dr.Jit value."""
         return self._holder(key)[key]
 
     def quantity(self, key: str) -> str | None:
-        """Return the quantity of `key`: `length`, `degrees` or `scale` of a motion; None for the scene's own
-        parameters.
+        """Return the quantity of `key`: `length`, `degrees` or `scale` of a motion. For the scene's own parameters,
+        return None.
         """
         return self.deformation.quantities.get(key)
 
     def array(self, key: str) -> np.ndarray[Any, Any]:
-        """Return the current value of `key`: a texture (H, W, C), a colour (C,), a buffer (N,), a number ().
+        """Return the current value of `key`: a texture (H, W, C), a colour (C,), a buffer (N,), or a number ().
 
-        An environment map has no halo columns, which its tensor has.
+        The array of an environment map lacks the halo columns of its tensor.
         """
         return self.slot(key).get()
 
     def hand_over(self, values: Mapping[str, Any]) -> None:
-        """Write values by key, in Dr.Jit's form, to the scene, so that the gradients of a step reach them.
+        """Write values by key, as Dr.Jit values, to the scene, so that the gradients of a step reach them.
 
         Everything is evaluated, so that a step's kernels are the same from the first one on.
         """
@@ -139,7 +139,7 @@ class Selection:
         self.deformation.push()
 
     def shown(self, key: str, value: Any) -> np.ndarray[Any, Any]:
-        """Return another value of `key`, in Dr.Jit's form, in the form of `array`."""
+        """Convert another value of `key` from a Dr.Jit value to the form of `array`."""
         return self.slot(key).shown(value)
 
     def set_arrays(self, values: Mapping[str, np.ndarray[Any, Any]]) -> None:
@@ -157,21 +157,25 @@ class Selection:
         self.params.update()
 
     def is_map(self, key: str) -> bool:
-        """Whether `key` is a texture or a heightmap of at least two texels, whose sides do not meet."""
+        """Whether `key` is a texture or a heightmap with at least two texels. Environment maps, whose sides meet, do
+        not count.
+        """
         slot = self.slot(key)
         return slot.is_texture and not slot.halo and min(slot.get().shape[:2]) > 1
 
     def faces(self, key: str) -> np.ndarray[Any, Any] | None:
-        """Return the triangles (3 m indices) of the mesh with the vertex positions `key`; None for other keys."""
+        """Return the triangles (3 m indices) of the mesh with the vertex positions `key`. For other keys, return
+        None.
+        """
         mesh, _, name = key.rpartition(".")
         return np.array(self.params[f"{mesh}.faces"]) if name == "vertex_positions" else None
 
     def slot(self, key: str) -> ParameterValue:
-        """Return the value of `key`, to read and set; `update` must follow."""
+        """Return the value of `key`, to read and set. Call `update` afterwards."""
         return ParameterValue(self._holder(key), key)
 
     def _holder(self, key: str) -> Any:
-        """Return the object that has the value of `key` under this name."""
+        """Return the object that stores the value of `key`."""
         if key in self.factors:
             return self.factors
         return self.deformation.values if key in self.deformation.values else self.params
@@ -186,9 +190,12 @@ def select_parameters(
     """Select the parameters of `scene` in `specs`, and set their initial values, or `values`, in the scene.
 
     A glob selects the matching parameters that can be recovered. `source` names the configuration in errors. Raises
-    ConfigError if a key matches nothing, nothing that can be recovered, or a parameter of another spec; if an object
-    cannot be moved; if an initial value does not fit, is not finite, or lies outside of the bounds or the range of the
-    transform; and if a resolution is given for another parameter than a texture.
+    ConfigError for:
+
+    - a key that matches nothing, nothing that can be recovered, or a parameter of another spec;
+    - an object that cannot be moved;
+    - an initial value that does not fit, is not finite, or lies outside of the bounds or the range of the transform;
+    - a resolution for another parameter than a texture.
     """
     selection, origin = _choose(mi.traverse(scene), specs, source)
     for key, settings in selection.specs.items():
@@ -215,10 +222,10 @@ def select_parameters(
 def set_values(
     scene: mi.Scene, specs: Sequence[ParameterSpec], values: Mapping[str, Any], source: object, option: str
 ) -> Selection:
-    """Select the parameters of another load of the scene as `specs` do, and set `values`, by any of its keys.
+    """Select the same parameters in another load of the scene, and set `values`. Any of their keys can be used.
 
-    Other parameters keep the values of the scene. Values are checked like initial ones; errors are located at `option`
-    and the key. A heightmap may have the resolution of its image file.
+    Other parameters keep the values of the scene. Values are checked like initial values. Errors are located at
+    `option` and the key. A heightmap may have the resolution of its image file.
     """
     selection, _ = _choose(mi.traverse(scene), specs, source)
     names = selection.deformation.values
@@ -243,7 +250,7 @@ def set_values(
 
 def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: object
             ) -> tuple[Selection, dict[str, int]]:  # fmt: skip
-    """Return the selection of `specs` in an unchanged scene, and the number of the spec of each key."""
+    """Return the selection of `specs` in an unchanged scene, and the index of the spec of each key."""
     chosen: dict[str, Settings] = {}
     tied: dict[str, list[str]] = {}
     origin: dict[str, int] = {}  # of recovered parameters, and of all scene parameters that they determine
@@ -275,7 +282,7 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
 
 
 def _warn_of_finer(items: tuple[Movable, ...], resolution: tuple[int, int]) -> None:
-    """Warn, once, of a map with more texels than its meshes have vertices: texels between vertices have no effect."""
+    """Warn, once, of a map with more texels than its meshes have vertices. Texels between vertices have no effect."""
     vertices, (width, height) = sum(item.node.vertex_count() for item in items), resolution
     if width * height > vertices:
         hint = f"; `grid: [{width}, {height}]` makes such a mesh from a rectangle" if vertices == 4 * len(items) else ""
@@ -319,7 +326,7 @@ def _check_effect(items: list[Movable], word: str, pivot: bool, place: Place) ->
 
 
 def _tied_keys(params: mi.SceneParameters, keys: list[str], place: Place) -> list[str]:
-    """Return keys that share one value; each names one parameter, and all have one shape."""
+    """Return keys that share one value. Each names one parameter, and all have one shape."""
     found: list[str] = []
     for number, key in enumerate(keys):
         at = Place(place.source, f"{place.key}.key[{number}]", lambda _: "")
@@ -335,7 +342,7 @@ def _tied_keys(params: mi.SceneParameters, keys: list[str], place: Place) -> lis
 
 
 def _matching(params: mi.SceneParameters, pattern: str, place: Place, names: Sequence[str] = ()) -> list[str]:
-    """Return the keys that match `pattern`, which must be recoverable; `names` are other suggestions."""
+    """Return the keys that match `pattern`. They must be recoverable. `names` are other suggestions."""
     is_key = pattern in params.properties
     matches = [pattern] if is_key else [key for key in params.properties if fnmatchcase(key, pattern)]
     if not matches:

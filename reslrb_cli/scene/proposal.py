@@ -47,10 +47,10 @@ def open_photograph(path: Path) -> Photograph:
 
 
 def write_smaller(photo: Photograph, size: tuple[int, int], path: Path) -> None:
-    """Write the photograph with fewer pixels, `size` (width, height), to `path`: means of linear values.
+    """Write the photograph with fewer pixels, `size` (width, height), to `path`, as means of linear values.
 
-    Integers become PNG of 16 bits, in which a pixel keeps the mark of any of its parts: clipped (at the maximum) or
-    transparent (alpha 0). Floats become EXR, which keeps values that are not finite. Raises OSError.
+    Integers become a PNG of 16 bits. A pixel of the PNG is clipped (at the maximum) or transparent (alpha 0) if any of
+    its parts is. Floats become an EXR, which keeps non-finite values. Raises OSError.
     """
     raw = np.array(photo.bitmap)
     raw = raw.reshape(*raw.shape[:2], -1)
@@ -74,7 +74,7 @@ def write_smaller(photo: Photograph, size: tuple[int, int], path: Path) -> None:
 
 
 def _means(image: Image, size: tuple[int, int]) -> Image:
-    """Return the area-weighted means of an (H, W, C) image over the pixels of one of `size` (width, height)."""
+    """Return the area-weighted means of an (H, W, C) image over the pixels of an image of `size` (width, height)."""
     values = image.astype(np.float32)
     known = np.isfinite(values)
     if not known.all():  # otherwise NaN would spread over whole rows
@@ -114,10 +114,10 @@ TEXELS = 64
 
 @dataclass(frozen=True)
 class Proposal:
-    """Parameter that could be recovered: `share` is the part of the picture that it colours, 0 if it is not visible.
+    """Parameter that could be recovered. `share` is the part of the picture that it colours, or 0 if it is not visible.
 
-    `bounds` are YAML, or None; `resolution` is (width, height) of a texture with many texels, else None; `first` says
-    whether it is recovered by default.
+    `bounds` are YAML, or None. `resolution` is the (width, height) of a texture with many texels, or None. `first`
+    tells whether it is recovered by default.
     """
 
     info: ParameterInfo
@@ -135,9 +135,10 @@ class Proposal:
 def propose(scene: mi.Scene, sensor: int, lamps: bool = False, wanted: Sequence[str] = ()) -> list[Proposal]:
     """Return the recoverable parameters of `scene` through the sensor of this index, without vertices of meshes.
 
-    They are sorted by their shares. If there are any, at least one is recovered by default: those that match a glob of
-    `wanted`, or without globs those that are large in view, including lamps if the photograph shows their brightness
-    (`lamps`). Raises LookupError, with the glob, if one matches nothing.
+    They are sorted by their shares. `wanted` has globs that select the parameters recovered by default. Without globs,
+    these are the parameters that are large in view. They include lamps if the photograph shows their brightness
+    (`lamps`). At least one parameter is selected if there are any. Raises LookupError, with the glob, if a glob matches
+    nothing.
     """
     params = mi.traverse(scene)
     shares = _shares(scene, sensor)
@@ -182,7 +183,7 @@ def _is_foremost(params: mi.SceneParameters, info: ParameterInfo) -> bool:
 
 
 def _is_left_out(params: mi.SceneParameters, info: ParameterInfo) -> bool:
-    """Whether Mitsuba has left out the lobe of a parameter, so that no value has any effect."""
+    """Whether Mitsuba has left out the lobe of a parameter, so that its value has no effect."""
     owner, name = params.hierarchy[params.properties[info.key][2]][0], info.key.split(".")[-2]
     is_principled = owner is not None and owner.class_name().startswith("Principled")
     return is_principled and name in LOBES and info.value is not None and info.value.high == 0
@@ -202,9 +203,9 @@ def _above(params: mi.SceneParameters, key: str) -> list[Any]:
 
 
 def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
-    """Return the share of the picture of each BSDF, shape and emitter that rays from the sensor meet first.
+    """Return the share of the picture of each BSDF, shape and emitter.
 
-    Rays also pass mirrors and clear glass.
+    It is the share of rays from the sensor that meet it first. Rays also pass mirrors and clear glass.
     """
     sensor = scene.sensors()[index]
     # One for each ray: an irradiance meter would give one direction for a single ray, which Dr.Jit fails to compile.

@@ -22,23 +22,23 @@ Array = np.ndarray[Any, Any]
 class Place:
     """Place of a value in the configuration, for errors of `fail`.
 
-    `at` is the name of one of its options there, "" if it has none.
+    `at` is the name of one of its options there, or "" if it has none.
     """
 
     def __init__(self, source: object, key: str, at: Callable[[str], str] = str) -> None:
         self.source, self.key, self.at = source, key, at
 
     def fail(self, option: str, message: str) -> ConfigError:
-        """Return the error for `option` of this place."""
+        """Return the error for an `option` of the value at this place."""
         option = self.at(option)
         return ConfigError(self.source, f"{self.key}.{option}" if option else self.key, message)
 
 
 class ParameterValue:
-    """One value of `holder` as a NumPy array: a texture (H, W, C), a colour (C,), a buffer (N,), a number ().
+    """One value of `holder` as a NumPy array: a texture (H, W, C), a colour (C,), a buffer (N,), or a number ().
 
-    `holder` is a scene's `mi.traverse`, or a mapping of values outside of the scene. An environment map has no halo
-    columns, which Mitsuba adds to it.
+    `holder` is a scene's `mi.traverse`, or a mapping of values outside of the scene. The array of an environment map
+    lacks the halo columns that Mitsuba adds.
     """
 
     def __init__(self, holder: Any, key: str) -> None:
@@ -59,14 +59,14 @@ class ParameterValue:
         return self.shown(self.holder[self.key])
 
     def shown(self, value: Any) -> Array:
-        """Return another value for the same place, in Dr.Jit's form, in the shape of `get`."""
+        """Convert another value for the same place from a Dr.Jit value to the shape of `get`."""
         array = np.array(dr.detach(value), dtype=np.float32)
         if not self.is_tensor and array.ndim and array.shape[-1] == 1:
             array = array[..., 0]
         return array[:, self.halo : array.shape[1] - self.halo] if self.halo else array
 
     def set(self, array: Array) -> None:
-        """Set the value; for a scene, `params.update()` must follow."""
+        """Set the value. For a scene, call `params.update()` afterwards."""
         if self.halo:
             array = np.concatenate([array[:, -self.halo :], array, array[:, : self.halo]], axis=1)
         array = np.ascontiguousarray(array, dtype=np.float32)
@@ -83,8 +83,8 @@ def initial_array(
 ) -> Array:
     """Return the initial value of the parameter in `slot` from "scene", a number, a list, an image file or a run.
 
-    `resolution` is the (width, height) to which a texture is resampled, or None; with `any_size` it may be that of the
-    file. Raises ConfigError at `place`.
+    `resolution` is the (width, height) to which a texture is resampled, or None. With `any_size`, the resolution of the
+    file is kept. Raises ConfigError at `place`.
     """
     current, resizable = slot.get(), any_size or resolution is not None
     if resolution is not None:
@@ -135,7 +135,7 @@ def check_transform(slot: ParameterValue, array: Array, spec: Settings, place: P
 
 
 def resample(array: Array, resolution: tuple[int, int]) -> Array:
-    """Resample an (H, W, C) image to `resolution` (width, height): means over areas, linear where it grows."""
+    """Resample an (H, W, C) image to `resolution` (width, height), by means over areas, or linearly if it grows."""
     from reslrb_cli.lens.transport import resized  # late, because SciPy takes a while to load
 
     return np.asarray(resized(array, resolution[::-1], between=True), dtype=np.float32)
@@ -201,7 +201,7 @@ def _size(image: Array) -> str:
 
 
 def _first(array: Array, mask: Array) -> str | None:
-    """Return the first entry of `array` in `mask`, and its index, in words; None if there is none."""
+    """Return the first entry of `array` in `mask` and its index in words, or None if there is none."""
     if not mask.any():
         return None
     value, index = f"{float(array[mask].flat[0]):g}", [int(n) for n in np.argwhere(mask)[0]]
@@ -211,10 +211,11 @@ def _first(array: Array, mask: Array) -> str | None:
 
 
 def settle(params: mi.SceneParameters, keys: Iterable[str]) -> list[Any]:
-    """Compute data that depend on newly set parameters now; return the arrays to evaluate.
+    """Compute data that depend on newly set parameters now. Returns the arrays to evaluate.
 
-    A texture pads its storage at its first lookup, and unpads it when it is read; the normals of a mesh depend on its
-    vertices. In a step, either would split its kernels, and differently in the first step and the second.
+    A texture pads its storage at its first lookup, and unpads it when it is read. The normals of a mesh depend on its
+    vertices. If a step computed these data, its kernels would be split, and differently in the first and the second
+    step.
     """
     normals = []
     for key in keys:

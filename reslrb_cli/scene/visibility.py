@@ -1,9 +1,9 @@
 """View of sensors: useful pixels and texels for light tracing, and the necessary length of paths.
 
-Light tracing lacks light at the film's border (`interior`), and where the sensor sees glass, mirrors, or coats
-(`sees_specular`), whose smooth lobes do not connect to the sensor. A photograph contains light of any number of
-bounces. An image of paths of at most d segments is darker, and an exposure or a colour would compensate for this
-(`find_depth`).
+Light tracing lacks light at the film's border (`interior`). It also lacks light where the sensor sees glass, mirrors,
+or coats (`sees_specular`), because smooth lobes cannot be connected to the sensor. A photograph contains light of any
+number of bounces. An image of paths of at most d segments is darker, and an exposure or a colour would compensate for
+this (`find_depth`).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def interior(shape: tuple[int, ...], sensor: mi.Sensor) -> np.ndarray:
     """Return where light tracing loses nothing at the film's border: boolean (H, W), for a sensor with such a film.
 
     Samples just outside of the film are lost, so pixels within the filter's radius of its border are too dark. Camera
-    paths lose none.
+    paths do not lose light there.
     """
     margin = _margin(sensor)
     inside = np.zeros(shape[:2], dtype=bool)
@@ -44,7 +44,9 @@ def interior(shape: tuple[int, ...], sensor: mi.Sensor) -> np.ndarray:
 
 
 def spread(pixels: np.ndarray, sensor: mi.Sensor) -> np.ndarray:
-    """Return the pixels whose reconstruction filter reaches some of `pixels`, including these; boolean (H, W) each."""
+    """Return the pixels whose reconstruction filter reaches some of `pixels`, including these. Masks are boolean (H,
+    W).
+    """
     from scipy.ndimage import maximum_filter  # here, because some runs do not need it
 
     return np.asarray(maximum_filter(pixels, 2 * _margin(sensor) + 1))
@@ -54,8 +56,8 @@ def spread(pixels: np.ndarray, sensor: mi.Sensor) -> np.ndarray:
 class SeenSpecular:
     """Pixels (H, W) of a sensor's crop window that smooth specular lobes reach, including the reconstruction filter.
 
-    `alone`: of surfaces that have no other lobes (glass, mirrors), which stay black under light tracing. `mixed`: of
-    surfaces with other lobes, too (coats, blends, thin panes), of which light tracing lacks a part.
+    `alone` marks surfaces without other lobes (glass, mirrors), which stay black under light tracing. `mixed` marks
+    surfaces with other lobes, too (coats, blends, thin panes), for which light tracing lacks a part of the light.
     """
 
     alone: np.ndarray
@@ -65,7 +67,7 @@ class SeenSpecular:
 def sees_specular(scene: mi.Scene, sensor: mi.Sensor) -> SeenSpecular:
     """Trace CELLS^2 primary rays per pixel through see-through surfaces, and mark the pixels that their filter reaches.
 
-    Objects smaller than a cell may be missed. The rays are the same at every call.
+    The function may miss objects smaller than a cell. The rays are the same at every call.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     count = width * height
@@ -88,9 +90,10 @@ def sees_specular(scene: mi.Scene, sensor: mi.Sensor) -> SeenSpecular:
 
 
 def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
-    """Return pixels (H, W) of a sensor's crop window that see an emitter directly, including the reconstruction filter.
+    """Return the pixels (H, W) of a sensor's crop window that see an emitter directly.
 
-    A lamp smaller than the cells of a grid of LOOK^2 may be missed.
+    They include pixels that the reconstruction filter reaches. The function may miss a lamp smaller than the cells of a
+    grid of LOOK^2.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     cells = np.zeros((LOOK, LOOK), dtype=bool)
@@ -108,7 +111,10 @@ def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
 
 
 def _first_surfaces(scene: mi.Scene, ray: mi.Ray3f, count: int) -> tuple[mi.Bool, mi.Bool]:
-    """Return whether a surface has only delta lobes, or some, up to the first surface that is not see-through."""
+    """Return whether surfaces have only delta lobes, and whether some have delta lobes.
+
+    The surfaces are those along a ray up to the first one that is not see-through.
+    """
     lobes = int(mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission)
     alone, mixed = dr.zeros(mi.Bool, count), dr.zeros(mi.Bool, count)
     for si, reached in surfaces_met(scene, ray, dr.full(mi.Bool, True, count)):
@@ -130,13 +136,13 @@ def visible_texels(
 ) -> np.ndarray[Any, Any]:  # fmt: skip
     """Return the texels of the texture `key` that some sensor sees: boolean (H, W).
 
-    `pixels` (H, W) are those of each sensor that count; None if all do. With `mirrored`, views through mirrors and
-    clear glass count, which camera paths find.
+    `pixels` (H, W) selects the pixels of each sensor that count, or is None if all do. With `mirrored`, views through
+    mirrors and clear glass count, which camera paths find.
 
-    A texel counts if a primary ray hits the inner quarter of its cell, behind see-through surfaces (masks), but
-    otherwise not through glass or in mirrors, from where light paths cannot connect to the sensor. For a texture that
-    is on no surface (an environment map, emission), every texel counts. Texture coordinates outside of [0, 1] are
-    assumed to repeat.
+    A texel counts if a primary ray hits the inner quarter of its cell. Rays pass see-through surfaces (masks). Without
+    `mirrored`, they do not pass glass or mirrors, because light paths cannot connect to the sensor through these. For a
+    texture that is on no surface (an environment map, emission), every texel counts. Texture coordinates outside of [0,
+    1] are assumed to repeat.
     """
     params = mi.traverse(scene)
     node = params.properties[key][2]
@@ -212,9 +218,9 @@ _RAYS, _PATHS = 48, 32
 
 @dataclass(frozen=True)
 class Depth:
-    """Path depth in segments, and the mean share of a pixel's light that longer paths have.
+    """Path depth in segments, and the mean share of a pixel's light that longer paths would add.
 
-    The share is None for the greatest depth, which was compared with nothing.
+    For the greatest depth the share is None, because it was not compared with a greater one.
     """
 
     segments: int
@@ -222,11 +228,10 @@ class Depth:
 
 
 def find_depth(scene: mi.Scene, sensor: int) -> Depth:
-    """Return the smallest of `DEPTHS` at which the view through the sensor of this index lacks at most `LOST` of its
-    light.
+    """Return the smallest of `DEPTHS` whose image lacks at most `LOST` of the light, for the sensor with this index.
 
-    It uses camera paths with equal random numbers and without roulette, so that paths of one depth begin those of the
-    next.
+    The function uses camera paths with equal random numbers and without roulette. The paths of one depth are then the
+    beginnings of those of the next depth.
     """
     whole = _pixels(scene, sensor, DEPTHS[-1])
     lit = np.isfinite(whole) & (whole > 0)
@@ -240,7 +245,7 @@ def find_depth(scene: mi.Scene, sensor: int) -> Depth:
 
 
 def _pixels(scene: mi.Scene, index: int, segments: int) -> np.ndarray:
-    """Return the light of paths of at most `segments` segments, by ray: (N,) float64."""
+    """Return the light (N,) of paths of at most `segments` segments, by ray, as float64."""
     sensor, count = scene.sensors()[index], _RAYS**2 * _PATHS
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, count)

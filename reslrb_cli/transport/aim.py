@@ -1,24 +1,25 @@
 """Scattering towards visible points, mixed with the directions of the BSDF.
 
-A glossy surface reflects light to the sensor from few directions. Few paths come from these directions, but they have
-such large weights that they dominate the noise. At each surface, a share SHARE of the paths is therefore aimed at a
-point that the sensor sees: a position on the film is sampled, the first surface there is found, and the path continues
-to it. Both ways to find the next vertex z form a mixture (Veach's thesis, ch. 9; one-sample model, balance heuristic).
-In place of f cos / p_b, a path has
+A glossy surface reflects light to the sensor from few directions. Few paths come from these directions, but with such
+large weights that they dominate the noise. At each surface, a share SHARE of the paths is therefore aimed at a point
+that the sensor sees. A position on the film is sampled, the first surface there is found, and the path continues to it.
+Both ways to find the next vertex z form a mixture (Veach's thesis, ch. 9; one-sample model, balance heuristic). The
+following weight replaces f cos / p_b.
 
     f cos / ((1 - SHARE) p_b + SHARE p_a)        p_a = p_film |cos_z| W / d^2 * |x - z|^2 / |cos|
 
-p_b is the density of the BSDF's directions at x, W / d^2 the sensor's importance and geometry at z, cos_z the cosine at
-z towards the sensor, and cos that at z towards x. p_a is 0 if the sensor does not see z, which is known only at z. A
-path therefore leaves x with the weight f cos / p_b in both cases, and at z its weight is multiplied by
+p_b is the density of the BSDF's directions at x. W / d^2 is the sensor's importance and geometry at z, cos_z the cosine
+at z towards the sensor, and cos the cosine at z towards x. If the sensor does not see z, p_a is 0, which is known only
+at z. A path therefore leaves x with the weight f cos / p_b in both cases. At z, its weight is multiplied by r, which is
+at most 1 / (1 - SHARE).
 
     r = 1 / ((1 - SHARE) + SHARE p_a / p_b)
 
-which is at most 1 / (1 - SHARE). An aimed path ends if it meets another surface on its way, or a point that the sensor
-does not see. r has no derivative, like the weight of roulette.
+An aimed path ends if it meets another surface on its way, or a point that the sensor does not see. Like the weight of
+roulette, r has no derivative.
 
-Positions on the film are sampled by blocks of pixels: a share AIM_UNIFORM evenly, the others by the contributions found
-in earlier steps and by the step's own dL/dI if it is known before the samples are drawn (`Aim`).
+Positions on the film are sampled by blocks of pixels (`Aim`). A share AIM_UNIFORM is uniform. The rest follows the
+contributions found in earlier steps, and the step's own dL/dI if it is known before the samples are drawn.
 """
 
 from __future__ import annotations
@@ -44,8 +45,9 @@ REACHED = 1 - 1e-3  # part of the distance to a point that must be free, as for 
 
 @dataclass
 class Aim:
-    """Sampling of positions on the film: the block of each slot (SLOTS), and the density of each block's positions
-    relative to a uniform density.
+    """Sampling of positions on the film.
+
+    It has the block of each slot (SLOTS), and the density of each block's positions relative to a uniform density.
     """
 
     slots: mi.UInt32
@@ -53,7 +55,9 @@ class Aim:
 
     @staticmethod
     def of(blocks: Blocks, wanted: NDArray[np.float64]) -> Aim:
-        """Return blocks in proportion to `wanted` (rows * columns, nowhere negative), with a share UNIFORM evenly."""
+        """Return blocks with a density proportional to `wanted` (rows * columns, nonnegative), and a uniform share
+        UNIFORM.
+        """
         even = blocks.areas() / blocks.areas().sum()
         total = wanted.sum()
         density = AIM_UNIFORM * even + (1 - AIM_UNIFORM) * (
@@ -70,10 +74,10 @@ class Aim:
 
 @dataclass
 class Pending:
-    """Loop state: the last scattering event, as the next vertex needs it.
+    """Loop state: the data of the last scattering event that the next vertex needs.
 
-    `share` is the share of aimed paths at the event, `pdf` is p_b (infinite for discrete directions, which aimed paths
-    never take), and `distance` is the distance to the point that the path is aimed at, negative if it is not aimed.
+    `share` is the share of aimed paths at the event. `pdf` is p_b, and infinite for discrete directions, which aimed
+    paths never take. `distance` is the distance to the point that the path is aimed at, or negative if it is not aimed.
     """
 
     share: mi.Float
@@ -87,9 +91,7 @@ class Pending:
 
     @staticmethod
     def of(aimed: Aimed, si: mi.SurfaceInteraction3f, pdf: mi.Float, discrete: mi.Bool) -> Pending:
-        """Return the state after an event at `si`, aimed or not, with a direction of this density, or a `discrete`
-        direction.
-        """
+        """Return the state after an event at `si`. `pdf` is the density of its direction, which may be `discrete`."""
         distance = dr.select(aimed.active, dr.norm(aimed.point - si.p), -1)
         return Pending(aimed.share, dr.select(discrete, dr.inf, dr.detach(pdf)), dr.detach(distance))
 
@@ -97,10 +99,10 @@ class Pending:
         self, aim: Aim, sensor: mi.Sensor, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, connection: Connection,
         visible: mi.Bool,
     ) -> mi.Float:  # fmt: skip
-        """Return r at the vertex `si` that `ray` reaches; 0 if the path ends there.
+        """Return r at the vertex `si` that `ray` reaches. It is 0 if the path ends there.
 
-        `visible` says whether the sensor sees the vertex. `connection` is that from an emitter, without the correction
-        for shading normals.
+        `visible` tells whether the sensor sees the vertex. `connection` is a connection as from an emitter, without the
+        correction for shading normals.
         """
         film = film_blocks(sensor)
         p_film = dr.gather(mi.Float, aim.density, film.block(connection.u), visible)
@@ -113,7 +115,7 @@ class Pending:
 
 
 def worthwhile(needs: SceneNeeds, max_depth: int) -> bool:
-    """Whether paths are aimed in the scene: it needs glossy surfaces, and a pinhole camera.
+    """Whether paths are aimed in this scene. Aiming needs glossy surfaces and a pinhole camera.
 
     Diffuse surfaces gain little, because they reflect light from all directions. Perturbed normals use their own
     mixture.
@@ -132,8 +134,8 @@ def choose(
 ) -> tuple[Aimed, mi.Float]:  # fmt: skip
     """Choose the aimed lanes among the `able` ones, and their points.
 
-    Also returns the 1D number of the BSDF, rescaled for the other lanes. This number chooses; `slot`, in [0, 1), and
-    the two other numbers of the BSDF give the position on the film.
+    The 1D number of the BSDF selects the lanes. The function also returns this number, rescaled for the other lanes.
+    `slot`, in [0, 1), and the two other numbers of the BSDF give the position on the film.
     """
     share, below = dr.select(able, mi.Float(SHARE), 0), dr.one_minus_epsilon(mi.Float)
     active = bsdf_1d < share

@@ -1,21 +1,21 @@
 """BSDFs along a light path: sampling of scattering events, evaluation, and the derivatives of both.
 
 A path has BSDF factors of two kinds: s_j (along the path) and c_i (towards the sensor). Sampling is detached:
-directions and densities do not depend on the parameters. A factor is then f / pdf, and only
+directions and densities do not depend on the parameters. A factor is f / pdf, where only f has a derivative
+(`tracked_factor`, `tracked_factors`).
 
     f = bsdf * cos        a smooth lobe, evaluated for a given direction
     f = weight * pdf      a delta lobe, which has a weight and a discrete probability, but no value
     f = transmission      passing straight through (a mask, a thin sheet)
 
-has a derivative (`tracked_factor`, `tracked_factors`). A scattering event (`scatter`) is a direction sampled from the
-BSDF, and its weight.
+A scattering event (`scatter`) is a direction sampled from the BSDF, and its weight.
 
-Bump and normal maps perturb the shading frame inside the BSDF, where Veach's correction cannot see it. In scenes with
-such maps, a smooth lobe is evaluated as a camera path would, with exchanged directions,
+Bump and normal maps perturb the shading frame inside the BSDF, so Veach's correction does not include this change. In
+scenes with such maps, a smooth lobe is evaluated as a camera path would, with exchanged directions.
 
     f = bsdf(wo -> wi) * cos_p wi * |n . wo| / |n . wi|        n: geometric normal, p: perturbed one
 
-which is the adjoint BSDF by definition, and needs neither p nor reciprocity.
+This is the definition of the adjoint BSDF. It needs neither p nor reciprocity.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ DEFENSIVE = 0.2  # share of samples that a perturbed BSDF does not sample itself
 
 
 def context_of(plan: Plan) -> mi.BSDFContext:
-    """Return the context of BSDF queries. Light paths carry importance towards the sensor, so eta^2 is not applied
+    """Return the context of BSDF queries. Light paths carry importance towards the sensor, so that eta^2 is not applied
     twice.
     """
     return mi.BSDFContext(mi.TransportMode.Radiance if plan.camera else mi.TransportMode.Importance)
@@ -151,12 +151,11 @@ class Scattering:
 
 @dataclass
 class Ways:
-    """Densities of directions at a vertex per solid angle, for the weights of combined paths (`weights.py`); 0 if not
-    requested.
+    """Densities of directions at a vertex per solid angle, for the weights of combined paths (`weights.py`).
 
-    `p` is that of the sampled direction, `back` that of the way back in the walk from the other side; `ahead` and
-    `ahead_back` are the same for the connection, or the next event. `valid` and `ahead_valid` say whether both
-    directions lie on consistent sides, as light paths require.
+    `p` is the density of the sampled direction, and `back` the density of the reverse direction in the walk from the
+    other side. `ahead` and `ahead_back` are the same for the connection or next event. Densities that are not requested
+    are 0. `valid` and `ahead_valid` tell whether both directions lie on consistent sides, as light paths require.
     """
 
     p: mi.Float
@@ -168,7 +167,7 @@ class Ways:
 
 
 def mixes(plan: Plan) -> bool:
-    """Whether directions are sampled from a mixture: by light paths, at perturbed normals."""
+    """Whether directions are sampled from a mixture. Light paths do this at perturbed normals."""
     return plan.needs.has_perturbed_normals and not plan.camera
 
 
@@ -188,7 +187,7 @@ def density(
 def _back(
     plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr | mi.BSDF, wo: mi.Vector3f, active: mi.Bool
 ) -> mi.Float:
-    """Return the density of the way back along `wo` and `si.wi`, in the walk from the other side."""
+    """Return the density of the reverse direction, along `wo` and `si.wi`, in the walk from the other side."""
     turned = type(si)(si)
     turned.wi = wo
     return density(plan, turned, bsdf, si.wi, active, not plan.camera)
@@ -198,7 +197,7 @@ def _ways(
     plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr | mi.BSDF, connection_wo: mi.Vector3f,
     connected: mi.Bool | None, wo: mi.Vector3f, pdf: mi.Float, active: mi.Bool,
 ) -> tuple[mi.Float, ...]:  # fmt: skip
-    """Return the densities of `Ways`; 0 for those that are not requested."""
+    """Return the densities of `Ways`. Densities that are not requested are 0."""
     zero = mi.Float(0)
     back, ahead, ahead_back = zero, zero, zero
     if plan.weighs:
@@ -217,9 +216,9 @@ def shading_correction(
     """Return Veach's factor for shading normals (thesis, p. 155), and whether both directions are on consistent sides.
 
     Without shading normals the factor is 1 and the sides are always consistent, so neither is computed. With perturbed
-    normals it is |n . wo| / |n . wi|, which remains beside the exchanged BSDF. n is taken on the side of the shading
-    normal: a transform that mirrors a mesh reverses the winding of its faces, and camera paths, which use only the
-    shading normal, do not notice this.
+    normals the factor is |n . wo| / |n . wi|. The exchanged BSDF contains the rest. n is taken on the side of the
+    shading normal. A transform that mirrors a mesh reverses the winding of its faces, but camera paths use only the
+    shading normal and do not notice this.
     """
     if not (plan.needs.has_shading_normals or plan.needs.has_perturbed_normals):
         return mi.Float(1), mi.Bool(True)
@@ -244,9 +243,9 @@ def scatter(
 ) -> tuple[Scattering, mi.Spectrum | None]:  # fmt: skip
     """Sample the next direction, and evaluate f (C,) towards `connection_wo` in `connected` lanes (None: in no lane).
 
-    Detached, unless `attached`. Both queries share one indirect call, and with it common work such as the lookup of
-    textures. Lanes that are `aimed` use the direction of their point, and the density of the BSDF for it. `weighed`
-    lanes also compute the densities of `Ways`.
+    The results are detached, unless `attached`. Both queries share one indirect call, and common work such as the
+    lookup of textures. Lanes that are `aimed` use the direction of their point, and the density of the BSDF for it.
+    `weighed` lanes also compute the densities of `Ways`.
     """
     si, bsdf, context, drawn = hit.si, hit.bsdf, context_of(plan), sample_1
     ways_asked = plan.camera or plan.weighs
@@ -321,11 +320,11 @@ def scatter(
 def following(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool, sample: Sample) -> Sample:
     """Return a sample whose derivative is that of the integral that it estimates.
 
-    For a BSDF whose sampling is smooth (or whose choice of a lobe is weighted accordingly, as in Mitsuba's
-    dielectrics), this is the derivative of the sample itself: the direction follows the surface and the roughness.
-    Other BSDFs choose a lobe by a probability that depends on their parameters and on the incident direction, and the
-    derivative of a sample ignores this choice. Their smooth lobes keep their direction in the local frame, and f / pdf
-    is differentiated through f alone; their delta lobes keep the probability.
+    For some BSDFs, this is the derivative of the sample itself, and the direction follows the surface and the
+    roughness. The sampling of these BSDFs is smooth, or the choice of a lobe is weighted accordingly, as in Mitsuba's
+    dielectrics. Other BSDFs choose a lobe by a probability that depends on their parameters and on the incident
+    direction. The derivative of a sample ignores this choice. Their smooth lobes therefore keep their direction in the
+    local frame, and f / pdf is differentiated through f alone. Their delta lobes keep the probability.
     """
     if not plan.needs.unfollowed:
         return sample
@@ -345,7 +344,7 @@ def following(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active:
 def stays_behind(plan: Plan, bsdf: mi.BSDFPtr, is_delta: mi.Bool) -> mi.Bool:
     """Return the lanes in which the vertex behind a scattering event stays at its place on its surface.
 
-    If glossy BSDFs follow, a BSDF with a glossy and a diffuse lobe follows with both.
+    If glossy BSDFs follow, a BSDF with both a glossy and a diffuse lobe follows with both lobes.
     """
     if not plan.glossy_follows:
         return ~is_delta
@@ -353,11 +352,11 @@ def stays_behind(plan: Plan, bsdf: mi.BSDFPtr, is_delta: mi.Bool) -> mi.Bool:
 
 
 def staying(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool, sample: Sample) -> Sample:
-    """Return the sample of `following`, except that a smooth lobe's direction leads to a point that does not move with
+    """Return the sample of `following`, but with directions of smooth lobes towards a point that does not move with
     this vertex.
 
     The vertex at the far end accounts for the change of direction (`estimators.attached`). Here the direction is
-    constant in world space, and f / pdf changes through f alone. Delta lobes are as in `following`.
+    constant in world space, and f / pdf changes only through f. Delta lobes are as in `following`.
     """
     followed = following(plan, si, bsdf, active, sample)
     kept = dr.detach(sample.pdf)
@@ -370,7 +369,9 @@ def staying(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: m
 
 
 def _defensive(sample_1: mi.Float) -> tuple[mi.Bool, mi.Float]:
-    """Return the lanes in which a perturbed BSDF does not sample itself, and the rescaled number of the other lanes."""
+    """Return the lanes in which a perturbed BSDF does not sample itself. Also returns the number, rescaled for the
+    other lanes.
+    """
     defensive = sample_1 < DEFENSIVE
     return defensive, dr.select(defensive, sample_1 / DEFENSIVE, (sample_1 - DEFENSIVE) / (1 - DEFENSIVE))
 
@@ -379,11 +380,10 @@ def _mixed(
     plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, sample_2: mi.Point2f, defensive: mi.Bool,
     active: mi.Bool, sample: Sample,
 ) -> Sample:  # fmt: skip
-    """Return a BSDF's sample, replaced by a cosine-weighted direction in `defensive` lanes, with the density of the
-    mixture.
+    """Return a BSDF's sample with the density of the mixture. In `defensive` lanes, it is a cosine-weighted direction.
 
     A BSDF with a perturbed normal samples around the normal that faces wi, and its exchanged evaluation uses the normal
-    that faces wo. Some directions have a nonzero value, but are never sampled by the BSDF.
+    that faces wo. Some directions therefore have a nonzero value, although the BSDF never samples them.
     """
     hemisphere = mi.warp.square_to_cosine_hemisphere(sample_2)
     hemisphere.z = dr.mulsign(hemisphere.z, mi.Frame3f.cos_theta(si.wi))
@@ -397,7 +397,7 @@ def _mixed(
 
 
 def _to_point(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, aimed: Aimed, sample: Sample) -> Sample:
-    """Return a BSDF's sample, replaced by the direction to the point in aimed lanes.
+    """Return a BSDF's sample. In aimed lanes, it is the direction to the point.
 
     The density is 0 if there is no point, or if the BSDF itself never samples this direction.
     """

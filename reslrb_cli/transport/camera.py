@@ -1,6 +1,6 @@
-"""The only camera-path loop: film ray, light that is met, next event estimation, scattering, roulette.
+"""The only camera-path loop: film ray, hit emitters, next event estimation, scattering, roulette.
 
-The hooks process the light that is found, as in the light-path loop (`walk.py`), which shares the scattering, the
+The hooks process the light that is found, as in the light-path loop (`walk.py`). Both loops share the scattering, the
 factors and the random numbers of a segment. The two ways to find light are weighted against each other, and against
 light paths if there are any (`weights.py`).
 """
@@ -42,7 +42,8 @@ class FilmRay:
 
 
 def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
-    """Return a ray for each lane, distributed evenly over the pixels of the crop window or as the pixels are weighted.
+    """Return a ray for each lane, distributed over the pixels of the crop window, evenly or by the weights of the
+    pixels.
 
     If there are fewer rays than pixels, each ray goes to a random pixel of its own group of pixels.
     """
@@ -90,7 +91,10 @@ def axis_of(sensor: mi.Sensor) -> mi.Vector3f:
 
 @dataclass
 class MetLight:
-    """Light that a camera path meets: radiance `Le` (C,), detached, and its weight w_H, 0 if it does not count."""
+    """Emission of an emitter that a camera path hits.
+
+    `Le` (C,) is the detached radiance, and `weight` is w_H, or 0 if it does not count.
+    """
 
     Le: mi.Spectrum
     weight: mi.Float
@@ -108,7 +112,8 @@ class NextEvent(Connection):
     """Connection of a vertex of a camera path to a point on an emitter, or to a direction.
 
     `weight` (C,) is the contribution without BSDF and transmittance: Le w_N / density. `scale` is `weight` without the
-    radiance, `Le` (C,) the radiance, detached, `through` (C,) the transmittance, and `target` the point on the emitter.
+    radiance. `Le` (C,) is the detached radiance, `through` (C,) the transmittance, and `target` the point on the
+    emitter.
     """
 
     Le: mi.Spectrum
@@ -131,7 +136,7 @@ class NextEvent(Connection):
 
 
 class CameraHooks:
-    """Hooks of a camera path. All are pure except for the derivatives that they add, and none draws a random number.
+    """Hooks of a camera path. They are pure, except for the derivatives that they add, and draw no random numbers.
 
     `tracked` hooks keep derivatives of the factors in the loop state. The loop is then evaluated vertex by vertex
     (naive AD).
@@ -144,7 +149,7 @@ class CameraHooks:
         return []
 
     def goes_on(self, state: Any, vertex: Vertex) -> mi.Bool:
-        """Return the lanes that continue from this vertex, as far as the hooks are concerned."""
+        """Return the lanes that the hooks continue from this vertex."""
         return mi.Bool(True)
 
     def vertex(
@@ -152,7 +157,7 @@ class CameraHooks:
     ) -> Any:  # fmt: skip
         """Return the state after a vertex, or after a ray has left the scene.
 
-        `met` and `event` are None if the path meets or samples no light.
+        `met` and `event` are None if the path hits or samples no emitter.
         """
         return state
 
@@ -165,8 +170,8 @@ class CameraHooks:
 class CameraPath:
     """Loop state of one camera path.
 
-    `before` is the last vertex that is no null event, `events` counts such vertices, and `M` is 1 / p of the last of
-    them (0 for the sensor or a delta event) if no light paths compete.
+    `before` is the last vertex that is no null event, and `events` counts such vertices. If no light paths compete, `M`
+    is 1 / p of the last of these events, or 0 for the sensor or a delta event.
     """
 
     active: mi.Bool
@@ -182,7 +187,7 @@ class CameraPath:
 
 
 def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = True) -> tuple[FilmRay, Any]:
-    """Trace one camera path per lane of `samples`, in `active` lanes; return the rays and the final state of
+    """Trace one camera path per lane of `samples`, in `active` lanes. Returns the rays and the final state of
     `hooks`.
     """
     plan, scene = samples.plan, samples.scene
@@ -287,7 +292,7 @@ def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = T
 
 
 def _behind_lamps(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Ray3f:
-    """Return the rays moved behind the hidden lamps that they meet first."""
+    """Return the rays, moved behind the hidden lamps that they meet first."""
 
     def body(active: mi.Bool, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Ray3f]:
         si = scene.ray_intersect(ray, active)
@@ -345,7 +350,7 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
 def _next_event(
     samples: Samples, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, numbers: mi.Point2f, active: mi.Bool
 ) -> NextEvent:  # fmt: skip
-    """Sample a point on an emitter, or a direction; `weight` and `scale` do not include w_N yet."""
+    """Sample a point on an emitter, or a direction. `weight` and `scale` do not include w_N yet."""
     scene = samples.scene
     unseen = frozenset(lamp.emitter for lamp in samples.plan.needs.lamps if lamp.parallel)
     active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)

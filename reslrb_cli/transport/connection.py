@@ -17,7 +17,8 @@ from reslrb_cli.transport.plan import Plan
 
 
 def forward_derivatives(*values: mi.Spectrum) -> list[mi.Spectrum]:
-    """Return the derivatives of `values` along the parameters' tangents; zero for values that depend on no parameter.
+    """Return the derivatives of `values` along the parameters' tangents. Values that depend on no parameter have zero
+    derivatives.
 
     One propagation handles all values, because a second one would meet the edges of the first. The tangents of the
     parameters remain for the next vertex.
@@ -32,7 +33,7 @@ def forward_derivatives(*values: mi.Spectrum) -> list[mi.Spectrum]:
 class Passage:
     """Loop state of a ray on its way through null surfaces.
 
-    `value` is the product of the transmissions so far, (C,), and `tangent` its derivative (empty unless requested).
+    `value` (C,) is the product of the transmissions so far, and `tangent` its derivative (empty unless requested).
     `reached` becomes true once nothing blocks the way.
     """
 
@@ -51,9 +52,9 @@ def transmittance(
     """Follow the segment from the interaction `start` to the point `target` through at most `limit` null surfaces.
 
     Each crossing counts as a vertex, as for `path`. `on_crossing(transmission, active)` is called at each crossing with
-    its transmission (C,), tracked if gradients are enabled, so that it can be differentiated there. With `tangents`,
-    the derivative along the parameters' tangents is computed (forward mode); gradients must then be suspended, because
-    the loop itself must not track any. With `past_lamps`, lamps do not block the way.
+    its transmission (C,), which is tracked if gradients are enabled. It can therefore be differentiated there. With
+    `tangents`, the derivative along the parameters' tangents is computed (forward mode). Gradients must then be
+    suspended, because the loop itself must not track any. With `past_lamps`, lamps do not block the way.
     """
 
     def body(passage: Passage, ray: mi.Ray3f) -> tuple[Passage, mi.Ray3f]:
@@ -123,9 +124,9 @@ def connect(
     plan: Plan, sensor: mi.Sensor, si: mi.SurfaceInteraction3f, ray: mi.Ray3f | None, sample: mi.Point2f,
     active: mi.Bool, attached: bool = False,
 ) -> Connection:  # fmt: skip
-    """Find the film position of the vertex `si`; it moves with the vertex if `attached`.
+    """Find the film position of the vertex `si`. If `attached`, it moves with the vertex.
 
-    `ray` reaches the vertex; None if light starts there, on an emitter.
+    `ray` is the ray that reaches the vertex. It is None if light starts there, on an emitter.
     """
     with dr.suspend_grad(when=not attached):
         ds, importance = sensor.sample_direction(si, sample, active)
@@ -147,8 +148,7 @@ def connect(
 
 
 def _clip(plan: Plan, sensor: mi.Sensor, ds: mi.DirectionSample3f) -> tuple[mi.Bool, mi.Point3f]:
-    """Return whether the sensor's clip planes include the point, and the point on the near plane where camera rays
-    start.
+    """Return whether the point is within the sensor's clip planes, and where its camera ray crosses the near plane.
 
     For thin lenses, Mitsuba ignores the planes, and sees nothing if the lens focuses outside of them.
     """
@@ -190,7 +190,7 @@ class Seen:
 
 
 def stand_in(connection: Connection) -> tuple[mi.Float, mi.Spectrum]:
-    """Return replacements for bsdf * cos and for c_i (C,) if they are zero (`Product.times`): those of a white
+    """Return replacements for bsdf * cos and for c_i (C,) if they are zero (`Product.times`). They are those of a white
     surface.
     """
     f = dr.maximum(dr.abs(mi.Frame3f.cos_theta(connection.wo)), 1e-3) * dr.inv_pi
@@ -201,10 +201,11 @@ def passage(
     plan: Plan, scene: mi.Scene, si: mi.SurfaceInteraction3f, depth: mi.UInt32, connection: Connection,
     seen: Seen | None = None, loop_mode: str = "symbolic",
 ) -> tuple[mi.Bool, mi.Spectrum]:  # fmt: skip
-    """Trace the shadow ray; return the lanes that the sensor sees, and the transmittance (C,) of masks on the way.
+    """Trace the shadow ray. Returns the lanes that the sensor sees, and the transmittance (C,) of masks on the way.
 
-    No ray is traced in lanes with a known visibility `seen`. Without null surfaces in the scene, no transmittance is
-    computed; with them, `seen` cannot be used. `loop_mode` is the mode of the loop; naive AD needs it evaluated.
+    If visibility is known (`seen`), no ray is traced. In scenes without null surfaces, no transmittance is computed. In
+    scenes with null surfaces, `seen` cannot be used. `loop_mode` is the mode of the loop, which must be evaluated for
+    naive AD.
     """
     active, one = connection.active, mi.Spectrum(1)
     past_lamps = plan.passes_lamps

@@ -1,7 +1,7 @@
-"""Densities of the rays that a scene's emitters send out, for any ray, not only for sampled ones.
+"""Densities of the rays that a scene's emitters send out, for any ray instead of only sampled ones.
 
-Mitsuba does not provide them. They are the densities of its `sample_ray`, and of the rays that `emission.py` and
-`lamps.py` sample:
+Mitsuba does not provide these densities. They are the densities of its `sample_ray`, and of the rays that `emission.py`
+and `lamps.py` sample.
 
     lamp                 choice / area * cos / pi;  textured, in proportion to its texture
     constant, map, sky   choice p(d) / (pi r^2)         r: of the sphere around the scene
@@ -27,10 +27,11 @@ EVEN, TEXTURED, ENVIRONMENT, PROJECTOR, UNSEEN = range(5)  # method for the dens
 
 @dataclass
 class EmitterDensities:
-    """Densities of a scene's emitters by their numbers in Dr.Jit's registry (as pointers are), (R,) each, opaque.
+    """Densities of a scene's emitters, (R,) each, opaque. The index is the emitter's number in Dr.Jit's registry, as in
+    pointers.
 
     `choice` is the probability of selecting an emitter. `emitted` is e, without a factor that depends on a texture.
-    `kind` says which factor this is.
+    `kind` tells which factor this is.
     """
 
     choice: mi.Float
@@ -56,7 +57,7 @@ class EmitterDensities:
 
 
 def _ray_density(plan: Plan, emitter: mi.Emitter, lamp: Lamp | None, surrounds: bool) -> tuple[float, int]:
-    """Return the part of an emitter's e that is the same for all its rays, and the kind of the rest."""
+    """Return the part of e that is equal for all rays of an emitter, and the kind of the remaining factor."""
     name = emitter.class_name()
     disk = 0.0 if plan.horizon is None else 1 / (np.pi * plan.horizon.radius**2)
     if lamp is not None:
@@ -99,9 +100,8 @@ def _projected_area(projector: mi.Emitter) -> float:
 class Place:
     """Place where light leaves an emitter, for the density.
 
-    `own` is the density with which next event estimation samples this place (for a lamp, per area) or direction (for
-    environments), without the choice of the emitter. `uv` are texture coordinates, and `d` is the direction of the
-    light.
+    `own` is the density of this place (for a lamp, per area) or direction (for environments) in next event estimation,
+    without the choice of the emitter. `uv` are texture coordinates, and `d` is the direction of the light.
     """
 
     emitter: mi.EmitterPtr
@@ -141,7 +141,7 @@ def _constant_environment(plan: Plan) -> bool:
 
 
 def _evened(lamp: Lamp, at: Place, active: mi.Bool) -> mi.Float:
-    """Return the density per area of a lamp whose points are sampled from its texture, and in part uniformly."""
+    """Return the density per area of a lamp whose points are sampled partly from its texture and partly uniformly."""
     here = active & (at.emitter == mi.EmitterPtr(lamp.emitter))
     there = lamp.shape.eval_parameterization(at.uv, mi.RayFlags.All, here)
     stretch = dr.norm(dr.cross(there.dp_du, there.dp_dv))
@@ -150,7 +150,7 @@ def _evened(lamp: Lamp, at: Place, active: mi.Bool) -> mi.Float:
 
 
 def _projected(at: Place, active: mi.Bool) -> mi.Float:
-    """Return the density of a projector's directions without the area of its picture; `at.uv` are those of the
+    """Return the density of a projector's directions without the area of its picture. `at.uv` are coordinates of the
     picture.
     """
 

@@ -1,6 +1,6 @@
-"""Start of light paths: rays from the emitters, sampled by `lamps.py` if necessary.
+"""Start of light paths: rays from the emitters, sampled by Mitsuba or by `lamps.py`.
 
-`used_numbers` says which of the random numbers of emission the emitters of a scene use.
+`used_numbers` tells which of the random numbers of emission the emitters of a scene use.
 """
 
 from __future__ import annotations
@@ -40,10 +40,11 @@ def used_numbers(samples: Samples) -> list[bool]:
 
 @dataclass
 class Emission:
-    """Ray that leaves an emitter, with the weight E: radiance divided by the density of the ray, (C,).
+    """Ray that leaves an emitter, with the weight E (C,), which is radiance divided by the density of the ray.
 
-    `weight` tracks derivatives of emission if they are enabled; ray and density do if emitters move. `guided` is the
-    factor of `weight` from a guide; None without a guide. `position` contains the numbers that sampled the place.
+    If derivatives are enabled, `weight` tracks those of emission. If emitters move, ray and density track derivatives
+    as well. `guided` is the factor of `weight` from a guide, or None without a guide. `position` contains the random
+    numbers of the place.
     """
 
     ray: mi.Ray3f
@@ -54,7 +55,7 @@ class Emission:
 
 
 def sample_time(plan: Plan, sensor: mi.Sensor, sampler: mi.Sampler | NumberStream) -> mi.Float:
-    """Return a time within the shutter interval; draws a number only if this interval has a length."""
+    """Return a time within the shutter interval. A number is drawn only if this interval has a length."""
     time = mi.Float(sensor.shutter_open())
     if plan.needs.moving_shutter:
         time += sampler.next_1d() * sensor.shutter_open_time()
@@ -62,7 +63,9 @@ def sample_time(plan: Plan, sensor: mi.Sensor, sampler: mi.Sampler | NumberStrea
 
 
 def sample_emission(samples: Samples, sampler: mi.Sampler) -> Emission:
-    """Sample a ray from a random emitter of the scene, with as many numbers, in the same order, as `ptracer`."""
+    """Sample a ray from a random emitter of the scene. It uses the same random numbers, in the same order, as
+    `ptracer`.
+    """
     time = sample_time(samples.plan, samples.sensor, sampler)
     wavelength_sample, sample_2, sample_3 = samples.emission_numbers(sampler)
     drawn = samples.drawn(wavelength_sample, sample_2, sample_3)
@@ -130,8 +133,8 @@ def _environment_ray(
     """Return a ray from an environment map, through a disk perpendicular to it that covers the scene's bounding sphere.
 
     Mitsuba's `envmap.sample_ray` places the disk in the local frame of the map, which is wrong if `to_world` rotates
-    it. Directions are sampled in proportion to the map's radiance, and in part uniformly if the map is differentiated:
-    black texels beside a sun have derivatives as large as any.
+    it. Directions are sampled in proportion to the map's radiance. If the map is differentiated, a part of them is
+    uniform, because black texels beside a sun have derivatives as large as any.
     """
     assert plan.horizon is not None
     center, radius = mi.Point3f(*plan.horizon.center), plan.horizon.radius * (1 + 1e-4)
@@ -151,8 +154,9 @@ def _environment_ray(
 def _any_direction(
     environment: mi.Emitter, reference: mi.Interaction3f, sample: mi.Point2f
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """Sample a direction from a mixture of the environment's own density and the uniform density; return radiance /
-    density, too.
+    """Sample a direction from a mixture of the environment's own density and the uniform density.
+
+    Also returns radiance / density.
     """
     with dr.suspend_grad():
         uniform = sample.x < DEFENSIVE

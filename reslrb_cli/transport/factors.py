@@ -1,8 +1,8 @@
 """Products of path factors that count zeros, so that the derivative at a zero factor is not lost.
 
 The contribution of a path is a product of factors, f_0 f_1 ... f_k, per channel. Its derivative with respect to f_j is
-the product of all others. Dividing the product by f_j fails if f_j = 0, so the product of the nonzero factors is stored
-with the index of the zero factor:
+the product of all others. Dividing the product by f_j fails if f_j = 0. Therefore the product of the nonzero factors is
+stored with the index of the zero factor.
 
     one zero factor, f_j:  d(f_0 ... f_k) = (product of the others) df_j       nothing for any other factor
     two or more:           d(f_0 ... f_k) = 0
@@ -34,12 +34,13 @@ def showing(value: mi.Float | mi.Spectrum) -> mi.Float | mi.Spectrum:
 
 @dataclass
 class Product:
-    """Product of factors, one value per channel; part of the loop state.
+    """Product of factors, one value per channel, as part of the loop state.
 
     `nonzero` is the product of all factors (untracked), or of the nonzero factors with replacements for the others
-    (tracked). `zero` is, per channel, the index of the zero factor, NO_ZERO or MANY_ZEROS; it is empty if zeros are not
-    tracked. `tracked` is the plain product with derivatives, for naive AD only; otherwise it is empty. `raised` is the
-    product of the factors, each at least DIM times its replacement; it is empty if zeros are not tracked.
+    (tracked). `zero` is, per channel, the index of the zero factor, NO_ZERO or MANY_ZEROS. `tracked` is the plain
+    product with derivatives, for naive AD only. `raised` is the product of the factors, each raised to at least DIM
+    times its replacement. `zero` and `raised` are empty if zeros are not tracked, and `tracked` is empty without naive
+    AD.
     """
 
     nonzero: mi.Spectrum
@@ -55,14 +56,14 @@ class Product:
 
     @staticmethod
     def none(track_zeros: bool) -> Product:
-        """Return the product of a connection that does not exist; its value and derivative are zero."""
+        """Return the product of a connection that does not exist. Its value and derivative are zero."""
         return Product(mi.Spectrum(0), [mi.Int32(MANY_ZEROS) for _ in Product.one(track_zeros).zero])
 
     def times(self, factor: mi.Spectrum, index: mi.UInt32 | mi.Int32, stand_in: mi.Spectrum | float = 1) -> Product:
         """Return the product with one more factor, (C,) per lane, at position `index` of the path.
 
-        `stand_in` replaces the factor in `nonzero` if it is zero. It is a positive number of the size of the factor's
-        derivative.
+        If the factor is zero, `stand_in` replaces it in `nonzero`. This is a positive number of the size of the
+        factor's derivative.
         """
         tracked = [self.tracked[0] * factor] if self.tracked else []
         factor = dr.detach(factor)
@@ -80,7 +81,7 @@ class Product:
         return Product(self.nonzero * scale, self.zero, tracked, raised)
 
     def stored(self) -> Product:
-        """Return the product without data that is not needed after it has been selected."""
+        """Return the product without data that is no longer needed after the selection."""
         return replace(self, raised=[])
 
     def value(self) -> mi.Spectrum:
@@ -88,13 +89,11 @@ class Product:
         return self.tracked[0] if self.tracked else self._where(self.nonzero, [z == NO_ZERO for z in self.zero])
 
     def differentiable(self) -> mi.Spectrum:
-        """Return the product of the nonzero factors in channels whose value or derivative can be nonzero, otherwise
-        zero.
-        """
+        """Return the product of the nonzero factors. In channels whose value and derivative vanish, return zero."""
         return self._where(self.nonzero, [z != MANY_ZEROS for z in self.zero])
 
     def weight(self) -> mi.Spectrum:
-        """Return the weight (C,) for roulette and selection: the possible size of value and derivative behind this
+        """Return the weight (C,) for roulette and selection, which estimates value and derivative behind this
         product.
         """
         return self._where(self.raised[0] if self.raised else self.nonzero, [z != MANY_ZEROS for z in self.zero])

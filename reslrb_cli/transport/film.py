@@ -1,9 +1,10 @@
 """The film: splatting through its reconstruction filter, the exact adjoint of splatting, and blocks of pixels.
 
-The adjoint of a splat looks up dL/dI at the film position:
+The adjoint of a splat looks up dL/dI at the film position. filter_p(u) is the weight of pixel p for film position u.
+The weights sum to 1 over the pixels.
 
-splat:   I_p += filter_p(u) C        filter_p(u): weight of pixel p for film position u, summing to 1 over pixels
-lookup:  delta = sum_p filter_p(u) dL/dI_p
+    splat:   I_p += filter_p(u) C
+    lookup:  delta = sum_p filter_p(u) dL/dI_p
 
 `Blocks` divides a film into blocks of pixels, for learning by position. `PixelShares` distributes camera paths over its
 pixels.
@@ -41,7 +42,7 @@ class Film:
         self.offset = self.film.crop_offset()
 
     def block(self) -> mi.ImageBlock:
-        """Return an empty image block that covers the crop window; filter weights are normalised per splat."""
+        """Return an empty image block that covers the crop window. Filter weights are normalised per splat."""
         block = self.film.create_block(normalize=not self.whole, borders=False)
         block.set_offset(self.offset)
         block.set_coalesce(False)  # splats of neighbouring lanes land in arbitrary pixels
@@ -53,7 +54,7 @@ class Film:
         """Add `value` (C,) at film position `u` (pixels, relative to the crop window) through the filter.
 
         Under naive AD, the weights of the pixels move with `u`. Mitsuba divides them by their sum, and detaches this
-        sum; with `normalization`, the sum is differentiated as well. A `whole` film divides by no sum.
+        sum. With `normalization`, the sum is differentiated as well. A `whole` film does not divide by the sum.
         """
         if normalization and not self.whole:
             total = filter_weights(self.film.rfilter(), u)[2]
@@ -64,8 +65,8 @@ class Film:
         block.put(u + mi.Vector2f(self.offset), color + [mi.Float(0)] * (block.channel_count() - N_COLOR), active)
 
     def taps(self, u: mi.Point2f, normalization: bool) -> list[tuple[mi.Point2u, mi.Float]]:
-        """Return the pixels that a splat at film position `u` touches, some of them off the film, and the weight of
-        each.
+        """Return the pixels that a splat at film position `u` touches, with their weights. Some pixels may be off the
+        film.
         """
         first, (weights_x, weights_y), total = filter_weights(self.film.rfilter(), u)
         if self.whole:
@@ -88,7 +89,7 @@ class Film:
             dr.scatter_reduce(dr.ReduceOp.Add, block.tensor().array, one, at, inside)
 
     def develop(self, block: mi.ImageBlock, tangent: bool = False) -> mi.TensorXf:
-        """Return the image (H, W, channels) in the film's own pixel format; differentiable with respect to the block.
+        """Return the image (H, W, channels) in the film's own pixel format, differentiable with respect to the block.
 
         With `tangent`, the block is a derivative, and the opaque alpha channel has none.
         """
@@ -118,7 +119,7 @@ class Film:
         return mi.TensorXf(part, shape)
 
     def adjoint(self, image_gradient: mi.TensorXf) -> AdjointImage:
-        """Return dL/d(block) from dL/d(developed image), for lookups."""
+        """Return dL/d(block) for lookups, given dL/d(developed image)."""
         with dr.resume_grad():
             block = self.block()
             dr.enable_grad(block.tensor())
@@ -181,7 +182,7 @@ STEPS = 256  # for a filter's integral, in each pixel
 
 @functools.lru_cache(maxsize=64)
 def _integrals(rfilter: mi.ReconstructionFilter) -> list[tuple[int, float]]:
-    """Return the integral of a pixel's filter over each pixel that it reaches along one axis, by offset."""
+    """Return the integral of a pixel's filter over each pixel that it reaches, along one axis, by offset."""
     taps = int(np.ceil(float(rfilter.radius()) - 0.5))
     x = (np.arange((2 * taps + 1) * STEPS) + 0.5) / STEPS - taps - 0.5
     values = np.array(rfilter.eval(mi.Float(x.astype(np.float32))), np.float64)
@@ -193,8 +194,8 @@ def filter_weights(
 ) -> tuple[mi.Point2i, tuple[list[mi.Float], list[mi.Float]], mi.Float]:
     """Return the filter weights that `ImageBlock.put` uses at film position `u`.
 
-    They are the first touched pixel, the weights by column and by row, and their sum over all pixels, including those
-    off the film.
+    The result has the first touched pixel, the weights by column and by row, and their sum over all pixels, including
+    pixels off the film.
     """
     radius = rfilter.radius()
     taps = int(dr.ceil(2 * radius))
@@ -210,7 +211,9 @@ BLOCKS = 1 << 14  # maximum number of blocks of pixels
 
 @dataclass(frozen=True)
 class Blocks:
-    """Blocks of `side` x `side` pixels that cover a film (crop window) of `width` x `height`, cut off at its end."""
+    """Blocks of `side` x `side` pixels that cover a film (crop window) of `width` x `height`. The last blocks may be
+    cut off.
+    """
 
     width: int
     height: int
@@ -218,7 +221,7 @@ class Blocks:
 
     @staticmethod
     def of(size: tuple[int, int]) -> Blocks:
-        """Return the smallest blocks of which there are at most BLOCKS."""
+        """Return the smallest blocks with a total number of at most BLOCKS."""
         side = 1
         while -(-size[0] // side) * -(-size[1] // side) > BLOCKS:
             side += 1
@@ -247,8 +250,8 @@ class Blocks:
         return np.outer(down, across).ravel().astype(np.float64)
 
     def root_means(self, image: mi.TensorXf) -> NDArray[np.float64]:
-        """Return the root mean square of an image (height, width, C) in each block (rows * columns), times the area of
-        the block.
+        """Return the root mean square of an image (height, width, C) in each block (rows * columns), times the block's
+        area.
 
         The unit is the largest value of the image. Values that are not finite count as 0.
         """
@@ -278,10 +281,10 @@ MOST_SLOTS = 4  # per pixel
 
 @dataclass
 class PixelShares:
-    """Distribution of the camera paths of a pass over the n pixels of a film; each pixel has some.
+    """Distribution of the camera paths of a pass over the n pixels of a film. Each pixel has some paths.
 
     The first `even` paths (width 1) are distributed evenly, with at most one more in some pixels. The other paths go
-    `rounds` times (width 1) through all `slots` (S,), which hold the pixels in order: pixel i has `each[i]` (n,) slots
+    `rounds` times (width 1) through all `slots` (S,), which hold the pixels in order. Pixel i has `each[i]` (n,) slots
     from number `first[i]` (n,) on. The number of paths of a pixel is therefore not random, and dividing by it adds no
     noise.
     """
@@ -294,9 +297,10 @@ class PixelShares:
 
     @staticmethod
     def of(wanted: NDArray[np.floating], paths: int) -> PixelShares | None:
-        """Return this number of paths in proportion to `wanted` (n,), with a share of EVEN distributed evenly.
+        """Return the distribution of `paths` paths in proportion to `wanted` (n,). A share of EVEN is distributed
+        evenly.
 
-        None if there are not more paths than pixels.
+        Returns None if there are not more paths than pixels.
         """
         n = wanted.size
         spare = min(int((1 - EVEN) * paths), paths - n)  # one per pixel: without it, light would be lost

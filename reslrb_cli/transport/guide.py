@@ -2,14 +2,14 @@
 
 The start of a path is a point of the unit cube in four dimensions (two numbers for a place or a disk, two for a
 direction) and a number that selects an emitter. The cube is divided into cells, separately for each emitter. A cell k
-with measure v_k is sampled with probability p_k; numbers are uniform within it, and the path's weight is multiplied by
-v_k / p_k. The expected contribution of a path stays the same for every emitter, if every cell can be sampled and p does
-not depend on the numbers that it is used with.
+with measure v_k is sampled with probability p_k. Numbers are uniform within it, and the path's weight is multiplied by
+v_k / p_k. The expected contribution of a path does not change if every cell can be sampled and p does not depend on the
+numbers that it is used with.
 
-Sampling takes one lookup: of M slots, cell k owns m_k, and p_k = m_k / M exactly. Lanes are stratified: lane i of n
-samples from the i-th n-th of all slots. Only the noise within cells remains, and similar paths are traced side by side.
-At least a share GUIDE_UNIFORM of all slots is distributed evenly, so that no table makes a weight larger than 1 /
-GUIDE_UNIFORM.
+Sampling takes one lookup. Of M slots, cell k owns m_k, and p_k = m_k / M exactly. Lanes are stratified: the slots are
+divided into n equal parts for n lanes, and lane i samples from part i. Only the noise within cells remains, and similar
+paths are traced side by side. At least a share GUIDE_UNIFORM of all slots is distributed evenly, so no table makes a
+weight larger than 1 / GUIDE_UNIFORM.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ MOST_EMITTERS = 1024  # with their own cells; among more emitters, neighbours sh
 
 
 def make_grid(used: Sequence[bool], weights: Sequence[float], cell_bits: int = CELL_BITS) -> Grid:
-    """Return a grid of at most 2^cell_bits cells for emitters of these sampling weights, divided along the used
-    numbers.
+    """Return a grid of at most 2^cell_bits cells for emitters with these sampling weights. Only the used numbers are
+    divided.
     """
     if not sum(weights) > 0:
         weights = [1.0] * max(len(weights), 1)  # no emitter emits; the grid has no use, and no effect
@@ -50,7 +50,9 @@ def make_grid(used: Sequence[bool], weights: Sequence[float], cell_bits: int = C
 
 
 def apportion(grid: Grid, density: Array) -> Array:
-    """Return the slots of each cell (int64): at least UNIFORM of its measure, the others in proportion to `density`."""
+    """Return the slots of each cell (int64). Each has at least UNIFORM of its measure; the rest is proportional to
+    `density`.
+    """
     least = least_slots(grid)
     # Rounded along the order of the cells, so that neighbours balance.
     ends = np.cumsum(density, dtype=np.float64)
@@ -65,8 +67,9 @@ def apportion(grid: Grid, density: Array) -> Array:
 
 @dataclass
 class Table:
-    """Table for sampling: the cell of each slot, v / p of each cell, the edges of the grid, and data for roulette and
-    aiming.
+    """Table for sampling.
+
+    It has the cell of each slot, v / p of each cell, the edges of the grid, and data for roulette and aiming.
     """
 
     slots: mi.UInt32
@@ -77,7 +80,7 @@ class Table:
 
     @staticmethod
     def of(grid: Grid, counts: Array, survival: Survival | None = None, aim: Aim | None = None) -> Table:
-        """Return the table in which cell k has `counts[k]` slots, `grid.slots` in total."""
+        """Return the table in which cell k has `counts[k]` slots. The total is `grid.slots`."""
         weights = grid.measures() * grid.slots  # 0 without a slot
         weights /= np.maximum(counts, 1)
         return Table(
@@ -91,7 +94,7 @@ class Table:
 
 @dataclass
 class Drawn:
-    """Random numbers of emission drawn with a guide, with their cell and its v / p."""
+    """Random numbers of emission from a guide, with their cell and its v / p."""
 
     choice: mi.Float
     position: mi.Point2f
@@ -102,7 +105,7 @@ class Drawn:
 
 @dataclass
 class Guide:
-    """Table with the number of lanes that share it (opaque)."""
+    """Table with the number of lanes that share it. The number is opaque."""
 
     table: Table
     lanes: mi.UInt64
@@ -115,7 +118,7 @@ class Guide:
     def draw(
         self, grid: Grid, width: int, stream: mi.PCG32, choice: mi.Float, position: mi.Point2f, direction: mi.Point2f,
     ) -> Drawn:  # fmt: skip
-        """Draw the start of each of `width` lanes; `choice`, `position` and `direction` determine the place within its
+        """Draw the start of each of `width` lanes. `choice`, `position` and `direction` determine the place within its
         cell.
         """
         lane, jitter = mi.UInt64(dr.arange(mi.UInt32, width)), mi.UInt64(stream.next_uint32())

@@ -1,17 +1,15 @@
 """Points on lamps (shapes that emit), and the rays that leave them.
 
-`lamp_ray` samples light if Mitsuba's own samples are wrong, or lack a derivative:
+`lamp_ray` samples light in five cases in which Mitsuba's own samples are wrong, or lack a derivative.
 
-sphere             Mitsuba rotates the points of a sphere with its `to_world`, but not their normals
-directionalarea    it keeps the area that the shape had when it was loaded
-moving mesh        it samples a face in proportion to its area, and divides by the area of the mesh. Both are constants
-                   to it; the density on face f is P_f / A_f(theta), and only P_f is constant
-textured moving mesh
-                   it finds points by a ray in the plane of texture coordinates, and differentiates them as if they
-                   moved along this ray
-differentiated texture
-                   it samples texels in proportion to their radiance, and never black texels, whose derivatives are as
-                   large as any
+- Sphere: Mitsuba rotates the points of a sphere with its `to_world`, but not their normals.
+- `directionalarea`: Mitsuba keeps the area that the shape had when it was loaded.
+- Moving mesh: Mitsuba samples a face in proportion to its area, and divides by the area of the mesh. It treats both as
+    constants. The density on face f is P_f / A_f(theta), and only P_f is constant.
+- Textured moving mesh: Mitsuba finds points by a ray in the plane of texture coordinates, and differentiates them as if
+    they moved along this ray.
+- Differentiated texture: Mitsuba samples texels in proportion to their radiance, and never black texels, whose
+    derivatives are as large as any.
 """
 
 from __future__ import annotations
@@ -32,7 +30,7 @@ def lamp_ray(
 ) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
     """Return a ray that leaves the lamp, and radiance / density (C,), from the same random numbers as Mitsuba.
 
-    `areas` are the sums of `sums_of_areas` for a mesh whose faces move, else None. With `evened`, black texels are
+    `areas` are the sums of `sums_of_areas` for a mesh whose faces move, otherwise None. With `evened`, black texels are
     sampled, too.
     """
     si, weight = lamp_point(lamp, areas, time, position, active, evened)
@@ -48,7 +46,7 @@ def lamp_ray(
 def lamp_point(
     lamp: Lamp, areas: mi.Float | None, time: mi.Float, sample: mi.Point2f, active: mi.Bool, evened: bool = False
 ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
-    """Return a point on the lamp, and the reciprocal of its density; both move with the lamp."""
+    """Return a point on the lamp, and the inverse of its density. Both move with the lamp."""
     if lamp.texture is not None and lamp.has_faces:
         return _textured_point(lamp.shape, lamp.texture, sample, active, evened)
     if lamp.texture is not None and evened:
@@ -72,7 +70,7 @@ def lamp_point(
 def _textured_point(
     mesh: mi.Mesh, texture: mi.Texture, sample: mi.Point2f, active: mi.Bool, evened: bool
 ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
-    """Return a point that Mitsuba samples from a texture, or uniformly; the point keeps its place in its moving
+    """Return a point that Mitsuba samples from a texture, or uniformly. The point keeps its place in its moving
     face.
     """
     uv, density = _any_uv(texture, sample, active) if evened else texture.sample_position(sample, active)
@@ -86,7 +84,7 @@ def _textured_point(
 def _any_point(
     shape: mi.Shape, texture: mi.Texture, time: mi.Float, sample: mi.Point2f, active: mi.Bool
 ) -> tuple[mi.PositionSample3f, mi.Float]:
-    """Return a point that Mitsuba's emitter samples from a texture on a shape, or in part any other point."""
+    """Return a point on a textured lamp. It is sampled partly as in Mitsuba's emitter, and partly uniformly."""
     uv, density = _any_uv(texture, sample, active)
     there = shape.eval_parameterization(uv, mi.RayFlags.All, active)
     there.time = time
@@ -94,9 +92,7 @@ def _any_point(
 
 
 def _weight(there: mi.SurfaceInteraction3f, density: mi.Float, active: mi.Bool) -> mi.Float:
-    """Return the reciprocal of the density per area of a point that was sampled with this density of texture
-    coordinates.
-    """
+    """Return the inverse of a point's density per area. `density` is its density in texture coordinates."""
     return dr.select(active & there.is_valid(), dr.norm(dr.cross(there.dp_du, there.dp_dv)) / density, 0)
 
 
@@ -114,14 +110,16 @@ def _any_uv(texture: mi.Texture, sample: mi.Point2f, active: mi.Bool) -> tuple[m
 
 
 def drawn_face(areas: mi.Float, sample: mi.Float) -> mi.UInt32:
-    """Return the face that Mitsuba samples with this number, by these sums of areas."""
+    """Return the face that Mitsuba samples with this number, given the cumulative areas."""
     last = dr.width(areas) - 1
     value = sample * dr.gather(mi.Float, areas, mi.UInt32(last))
     return dr.binary_search(0, last, lambda index: dr.gather(mi.Float, areas, index) < value)
 
 
 def sums_of_areas(lamps: Sequence[Lamp]) -> list[mi.Float]:
-    """Return the cumulative areas of the faces of each lamp, a mesh: (F,), evaluated and detached."""
+    """Return the cumulative areas (F,) of the faces of each lamp, which is a mesh. The result is evaluated and
+    detached.
+    """
     with dr.suspend_grad():
         found = [dr.cumsum(face_area(lamp.shape, dr.arange(mi.UInt32, lamp.shape.face_count()))) for lamp in lamps]
         dr.eval(found)

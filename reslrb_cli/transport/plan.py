@@ -22,9 +22,10 @@ SLOTS_OF_SEVERAL = 8  # if emitters have unequal shares, which are rounded up to
 
 @dataclass(frozen=True)
 class Grid:
-    """Grid of the cells: the cube is divided into 2^bits along each of its four numbers, those of the place first.
+    """Grid of the cells: the cube is divided into 2^bits parts along each of its four numbers, those of the place
+    first.
 
-    `edges` (E + 1) are the bounds of the choosing number for each emitter, or for groups of emitters.
+    `edges` (E + 1) divide the range of the selecting number among emitters, or groups of emitters.
     """
 
     bits: tuple[int, int, int, int]
@@ -37,7 +38,7 @@ class Grid:
 
     @property
     def cells(self) -> int:
-        """Number of cells of all emitters; those of one emitter are contiguous."""
+        """Number of cells of all emitters. The cells of one emitter are contiguous."""
         return self.emitters << sum(self.bits)
 
     @property
@@ -48,17 +49,18 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of an array of all cells: the emitter, then the four numbers in reverse order, because the first number
-        varies fastest in a cell's index.
+        """Shape of an array of all cells: the emitter, then the four numbers in reverse order.
+
+        The order is reversed because the first number varies fastest in a cell's index.
         """
         return (self.emitters, *(1 << bits for bits in reversed(self.bits)))
 
     def measures(self) -> Array:
-        """Return v_k of all cells, float64, read-only; they sum to 1."""
+        """Return v_k of all cells, float64, read-only. They sum to 1."""
         return _measures(self)
 
     def coarser(self, cells: float) -> Grid:
-        """Return the same grid with at most this number of cells, or one per emitter; each is a union of cells of this
+        """Return a coarser grid with at most this number of cells, or one per emitter. Each is a union of cells of this
         grid.
         """
         bits = list(self.bits)
@@ -67,7 +69,7 @@ class Grid:
         return Grid((bits[0], bits[1], bits[2], bits[3]), self.edges)
 
     def summed(self, values: Array, coarser: Grid) -> Array:
-        """Return the sums of values (cells,) over the cells of each coarser cell, of the same type."""
+        """Return the sums of values (cells,) over the cells of each coarser cell, with the same type."""
         result = values.reshape(self.shape)
         for axis, few in enumerate(coarser.shape):
             while result.shape[axis] > few:
@@ -76,7 +78,7 @@ class Grid:
         return result.ravel()
 
     def shared_out(self, values: Array, coarser: Grid) -> Array:
-        """Return the values of coarser cells, distributed evenly over their cells; the inverse of `summed`."""
+        """Return the values of coarser cells, distributed evenly over their cells. This is the inverse of `summed`."""
         result = values.reshape(coarser.shape) * (coarser.cells / self.cells)
         for axis, (fine, few) in enumerate(zip(self.shape, coarser.shape, strict=True)):
             result = result.repeat(fine // few, axis)
@@ -93,7 +95,7 @@ def _measures(grid: Grid) -> Array:
 
 @functools.lru_cache(maxsize=4)
 def least_slots(grid: Grid) -> Array:
-    """Return the minimum slots of each cell, float64: UNIFORM of its measure."""
+    """Return the minimum number of slots of each cell as float64, which is UNIFORM of its measure."""
     measures = grid.measures()
     result = np.where(measures > 0, np.maximum(np.ceil(GUIDE_UNIFORM * grid.slots * measures - 1e-6), 1), 0)
     result.setflags(write=False)
@@ -107,7 +109,7 @@ UNBOUNDED = 0xFFFFFFFF
 class Plan:
     """Static choices of a walk: Python values that are not part of a kernel's data.
 
-    `max_depth` and `rr_depth` count path edges as Mitsuba's `ptracer` does; `max_depth` is UNBOUNDED for -1.
+    `max_depth` and `rr_depth` count path edges as in Mitsuba's `ptracer`. A `max_depth` of -1 becomes UNBOUNDED.
     """
 
     needs: SceneNeeds
@@ -200,15 +202,15 @@ class Plan:
 
     @property
     def small_lamps(self) -> tuple[Lamp, ...]:
-        """Lamps smaller than a pixel, which are seen through points on them instead of rays through the pixels.
+        """Lamps smaller than a pixel. Points on the lamps show them, instead of rays through the pixels.
 
-        Empty if masks have derivatives, which need primary rays.
+        The tuple is empty if masks have derivatives, which need primary rays.
         """
         return self.needs.small_lamps if self.visible_emission and not self.differentiate_null else ()
 
     @property
     def environment_map(self) -> bool:
-        """Whether an environment map emits, whose rays `emission.py` samples."""
+        """Whether an environment map emits. `emission.py` samples its rays."""
         return (
             self.needs.environment is not None
             and self.needs.emitters[self.needs.environment] == "EnvironmentMapEmitter"
@@ -228,26 +230,27 @@ class Plan:
 
     @property
     def reshaped_lamps(self) -> tuple[Lamp, ...]:
-        """Meshes among the placed lamps whose faces move, and are sampled in proportion to their areas."""
+        """Meshes among the placed lamps with moving faces that are sampled in proportion to their areas."""
         return tuple(lamp for lamp in self.needs.lamps if lamp.faces_by_area and lamp.shape in self.moving_shapes)
 
     @property
     def visible_moving_lamps(self) -> tuple[Lamp, ...]:
-        """Shapes that move, emit in all directions, and may be seen directly."""
+        """Shapes that move, emit in all directions, and may be directly visible."""
         if not (self.visible_emission and self.moving_emission):
             return ()
         return tuple(lamp for lamp in self.needs.lamps if lamp.shape in self.moving_shapes and not lamp.parallel)
 
     @property
     def passage_in_gradient(self) -> bool:
-        """Whether a gradient needs the masks between a vertex and the sensor: their derivative, or, beside a zero
-        factor, their transmittance.
+        """Whether a gradient needs the masks between a vertex and the sensor.
+
+        It needs their derivative or, beside a zero factor, their transmittance.
         """
         return self.needs.has_null and (self.differentiate_null or self.track_zeros)
 
     @property
     def keep_geometry(self) -> bool:
-        """Whether a stored vertex must be found again on its surface."""
+        """Whether a stored vertex must contain the data to find it again on its surface."""
         return self.attached or self.needs.bsdfs_read_geometry or self.passage_in_gradient
 
     @property
@@ -265,8 +268,9 @@ class Plan:
         return result
 
     def concerns(self, bsdf: mi.BSDFPtr) -> mi.Bool:
-        """Return the lanes in which a vertex with this BSDF (a pointer) has something to differentiate, including masks
-        on its connection.
+        """Return the lanes in which a vertex with this BSDF (a pointer) depends on a differentiated parameter.
+
+        Masks on its connection count, too.
         """
         return mi.Bool(True) if self.differentiate_null else self.differentiates(bsdf)
 
@@ -280,7 +284,7 @@ class Plan:
     def differentiating(
         self, bsdfs: bool, emission: bool, track_zeros: bool, only_bsdfs: tuple[mi.BSDF, ...] = ()
     ) -> Plan:
-        """Return the same plan for a step that differentiates these; with `track_zeros`, some of their factors may be
+        """Return the same plan for a step that differentiates these. With `track_zeros`, some of their factors may be
         zero.
         """
         delta, null = self.needs.has_delta_lobes, self.needs.has_null
@@ -300,5 +304,5 @@ class Plan:
 
 
 def make_plan(needs: SceneNeeds, max_depth: int, rr_depth: int, hide_emitters: bool) -> Plan:
-    """Return the plan of a walk through a scene with these needs; `max_depth` may be -1."""
+    """Return the plan of a walk through a scene with these needs. `max_depth` may be -1."""
     return Plan(needs, UNBOUNDED if max_depth < 0 else max_depth, rr_depth, hide_emitters)

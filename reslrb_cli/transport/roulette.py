@@ -1,16 +1,18 @@
 """Russian roulette on throughput, as in `ptracer`, and learned roulette, by the direction of a path.
 
 The learned roulette ends paths in directions where earlier paths contributed little. The bounding box of the scene is
-divided into cubes, and the directions in each cube into octants. A path that leaves a vertex with throughput w (the
-largest channel, including emission and earlier roulette) survives with probability
+divided into cubes, and the directions in each cube into octants. A path that leaves a vertex with throughput w survives
+with probability q, and its weight is divided by q. w is the largest channel, including emission and earlier roulette. s
+is the value of the cell of the vertex and the new direction.
 
-    q = min(1, max(LEAST, w s))        s: the value of the cell of the vertex and the new direction
+    q = min(1, max(LEAST, w s))
 
-and its weight is divided by q. The expected value does not change for any s that does not depend on the random numbers
-that it is used with. `guiding/collect.py` explains how s is learned.
+The expected value does not change for any s that does not depend on the random numbers that it is used with.
+`guiding/collect.py` explains how s is learned.
 
-Paths with larger weights have a larger w, and so a larger q. Since q is at least w s where it is below 1, no throughput
-is raised beyond 1 / s_0, where s_0 is the smallest s. Roulette on throughput also applies from `rr_depth` on.
+Paths with larger weights have a larger w, and so a larger q. If q is below 1, it is at least w s. Therefore no
+throughput is raised beyond 1 / s_0, where s_0 is the smallest s. Roulette on throughput also applies from `rr_depth`
+on.
 """
 
 from __future__ import annotations
@@ -37,8 +39,10 @@ LEAST = 0.5  # smallest survival probability
 
 @dataclass
 class Survival:
-    """Learned roulette: `chances` (CELLS) are s of all cells, `corner` is the lower corner of the box, and `cubes` the
-    number of cubes per unit length along each axis. The latter two are opaque.
+    """Learned roulette. `chances` (CELLS) are s of all cells.
+
+    `corner` is the lower corner of the box, and `cubes` the number of cubes per unit length along each axis. Both are
+    opaque.
     """
 
     chances: mi.Float
@@ -58,11 +62,11 @@ class Survival:
 
     @staticmethod
     def certain() -> Survival:
-        """Return a roulette that no path ends by."""
+        """Return a roulette that ends no path."""
         return Survival.of(np.zeros((2, 3)), np.full(CELLS, np.inf))
 
     def cell(self, o: mi.Point3f, d: mi.Vector3f) -> mi.UInt32:
-        """Return the cell of a ray that leaves `o`; positions outside of the box belong to the nearest cube."""
+        """Return the cell of a ray that leaves `o`. Positions outside of the box belong to the nearest cube."""
         place, most = dr.detach((o - self.corner) * self.cubes), (1 << BITS) - 1
         result = mi.UInt32(0)
         for k in range(3):
@@ -73,24 +77,25 @@ class Survival:
         return result
 
     def probability(self, o: mi.Point3f, d: mi.Vector3f, throughput: mi.Float) -> mi.Float:
-        """Return q of a ray that leaves `o` along `d`; detached."""
+        """Return the detached q of a ray that leaves `o` along `d`."""
         # A throughput of NaN has q = LEAST, so that it stays visible.
         chance = dr.gather(mi.Float, self.chances, self.cell(o, d))
         return dr.fmin(dr.fmax(dr.detach(throughput) * chance, LEAST), 1)
 
 
 def box_of(scene: mi.Scene) -> Array:
-    """Return the box (2, 3) of a scene's shapes, float32; of size 0 without shapes."""
+    """Return the box (2, 3) of a scene's shapes, float32. Without shapes, its size is 0."""
     bounds = scene.bbox()
     box = np.array([np.array(bounds.min).ravel(), np.array(bounds.max).ravel()], np.float32)
     return box if np.isfinite(box).all() and (box[1] >= box[0]).all() else np.zeros((2, 3), np.float32)
 
 
 def first_eta(light: mi.Float, guided: mi.Float | None) -> mi.Float:
-    """Return the initial index of refraction of a path for roulette: larger if its emission `light` is dim.
+    """Return the initial index of refraction of a path for roulette, which is larger for dim emission `light`.
 
-    Otherwise, light of small lamps, or in large units, would end at once. `guided` is the weight of a guide and is
-    excluded, because paths that the guide samples often would end otherwise.
+    With an initial index of 1, roulette would end paths of small lamps at once, or all paths if the unit of light is
+    large. `guided` is the weight of a guide, and is excluded. Otherwise roulette would end paths that the guide samples
+    often.
     """
     if guided is None:
         return dr.rsqrt(dr.clip(light, DIMMEST, 1))
@@ -101,7 +106,7 @@ def play(
     plan: Plan, survival: Survival | None, depth: mi.UInt32, throughput: mi.Float, eta: mi.Float, o: mi.Point3f,
     d: mi.Vector3f, number: mi.Float,
 ) -> tuple[mi.Bool, mi.Float]:  # fmt: skip
-    """Return whether a path survives at vertex `depth`, which it leaves with the ray (o, d), and its weight."""
+    """Return whether a path survives at vertex `depth`, and its weight. It leaves the vertex with the ray (o, d)."""
     q, playing = mi.Float(1), mi.Bool(False)
     if plan.roulette:
         q = dr.minimum(throughput * dr.square(eta), LIMIT)

@@ -1,7 +1,7 @@
 """Samples of an image in passes: random numbers, number of paths, and film.
 
-Images and gradients of several passes are added. In single precision, a sum over all samples would lose the last ones
-(1e8 samples: a quarter of a pixel). Each pass therefore has its own block and gradients.
+Images and gradients of several passes are added. In single precision, a sum over very many samples would lose the last
+terms. With 1e8 samples, it would lose a quarter of a pixel. Each pass therefore has its own block and gradients.
 
 Random numbers are drawn in the order of Mitsuba's `ptracer`, used or not, so that both trace the same paths from one
 seed. Low-discrepancy numbers (`sobol.py`) replace the first ones.
@@ -29,7 +29,7 @@ def in_passes(
     samples: list[Samples], work: Callable[[Samples, mi.ImageBlock | None], None], block: mi.ImageBlock | None,
     params: mi.SceneParameters | None = None,
 ) -> None:  # fmt: skip
-    """Call `work(part, block)` for each pass, which splats into the block and adds gradients of `params`.
+    """Call `work(part, block)` for each pass. It splats into the block and adds gradients of `params`.
 
     `block` is None if nothing is splatted, and `params` is None if nothing is differentiated.
     """
@@ -75,12 +75,12 @@ class GradientSum:
 
 
 def _arrays(value: dr.ArrayBase | mi.AffineTransform4f) -> list[dr.ArrayBase]:
-    """Return the arrays of a parameter that have gradients; a transform, which cannot be added, has two."""
+    """Return the arrays of a parameter that have gradients. A transform cannot be added, so it has two arrays."""
     return [value.matrix, value.inverse_transpose] if isinstance(value, mi.AffineTransform4f) else [value]
 
 
 def finish_pass(*results: object) -> None:
-    """Evaluate the result of a pass and wait for it; queued passes would otherwise accumulate memory."""
+    """Evaluate the result of a pass and wait for it. Otherwise, queued passes would accumulate memory."""
     dr.eval(*results)
     dr.sync_thread()
 
@@ -106,11 +106,13 @@ class Numbers:
 
     @staticmethod
     def draw(sampler: mi.Sampler, active: mi.Bool) -> Numbers:
-        """Return the numbers of the next segment. The walk then draws the number of roulette."""
+        """Draw the numbers of the next segment. Afterwards, the walk draws the number of roulette."""
         return Numbers(sampler.next_2d(active), sampler.next_2d(active), sampler.next_1d(active))
 
     def of_early(self, early: list[Early], depth: mi.UInt32) -> Numbers:
-        """Return the same numbers, with those of `early` for the BSDFs of the first vertices; the first has depth 1."""
+        """Return these numbers, with `early` numbers for the BSDFs of the first vertices. The first vertex has
+        depth 1.
+        """
         bsdf = Early(self.bsdf_2d, self.bsdf_1d)
         for bounce, own in enumerate(early):
             bsdf = dr.select(depth == bounce + 1, own, bsdf)
@@ -130,8 +132,8 @@ class Samples:
     """Samples of one pass: `width` light paths, or camera paths if the plan says so. `seed` is an opaque UInt32.
 
     `scale` (width 1) normalises a sum over paths to an image. The pass contains the part `fraction` (width 1) of all
-    samples of this image. With a `guide`, emission is sampled from its table. With a `net`, numbers are of low
-    discrepancy.
+    samples of this image. With a `guide`, emission is sampled from its table. With a `net`, the first numbers are
+    low-discrepancy numbers.
     """
 
     scene: mi.Scene
@@ -161,7 +163,7 @@ class Samples:
         self._areas = sums_of_areas(lamps) if lamps else []
 
     def areas(self, lamp: Lamp) -> mi.Float | None:
-        """Return the cumulative areas of a lamp's faces if these move, else None."""
+        """Return the cumulative areas of a lamp's faces if these move, otherwise None."""
         reshaped = self.plan.reshaped_lamps
         return self._areas[reshaped.index(lamp)] if lamp in reshaped else None
 
@@ -191,21 +193,21 @@ class Samples:
         return sampler
 
     def sides(self) -> list[Samples]:
-        """Return these samples, and the camera paths that go with them."""
+        """Return these samples, and the camera paths of the same pass."""
         return [self] if self.camera is None else [self, self.camera]
 
     def stream(self, name: int) -> mi.PCG32:
         """Return a stream of random numbers independent of the sampler.
 
-        It is hashed for each lane, as in Mitsuba's samplers. Generators that differ only in the number of their
-        sequence start with numbers that are evenly distributed over the lanes, with the same offset for all seeds.
+        The stream is hashed for each lane, as in Mitsuba's samplers. Without the hash, the first numbers of the lanes
+        would be evenly distributed, with the same offset for all seeds.
         """
         seed = mi.sample_tea_32(self.seed, mi.UInt32(name))[0]
         state, sequence = mi.sample_tea_32(seed, dr.arange(mi.UInt32, self.width))
         return mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))
 
     def emission_numbers(self, sampler: mi.Sampler) -> tuple[mi.Float, mi.Point2f, mi.Point2f]:
-        """Return the numbers of emission in the order of `ptracer`: the choice of an emitter, the place, the
+        """Return the numbers of emission in the order of `ptracer`: the choice of an emitter, the place, and the
         direction.
         """
         choice, place, direction = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
@@ -214,7 +216,7 @@ class Samples:
         return self._points(choice, place, direction)[1]
 
     def early_numbers(self) -> list[Early]:
-        """Return the numbers of the BSDFs of the first vertices if they are of low discrepancy; otherwise an empty
+        """Return the numbers of the BSDFs of the first vertices if they are low-discrepancy numbers, otherwise an empty
         list.
         """
         if self.net is None:
@@ -227,7 +229,7 @@ class Samples:
     def _points(
         self, choice: mi.Float, place: mi.Point2f, direction: mi.Point2f
     ) -> tuple[Points, tuple[mi.Float, mi.Point2f, mi.Point2f]]:
-        """Return the points of the net, after those of emission have been drawn, and the numbers of emission.
+        """Return the points of the net after drawing the numbers of emission, and these numbers.
 
         The arguments are the corresponding independent numbers.
         """
@@ -245,7 +247,7 @@ class Samples:
         return points, (choice, place, direction)
 
     def drawn(self, choice: mi.Float, position: mi.Point2f, direction: mi.Point2f) -> Drawn | None:
-        """Return the start of each path from the guide, for emission's own numbers; None without a guide."""
+        """Return the start of each path from the guide, given emission's own numbers, or None without a guide."""
         if self.guide is None:
             return None
         assert self.plan.grid is not None
@@ -278,9 +280,9 @@ def passes(
     """Return all samples of an image, in passes of at most `spp_per_pass` samples per pixel, which must divide `spp`.
 
     The first pass has the seed itself, so that it traces the same paths as `ptracer`. With a `table` for the plan's
-    grid, emission is sampled from the table. If the plan has both kinds of paths, a share `light_share` of each pass
-    are light paths, and `emitters` contains their densities. Raises ValueError for too many passes, or too many paths
-    in one pass.
+    grid, emission is sampled from the table. If the plan has both kinds of paths, `light_share` is the share of light
+    paths in each pass, and `emitters` contains their densities. Raises ValueError for too many passes, or too many
+    paths in one pass.
     """
     unit = spp if spp_per_pass is None else min(spp_per_pass, spp)
     if spp % unit:
@@ -343,7 +345,7 @@ def _of_both(
     plan: Plan, scene: mi.Scene, sensor: mi.Sensor, film: Film, spp: int, fraction: mi.Float, light_share: float,
     table: Table | None, emitters: EmitterDensities | None, shares: Callable[[int], PixelShares | None] | None,
 ) -> Samples:  # fmt: skip
-    """Return light paths and camera paths, together `spp` samples per pixel; at least one of each."""
+    """Return light paths and camera paths, together `spp` samples per pixel. There is at least one of each kind."""
     pixels, crop = int(dr.prod(sensor.film().size())), int(dr.prod(film.size))
     width = max(round(light_share * spp * pixels), 1)
     n_camera = max(round((1 - light_share) * spp * crop), 1)
@@ -358,6 +360,6 @@ def _of_both(
 
 
 def _parts(spp: int) -> list[int]:
-    """Return sizes of the fewest parts of at most PASS_SAMPLES samples, which differ by 1 at most."""
+    """Divide `spp` into the fewest parts of at most PASS_SAMPLES samples. Their sizes differ by at most 1."""
     count = -(-spp // PASS_SAMPLES)
     return [spp // count + (part < spp % count) for part in range(count)]

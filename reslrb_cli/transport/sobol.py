@@ -1,18 +1,20 @@
 """Low-discrepancy numbers: scrambled Sobol points.
 
 They distribute the starts of light paths, and their first scattering events, evenly over all paths. The first number is
-stratified: lane i of n has it in the i-th n-th of [0, 1). n does not need to be a power of two, and similar paths are
-traced side by side. The other numbers are Sobol points with the lane number as index. Of 2^k consecutive lanes that
-start at a multiple of 2^k, every box of area 2^-k along the first two of these numbers, whose sides are [a, a + 1)
-times powers of two, contains exactly one point. Along more numbers, boxes contain few points each.
+stratified: [0, 1) is divided into n equal intervals for n lanes, and the number of lane i lies in interval i. n does
+not need to be a power of two, and similar paths are traced side by side.
 
-Points are scrambled for every pass: binary digits are permuted, each by a permutation that depends on the digits before
-it (Owen 1995), which preserves the boxes. The permutations are hashes, as in Laine and Karras (2011), Burley (2020) and
-Vegdahl (2022). A random number is added to each coordinate, so each point is uniformly distributed for any hash. A sum
-over the lanes is therefore unbiased, and sums of different seeds are independent. Direction numbers are those of Joe
-and Kuo (2008).
+The other numbers are Sobol points with the lane number as index. Take 2^k consecutive lanes that start at a multiple of
+2^k, and boxes of area 2^-k along the first two of these numbers, with sides [a, a + 1) times powers of two. Every such
+box contains exactly one point. Boxes along more numbers contain few points each.
 
-Digits are stored in reverse order, the first one lowest, so that sums and products carry only to later digits.
+Points are scrambled for every pass (Owen 1995). Each binary digit is permuted by a permutation that depends on the
+digits before it, which preserves the boxes. The permutations are hashes, as in Laine and Karras (2011), Burley (2020)
+and Vegdahl (2022). A random number is added to each coordinate, so each point is uniformly distributed for any hash. A
+sum over the lanes is therefore unbiased, and sums of different seeds are independent. Direction numbers are those of
+Joe and Kuo (2008).
+
+Digits are stored in reverse order, with the first one lowest. Sums and products then carry only to later digits.
 """
 
 from __future__ import annotations
@@ -45,8 +47,9 @@ BOUNCES = 2
 
 @cache
 def directions(coordinate: int) -> tuple[int, ...]:
-    """Return the number that each binary digit of an index, the lowest first, adds (modulo 2) to the point's 32
-    digits.
+    """Return a direction number for each binary digit of an index, from the lowest digit on.
+
+    It is added (modulo 2) to the 32 digits of the point.
     """
     if coordinate == 0:
         return tuple(1 << k for k in range(DIGITS))
@@ -66,7 +69,7 @@ def _reversed(digits: int) -> int:
 
 
 def point(index: mi.UInt32, coordinate: int, digits: int = DIGITS) -> mi.UInt32:
-    """Return the digits of a coordinate of the Sobol points with these indices, which have at most `digits` binary
+    """Return the digits of a coordinate of the Sobol points with these indices. Indices have at most `digits` binary
     digits.
     """
     if coordinate == 0:
@@ -78,7 +81,7 @@ def point(index: mi.UInt32, coordinate: int, digits: int = DIGITS) -> mi.UInt32:
 
 
 def scrambled(point: mi.UInt32, shift: mi.UInt32, key: mi.UInt32) -> mi.UInt32:
-    """Return the digits, each permuted by the digits before it; uniformly distributed over all `shift`."""
+    """Return the digits after scrambling. Over all values of `shift`, the result is uniformly distributed."""
     x = point ^ (point * 0x3D20ADEA)
     x = (x + shift) * (key | 1)
     x ^= x * 0x05526C56
@@ -87,10 +90,10 @@ def scrambled(point: mi.UInt32, shift: mi.UInt32, key: mi.UInt32) -> mi.UInt32:
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Numbers of a path that are coordinates of its point.
+    """Random numbers of a path that are coordinates of its Sobol point.
 
-    They are the numbers that emitters use (the choice, the two of the place and those of the direction), and three
-    numbers of each of the first `bounces` scattering events.
+    These are the numbers that emitters use (the choice, the place and the direction), and three numbers for each of the
+    first `bounces` scattering events.
     """
 
     choice: bool
@@ -100,8 +103,8 @@ class Coordinates:
 
 
 def make_coordinates(used: Sequence[bool], emitters: int, max_depth: int) -> Coordinates:
-    """Return the coordinates for this number of emitters, which use these of the four numbers of place and
-    direction.
+    """Return the coordinates for this number of emitters. `used` tells which numbers of place and direction they
+    use.
     """
     bounces = min(max(max_depth - 2, 0), BOUNCES)
     return Coordinates(emitters > 1, (used[0], used[1]), (used[2], used[3]), bounces)
@@ -109,7 +112,7 @@ def make_coordinates(used: Sequence[bool], emitters: int, max_depth: int) -> Coo
 
 @dataclass
 class Net:
-    """Distance of lanes in the first coordinate, in 2^-64 (opaque, width 1)."""
+    """Distance of lanes in the first coordinate, in units of 2^-64 (opaque, width 1)."""
 
     step: mi.UInt64
 
@@ -119,15 +122,15 @@ class Net:
         return Net(dr.opaque(mi.UInt64, min(2**64 // width, 2**64 - 1)))
 
     def stratified(self, lane: mi.UInt32, jitter: mi.Float) -> mi.Float:
-        """Return the first coordinate; `jitter` in [0, 1) is the position in its stratum."""
+        """Return the first coordinate. `jitter` in [0, 1) is the position in its interval."""
         within = mi.UInt64(mi.UInt32(jitter * 2.0**24)) * (self.step >> 24)
         return _float(mi.UInt32((mi.UInt64(lane) * self.step + within) >> 32))
 
 
 class Points:
-    """Coordinates of the lanes' points, returned in order, from `used` on; `seed` is opaque.
+    """Coordinates of the lanes' points, returned in order, from `used` on. `seed` is opaque.
 
-    With `net`, the first requested coordinate is stratified. Without, a guide has stratified the lanes already.
+    With `net`, the first requested coordinate is stratified. Without a net, a guide has stratified the lanes already.
     """
 
     def __init__(self, seed: mi.UInt32, width: int, net: Net | None, used: int = 0) -> None:
@@ -136,7 +139,9 @@ class Points:
         self.digits = 24 if width <= 2**24 else DIGITS
 
     def next_1d(self, independent: mi.Float | None = None) -> mi.Float:
-        """Return the next coordinate, in [0, 1), in place of the random number `independent`, which strata use."""
+        """Return the next coordinate, in [0, 1). It replaces the random number `independent`, which is used within
+        intervals.
+        """
         if self.net is not None:
             assert independent is not None
             net, self.net = self.net, None
@@ -147,11 +152,11 @@ class Points:
         return _float(dr.brev(scrambled(digits, shift, key)))
 
     def next_2d(self, independent: mi.Point2f | None = None, used: tuple[bool, bool] = (True, True)) -> mi.Point2f:
-        """Return the next two coordinates, in place of the numbers that are `used`."""
+        """Return the next two coordinates. They replace the random numbers that are `used`."""
         own = mi.Point2f(0.5) if independent is None else independent
         return mi.Point2f(*(self.next_1d(u) if used[k] else u for k, u in enumerate((own.x, own.y))))
 
 
 def _float(digits: mi.UInt32) -> mi.Float:
-    """Return a number in [0, 1) from digits whose first is the highest bit."""
+    """Return a number in [0, 1) from digits. The highest bit is the first digit."""
     return mi.Float(digits >> 8) * 2.0**-24

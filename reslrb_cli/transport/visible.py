@@ -1,18 +1,18 @@
 """Directly visible emitters: C_0, by points on lamps that move or are small, and by primary rays.
 
-By points on lamps, instead of primary rays:
+Points on lamps have this contribution at film position u(x).
 
-    C_0 = Le(x) |n . w| W(x) / p(x)        at film position u(x)
+    C_0 = Le(x) |n . w| W(x) / p(x)
 
-For moving lamps, this form has the derivative with respect to their position: film position, normal and density move
-with the lamp. The outline of the lamp is included, because points at its rim move, too. Occlusion of and by the lamp is
-missing. The light itself, and its derivative with respect to radiance, comes from primary rays.
+For moving lamps, this form has the derivative with respect to their position, because film position, normal and density
+move with the lamp. The outline of the lamp is included, because points at its rim move, too. Occlusion of and by the
+lamp is missing. Primary rays give the light itself, and its derivative with respect to radiance.
 
-Primary rays rarely hit lamps smaller than a pixel. For these, the form above is the light itself.
+Primary rays rarely hit lamps smaller than a pixel. For these lamps, points give the light itself.
 
-There is one primary ray per light path, with its own samples. The lanes are distributed evenly over the pixels, so that
-a constant background has no noise. Connecting random points of the emitters to the sensor, as `ptracer` does, has more
-noise for larger emitters.
+There is one primary ray per light path, with its own samples. The rays are distributed evenly over the pixels, so a
+constant background has no noise. `ptracer` connects random points of the emitters to the sensor, which has more noise
+for larger emitters.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ from reslrb_cli.transport.samples import LAMP_STREAM, SMALL_LAMP_STREAM, VISIBLE
 def moving_splats(samples: Samples) -> Iterator[tuple[mi.Point2f, mi.Spectrum, mi.Bool]]:
     """Yield film position u, C_0 (C,) and the active lanes for each visible lamp that moves.
 
-    u and C_0 have derivatives if gradients are enabled. Their light is already in the image.
+    If gradients are enabled, u and C_0 have derivatives. Primary rays have already added the light of these lamps to
+    the image.
     """
     for lamp in samples.plan.visible_moving_lamps:
         point = _points(samples, (lamp,), mi.UInt32(lamp.index), samples.numbers(LAMP_STREAM + lamp.index), True)
@@ -46,14 +47,14 @@ def moving_splats(samples: Samples) -> Iterator[tuple[mi.Point2f, mi.Spectrum, m
 def small_splat(samples: Samples) -> tuple[mi.Point2f, mi.Spectrum, mi.Bool]:
     """Return film position u, C_0 (C,) and the active lanes for lamps smaller than a pixel.
 
-    C_0 has its derivative with respect to radiance if gradients are enabled.
+    If gradients are enabled, C_0 has its derivative with respect to radiance.
     """
     point = small_points(samples)
     return point.u, dr.select(point.active, point.radiance() * point.weight, 0), point.active
 
 
 def small_points(samples: Samples) -> LampPoints:
-    """Return points on the lamps smaller than a pixel, which take turns; detached."""
+    """Return detached points on the lamps smaller than a pixel. The lanes go through these lamps in turn."""
     lamps, numbers = samples.plan.small_lamps, samples.numbers(SMALL_LAMP_STREAM)
     count, lane = dr.opaque(mi.UInt32, samples.width), dr.arange(mi.UInt32, samples.width)
     turn, index = lane % len(lamps), mi.UInt32(lamps[0].index)
@@ -67,7 +68,7 @@ def small_points(samples: Samples) -> LampPoints:
 
 @dataclass
 class LampPoints:
-    """Points on lamps as the sensor sees them: `weight` (C,) is C_0 / radiance, normalised for the image."""
+    """Points on lamps as seen from the sensor. `weight` (C,) is C_0 / radiance, normalised for the image."""
 
     emitter: mi.EmitterPtr
     si: mi.SurfaceInteraction3f
@@ -127,7 +128,7 @@ class PrimaryRay:
 def primary_ray(samples: Samples) -> PrimaryRay:
     """Return a primary ray for each path, distributed evenly over the pixels of the crop window.
 
-    Their random numbers are a separate stream.
+    The rays have their own stream of random numbers.
     """
     plan, sensor, width, sampler = samples.plan, samples.sensor, samples.width, samples.numbers(VISIBLE_STREAM)
     size = sensor.film().crop_size()
@@ -145,8 +146,9 @@ def primary_ray(samples: Samples) -> PrimaryRay:
 
 @dataclass
 class _Look:
-    """Loop state of a primary ray on its way through null surfaces; `tangents`, in forward mode, are the derivatives of
-    transmittance and radiance.
+    """Loop state of a primary ray on its way through null surfaces.
+
+    In forward mode, `tangents` are the derivatives of transmittance and radiance.
     """
 
     active: mi.Bool
@@ -174,7 +176,8 @@ def visible_tangent(plan: Plan, scene: mi.Scene, primary: PrimaryRay) -> mi.Spec
 def differentiate_visible_radiance(plan: Plan, scene: mi.Scene, primary: PrimaryRay, adjoint: mi.Spectrum) -> None:
     """Add the derivatives of the radiance along the primary rays, times `adjoint` (C,), to the parameters.
 
-    Transmission is divided out of the radiance behind it, which a first look measures.
+    The derivative with respect to a transmission needs the radiance behind the surface. A first pass measures the
+    radiance at the sensor, which is then divided by the transmission.
     """
     masks = plan.differentiate_null
     total = visible_radiance(plan, scene, primary) if masks else mi.Spectrum(0)
@@ -193,7 +196,9 @@ def differentiate_visible_radiance(plan: Plan, scene: mi.Scene, primary: Primary
 
 
 def _radiance(plan: Plan, scene: mi.Scene, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
-    """Return the radiance (C,) that leaves `si`, without lamps smaller than a pixel, which have their own samples."""
+    """Return the radiance (C,) that leaves `si`. Lamps smaller than a pixel are left out, because they have their own
+    samples.
+    """
     emitter = si.emitter(scene)
     for lamp in plan.small_lamps:
         active = active & (emitter != mi.EmitterPtr(lamp.emitter))

@@ -1,14 +1,14 @@
 """The only light-path loop: random numbers, segment, hooks, roulette.
 
-The hooks process the connections (`Hooks` is the interface between a walk and an estimator). No estimator or integrator
+The hooks process the connections. `Hooks` is the interface between a walk and an estimator. No estimator or integrator
 repeats the loop.
 
-One segment of a light path leads from the ray that reaches a vertex to its connection, the scattering event, and the
-next ray. It depends only on the ray, the intersection, the random numbers of the segment, and the scene, so it can be
-evaluated again from these.
+One segment of a light path starts with the ray that reaches a vertex. It consists of the vertex's connection, the
+scattering event, and the next ray. It depends only on the ray, the intersection, the random numbers of the segment, and
+the scene. It can therefore be evaluated again from these.
 
 Random numbers are drawn in the order of Mitsuba's `ptracer`, so that both trace the same paths from the same seed.
-Numbers for selections by hooks come from a separate stream, so that a replay that selects nothing meets the same
+Numbers for selections by hooks come from a separate stream. A replay that selects nothing therefore visits the same
 vertices.
 """
 
@@ -33,7 +33,7 @@ from reslrb_cli.transport.weights import Rivals, cosine, leave_emitter, weight_o
 
 @dataclass
 class Vertex(Hit):
-    """Current vertex for hooks; `product` does not include the vertex's own scattering."""
+    """Current vertex for hooks. `product` does not include the vertex's own scattering."""
 
     pi: mi.PreliminaryIntersection3f
     depth: mi.UInt32
@@ -46,11 +46,11 @@ class Hooks:
 
     - `numbers` is the number of random numbers that `vertex` gets at each vertex.
     - Without `connects`, no connection is evaluated, and `vertex` gets only its geometry.
-    - With `replaying`, the path is known to continue as far as `goes_on` requests, so throughput and roulette are not
-      computed.
+    - With `replaying`, the path is known to continue as far as `goes_on` requests. Throughput and roulette are then not
+        computed.
     - `tracked` hooks keep derivatives of the factors in the loop state, and the loop is evaluated vertex by vertex
-      (naive AD). With `max_iterations`, the loop stays symbolic, and Dr.Jit reverses it from a record of the loop state
-      in thread-local memory. If the hooks are also `attached`, the rays have derivatives, too.
+        (naive AD). With `max_iterations`, the loop stays symbolic, and Dr.Jit reverses it from a record of the loop
+        state in thread-local memory. If the hooks are also `attached`, the rays have derivatives, too.
     """
 
     numbers: int = 0
@@ -61,7 +61,7 @@ class Hooks:
     max_iterations: int | None = None
 
     def start(self, product: Product) -> Any:
-        """Return the state before the first vertex, any PyTree; `product` is E."""
+        """Return the state before the first vertex, any PyTree. `product` is E."""
         return []
 
     def seen(self, vertex: Vertex) -> Seen | None:
@@ -69,11 +69,11 @@ class Hooks:
         return None
 
     def wants(self, state: Any, vertex: Vertex) -> mi.Bool:
-        """Return the lanes that need a connection from this vertex; others trace no shadow ray."""
+        """Return the lanes that need a connection from this vertex. Other lanes trace no shadow ray."""
         return mi.Bool(True)
 
     def goes_on(self, state: Any, vertex: Vertex) -> mi.Bool:
-        """Return the lanes that continue from this vertex, as far as the hooks are concerned."""
+        """Return the lanes that the hooks continue from this vertex."""
         return mi.Bool(True)
 
     def is_followed(self, state: Any, vertex: Vertex) -> mi.Bool:
@@ -90,8 +90,8 @@ class Hooks:
         return state
 
     def survived(self, state: Any, weight: mi.Float) -> Any:
-        """Return the state after roulette has multiplied the path's product by `weight`, which is 1 without
-        roulette.
+        """Return the state after roulette has multiplied the path's product by `weight`. Without roulette, the weight
+        is 1.
         """
         return state
 
@@ -118,8 +118,9 @@ class Splat(Hooks):
 
 @dataclass
 class Segment:
-    """Segment from a vertex, without visibility: `connection.c` is not set, and `connection.active` says whether the
-    sensor would see the vertex without occlusion.
+    """Segment from a vertex, without visibility.
+
+    `connection.c` is not set. `connection.active` tells whether the sensor would see the vertex without occlusion.
     """
 
     si: mi.SurfaceInteraction3f
@@ -141,11 +142,12 @@ def find_vertex(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool
 def find_following_vertex(
     ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> tuple[mi.SurfaceInteraction3f, mi.Ray3f, mi.Float]:
-    """Return the surface interaction of a vertex that stays at its place on its surface, and moves only with it.
+    """Return the surface interaction of a vertex that stays at its place on its surface, and moves only with the
+    surface.
 
-    Also returns the ray that reaches the vertex, whose direction changes with both ends, and the factor (1, with a
-    derivative) that converts a measure of directions at the ray's origin to one on the surface: |cos| / distance^2
-    times the stretching of the surface.
+    Also returns the ray that reaches the vertex, and a factor. The direction of the ray changes with both ends. The
+    factor has the value 1 and a derivative. It converts a measure of directions at the ray's origin to a measure on the
+    surface, and is |cos| / distance^2 times the stretching of the surface.
     """
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
     there = si.p - ray.o
@@ -165,8 +167,8 @@ def segment(
     """Return the segment from a vertex, with `connected` and `scattered` lanes.
 
     Without `evaluates`, the BSDF is not evaluated towards the sensor. With `tracked`, the scattering weight has
-    derivatives of the scene's parameters if gradients are enabled, and the connection is evaluated later if it is
-    visible; directions, densities and film positions have no derivatives. With `attached`, everything has derivatives.
+    derivatives of the scene's parameters if gradients are enabled. The connection is then evaluated later, if it is
+    visible. Directions, densities and film positions have no derivatives. With `attached`, everything has derivatives.
     `aimed` lanes scatter to their points.
     """
     plan, si = samples.plan, hit.si
@@ -334,8 +336,8 @@ def intersect(
 
 
 def _without_masks(path: Path) -> Path:
-    """Return the path without masks, for a record of the loop state: masked writes of booleans to thread-local memory
-    end the process.
+    """Return the path without masks, for a record of the loop state. Masked writes of booleans to thread-local memory
+    crash the process.
     """
     path.pi.valid = mi.Bool(True)
     return replace(path, active=dr.select(path.active, mi.UInt32(1), 0))

@@ -1,17 +1,21 @@
 """Weights of paths that both sides can find: the balance heuristic.
 
-A path z_0 (sensor), z_1 .. z_{K-1} (surfaces), z_K (on an emitter) can be found in three ways: a camera path meets the
+A path z_0 (sensor), z_1 .. z_{K-1} (surfaces), z_K (on an emitter) can be found in three ways. A camera path hits the
 emitter (H), its last vertex z_{K-1} samples the emitter (N, next event), or a light path's last vertex z_1 connects to
-the sensor (L). The weight of each way is its density over the sum of all three, so that w_H + w_N + w_L = 1. The
+the sensor (L). The weight of each way is its density divided by the sum of all three, so w_H + w_N + w_L = 1. The
 weights depend only on the path, and have no derivative.
 
-Each walk carries two numbers: M, the density of the other walk that joins at the newest vertex, relative to its own,
-and V, that of the other ways from earlier vertices. p and p~ are the BSDF's densities of the direction taken, and of
-the way back in the other walk; c is the |cosine| of the direction taken, d the length of the segment; N is the number
-of all light paths over that of the camera paths of a pixel, and p_cam the sensor's density of a direction for one
-pixel. For an emitter, e is the density of its rays (of place and direction) over the cosine at its surface, if it has
-one, and p_D the density with which next event estimation samples its directions as a vertex sees them; both include the
-choice of the emitter.
+Each walk carries two numbers. M is the density of the other walk that joins at the newest vertex, relative to its own
+density. V is the density of the other ways from earlier vertices. These symbols are used below.
+
+- p and p~ are the BSDF's densities of the direction taken, and of the reverse direction in the other walk.
+- c is the |cosine| of the direction taken, and d the length of the segment.
+- N is the number of all light paths divided by that of the camera paths of a pixel.
+- p_cam is the sensor's density of a direction for one pixel.
+- e is the density of an emitter's rays (of place and direction) divided by the cosine at its surface, if it has one.
+- p_D is the density with which next event estimation samples an emitter's directions at a vertex.
+
+Both e and p_D include the choice of the emitter.
 
     every arrival     M *= d^2 (not from infinity);  M, V /= |cos| at the surface that is reached
     camera walk       start: M = N / p_cam, V = 0.    m = M at the first vertex, V p~ at later ones
@@ -22,9 +26,9 @@ choice of the emitter.
       connection      w_L = 1 / (1 + p_camA / N (M + V p~))        p_camA: p_cam as a density of area at the vertex
       smooth event    V = (c / p) (M + V p~), then M = 0 for good  delta event   V *= c,  M = 0
 
-A null event is no vertex: M and V stay the same, and d continues. Roulette, guiding and aiming are not in the weights,
-which sum to 1 nevertheless. Source: Georgiev 2012, "Implementing Vertex Connection and Merging", whose recursion
-weights all connections; this is its restriction to three ways.
+A null event is no vertex: M and V stay the same, and d continues. The weights do not include roulette, guiding and
+aiming, but still sum to 1. Source: Georgiev 2012, "Implementing Vertex Connection and Merging". Its recursion weights
+all connections. This is the restriction to three ways.
 """
 
 from __future__ import annotations
@@ -45,11 +49,10 @@ FROM_INFINITY = -1e30  # the length so far of a path that comes from infinity
 
 @dataclass
 class Rivals:
-    """Loop state: M and V of a walk before the arrival at its current vertex, and d since the last vertex that is no
-    null event.
+    """Loop state: M and V of a walk before the arrival at its current vertex, and d since the last vertex.
 
-    If any lamp is a sphere (whose p_D depends on the vertex), `sphere` is the number of the shape that the path comes
-    from, and 0 for other shapes.
+    Null events are no vertices. p_D of a sphere depends on the vertex. If any lamp is a sphere, `sphere` is therefore
+    the number of the shape that the path comes from, or 0 for other shapes.
     """
 
     M: mi.Float
@@ -71,11 +74,11 @@ class Rivals:
         return Rivals(M, self.V / cos, d, self.sphere)
 
     def after_null(self, arrived: Rivals) -> Rivals:
-        """Return M and V after a null event; `arrived` are those at the vertex."""
+        """Return M and V after a null event. `arrived` has their values at the vertex."""
         return replace(self, distance=arrived.distance)
 
     def after(self, renewed: mi.Float, joined: mi.Float, scattering: Scattering, cos: mi.Float) -> Rivals:
-        """Return M and V after an event: M is `renewed` by a smooth event, and V is computed from `joined`."""
+        """Return M and V after an event. A smooth event replaces M by `renewed`, and V is computed from `joined`."""
         p, is_delta = scattering.ways.p, scattering.is_delta
         V = dr.select(is_delta, self.V * cos, dr.select(joined > 0, cos / p * joined, 0))
         sphere = [mi.UInt32(0) for _ in self.sphere]
@@ -100,7 +103,9 @@ def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission
     def leave(
         self: mi.Emitter, time: mi.Float, position: mi.Point2f, o: mi.Point3f, d: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float, mi.Point2f, mi.Float, mi.Float]:  # fmt: skip
-        """Return the density of places or directions, the cosine, texture coordinates, whether there is a V, and d."""
+        """Return five numbers: the density of places or directions, the cosine, texture coordinates, 1 if there is a V,
+        and d.
+        """
         one, zero = mi.Float(1), mi.Float(0)
         lamp = lamps.get(self)
         if lamp is not None and not lamp.parallel:
@@ -151,6 +156,8 @@ def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission
 def weight_of_connection(
     arrived: Rivals, p_camA: mi.Float, N: mi.Float, back: mi.Float
 ) -> mi.Float:  # fmt: skip
-    """Return w_L of a connection to the sensor; `back` is p~, the density of the way from the sensor on."""
+    """Return w_L of a connection to the sensor. `back` is p~, the density of the continuation of a path from the
+    sensor.
+    """
     rivals = p_camA / N * (arrived.M + arrived.V * back)
     return dr.rcp(1 + dr.select(p_camA > 0, rivals, 0))

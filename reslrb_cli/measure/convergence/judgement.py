@@ -39,7 +39,7 @@ class ConvergenceResults:
 
 @dataclass(frozen=True)
 class _Bias:
-    """Bias of one parameter, or the worst of all of them; fields are as in a `MethodRecord`."""
+    """Bias of one parameter, or the worst bias of all parameters. The fields are as in a `MethodRecord`."""
 
     biased: bool | None = None
     bias_z: float | None = None
@@ -62,13 +62,13 @@ class Judgement:
                 self._whole = {key: ReferenceMean(self._rows(found, place)) for key, place in self._places().items()}
 
     def _places(self) -> dict[str, slice]:
-        """Return the place of each parameter, and of all together unless the image is estimated."""
+        """Return the slice of each parameter, and of all parameters together. Images have only the latter."""
         if "image" in self._slices:
             return self._slices
         return self._slices | {ALL: slice(None)}
 
     def _rows(self, member: Member, place: slice) -> np.ndarray:
-        """Return independent estimates by a reference; steps with the same of several dL/dI are combined."""
+        """Return independent estimates by a reference. Steps with the same of several dL/dI are combined."""
         several = self._session.plan.objective == "loss" and len(set(member.turns)) > IMAGES
         return member.means(place, IMAGES if several else None)
 
@@ -78,7 +78,7 @@ class Judgement:
         return bool(self._whole)
 
     def overall(self, member: Member) -> MethodRecord:
-        """Return the figures of all parameters together (or the image), without biases."""
+        """Return the figures of all parameters together, or of the image, without biases."""
         key = next(reversed(self._places()))
         return self._method(member, key, self._places()[key], _Bias())
 
@@ -110,7 +110,9 @@ class Judgement:
     # --- bias ---------------------------------------------------------------------------------------------------------
 
     def _judge(self, member: Member, key: str) -> Member | None:
-        """Return the member that tests for bias: an independent stock integrator, otherwise the reference."""
+        """Return the member that tests for bias: an independent stock integrator if there is one, otherwise the
+        reference.
+        """
         session = self._session
         reference = session.of(Role.REFERENCE)[0]
         stock = session.judges.get(session.facts["independent"][key] or "")
@@ -218,7 +220,7 @@ _UNSEEN = "nothing exceeds the reference's noise"
 
 
 def _kin(member: Member) -> str:
-    """Return whose code traces a member's paths: that of `reslrb`, or a stock integrator."""
+    """Return whose code traces a member's paths: `reslrb`, or a stock integrator."""
     name = member.method.integrator
     return name if name in ("ptracer", "prb") else "ours"
 

@@ -1,7 +1,7 @@
 """Processes of a `convergence`: the compared methods, the reference, and the tests for bias.
 
-All take turns (`Arena`), with their own seeds, so that no two share noise. A session may continue from the steps of an
-earlier one, with the same dL/dI.
+All members take turns (`Arena`), with their own seeds, so no two share noise. A session may continue from the steps of
+an earlier one, with the same dL/dI.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Session(Arena[Plan, Member]):
         return [member for member in self.members if member.role is role]
 
     def run(self) -> Iterator[int]:
-        """Measure; yield the number of rounds after each of them. Ends early, with the finished results, after
+        """Measure. Yields the number of completed rounds after each round. Ends early, with the finished results, after
         `stop()`.
 
         Raises Refused if a required member cannot start.
@@ -66,9 +66,9 @@ class Session(Arena[Plan, Member]):
         self._say_what_it_takes()
 
     def kept(self) -> Kept | None:
-        """Return the data for a later session; None if nothing has been sampled.
+        """Return the data for a later session, or None if nothing has been sampled.
 
-        A method that was left out, or never took a step, has none there, so that it is tried again.
+        The data leave out methods that were left out or never took a step, so that a later session tries them again.
         """
         if not self.rounds or not any(member.rows for member in self.members):
             return None
@@ -100,7 +100,7 @@ class Session(Arena[Plan, Member]):
     # --- before the rounds --------------------------------------------------------------------------------------------
 
     def _survey(self) -> bool:
-        """Find the references, and make dL/dI; return false if time is up."""
+        """Find the references, and make dL/dI. Returns false if time is up."""
         plan = self.plan
         if self._earlier is not None:
             found = {name: array for (what, name), array in self._earlier.samples.items() if what == "survey"}
@@ -210,7 +210,7 @@ class Session(Arena[Plan, Member]):
         return sum(member.count * member.step_s for member in self._alive())
 
     def _say_what_it_takes(self) -> None:
-        """Print the budget that would suffice for figures, or for slopes, if this one did not."""
+        """Print the budget that would suffice for figures, or for slopes, if the actual budget did not suffice."""
         late = [member for member in self.members if member.late]
         taken = self.rounds - self._before
         if taken >= self._fewest and not late:

@@ -1,6 +1,6 @@
-"""Members of a `convergence`, the facts found before it measures (`survey`), and the steps of a member (`Sampler`).
+"""Members of a `convergence`, the facts that precede the measurement (`survey`), and the steps of a member (`Sampler`).
 
-Both run in separate processes (`workers.py`), which `begin_survey` and `begin_sampling` start.
+Survey and sampler run in separate processes (`workers.py`), which `begin_survey` and `begin_sampling` start.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ class Role(str, enum.Enum):
 class Member(Stepping):
     """Process with its steps so far and its steps per turn.
 
-    `rows` are samples (P,), `turns` are their rounds, and `seconds` the time of one step in each turn. `count` is the
-    number of steps of a turn, and `taken` that of all requested steps, which determines the seeds.
+    `rows` are samples (P,), `turns` are their rounds, and `seconds` has the time of one step in each turn. `count` is
+    the number of steps in a turn. `taken` is the number of all requested steps, which determines the seeds.
     """
 
     role: Role
@@ -90,7 +90,7 @@ class Member(Stepping):
 
     @property
     def cold_s(self) -> float | None:
-        """Seconds of the first step, which compiles."""
+        """Seconds of the first step, which includes compilation."""
         return None if self.cold is None else self.cold["step_ms"][0] / 1e3
 
     @property
@@ -99,7 +99,7 @@ class Member(Stepping):
         return f"{self.role.value} {self.label}"
 
     def question(self, round: int | None) -> dict[str, Any]:
-        """Return the request for the steps of a turn, with the round's dL/dI; one step during warm-up."""
+        """Return the request for the steps of a turn, with the round's dL/dI. During warm-up, a turn has one step."""
         start, count = self.taken, 1 if round is None else self.count
         self.taken += count
         return {"start": start, "count": count, "spp": self.spp, "image": round or 0, "out": str(self.out)}
@@ -115,9 +115,9 @@ class Member(Stepping):
         self.seconds.append(float(np.mean(times[1:] if len(times) > 1 else times)) / 1e3)
 
     def kept(self, rounds: int) -> tuple[dict[str, Any], np.ndarray]:
-        """Return the data for a later session, for JSON, and the samples (N, P) of this number of rounds.
+        """Return the data of the first `rounds` rounds for a later session: a JSON object, and the samples (N, P).
 
-        An interrupted round is left out; the next session repeats it with other seeds.
+        An interrupted round is left out. The next session repeats it with other seeds.
         """
         turns = [turn for turn in self.turns if turn < rounds]
         entry = {"name": self.name, "config": dump(self.config), "taken": self.taken, "turns": turns,
@@ -126,7 +126,7 @@ class Member(Stepping):
         return entry, np.array(self.rows[: len(turns)], np.float32)
 
     def restore(self, entry: dict[str, Any], rows: np.ndarray) -> None:
-        """Restore the result of `kept`; members that have ended are not tried again."""
+        """Restore the result of `kept`. Members that have ended are not tried again."""
         for name in ("taken", "turns", "seconds", "message", "cold"):
             setattr(self, name, entry[name])
         self.rows, self.end = list(rows), entry["end"] and Ended(**entry["end"])
@@ -142,9 +142,9 @@ class Member(Stepping):
 
 
 def share_turns(members: list[Member], fixed: bool) -> None:
-    """Set the number of steps per turn of each member for about equal times; fast methods take more steps.
+    """Set the number of steps per turn of each member so that turns take about equal times.
 
-    With `fixed`, all take this number.
+    With `fixed`, every member takes this number.
     """
     for member in members if fixed else ():
         member.count = FIXED[member.role.value]
@@ -182,7 +182,9 @@ _PURPOSE = "convergence, dL/dI"
 
 
 def begin_survey(first: dict[str, Any]) -> Begun:
-    """Start the process. The only request names the file for arrays, `out`; its answer is `survey`'s facts."""
+    """Start the process. Its only request has the name of the file for arrays, `out`. The answer has the facts of
+    `survey`.
+    """
     problem = assemble_scene(told(first).with_exposures_fixed())
 
     def answer(question: dict[str, Any]) -> dict[str, Any]:
@@ -198,18 +200,19 @@ def survey(
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return the facts of a problem without targets, and the arrays for its samples.
 
-    The facts:
+    The facts have these keys.
 
-    - `keys` and `shapes` of the estimated quantities (of the parameters, or `image`)
-    - `independent` (key to the name of a stock integrator, or None), and `why` (key to the reason against others)
-    - `without` (stock integrators that are right for nothing here, with the reason)
-    - `paths` (those of the reference, which determine everything here)
-    - `masked` (whether pixels along the border are left out), and `pixels`
-    - `pictures`, the rendered images in words
+    - `keys` and `shapes` of the estimated quantities: parameters, or `image`.
+    - `independent`: the valid stock integrator for each key, or None. `why`: the reason against others for each key.
+    - `without`: stock integrators that are valid for no key, with the reason.
+    - `paths`: the paths of the reference, which determine the reference's light.
+    - `masked`: whether pixels along the border are left out. `pixels`: the number of pixels.
+    - `pictures`: a description of the rendered images.
 
     The arrays are `mask` (H, W, 1) and, unless the image is the objective, the first view's `target_arrays` and
-    `adjoints` (B, H, W, C). `camera`: camera paths take part, if they are right or `named`, which lose nothing at the
-    film's border; `light`: methods take part that do. `budget_s` is the time of the whole measurement, if it matters.
+    `adjoints` (B, H, W, C). `camera` is true if camera paths take part, if they are valid or `named`; they have no dark
+    film border. `light` is true if methods with a dark film border take part. `budget_s` is the time of the whole
+    measurement, if it is limited.
     """
     film = problem.scene.sensors()[problem.sensors[0]].film()
     width, height = (int(n) for n in film.crop_size())
@@ -238,7 +241,7 @@ def survey(
 
 
 def adjoint(problem: Problem, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return dL/dI (H, W, C) at an image of this shape, without the pixels whose `mask` (H, W, 1) is 0."""
+    """Return dL/dI (H, W, C) at an image of this shape. Pixels whose `mask` (H, W, 1) is 0 are left out."""
     leaf = mi.TensorXf(image)
     dr.enable_grad(leaf)
     dr.backward(masked_loss(problem.views[0], leaf, None if mask.all() else mi.TensorXf(mask)))
@@ -246,7 +249,7 @@ def adjoint(problem: Problem, image: np.ndarray, mask: np.ndarray) -> np.ndarray
 
 
 def masked_loss(view: View, image: mi.TensorXf, mask: mi.TensorXf | None) -> mi.Float:
-    """Return the view's loss of an attached image (H, W, C); pixels whose `mask` (H, W, 1) is 0 equal the target."""
+    """Return the view's loss of an attached image (H, W, C). Pixels whose `mask` (H, W, 1) is 0 equal the target."""
     if mask is None:
         return view.compare(image)
     target = view.target
@@ -254,7 +257,7 @@ def masked_loss(view: View, image: mi.TensorXf, mask: mi.TensorXf | None) -> mi.
 
 
 def find_references(problem: Problem, objective: str) -> dict[str, Any]:
-    """Return keys, shapes, and the valid stock integrator for each."""
+    """Return the keys, the shapes, and the valid stock integrator for each key."""
     at = Situation.of_problem(problem, problem.sensors[0])
     keys = ["image"] if objective == "image" else list(problem.selection.keys)
     found: dict[str, dict[Reference, str | None]] = {}
@@ -276,7 +279,7 @@ def find_references(problem: Problem, objective: str) -> dict[str, Any]:
 
 
 def _unlike(config: Config) -> str | None:
-    """Return why naive AD has other derivatives of moving parameters than the experiment requests."""
+    """Return why naive AD has other derivatives of moving parameters than the experiment requests, or None."""
     options, alike = config.integrator.options(), ALIKE[Reference.PTRACER]
     if all(options.get(name, value) == value for name, value in alike.items()):
         return None
@@ -284,7 +287,9 @@ def _unlike(config: Config) -> str | None:
 
 
 def affordable_paths(problem: Problem, pixels: int, seconds: float) -> int:
-    """Return the number of light paths for this time: a power of 2, so that similar machines have the same images."""
+    """Return the number of light paths for this time. It is a power of 2, so that similar machines have the same
+    images.
+    """
     spp = multiple_of(TRIAL // pixels, problem.samples_per_pass)
     for _ in range(2):  # the first one compiles kernels
         began = time.perf_counter()
@@ -311,8 +316,9 @@ def shorten_target(problem: Problem, most: int) -> tuple[Problem, str]:
 class Sampler(Steps):
     """Steps of `convergence`.
 
-    `mode` is the sampled quantity: `known`, the gradient with dL/dI fixed at one of `adjoints`; `loss`, the gradient of
-    the experiment's loss with its `run.adjoint`; `image`. `arrays` are the survey's.
+    `mode` is the sampled quantity. `known` is the gradient with dL/dI fixed at one of `adjoints`, `loss` is the
+    gradient of the experiment's loss with its `run.adjoint`, and `image` is the image. `arrays` are the arrays of the
+    survey.
     """
 
     def __init__(self, config: Config, mode: str, arrays: dict[str, np.ndarray]) -> None:
@@ -325,7 +331,7 @@ class Sampler(Steps):
         self.inside = arrays["mask"] != 0
 
     def step(self, seed: int, spp: int, image: int) -> tuple[np.ndarray, StepTimes]:
-        """Return one sample, all parameters (or pixels) flat, float32, and the times of the step alone."""
+        """Return one sample as a flat float32 array of all parameters (or pixels), and the times of the step alone."""
         problem = self.problem
         if self.mode == "image":
             with dr.suspend_grad(), self.clock.step() as times:
@@ -343,8 +349,9 @@ class Sampler(Steps):
 def begin_sampling(first: dict[str, Any]) -> Begun:
     """Start the process. A request asks for `count` steps from number `start` on, with `spp` samples per pixel.
 
-    Its answer has `step_ms` of each and the number of `new_kernels`; the samples (count, P) go to the file `out`. If
-    `cold`, it also has the peak of Dr.Jit's arrays. Seeds are those of the `purpose`; `image` selects dL/dI.
+    The answer has `step_ms` of each step and the number of `new_kernels`. The samples (count, P) go to the file `out`.
+    If `cold` is set, the answer also has the peak of Dr.Jit's arrays. `purpose` selects the seeds, and `image` selects
+    dL/dI.
     """
     config = told(first)
     with np.load(first["arrays"]) as arrays:

@@ -1,7 +1,8 @@
 """Statistics of convergence: the error of averages of n steps, its slope, efficiency, and the time for a given error.
 
-Samples x are (R, P): R steps, P entries. The reference r is the mean of rows (K, P), other steps, each an independent
-estimate of the same mean. Sums over entries of variances are traces, written tr:
+Samples x are (R, P): R steps, P entries. The reference r is the mean of K rows (K, P). Each row is an independent
+estimate of the same mean from other steps. tr is the trace of a covariance, which is the sum of the variances of all
+entries.
 
     noise   = tr Var(r)                                  the reference's own squared standard error
     signal  = |r|^2 - noise                              the squared size of the estimated quantity
@@ -9,8 +10,8 @@ estimate of the same mean. Sums over entries of variances are traces, written tr
     RMSE(n) = sqrt(MSE(n) / signal)                      relative
     bias^2  = |mean(x) - r|^2 - tr Var(x) / R - noise
 
-All are unbiased, so single values may be negative. Intervals are those of the jackknife: one turn of steps after the
-other is left out of the samples, one row after the other of the reference, and the two variances are added.
+All these estimates are unbiased, so single values may be negative. Intervals come from the jackknife. It leaves out one
+turn of steps at a time from the samples, and one row at a time from the reference. The two variances are added.
 """
 
 from __future__ import annotations
@@ -42,19 +43,19 @@ FEWEST_FOR_SLOPE = min(GROUPS)
 
 @dataclass(frozen=True)
 class JackknifeEstimate:
-    """An estimate with its standard error and the degrees of freedom of that."""
+    """An estimate with its standard error, and the degrees of freedom of the standard error."""
 
     value: float
     error: float
     freedom: float
 
     def interval(self, confidence: float = CONFIDENCE) -> Range:
-        """By Student's t."""
+        """Return the interval by Student's t."""
         half = float(stats.t.isf((1 - confidence) / 2, self.freedom)) * self.error
         return Range(self.value, self.value - half, self.value + half)
 
     def exponential(self, confidence: float = CONFIDENCE) -> Range:
-        """The interval of the exponential, where this is of a logarithm."""
+        """Return the interval of the exponential of this estimate, which is a logarithm."""
         own = self.interval(confidence)
         low, value, high = np.exp(np.clip([own.low, own.value, own.high], -700, 700))
         return Range(float(value), float(low), float(high))
@@ -62,7 +63,9 @@ class JackknifeEstimate:
 
 @dataclass(frozen=True)
 class Point:
-    """The error of the average of `steps` steps, over `repeats` such; None where it drowns in the reference's own."""
+    """The error of averages of `steps` steps, over `repeats` averages. It is None if the reference's own error is
+    larger.
+    """
 
     steps: int
     elapsed_s: float
@@ -71,7 +74,7 @@ class Point:
 
 
 class ReferenceMean:
-    """What errors are taken from: the mean of (K, P) rows, K at least 2."""
+    """The reference of errors: the mean of (K, P) rows, with K at least 2."""
 
     def __init__(self, rows: np.ndarray) -> None:
         self.rows = rows.astype(np.float64)
@@ -81,12 +84,12 @@ class ReferenceMean:
 
     @property
     def floor(self) -> float | None:
-        """Its own relative standard error; None where nothing stands out of its noise."""
+        """The reference's own relative standard error, or None if its signal is not significant."""
         return float(np.sqrt(self.noise / self.signal)) if self.signal > 0 else None
 
     @cached_property
     def without(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """With one row after the other left out: what that adds to the mean (K, P), noise (K,) and signal (K,)."""
+        """The effect of leaving out one row at a time on the mean (K, P), the noise (K,) and the signal (K,)."""
         count, deviations = len(self.rows), self.rows - self.mean
         moved = -deviations / (count - 1)
         squares = np.square(deviations).sum(1)
@@ -98,9 +101,9 @@ class ReferenceMean:
 
 
 class MethodSamples:
-    """Steps (R, P) of one method beside a reference; `turns` (R,) says in which turn each was taken.
+    """Steps (R, P) of one method and their reference. `turns` (R,) is the turn of each step.
 
-    `seconds` (T,) are those of one step in each turn.
+    `seconds` (T,) has the time of one step in each turn.
     """
 
     def __init__(self, values: np.ndarray, turns: np.ndarray, seconds: np.ndarray, reference: ReferenceMean) -> None:
@@ -111,7 +114,7 @@ class MethodSamples:
 
     @property
     def step_s(self) -> float:
-        """Seconds of a step, the mean over turns."""
+        """Seconds of a step, as the mean over turns."""
         return float(self.seconds.mean())
 
     @cached_property
@@ -121,12 +124,12 @@ class MethodSamples:
 
     @cached_property
     def squared_bias(self) -> float:
-        """Relative to the signal; 0 where the estimate is negative."""
+        """Squared bias relative to the signal, or 0 if the estimate is negative."""
         mean, variance = self.deviations.mean(0), self.variance * self.reference.signal
         return max(0.0, float(mean @ mean - variance / self.count - self.reference.noise)) / self.reference.signal
 
     def points(self) -> list[Point]:
-        """Errors of averages of 1, 2, 4, ... steps, as far as there is one of them."""
+        """Return the errors of averages of 1, 2, 4, ... steps, up to the number of steps."""
         found, averages, steps = [], self.deviations, 1
         while len(averages):
             squared = float(np.square(averages).sum(1).mean()) - self.reference.noise
@@ -136,9 +139,10 @@ class MethodSamples:
         return found
 
     def slope(self) -> JackknifeEstimate | None:
-        """d log RMSE / d log time: -1/2 where steps are independent and unbiased. None where there are too few.
+        """Return d log RMSE / d log time, or None if there are too few steps. It is -1/2 for independent, unbiased
+        steps.
 
-        Averages are over steps of one group. Their errors are weighted by how many averages there are of each length.
+        Averages are over steps of one group. Their errors are weighted by the number of averages of each length.
         """
         groups = next((groups for steps, groups in GROUPS.items() if self.count >= steps), None)
         if groups is None:
@@ -165,9 +169,10 @@ class MethodSamples:
         return _joined(float(corrected), left, right)
 
     def efficiency(self, biased: bool = False) -> JackknifeEstimate | None:
-        """Logarithm of 1 / (relative variance * seconds of a step), with squared bias + variance where `biased`.
+        """Return the logarithm of 1 / (relative variance * seconds of a step), or None without noise or with too few
+        turns.
 
-        None where there are too few turns, or no noise at all.
+        If `biased`, the squared bias is added to the variance.
         """
         turns, reference = int(self.turns.max()) + 1, self.reference
         if turns < FEWEST or len(self.seconds) != turns or self.variance <= 0 or reference.signal <= 0:
@@ -197,9 +202,9 @@ class MethodSamples:
         return _joined(float(value), left, right)
 
     def seconds_to(self, error: float, biased: bool) -> tuple[float | None, bool]:
-        """Seconds until the relative error is so small, and whether that lies beyond the steps that were taken.
+        """Return the seconds until the relative error is `error`, and whether this takes more steps than were measured.
 
-        None where a bias keeps it from ever being so small. One step is the least.
+        The seconds are None if a bias prevents this error. At least one step is needed.
         """
         room = error**2 - (self.squared_bias if biased else 0.0)
         if room <= 0:
@@ -210,13 +215,15 @@ class MethodSamples:
 
 
 def _halved(averages: np.ndarray) -> np.ndarray:
-    """Averages over pairs of (N, ...) neighbours; an odd last one is left out."""
+    """Return the averages of pairs of neighbours in (N, ...). An odd last one is left out."""
     pairs = len(averages) // 2
     return 0.5 * (averages[0 : 2 * pairs : 2] + averages[1 : 2 * pairs : 2])
 
 
 def _fit(lengths: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """What gives the slope of half the logarithm of (levels, ...) squared errors over that of the lengths."""
+    """Return a function that fits the slope of log(squared errors) / 2 over log(lengths), for squared errors (levels,
+    ...).
+    """
     weights = 1 / lengths
     at = np.log(lengths) - np.average(np.log(lengths), weights=weights)
     coefficients = weights * at / (weights * at**2).sum()
@@ -224,7 +231,10 @@ def _fit(lengths: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def _error(squares: np.ndarray, sums: np.ndarray, counts: np.ndarray | int, noise: float, biased: bool) -> np.ndarray:
-    """Variance of a step, and squared bias where `biased`, from |deviation|^2 added up and |sum of deviations|^2."""
+    """Return the variance of a step and, if `biased`, the squared bias.
+
+    `squares` are sums of |deviation|^2, and `sums` are |sum of deviations|^2.
+    """
     variance = (squares - sums / counts) / (counts - 1)
     if not biased:
         return np.asarray(variance)
@@ -232,7 +242,7 @@ def _error(squares: np.ndarray, sums: np.ndarray, counts: np.ndarray | int, nois
 
 
 def _joined(value: float, left: np.ndarray, right: np.ndarray) -> JackknifeEstimate:
-    """With the jackknife's variances of both sides, by Welch and Satterthwaite."""
+    """Return an estimate with the jackknife's variances of both sides, combined by Welch and Satterthwaite."""
     sides = [side for side in (left, right) if len(side) > 1]
     variances = [float(jackknife_variance(side)) for side in sides]
     total = sum(variances)

@@ -51,7 +51,7 @@ def veiled(opacity: Any, **changes: Any) -> dict:
 
 
 def nested() -> dict:
-    """A ball of glass in a ball of water, outside of the camera's view of the floor below."""
+    """A glass ball in a ball of water, outside of the camera's view of the floor below."""
     water = glass(1.33, specular_transmittance=rgb(0.9, 0.8, 0.7))
     inner = glass(1.5, 1.33, specular_transmittance=rgb(0.7, 0.8, 0.9), specular_reflectance=rgb(0.9, 0.6, 0.8))
     return {
@@ -67,7 +67,7 @@ def nested() -> dict:
 def critical() -> dict:
     """A beam in a medium of index 1.5 that meets the medium's flat surface, y = 0, at the critical angle.
 
-    The camera sees the bottom, which total reflection lights.
+    The camera sees the bottom, which receives the totally reflected light.
     """
     theta = float(np.arcsin(1 / 1.5))
     start = [-float(np.sin(theta)), -float(np.cos(theta)), 0.0]
@@ -142,8 +142,8 @@ def pool(
 ) -> dict:  # fmt: skip
     """A receiver in glass with a wavy surface. With a `thickness`, the glass is a slab above the receiver.
 
-    `slope` is the slope of the waves in units of 0.1, and `scale` the size of everything. The flat faces of the `cells`
-    cause an error that falls with the square of their number (docs/method.md).
+    `slope` is the slope of the waves in units of 0.1, and `scale` the size of everything. The surface has `cells` flat
+    faces per side. Their error falls with the square of `cells` (docs/method.md).
     """
     seen = pinhole([0, scale, 0], [0, 0, 0], [0, 0, -1], 90, SIZE, rfilter=FILTER)
     positions, faces, uv = grid(cells, lambda x, z: height + slope * waves(x, z), 2.5)
@@ -373,10 +373,10 @@ def _case(kind: str, roughness: str) -> ExtremeCase:
 
 
 def _followed(kind: str, roughness: str) -> ExtremeCase:
-    """The derivative by a roughness that moves light. It has little noise, and finite differences give the reference.
+    """Return the case of the derivative with respect to a roughness that moves light.
 
-    Nearly smooth glass blurs by less than a pixel of the usual camera, which leaves almost no derivative. This camera
-    is closer and sees a narrow beam.
+    The derivative has little noise, and finite differences give the reference. Nearly smooth glass blurs by less than a
+    pixel of the usual camera, which leaves almost no derivative. This camera is closer and sees a narrow beam.
     """
 
     def scene() -> dict:

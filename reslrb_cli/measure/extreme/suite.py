@@ -1,7 +1,7 @@
 """The extreme suite: `ExtremeCase` describes a case, and `run_case` compares its estimators with references.
 
-Besides light paths, each case is run with camera paths (`WAYS`). Their references are the same except at the film's
-border (`_seen_by`), and naive AD of the same paths is one more.
+Each case is run with light paths and with camera paths (`WAYS`). Camera paths have the same references, except at the
+film's border (`_seen_by`), and are also compared with naive AD of the same paths.
 """
 
 from __future__ import annotations
@@ -36,10 +36,11 @@ Scene = Callable[[], dict]
 
 @dataclass(frozen=True)
 class ReferenceGradients:
-    """Gradients of a reference: (N, P) at seeds of its own, (N, P) at the estimator's seeds (`paired`), or exact, (P,).
+    """Gradients of a reference.
 
-    `along` (K, P) are the directions along which the derivative is known; None: all entries. `bias` bounds the error of
-    the reference itself.
+    They are (N, P) at other seeds, (N, P) at the estimator's seeds (`paired`), or exact values (P,). `along` (K, P) are
+    the directions along which the derivative is known, or None for all entries. `bias` bounds the error of the
+    reference itself.
     """
 
     values: np.ndarray
@@ -50,9 +51,7 @@ class ReferenceGradients:
 
 @dataclass(frozen=True)
 class Stock:
-    """A stock integrator in the same scene. If Russian roulette is on, the reference does not use it; see
-    docs/method.md.
-    """
+    """A stock integrator in the same scene. The reference never uses Russian roulette (docs/method.md)."""
 
     name: str
 
@@ -108,11 +107,11 @@ class Differences:
 
 @dataclass(frozen=True)
 class Extrapolated:
-    """Finite differences of the image by each amplitude of a motion, at the random numbers of the gradient.
+    """Finite differences of the image by each amplitude of a motion, with the random numbers of the gradient.
 
-    Differences of `step` are corrected by differences of twice the step (`extrapolated`). The assumed error is a tenth
-    of the correction, and `left` of the root mean square of the differences, for the faces of a mesh and higher powers
-    of the step.
+    Differences with a step are corrected by differences with twice the step (`extrapolated`). The assumed error has two
+    parts: a tenth of the correction, and the fraction `left` of the root mean square of the differences. The latter
+    covers the faces of a mesh and higher powers of the step.
     """
 
     step: float
@@ -154,7 +153,7 @@ Source = Stock | Twin | Differences | Extrapolated | Exact | Zero
 
 
 def residual(case: ExtremeCase, setup: Case, seed: int = 1) -> Comparison:
-    """Return the root mean square of the residual over that of S_0, as `relative_l2`."""
+    """Return the root mean square of the residual as `relative_l2`, relative to the root mean square of S_0."""
     import drjit as dr
     import mitsuba as mi
 
@@ -176,19 +175,21 @@ def residual(case: ExtremeCase, setup: Case, seed: int = 1) -> Comparison:
 
 @dataclass(frozen=True)
 class ExtremeCase:
-    """One case. `scene` is a function because it needs Mitsuba. The first sensor is used.
+    """One case. `scene` is a function because it needs Mitsuba. The case uses the scene's first sensor.
 
-    - `source`: the reference of gradients besides naive AD at equal seeds. `naive`: whether naive AD fits into memory.
-    - `image`: the stock integrator for the reference image, or "" if none can render the scene.
-    - `options`, `ours`: options of all integrators, and of `reslrb` and `walk_ad` only.
-    - `weights`: makes dL/dI of the usual dL/dI of mean 1.
-    - `signed`: derivatives can have either sign; otherwise none may be negative.
-    - `equal`: the limit of the relative L2 distance at equal seeds, and from exact values if there is one seed only.
-    - `residual`: whether the residual of the replay of `gather` is checked.
-    - `open_ended`: parameters that no z-test can decide, with the reason. They are compared at equal seeds only.
-    - `elsewhere`: parameters that another case decides, with its name. They are compared at equal seeds only.
-    - `moves`: motions of light. Their amplitudes are then the only parameter (`keys` is empty), estimators without
-      attached derivatives are left out, and dL/dI is smooth.
+    - `source` is the reference of gradients besides naive AD at equal seeds. `naive` tells whether naive AD fits into
+        memory.
+    - `image` is the stock integrator for the reference image, or "" if none can render the scene.
+    - `options` are options of all integrators, and `ours` options of `reslrb` and `walk_ad` only.
+    - `weights` changes the usual dL/dI of mean 1.
+    - `signed` tells whether derivatives can have either sign. Otherwise none may be negative.
+    - `equal` is the limit of the relative L2 distance at equal seeds. It also applies to exact values if there is only
+        one seed.
+    - `residual` tells whether the residual of the replay of `gather` is checked.
+    - `open_ended` lists parameters that no z-test can decide, with the reason. They are compared only at equal seeds.
+    - `elsewhere` lists parameters that another case decides, with its name. They are compared only at equal seeds.
+    - `moves` has motions of light. Their amplitudes are then the only parameters, `keys` is empty, and dL/dI is smooth.
+        Only estimators with attached derivatives take part.
     """
 
     name: str
@@ -226,7 +227,7 @@ def exact(
     name: str, about: str, known: Callable[[], KnownScene], keys: Mapping[str, str], max_depth: int,
     rr_depth: int | None = None, **more: Any,
 ) -> ExtremeCase:  # fmt: skip
-    """Return a case whose image is known in closed form. `keys` are its parameters, and `more` other fields of the
+    """Return a case whose image is known in closed form. `keys` are its parameters, and `more` sets other fields of the
     case.
     """
     options = {"max_depth": max_depth} | ({} if rr_depth is None else {"rr_depth": rr_depth})
@@ -268,7 +269,7 @@ def restore(before: Earlier) -> dict[str, list[GradcheckRecord]]:
 
 
 def kept(settings: Mapping[str, Any], cases: Mapping[str, Sequence[GradcheckRecord]]) -> Kept | None:
-    """Return the state for a later session; None if no case is finished."""
+    """Return the state for a later session, or None if no case is finished."""
     if not cases:
         return None
     rows = {case: [asdict(record) for record in records] for case, records in cases.items()}
@@ -326,7 +327,7 @@ def _loses_border(case: ExtremeCase, setup: Case) -> bool:
 
 
 def _hidden_from(case: ExtremeCase, setup: Case) -> str | None:
-    """Return the reason to leave out camera paths: they find no light, or too rarely for a z-test. Otherwise None."""
+    """Return the reason to leave out camera paths, or None: they find no light, or find it too rarely for a z-test."""
     depth, hidden = case.options["max_depth"], bool(case.options.get("hide_emitters", False))
     at = Situation.of(setup.scene, setup.scene.sensors()[0], setup.params, depth, hidden, paths="both")
     reason = prb_image(at)
@@ -336,7 +337,7 @@ def _hidden_from(case: ExtremeCase, setup: Case) -> str | None:
 
 
 def _seen_by(case: ExtremeCase, setup: Case, way: Mapping[str, Any]) -> ExtremeCase:
-    """Return the case for these paths. If `ptracer` loses light at the film's border, `prb` and `path` are the
+    """Return the case for these paths. If `ptracer` loses light at the film's border, `prb` and `path` become
     references.
     """
     changed: dict[str, Any] = {"ours": {**case.ours, **way}}
@@ -386,7 +387,7 @@ def _record(
 
 
 def _steps(case: ExtremeCase, setup: Case, name: str) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Return gradients (N, P), images (N, H, W, 3), and numbers of refused entries of dL/dI (N,) of an estimator."""
+    """Return gradients (N, P), images (N, H, W, 3), and numbers (N,) of refused entries of dL/dI of an estimator."""
     images, refused = [], []
 
     def step(*arguments: Any, **options: Any) -> None:
@@ -442,7 +443,9 @@ def _parameters(setup: Case) -> Iterator[tuple[str, slice, tuple[int, ...]]]:
 
 
 def _settled(case: ExtremeCase, parameter: str | None, found: Comparison, ours: np.ndarray) -> Comparison:
-    """Return the comparison after the case's other conditions. A suite leaves no comparison open without a reason."""
+    """Return the comparison after the case's other conditions. No comparison of the suite stays open without a
+    reason.
+    """
     if found.verdict is Verdict.UNREACHED and (isinstance(case.source, Zero) or parameter in case.open_ended):
         message = "exactly zero" if isinstance(case.source, Zero) else "exactly zero, like the reference"
         return replace(found, verdict=Verdict.HOLDS, message=message)
@@ -455,7 +458,7 @@ def _settled(case: ExtremeCase, parameter: str | None, found: Comparison, ours: 
 
 
 def _not_negative(found: Comparison, ours: np.ndarray, share: float) -> Comparison:
-    """Return the comparison, failed if an entry is negative by more than this `share` of the largest entry."""
+    """Return the comparison. It fails if an entry is negative by more than this `share` of the largest entry."""
     if found.verdict is Verdict.HOLDS and ours.min() < -share * np.abs(ours).max():
         return replace(found, verdict=Verdict.FAILS, message=f"negative: {ours.min():.3g}")
     return found

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Known:
-    """An image (H, W, 3), and its derivative (H, W, 3) by each parameter, under a name of its own."""
+    """An image (H, W, 3), and its derivative (H, W, 3) with respect to each parameter, by name."""
 
     image: Array
     derivatives: dict[str, Array]
@@ -37,7 +37,9 @@ class KnownScene:
     max_depth: int
 
     def gradient(self, weights: Any) -> np.ndarray:
-        """Return the gradient of sum(image * weights) in a row, in the order of `keys`. `weights` are (H, W, 3)."""
+        """Return the gradient of sum(image * weights) as a flat array, in the order of `keys`. `weights` are (H,
+        W, 3).
+        """
         G = np.asarray(weights, np.float64)
         return np.concatenate([np.sum(G * self.known.derivatives[name], (0, 1)) for name in self.keys])
 
@@ -199,11 +201,11 @@ def furnace(albedo: ArrayLike, emission: ArrayLike, max_depth: int, size: int) -
     """A closed surface, seen from inside, with constant emission `emission` and diffuse reflectance `albedo` (3,).
 
     Radiance is constant, because the cosine-weighted directions of a hemisphere integrate to pi. The Neumann series of
-    the rendering equation (J. T. Kajiya, The Rendering Equation, SIGGRAPH 1986) is geometric:
+    the rendering equation (Kajiya 1986) is geometric.
 
         L = Le (1 + rho + ... + rho^(D-1)),   D = max_depth;   its limit is Le / (1 - rho)
 
-    `max_depth` -1 is the limit. Raises ValueError if the limit does not exist.
+    A `max_depth` of -1 is the limit. Raises ValueError if the limit does not exist.
     """
     rho, Le = (np.broadcast_to(np.asarray(value, np.float64), 3) for value in (albedo, emission))
     if max_depth == -1:
@@ -225,14 +227,14 @@ def point_through_surface(
     """A point light at `light` (3,) over a medium of index `ior` with a flat surface at y = `depth`.
 
     A camera in the medium, straight above the origin, sees the light on the diffuse bottom, y = 0, after one
-    refraction. Light that leaves at an angle theta_1 from the vertical meets the bottom at x = h tan(theta_1) + depth
-    tan(theta_2) from the point below the light, sin(theta_1) = ior sin(theta_2). Light through a ring of directions
-    lands in a ring:
+    refraction. Light that leaves at an angle theta_1 from the vertical meets the bottom at a distance x from the point
+    below the light, with x = h tan(theta_1) + depth tan(theta_2) and sin(theta_1) = ior sin(theta_2). Light through a
+    ring of directions lands in a ring.
 
         E = I (1 - R(theta_1)) tau sin(theta_1) / (x dx/dtheta_1),   L = rho / pi * E
 
-    Snell's law, Fresnel's equations, conservation of flux (M. Born, E. Wolf, Principles of Optics, Sections 1.5, 3.1).
-    Light that the surface reflects back to the bottom is left out, as with max_depth 3.
+    This follows from Snell's law, Fresnel's equations and conservation of flux (Born and Wolf, Principles of Optics,
+    Sections 1.5 and 3.1). Light that the surface reflects back to the bottom is left out, as with max_depth 3.
     """
     points, weights = plane_points(camera_height, fov, size)
     light = np.asarray(light, np.float64)
@@ -256,18 +258,18 @@ def beam_through_slab(
     albedo: ArrayLike, radiance: ArrayLike, transmittance: ArrayLike, reflectance: ArrayLike, ior: float, angle: float,
     max_depth: int, size: int,
 ) -> Known:  # fmt: skip
-    """Parallel light through a parallel slab of index `ior`, on a diffuse plane parallel to it, away from its edges.
+    """Parallel light through a parallel slab of index `ior`, on a diffuse plane that is parallel to the slab.
 
-    `angle` is the angle of incidence in radians, and `radiance` the irradiance on a plane perpendicular to the beam.
-    With the reflectance R of one surface, factors tau of each refraction and r of each reflection, and K pairs of inner
-    reflections,
+    `angle` is the angle of incidence in radians, and `radiance` the irradiance on a plane perpendicular to the beam. R
+    is the reflectance of one surface. tau and r are the factors of each refraction and reflection, and K is the number
+    of pairs of inner reflections.
 
         T = tau^2 (1 - R)^2 (1 + q + ... + q^K),   q = (r R)^2;   the limit is tau^2 (1 - R)^2 / (1 - q)
         L = rho / pi * E cos(theta) T
 
-    This is the incoherent sum of intensities of M. Born, E. Wolf, Principles of Optics, Section 7.6, with the mean of
-    both polarisations at each surface, as renderers use it. A path of K pairs has 4 + 2 K edges. The plane is so far
-    away that it reflects no light back to the slab.
+    This is the incoherent sum of intensities (Born and Wolf, Principles of Optics, Section 7.6). Like renderers, it
+    uses the mean of both polarisations at each surface. A path of K pairs has 4 + 2 K edges. The plane is so far away
+    that it reflects no light back to the slab, and the edges of the slab do not matter.
     """
     rho, E, tau, r = (np.broadcast_to(np.asarray(v, float), 3) for v in (albedo, radiance, transmittance, reflectance))
     R = float(fresnel(np.array(angle), ior))
@@ -290,10 +292,11 @@ def fresnel(theta: Array, ior: float) -> Array:
 
 
 def plane_points(height: float, fov: float, size: int, order: int = 8) -> tuple[Array, Array]:
-    """Return points of the plane y = 0 seen by a camera above it, (H, W, order^2, 3), and their quadrature weights.
+    """Return points (H, W, order^2, 3) of the plane y = 0 seen by a camera above it, and their quadrature weights
+    (order^2,).
 
     The camera is at (0, `height`, 0), looks down, and has -z at its upper edge. `fov` is in degrees. The film position
-    of a point is linear in x and z. The points are Gauss-Legendre nodes of the pixels; the weights (order^2,) sum to 1.
+    of a point is linear in x and z. The points are Gauss-Legendre nodes of the pixels, and the weights sum to 1.
     """
     nodes, weights = np.polynomial.legendre.leggauss(order)
     half = height * np.tan(np.deg2rad(fov) / 2)

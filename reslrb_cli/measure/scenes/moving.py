@@ -47,7 +47,7 @@ def grid(cells: int, height: Callable[[Array, Array], Array], half: float = 1.0,
          ) -> tuple[Array, Array, Array]:  # fmt: skip
     """A sheet over [-half, half]^2 in x and z that faces up. Returns vertices, triangles and texture coordinates.
 
-    With `wide`, cells grow from the middle to the rim, by the hyperbolic sine of values up to `wide`.
+    With `wide`, cells grow from the middle to the rim. Their coordinates are hyperbolic sines of values up to `wide`.
     """
     at = np.linspace(-1, 1, cells + 1)
     axis = half * (np.sinh(wide * at) / np.sinh(wide) if wide else at)
@@ -112,7 +112,8 @@ class Displacement:
 class Pose:
     """Moves a `to_world`, or a position, by these degrees of freedom, in their order.
 
-    They are `tx` `ty` `tz` (scene units), and about `pivot`, `rx` `ry` `rz` (radians) and `s` (scale, 1 + amplitude).
+    `tx`, `ty` and `tz` are translations in scene units. `rx`, `ry`, `rz` (radians) and `s` (scale, 1 + amplitude) act
+    about `pivot`.
     """
 
     key: str
@@ -143,7 +144,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Number:
-    """Adds the only amplitude to a number such as a roughness."""
+    """Adds its only amplitude to a number, such as a roughness."""
 
     key: str
     size: int = 1
@@ -159,7 +160,7 @@ Move = Displacement | Pose | Number
 
 @dataclass
 class Displaced:
-    """The `measure.values.Values` of a scene that `moves` change: AMPLITUDES, the amplitudes of all moves in a row."""
+    """The `measure.values.Values` of a scene that `moves` change. AMPLITUDES has the amplitudes of all moves."""
 
     scene: mi.Scene
     moves: Sequence[Move]

@@ -1,1 +1,1 @@
-"""Measurements before the first iteration of a run: estimator, paths, guiding, sequence."""
+"""Decisions before the first iteration of a run: paths, pixels, guiding, and sequence."""

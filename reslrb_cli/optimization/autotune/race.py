@@ -1,20 +1,22 @@
-"""Comparisons of candidates before the first iteration: their cost, their evaluation, and their storage.
+"""Comparisons of options before the first iteration: their cost, their evaluation, and their storage.
 
-- `Tuner.decide`: one decision, from an earlier run, or measured now if the run is long enough.
-- `compare`: the gain in efficiency of one way of sampling a gradient over another, by steps of both, with its interval:
+- `Tuner.decide` makes one decision. It uses the result of an earlier run, or measures now if the run is long enough.
+- `compare` returns the gain in efficiency of one way of sampling a gradient over another, with its interval.
+- `Turns` decides whether another way of taking steps pays. It alternates steps whose gradients have the same mean.
 
-      gain = (variance * time of the one) / (variance * time of the other)
+The gain compares variance times time.
 
-  Variance is summed over the parameters, each divided by the mean square of its gradient. The interval is that of the
-logarithm of the quotient of variances by the jackknife over the steps, plus the error of single times. - `Turns`:
-whether another way of taking steps pays, by alternating steps whose gradients estimate the same. Times are those of
-kernels, plus, equally for both, the work beside them in a run, which counts if iterations take milliseconds. A table
+    gain = (variance * time of the one) / (variance * time of the other)
+
+The variance is summed over the parameters, each divided by the mean square of its gradient. The interval is that of the
+logarithm of the quotient of variances, by the jackknife over the steps. The error of single times is added. Times are
+those of kernels plus, equally for both, the other work of a run, which matters if iterations take milliseconds. A table
 that steps sample from is learned first, from other paths, and then kept.
 
-To add an option with two alternatives: its record in `records/decisions.py` (a `PaidRecord`); its row in `LATER`; in
-`sampling.py` a `Turns` that makes the record (`SequencePilot`), a function beside `_sequence` that calls `Tuner.decide`
-with a `StepTrial` of two integrators, and lines in `settle_sampling` that use it. If an option has more than two
-values, each competes with the best so far.
+An option with two alternatives needs four parts: a record in `records/decisions.py` (a `PaidRecord`), a row in `LATER`,
+a `Turns` in `sampling.py` that makes the record (like `SequencePilot`), and a function like `_sequence` that calls
+`Tuner.decide`. `settle_sampling` calls this function. If an option has more than two values, each competes with the
+best so far.
 """
 
 from __future__ import annotations
@@ -79,9 +81,9 @@ logger = logging.getLogger(__name__)
 
 
 class Tuner:
-    """Decisions before a run; `problem` is the given one, with the decisions so far.
+    """Decisions before a run. `problem` is the given problem, with the decisions so far.
 
-    `say` is called with the decisions, and once before a measurement; `cache` has measurements of earlier runs.
+    `say` is called with the decisions, and once before a measurement. `cache` has measurements of earlier runs.
     """
 
     def __init__(self, problem: Problem, say: Say, cache: PilotCache | None = None) -> None:
@@ -98,7 +100,7 @@ class Tuner:
             self.take(memory=replace(memory, expected_bytes=expected))
 
     def tell(self) -> None:
-        """Say the decisions in one line, or each with its reason in verbose runs."""
+        """Print the decisions in one line, or each with its reason in verbose runs."""
         decided = self.problem.sides, self.problem.guided, self.problem.sequence, self.problem.pixels
         found = [each for each in decided if each is not None]
         if logger.isEnabledFor(logging.DEBUG):
@@ -120,11 +122,11 @@ class Tuner:
         fits: Callable[[Record], bool] = lambda record: True,
         later: Sequence[Need] = (),
     ) -> Record:
-        """Return the decision of an earlier run if it `fits`; otherwise measure it now with `measure`, and store it.
+        """Return the decision of an earlier run if it `fits`. Otherwise measure it now with `measure`, and store it.
 
-        `of` is what the decision depends on besides the situation. `needs` are the minimum costs of a useful
+        `of` has the conditions of the decision besides the situation. `needs` are the minimum costs of a useful
         measurement by steps of `integrator` and others (`Allowance.affords`). `unmeasured` returns the decision without
-        measuring, from a note. Time for `later` measurements is reserved if there is enough for both.
+        measuring, given a note. Time for `later` measurements is reserved if there is enough for both.
         """
         key = ""
         if self._cache is not None:
@@ -148,8 +150,8 @@ class Tuner:
         return record
 
     def allowance(self, integrator: Tracer) -> Allowance:
-        """Return the time that may be spent: known already, or from two first steps of `integrator` with few
-        samples.
+        """Return the time limit of all measurements. If it is unknown, two first steps of `integrator` with few samples
+        determine it.
         """
         problem, run = self.problem, self.problem.config.run
         if problem.allowance is not None:
@@ -168,7 +170,7 @@ class Tuner:
 
 
 def is_auto(config: Config, option: str) -> bool:
-    """Whether this option of the integrator is left to measurement."""
+    """Whether this option of the integrator is decided by measurement."""
     options = config.integrator.options()
     if option == "paths":  # `both` measures its share in the same way
         return options.get("paths") == "auto" or (options.get("paths"), options.get("light_share")) == ("both", "auto")
@@ -176,12 +178,14 @@ def is_auto(config: Config, option: str) -> bool:
 
 
 def sets_of(config: Config) -> int:
-    """Return the number of sets that a step's samples are traced in: those with one dL/dI each, or their halves."""
+    """Return the number of sets in which a step's samples are traced. Each set has one dL/dI, or is one half."""
     return (config.run.batches if config.adjoint == "batched" else 1) * config.halves * config.shares
 
 
 def situation(problem: Problem) -> dict[str, Any]:
-    """Return everything that a decision depends on, as plain values: settings, and the contents of their files."""
+    """Return everything that a decision depends on as plain values, including settings and the contents of their
+    files.
+    """
     config = problem.config
     settings = config.model_dump(mode="json", include={"scene", "target", "views", "parameters", "integrator", "loss"})
     for spec in settings["parameters"]:
@@ -204,10 +208,10 @@ def situation(problem: Problem) -> dict[str, Any]:
 
 @dataclass
 class Step:
-    """Step or learning walk: its gradients, its image by view, and milliseconds.
+    """Step or learning walk, with its gradients, its image by view, and times in milliseconds.
 
-    The times are those of the kernels, of the kernels of an image with its own samples, and of everything except
-    `compile_ms`, in which kernels were generated and compiled.
+    `kernel_ms` is the time of the kernels, and `image_ms` that of an image with its own samples. `compile_ms` is the
+    time to generate and compile kernels. `wall_ms` is everything else.
     """
 
     gradients: Gradients = field(default_factory=dict)
@@ -224,14 +228,16 @@ class Step:
 
 
 def timed(times: StepTimes, wall_ms: float | None = None) -> Step:
-    """Return a step with these times; `wall_ms` replaces the time of the clock if more was waited for."""
+    """Return a step with these times. If the process waited for other work, `wall_ms` replaces the time of the
+    clock.
+    """
     # Kernels are compiled in parallel: their times can add up to more than the wait.
     waited_ms = max((times.wall_ms if wall_ms is None else wall_ms) - times.codegen_ms, times.kernel_ms)
     return Step(kernel_ms=times.kernel_ms, wall_ms=waited_ms, compile_ms=times.codegen_ms)
 
 
 def measured_step(problem: Problem, integrator: Any, clock: StepClock, round: int, spp: int) -> Step:
-    """Take one step of all views with its own seeds; leave neither a gradient nor a change."""
+    """Take one step of all views with its own seeds. Leaves neither a gradient nor a change."""
     start = time.perf_counter()
     problem.apply()
     with clock.step() as times:
@@ -247,9 +253,10 @@ def compare(
     other_ms: Sequence[float],
     confidence: float = CONFIDENCE,
 ) -> Gain:
-    """Return the efficiency of the other way over that of the own way, with its interval; NOTHING if one has no noise.
+    """Return the efficiency of the other way divided by that of the own way, with its interval.
 
-    Gradients are those of each step by parameter (at least three steps), and times are those of steps in any unit.
+    `own` and `other` have the gradients of at least three steps, by parameter. `own_ms` and `other_ms` have the times
+    of steps in any unit. Returns NOTHING if one way has no noise.
     """
     units = scales([*own, *other])
     found = [_log_variances(gradients, units) for gradients in (own, other)] if units else [None]  # such as no light
@@ -273,7 +280,7 @@ def scales(gradients: Sequence[Gradients]) -> dict[str, float]:
 
 
 def _log_variances(gradients: Sequence[Gradients], scales: dict[str, float]) -> tuple[float, Array] | None:
-    """Return the logarithm of the variance of all parameters, and the same without each of the rounds in turn."""
+    """Return the logarithm of the variance of all parameters, and the same with each round left out in turn."""
     rows = np.array([
         np.concatenate([g[key].astype(np.float64) / math.sqrt(scale) for key, scale in scales.items()])
         for g in gradients
@@ -305,7 +312,7 @@ LEARNING_SHARE, LEARNINGS = 0.4, 2
 
 
 def lessons(problem: Problem) -> float:
-    """Return how often tables of guided emission learn per iteration, on average over the run."""
+    """Return how often tables of guided emission learn per iteration, as the mean over the run."""
     run, sensors = problem.config.run, len(problem.trained)
     each = run.batches - 1 if problem.config.adjoint == "batched" else 1
     each = each * problem.config.halves if problem.config.shards == 1 else 1  # of shards, once a step
@@ -315,12 +322,12 @@ def lessons(problem: Problem) -> float:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Samples per pixel: of a step of the run (`step`), of each set with one dL/dI (`call`), and of a pass of these
+    """Samples per pixel: of a step of the run (`step`), of each set with one dL/dI (`call`), and of a pass of a set
     (`part`).
 
-    `alone` says whether images have their own samples. `rounds` is the planned number of rounds, and `lessons` how
-    often tables of guided emission learn for each set, on average over the run. A step of the other kind may take
-    `longer` times as long; `planned` is PLANNED or less.
+    `alone` tells whether images have their own samples. `rounds` is the planned number of rounds. `lessons` is how
+    often tables of guided emission learn for each set, as the mean over the run. A step of the other kind may take
+    `longer` times as long. `planned` is at most PLANNED.
     """
 
     step: int
@@ -353,8 +360,8 @@ Learn = Callable[[int, int], Step]
 class Turns(Generic[Record]):
     """One decision, by steps of `take` and learning walks of `learn` if a table must learn.
 
-    `views` is the number of views of an iteration divided by that of a step here, `share` the part of ITERATIONS that
-    the decision may cost, and `most` the part that the minimum number of rounds may cost, if that is more.
+    `views` is the number of views of an iteration divided by that of a step here. `share` is the part of ITERATIONS
+    that the decision may cost. `most` is the part that the minimum number of rounds may cost, if that is more.
     """
 
     LEAST, LOOKS = LEAST_ROUNDS, LOOKS
@@ -373,7 +380,7 @@ class Turns(Generic[Record]):
         self._walk = Step()
 
     def run(self) -> Record:
-        """Measure, and decide."""
+        """Measure and decide."""
         spp, take = self._sizes.trial, self._take
         self._spend(take(False, 0, spp), first=True)
         plain = self._spend(take(False, 0, spp))
@@ -395,7 +402,7 @@ class Turns(Generic[Record]):
         return self._decided()
 
     def _learned(self, round_ms: float) -> bool:
-        """Let the table learn if necessary; return False if there is no time for this and for rounds of this
+        """Let the table learn if it must. Returns False if there is no time for this and for rounds of this
         duration.
         """
         if self._learn is None:
@@ -414,15 +421,15 @@ class Turns(Generic[Record]):
 
     @property
     def _iteration_ms(self) -> float:
-        """Time of an iteration of the run: kernels of all its samples, and the work beside them for each set with one
-        dL/dI.
+        """Time of an iteration of the run in milliseconds: kernels of all its samples, and the other work for
+        each set.
         """
         kernels = statistics.median(step.kernel_ms + step.image_ms for step in self._plain)
         return self._views * (kernels + self._python_ms) * self._sizes.step / self._sizes.trial
 
     @property
     def _python_ms(self) -> float:
-        """Time beside the kernels for `trial` samples in a run, which occurs once for each `call`."""
+        """Time outside of kernels for `trial` samples in a run. It occurs once for each `call`."""
         beside = statistics.median(step.beside_ms for step in self._plain)
         return beside * self._sizes.trial / self._sizes.call
 
@@ -431,30 +438,32 @@ class Turns(Generic[Record]):
         return self._spent_ms + more_ms <= share * ITERATIONS * self._iteration_ms
 
     def _more_ms(self) -> float:
-        """Return the additional time of a step of the other kind, with `trial` samples, in a run beside its own
-        kernels.
+        """Return the additional time outside of its kernels that a step of the other kind takes in a run, for `trial`
+        samples.
         """
         return 0.0
 
     def _decide(self, other: bool, images: bool, found: dict[str, Any]) -> Record:
-        """Return the record of a decision; `found` has its common fields."""
+        """Return the record of a decision. `found` has its common fields."""
         raise NotImplementedError
 
     def _times(self, other: bool, images: bool) -> list[float]:
-        """Return the times of steps of one kind, whose images with their own samples are drawn the other way or not."""
+        """Return the times of steps of one kind. `images` tells whether images with their own samples are drawn the
+        other way.
+        """
         beside = self._python_ms + (self._more_ms() if other else 0.0)
         if self._sizes.alone:
             beside += statistics.median(step.image_ms for step in self._steps[other and images])
         return [step.kernel_ms + beside for step in self._steps[other]]
 
     def _gain(self, images: bool, confidence: float = CONFIDENCE) -> Gain:
-        """Return the gain of the gradient in steps whose images are drawn the other way or not."""
+        """Return the gain of the gradient. `images` tells whether images are drawn the other way."""
         own, other = ([step.gradients for step in steps] for steps in self._steps)
         return compare(own, self._times(False, images), other, self._times(True, images), confidence)
 
     def _image_gain(self) -> Gain:
-        """Return the gain of the image: of its own samples if it has them, otherwise of those that serve the gradient,
-        too.
+        """Return the gain of the image, from its own samples if it has them, otherwise from the samples that also serve
+        the gradient.
         """
         own, other = ([step.images for step in steps] for steps in self._steps)
         times = [self._times(each, False) for each in (False, True)]
@@ -463,13 +472,13 @@ class Turns(Generic[Record]):
         return compare(own, times[0], other, times[1])
 
     def _is_clear(self) -> bool:
-        """Whether no more steps are needed: the alternative is clearly on, or off."""
+        """Whether no more steps are needed, because the alternative is clearly better or clearly not."""
         _, low, high = self._gain(not self._apart or self._images(self._image_gain()), CLEAR)
         return low is None or high is None or low > 1 or high < 1
 
     def _images(self, gain: Gain) -> bool:
-        """Whether images use the alternative as well; if this is not decided separately, whether they are not
-        harmed.
+        """Whether images use the alternative as well. If this is not decided separately, whether it does not harm
+        images.
         """
         if self._apart:
             return gain[1] is not None and gain[1] > 1
@@ -503,7 +512,7 @@ class Turns(Generic[Record]):
         return {"rounds": len(self._steps[True]), "spp": self._sizes.trial, "note": note, **cost}
 
     def _spend(self, step: Step, first: bool = False) -> Step:
-        """Add the time of a step. A `first` step compiles kernels, so all of its time counts as compilation."""
+        """Add the time of a step. A `first` step compiles kernels, so its whole time counts as compilation."""
         self._spent_ms += 0.0 if first else step.wall_ms
         self._compile_ms += step.compile_ms + (step.wall_ms if first else 0.0)
         return step

@@ -1,21 +1,21 @@
 """Sampling of a run, decided before its first iteration: paths, pixels, guided emission, and the sequence of numbers.
 
-Settings that are left to measurement are decided in this order: paths, distribution of camera paths over the pixels
-without steps (`guiding/pixels.py`), guiding, sequence. Alternating steps (`race.Turns`) compare two ways of sampling,
-with dL/dI fixed at one image (`StepTrial`):
+Open settings are decided in this order: paths, distribution of camera paths over the pixels (without steps,
+`guiding/pixels.py`), guiding, sequence. Alternating steps (`race.Turns`) compare two ways of sampling, with dL/dI fixed
+at one image (`StepTrial`).
 
-- `PathsPilot`: another share of light paths, or paths of one side alone if it finds all light, unguided. Shares compete
-  with the best so far, from one half on towards the better side, as long as they win. Camera paths alone come first if
-  they find all light: they may have a thousand times the efficiency, so that even a run of a second gains, and a few
-  small steps decide (`CameraPilot`), with kernels that the run needs anyway if they win.
-- `GuidingPilot`: guided emission, from a table that learns first, and is then kept. The time of a guided step includes
-  its share of the run's learning: one more walk per lesson, and the Python code for a new table, often at first and
-  then rarely. Short steps underestimate the table of a run, which has learned from more paths, and has more paths per
-  cell. If light paths alone find all light, they compete when guided, because weights ignore guiding and take away most
-  of its benefit.
-- `SequencePilot`: low-discrepancy numbers, guided if the run is; both then sample from one table. Later learning costs
-  both the same, and is left out. The noise of low-discrepancy numbers falls at least as fast as with one over the
-  samples, so short steps underestimate the gain. If guiding pays, low-discrepancy numbers compete with it first.
+- `PathsPilot` tries another share of light paths, or one kind of paths alone if it finds all light, unguided. The first
+    share is one half. Other shares compete with the best so far, towards the better side, as long as they win. Camera
+    paths alone come first if they find all light, because they may be a thousand times as efficient. Even a run of a
+    second then gains, and a few small steps decide (`CameraPilot`). If they win, the run needs their kernels anyway.
+- `GuidingPilot` tries guided emission, from a table that learns first and is then kept. The time of a guided step
+    includes its share of the run's learning: one more walk per lesson, and the Python code for a new table. Short steps
+    underestimate the table of a run, which has learned from more paths. If light paths alone find all light, they
+    compete when guided, because weights ignore guiding and take away most of its benefit.
+- `SequencePilot` tries low-discrepancy numbers, guided if the run is guided. Both ways then sample from one table.
+    Later learning costs both the same, and is left out. The noise of low-discrepancy numbers falls at least as fast as
+    the inverse of the sample count, so short steps underestimate the gain. If guiding pays, low-discrepancy numbers
+    compete with it first.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ IMAGE_SHARE = 0.25
 def settle(problem: Problem, say: race.Say, cache: PilotCache | None = None) -> Problem:
     """Return `problem` with an integrator whose open sampling options have been decided.
 
-    Needs the targets. Fields of the problem hold the measurements, `say` is called with a line for them, and `cache`
-    has the measurements of earlier runs.
+    The problem needs its targets. Fields of the result hold the measurements. `say` is called with lines about them,
+    and `cache` has the measurements of earlier runs.
     """
     tuner = race.Tuner(problem, say, cache)
     settle_paths(tuner)
@@ -81,7 +81,7 @@ def settle(problem: Problem, say: race.Say, cache: PilotCache | None = None) -> 
 
 
 def settle_paths(tuner: race.Tuner) -> None:
-    """Decide the paths of the integrator, if open and if both kinds can render the scene."""
+    """Decide the paths of the integrator, if they are open and both kinds can render the scene."""
     problem = tuner.problem
     if not race.is_auto(problem.config, "paths") or problem.paths != "both":
         return
@@ -93,7 +93,8 @@ def settle_pixels(tuner: race.Tuner) -> None:
     """Distribute the camera paths of the problem's integrator over the pixels, for the initial values of the
     parameters.
 
-    The configuration asks for it, or leaves it to `_whether_pixels`. The kinds of paths must be decided first.
+    This happens if the configuration asks for it, or if `_whether_pixels` decides so. The kinds of paths must be
+    decided first.
     """
     problem = tuner.problem
     tracer, asked = problem.integrator, problem.config.integrator.options().get("pixels", "even")
@@ -115,11 +116,10 @@ def settle_pixels(tuner: race.Tuner) -> None:
 
 
 def _whether_pixels(problem: Problem) -> PixelsRecord:
-    """Decide whether `auto` distributes camera paths: only with the loss l2, and if the measurement is a small part of
-    the run.
+    """Decide whether `auto` distributes camera paths over the pixels.
 
-    A mirror room with relative_l2 has twice the variance with measured shares in some of its colours
-    (docs/notes/method.md).
+    It does so only with the loss l2, and if the measurement is a small part of the run. With relative_l2, a mirror room
+    had twice the variance in some colours (docs/notes/method.md).
     """
     if any(loss.type != "l2" for loss in problem.config.losses):
         return PixelsRecord(measured=False, note="unchanged, because not every loss is l2")
@@ -137,7 +137,9 @@ def with_sides(integrator: Any, sides: PathsRecord | None) -> Any:
 
 
 def settle_sampling(tuner: race.Tuner) -> None:
-    """Decide open options of sampling: guided or not; then the sequence, instead of guiding or in addition."""
+    """Decide the open options of sampling: first guiding, then the sequence, which may replace guiding or be added to
+    it.
+    """
     config, plain, memory = tuner.problem.config, tuner.problem.integrator, tuner.problem.memory
     trials: list[StepTrial] = []  # trials so far
     if race.is_auto(config, "guiding") and (guided := _guided(tuner, trials)) is not None:
@@ -178,7 +180,7 @@ def table_bytes(problem: Problem) -> int:
 
 
 def guides_light_alone(problem: Problem) -> bool:
-    """Whether guiding is tried with light paths alone, instead of a measured share of camera paths."""
+    """Whether guiding is tried with light paths alone, instead of the measured share of camera paths."""
     return problem.sides is not None and problem.sides.light_share < 1 and _light_finds_all(problem)
 
 
@@ -195,7 +197,7 @@ def _light_alone(sides: PathsRecord | None, guided: GuidedRecord) -> PathsRecord
 
 
 def suits_even_numbers(problem: Problem) -> str | None:
-    """Return why low-discrepancy numbers are likely better than guiding in this scene; None if unknown
+    """Return why low-discrepancy numbers are probably better than guiding in this scene, or None
     (docs/sequences.md).
     """
     if is_attached(problem):
@@ -218,14 +220,15 @@ def sizes(problem: Problem, longer: float, planned: float = race.PLANNED) -> rac
 
 
 def planned(share: float) -> float:
-    """Return the time, in steps, of the sequence's planned rounds; longer steps see more of the gain."""
+    """Return the time, in steps, for the sequence's planned rounds. Longer steps show more of the gain."""
     return min(ROUNDS_SHARE * share * race.ITERATIONS, race.PLANNED)
 
 
 def share_left(problem: Problem, allowance: Allowance, reserved: float = 0.0, kernels: float = 0.0) -> float:
     """Return the remaining share of 200 iterations that measurements may cost.
 
-    `reserved` is kept for others. In a short run, there may be less time, with `kernels` to compile.
+    `reserved` is kept for other measurements. A short run may have less time left. `kernels` is the number of kernels
+    to compile.
     """
     spent = sum(each.share for each in (problem.sides, problem.guided) if each is not None)
     return max(min(race.SHARE - spent - reserved, allowance.iterations_left(kernels) / race.ITERATIONS), 0.0)
@@ -240,7 +243,7 @@ class GuidingPilot(race.Turns[GuidedRecord]):
     APART = True
 
     def _more_ms(self) -> float:
-        """Return the additional time of learning, on average over the run."""
+        """Return the additional time of learning, as the mean over the run."""
         sizes = self._sizes
         kernel = self._walk.kernel_ms * sizes.part / sizes.learning
         return (kernel + self._walk.beside_ms) * sizes.lessons * sizes.trial / sizes.call
@@ -264,10 +267,10 @@ class PathsPilot(race.Turns[PathsRecord]):
 
 
 class CameraPilot(PathsPilot):
-    """Decision: camera paths alone, in a run of any length.
+    """Decision for or against camera paths alone, in a run of any length.
 
-    It takes the planned rounds, or as many as there are samples for at the minimum cost, regardless of Python's time:
-    with steps of milliseconds, times must not decide whether anything is measured.
+    It takes the planned rounds, or as many as the samples allow at the minimum cost. The time of Python code is
+    ignored. If steps take milliseconds, times must not decide whether anything is measured.
     """
 
     def __init__(self, take: race.Take, sizes: race.Sizes, *rest: Any, **more: Any) -> None:
@@ -329,7 +332,7 @@ def _paths(tuner: race.Tuner) -> PathsRecord:
 
 
 def _of_share(problem: Problem, share: float) -> Tracer:
-    """Return the problem's integrator with this share of light paths; a share of 0 leaves camera paths alone."""
+    """Return the problem's integrator with this share of light paths. A share of 0 leaves only camera paths."""
     tracer: Tracer = problem.integrator.afresh(light_share=share)
     return tracer
 
@@ -337,7 +340,7 @@ def _of_share(problem: Problem, share: float) -> Tracer:
 def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord | None:
     """Decide whether the problem's integrator is guided, or replaced by guided light paths.
 
-    `trials` receives the steps. None if nothing starts at emitters.
+    `trials` receives the steps. Returns None if no path starts at an emitter.
     """
     problem = tuner.problem
     alone = guides_light_alone(problem)
@@ -381,12 +384,12 @@ def _sides(problem: Problem) -> dict[str, Any]:
 
 
 def _sequence(tuner: race.Tuner, trials: list[StepTrial]) -> SequenceRecord:
-    """Decide the sequence of the problem's integrator; `trials` are those of the decision on guiding."""
+    """Decide the sequence of the problem's integrator. `trials` are those of the decision on guiding."""
     problem, found = tuner.problem, tuner.problem.guided
     plain, is_guided = problem.integrator, problem.integrator.preparation.guiding is not None
 
     def pilot(name: str, guided: bool | None, share: float) -> SequenceRecord:
-        """Return the result for this share of the run; `guided` overrides the guiding of the run."""
+        """Return the result for this share of the run. `guided` overrides the guiding of the run."""
         even = plain.afresh(guided=guided, low_discrepancy=True)
         trials.append(StepTrial(problem, name, plain.afresh(low_discrepancy=False), even, *trials[-1:]))
         return trials[-1].turns(SequencePilot, sizes(problem, SEQUENCE_LONGER, planned(share)), share)
@@ -418,11 +421,11 @@ def _sequence(tuner: race.Tuner, trials: list[StepTrial]) -> SequenceRecord:
 
 
 class StepTrial:
-    """Steps of a problem by `plain`, or by `other`, that leave neither a gradient nor a change.
+    """Steps of a problem by `plain`, or by `other`. They leave neither a gradient nor a change.
 
-    `views` are the used views. If either integrator is guided, both sample from one table: that of `earlier` if it has
-    learned, otherwise a new one. `what` is the current decision, and `earlier` the trial of the previous one, with the
-    same estimator; dL/dI is fixed as it was there.
+    `views` are the used views. If either integrator is guided, both sample from one table. This is the table of
+    `earlier` if it has learned, otherwise a new one. `what` is the current decision, and `earlier` the trial of the
+    previous one with the same estimator. Both trials have the same fixed dL/dI.
     """
 
     def __init__(
@@ -463,13 +466,13 @@ class StepTrial:
         return self.table is not None and not self.table.learned
 
     def _slope(self, view: View) -> mi.TensorXf:
-        """Return the fixed dL/dI; 0 where it is not finite."""
+        """Return the fixed dL/dI, with 0 for values that are not finite."""
         spp = max(int(IMAGE_SHARE * self._problem.config.run.spp), 1)
         image = render_image(self._tracers[False], self._problem.scene, view.sensor, self._seed(0, view, "image"), spp)
         return to_tensor(finite(slope(view.objective, np.array(image))))
 
     def learn(self, round: int, spp: int) -> race.Step:
-        """Let the table learn, and prepare it for sampling; it stays the same from then on.
+        """Let the table learn, and prepare it for sampling. It stays unchanged from then on.
 
         The first time, everything is done twice and the first result is dropped, so that compilation and recording do
         not count.
@@ -518,7 +521,7 @@ class StepTrial:
         return taken
 
     def _differentiate(self, tracer: Tracer, view: View, job: Job, gradient: mi.TensorXf) -> mi.TensorXf | None:
-        """Add the gradient of a job's samples as a step of the run does; return their image if there is one."""
+        """Add the gradient of a job's samples as in a step of the run. Returns their image if there is one."""
         on_samples = self._problem.on_samples(view)
         if self._adjoint == "correlated":
             image = tracer.correlated(job, lambda image: gradient)
@@ -541,6 +544,6 @@ class StepTrial:
 
 
 def _few(image: mi.TensorXf) -> Array:
-    """Return some values of an image, distributed over it, 0 where they are not finite."""
+    """Return some values of an image, distributed over it, with 0 for values that are not finite."""
     values = np.array(image, dtype=np.float32).ravel()
     return finite(values[:: -(-values.size // MOST_VALUES)])

@@ -1,30 +1,29 @@
 """Gauss-Newton curvature of the loss, and the directions in which it is measured.
 
 Images are differentiated along the entries of small parameters, and along the brightness of whole textures
-(`plan_changes`).
-
-The curvature (`Curvature`) is H = J^T W J at the parameters' values: J of the image, W = d2L/dI2, by pixel.
+(`plan_changes`). The curvature (`Curvature`) is H = J^T W J at the parameters' values. J is the derivative of the
+image, and W = d2L/dI2, by pixel.
 
     along directions    J by differences of images at common random numbers, from two independent sets of samples a, b:
                         H = (J_a^T W J_b + J_b^T W J_a) / 2, whose noise has no bias
     by entry            random signs v over the pixels: with p_s = J_s^T (sqrt(W) v), the mean of p_a p_b is the
                         diagonal of H (Hutchinson 1989; Bekas et al. 2007), again from two sets of samples
 
-Along directions, a standard error is subtracted, by the terms of the sum over the pixels, because too much curvature
-would make results look too certain. By entry, single values are mostly noise. Entries whose gradients have similar
-noise have similar curvature, so they are averaged: `smooth`.
+Along directions, a standard error is subtracted from the sum over the pixels, because too much curvature would make
+results look too certain. By entry, single values are mostly noise. Entries whose gradients have similar noise have
+similar curvature, so they are averaged (`smooth`).
 
-Regularizers have their own curvature, without noise: differences of their gradient are added to both kinds.
+Regularizers have their own curvature, without noise. Differences of their gradient are added to both kinds.
 
-Noise of a rendered target is the same in all gradients: b = J^T d, with d its effect on dL/dI. It is sampled by images
-of the target's own integrator (`_noises`). `d_even` is its mean, which pulls all pixels in the same direction (a
-relative loss gives darkened pixels more weight), and `d_odd` the rest, taken in blocks of pixels that the film's filter
-may have mixed. The second moment of b is then
+Noise of a rendered target is the same in all gradients: b = J^T d, where d is its effect on dL/dI. Images of the
+target's own integrator sample it (`_noises`). `d_even` is the mean of d, which pulls all pixels in the same direction,
+because a relative loss gives darkened pixels more weight. `d_odd` is the rest, in blocks of pixels that the film's
+filter may have mixed. B is the second moment of b.
 
     B = sum over blocks (J_a^T d_odd) (J_b^T d_odd)^T + (J^T d_even) (J^T d_even)^T
 
-By entry, its diagonal is probed and averaged like that of H, and a standard error is added: for few entries, the
-average may be almost zero, and too little noise would make results look too certain as well.
+By entry, the diagonal of B is probed and averaged like that of H, and a standard error is added. For few entries, the
+average may be almost zero by chance. Too little noise would make results look too certain as well.
 """
 
 from __future__ import annotations
@@ -69,10 +68,10 @@ PROBED = 2
 
 @dataclass(frozen=True)
 class Direction:
-    """One coordinate: `vector`, in the layout of a flat gradient, is the change of the parameter `key` per unit.
+    """One coordinate. `vector` is the change of the parameter `key` per unit, in the layout of a flat gradient.
 
-    `channel` is the only channel of images that it changes, or None. `entry` is that of a small parameter; None if all
-    entries of a texture's channel change together, in proportion to their values.
+    `channel` is the only channel of images that it changes, or None. `entry` is the entry of a small parameter. It is
+    None if all entries of a texture's channel change together, in proportion to their values.
     """
 
     key: str
@@ -93,7 +92,7 @@ class Change:
 
 
 def row_of(problem: Problem, key: str) -> Array:
-    """Return a parameter's value in the layout of its flat gradient (`take_gradient`), with an environment map's
+    """Return a parameter's value in the layout of its flat gradient (`take_gradient`), including an environment map's
     halo.
     """
     return np.array(dr.detach(problem.optimizer[key]), dtype=np.float64).ravel()
@@ -112,10 +111,9 @@ def separates(problem: Problem, key: str) -> bool:
 
 
 def plan_changes(problem: Problem, scales: Mapping[str, float], share: float, most: int) -> list[Change]:
-    """Return the renderings for the directions of all parameters, with steps of `share` of the scale, small parameters
-    first.
+    """Return the renderings for the directions of all parameters. Small parameters come first.
 
-    There are at most `most` renderings; the remaining parameters have no directions.
+    Steps are `share` of the scale. There are at most `most` renderings. The remaining parameters have no directions.
     """
     small = [key for key in problem.selection.keys if problem.selection.array(key).size <= MOST_ENTRIES]
     textures = [key for key in problem.selection.keys if problem.selection.array(key).ndim == 3]
@@ -154,10 +152,10 @@ def _wholes(problem: Problem, key: str, share: float) -> list[Change]:
 
 @dataclass
 class TargetNoise:
-    """Effect of the noise of one view's target on dL/dI, (H, W, C): `even` on average, and `odd` in addition in one
-    sample.
+    """Effect of the noise of one view's target on dL/dI, (H, W, C).
 
-    `side` is that of the blocks of pixels with common noise.
+    `even` is the mean effect, and `odd` the remaining effect of one sample. Pixels have common noise in blocks with
+    side `side`.
     """
 
     odd: Array
@@ -165,7 +163,7 @@ class TargetNoise:
     side: int
 
     def in_blocks(self, slope: Array) -> Array:
-        """Return the sums over each block of an image's derivative (H, W, C) times the odd part, flat."""
+        """Return the flat sums over each block of an image's derivative (H, W, C) times the odd part."""
         product = np.sum(slope * self.odd, axis=2)
         rows, columns = (np.arange(0, size, self.side) for size in product.shape)
         return np.asarray(np.add.reduceat(np.add.reduceat(product, rows, axis=0), columns, axis=1).ravel())
@@ -179,8 +177,9 @@ class TargetNoise:
 
 
 class Curvature:
-    """Measurement of the curvature at the current values of `problem`, which needs its targets, with `spp` samples per
-    pixel in each of two sets.
+    """Measurement of the curvature at the current values of `problem`, which needs its targets.
+
+    There are two sets of samples, each with `spp` samples per pixel.
     """
 
     def __init__(self, problem: Problem, spp: int) -> None:
@@ -200,8 +199,8 @@ class Curvature:
         self.noises = self._target_noises()
 
     def along(self, changes: Sequence[Change], go_on: Callable[[], bool]) -> tuple[list[Direction], Array, Array]:
-        """Return the directions of the changes that were rendered before `go_on` returned false, and their H and B (M,
-        M).
+        """Return the directions of the rendered changes, and their H and B (M, M). Rendering ends when `go_on` returns
+        false.
         """
         directions: list[Direction] = []
         columns: list[list[Array]] = [[], []]
@@ -240,7 +239,7 @@ class Curvature:
         return directions, H, _symmetric(a @ b.T / len(self.noises)) + np.outer(even, even)
 
     def _of_regularizers(self, directions: Sequence[Direction]) -> Array:
-        """Return the curvature of regularizers along directions (M, M); zero between different parameters."""
+        """Return the curvature of regularizers along directions (M, M). It is zero between different parameters."""
         bent = [self.problem.stiffness(direction.key, direction.vector) for direction in directions]
         return _symmetric(np.array([
             [one.vector @ change if one.key == other.key else 0.0
@@ -249,7 +248,9 @@ class Curvature:
         ]))  # fmt: skip
 
     def by_entry(self, probes: int, go_on: Callable[[], bool]) -> dict[str, Array]:
-        """Return the diagonal of H for each parameter, flat, unsmoothed; empty if `go_on` returned false at once."""
+        """Return the diagonal of H for each parameter as a flat array, unsmoothed. It is empty if `go_on` returned
+        false at once.
+        """
         total: dict[str, Array] = {}
         random = np.random.default_rng(self._seed(0, probes))
         for probe in range(probes):
@@ -263,7 +264,7 @@ class Curvature:
         return {key: value / self.probes for key, value in total.items()}
 
     def by_entry_of_target(self, first: int, go_on: Callable[[], bool]) -> dict[str, Array]:
-        """Return the diagonal of B in the same way, by probes from number `first` on; empty without a rendered
+        """Return the diagonal of B in the same way, by probes from number `first` on. It is empty without a rendered
         target.
         """
         odd: dict[str, Array] = {}
@@ -279,7 +280,7 @@ class Curvature:
         return {key: value / len(views) + even[key] for key, value in odd.items()}
 
     def _add_probe(self, total: dict[str, Array], gradients: Sequence[Array], number: int) -> None:
-        """Add the product of the gradients of two sets of samples, for dL/dI by view."""
+        """Add the product of the gradients of two sets of samples, with dL/dI by view."""
         a, b = (self._probe(gradients, number + half) for half in (0, 1))
         for key in a:
             total[key] = total.get(key, 0.0) + a[key].astype(np.float64) * b[key]
@@ -298,11 +299,11 @@ class Curvature:
         return [list(sample) for sample in zip(*by_view, strict=True)]
 
     def _noises(self, view: View, integrator: Any, spp: int, multiple: int | None) -> list[TargetNoise]:
-        """Return samples of the effect of the noise of a view's target, of `spp` samples, on dL/dI; empty for a file.
+        """Return samples of the effect of the noise of a view's target on dL/dI. The list is empty for a file.
 
-        Each of several images with as many samples takes the role of the target, and the mean of the others is its
-        expected value. If this would cost too much, and noise is small, differences of images of few samples are added
-        to the target. All numbers of samples are multiples of `multiple`.
+        The target has `spp` samples. Each of several images with as many samples takes the role of the target, and the
+        mean of the others is its expected value. If this would cost too much, and noise is small, differences of images
+        with few samples are added to the target. All sample counts are multiples of `multiple`.
         """
         true = np.array(view.target, dtype=np.float64)
         if view.wanted.file is not None:
@@ -359,10 +360,10 @@ class Curvature:
         return take_gradient(problem)
 
     def _weight(self, place: int, view: View) -> Array:
-        """Return d2L/dI2 of a view's exposed image, for its pixels (H, W, C): differences of dL/dI over the size of the
-        residual.
+        """Return d2L/dI2 of a view's exposed image, for its pixels (H, W, C), by differences of dL/dI.
 
-        If L has a kink (`l1`), this is its curvature at the scale of the noise.
+        The differences span the size of the residual. If L has a kink (`l1`), the result is its curvature at the scale
+        of the noise.
         """
         image = 0.5 * (self._base[0][place] + self._base[1][place])
         true = view.kept(np.array(view.target, dtype=np.float64))
@@ -377,7 +378,7 @@ class Curvature:
 def smooth(diagonal: Array, noise: Array, sure: float = 0.0) -> Array:
     """Return `diagonal` (N,) averaged over groups of at least GROUP entries whose gradients have similar `noise`.
 
-    `sure` standard errors of each average are added.
+    The function adds `sure` standard errors to each average.
     """
     order = np.argsort(noise, kind="stable")
     result = np.empty_like(diagonal)
@@ -398,10 +399,9 @@ def _of_channel(image: Array, channel: int | None) -> Array:
 
 
 def _sure_share(terms: Array) -> Array:
-    """Return the share of the sums of (M, N) terms that is left after MARGIN of their standard errors are subtracted,
-    (M,).
+    """Return the part (M,) of sums of (M, N) terms that remains after subtracting MARGIN standard errors.
 
-    A few bright pixels may make up all of a curvature by accident.
+    A few bright pixels may make up all of a curvature by chance.
     """
     sums, errors = terms.sum(axis=1), np.sqrt(np.square(terms).sum(axis=1))
     return np.asarray(np.clip(1 - MARGIN * errors / np.maximum(sums, 1e-300), 0, 1))

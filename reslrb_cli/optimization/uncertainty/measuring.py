@@ -45,8 +45,10 @@ SHARE, MOST_STEPS = 0.25, 50
 
 @dataclass(frozen=True)
 class Noted:
-    """Iterations at which data were recorded: squares of gradients (0: not yet) and their parameters, the number of
-    steps of small ones since, and the movement of each parameter per unit of gradient after some iterations.
+    """Iterations at which data were recorded.
+
+    These are squares of gradients (0: not yet) and their parameters, the number of steps of small parameters since
+    then, and the movement of each parameter per unit of gradient after some iterations.
     """
 
     seen: int
@@ -56,7 +58,7 @@ class Noted:
 
 
 class Certainty:
-    """Certainty of one run of `problem`: make it before the first iteration, and call `measure` after the last."""
+    """Certainty of one run of `problem`. Make it before the first iteration, and call `measure` after the last."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
@@ -82,7 +84,7 @@ class Certainty:
         return {name: {key: getattr(each, name) for key, each in self.last.items()} for name in names}
 
     def restore(self, noted: Noted, squares: dict[str, Any], last: Mapping[str, Mapping[str, Array]]) -> None:
-        """Continue from recorded data; `last` are the arrays of `LastSteps`, by name and key."""
+        """Continue from recorded data. `last` has the arrays of `LastSteps`, by name and key."""
         self._seen, self.squares = noted.seen, squares
         names = [each.name for each in fields(LastSteps)]
         known = [key for key in noted.steps if key in self._initial]
@@ -90,13 +92,13 @@ class Certainty:
         self._paces |= {key: looks for key, looks in noted.paces.items() if key in self._initial}
 
     def expects(self, noted: Noted) -> dict[str, dict[str, Array]]:
-        """Return the expected argument `last` of `restore`, by shape, for a run's own parameters."""
+        """Return placeholders, with the right shapes, for the argument `last` of `restore`."""
         sizes = {key: (rows, self._initial[key].size) for key, rows in noted.steps.items() if key in self._initial}
         shapes = {key: expected(size) for key, size in sizes.items()}
         return {each.name: shapes for each in fields(LastSteps)}
 
     def see(self, before: State, state: State) -> None:
-        """Record data of an iteration from `before` to `state`, at almost no cost."""
+        """Record data of an iteration from `before` to `state`. This costs almost nothing."""
         planned, iterations = self.problem.config.run.iterations, state.iteration
         is_last = state.stage == before.stage == len(self.problem.config.run.stages)
         if is_last and 0 < self._seen < iterations:
@@ -124,13 +126,13 @@ class Certainty:
         )
 
     def _pace(self, key: str) -> float:
-        """Return the current movement of a parameter by a step per unit of gradient, for its steepest entries."""
+        """Return the current movement of a parameter by a step, per unit of gradient, for its steepest entries."""
         with np.errstate(divide="ignore"):  # of parameters that have not moved yet
             steepness = rms(1 / self.problem.optimizer.response(key))
         return 1 / max(steepness, 1e-300)
 
     def _recent(self, key: str, iterations: int) -> Array | None:
-        """Return the mean square of the gradients since the recorded squares, (N,); None if the optimiser stores
+        """Return the mean square (N,) of the gradients since the recorded squares, or None if the optimiser stores
         none.
         """
         before, now = self.squares.get(key), self.problem.optimizer.squares(key)
@@ -142,8 +144,8 @@ class Certainty:
         return np.asarray(squares / np.maximum(self.problem.optimizer.slope(key) ** 2, 1e-300))
 
     def measure(self, iterations: int, elapsed_s: float, stop: Callable[[], bool]) -> CertaintyRecord | None:
-        """Measure after `iterations` iterations of `elapsed_s` seconds; None after too few, or if `stop()` returns
-        true.
+        """Measure after `iterations` iterations of `elapsed_s` seconds. Returns None after too few, or if `stop()`
+        returns true.
 
         Parameters and optimiser are not changed.
         """
@@ -215,7 +217,9 @@ class Certainty:
         return "left out" if all(read) else "in part" if any(read) else "measured"
 
     def _with_course(self, key: str, about: ParameterCertainty, own: Measured) -> ParameterCertainty:
-        """Return the certainty with the distance moved, the possible distance, and the visible share."""
+        """Return the certainty with three additions: the distance moved, the possible distance, and the visible
+        share.
+        """
         optimizer = self.problem.optimizer
         step = optimizer.first_step(key)
         reach = None if step is None else step * float(sum(own.rates))
@@ -227,8 +231,8 @@ class Certainty:
     def scale(self, key: str) -> float:
         """Return the scale of a parameter, in its unit.
 
-        It is the largest root mean square of its initial values, its final values, and their difference; for parameters
-        without a unit of light, at least half of its range; 1 if all are 0.
+        It is the largest root mean square of its initial values, its final values, and their difference. For parameters
+        without a unit of light, it is at least half of the range. If all are 0, it is 1.
         """
         first, last = self._initial[key], row_of(self.problem, key)
         sizes = [rms(first), rms(last), rms(last - first)]
@@ -239,8 +243,8 @@ class Certainty:
         return max(sizes) or 1.0
 
     def _seen_entries(self, key: str, gradients: Array) -> Array | None:
-        """Return the entries of a texture that some view shows, in the layout of flat gradients; None for other
-        parameters.
+        """Return the entries of a texture that some view shows, in the layout of flat gradients. For other parameters,
+        return None.
         """
         shown = shown_texels(self.problem, key)
         if shown is None:
@@ -278,7 +282,7 @@ class Certainty:
         return found
 
     def _paces_of(self, key: str, iterations: int) -> Array | None:
-        """Return the step length of a parameter in each iteration, divided by the current one; None if it was not
+        """Return the step length of a parameter in each iteration, divided by the current one, or None if it was not
         recorded.
         """
         if not (looks := self._paces[key]):
@@ -288,13 +292,13 @@ class Certainty:
 
 
 def hides(directions: Sequence[Direction], curvature: Array, gradients: Gradients) -> bool:
-    """Whether noise hides all curvature (M, M) along the direction of an entry that has gradients."""
+    """Whether noise hides all curvature (M, M) along the direction of some entry with gradients."""
     flat = [d for d, h in zip(directions, np.diag(curvature), strict=True) if d.entry is not None and h <= 0]
     return any(np.any(gradients[d.key][:, d.entry]) for d in flat)
 
 
 class _Budget:
-    """Time for more measurements; the first call always returns true, because it compiles."""
+    """Time for more measurements. The first call always returns true, because it compiles kernels."""
 
     def __init__(self, seconds: float, stop: Callable[[], bool]) -> None:
         self._seconds, self._stop = seconds, stop

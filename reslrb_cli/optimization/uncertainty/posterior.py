@@ -1,48 +1,50 @@
 """Distance of final values from the optimum: the remainder after the run's steps, corrected by gradients at the end.
 
-A `Measured` has the measurements of one parameter at the end of a run; a `Posterior` is the result, for entries
-together (`joint`), or for each as if all others were known (`alone`).
+A `Measured` has the measurements of one parameter at the end of a run. A `Posterior` is the result: for entries
+together (`joint`), or for each entry as if all others were known (`alone`).
 
-Near the optimum the loss is quadratic with curvature H, and the offset d = x - x* of the values x follows the steps
+Near the optimum, the loss is quadratic with curvature H. The offset of the values from the optimum is d = x - x*. P is
+the movement of an entry by a step per unit of gradient (`Optimizer.response`).
 
-    d <- d - eta_t P (H d + noise)        P: movement of an entry by a step per unit of gradient (`Optimizer.response`)
+    d <- d - eta_t P (H d + noise)
 
-The covariance C of the offset starts with the square of each entry's scale (nothing is known of the optimum), and
-changes with each step to
+C is the covariance of the offset. It starts with the square of each entry's scale, because nothing is known about the
+optimum, and changes with each step.
 
     C <- (1 - eta_t P H) C (1 - eta_t P H)^T + eta_t^2 P Sigma P
 
-It contains the remainder of the start after too few iterations, the directions that the view does not determine (H has
-no curvature there, and the start remains), and the noise of the steps. K gradients at the final values, of mean g, then
-measure H d (Kalman):
+C contains three parts: the remainder of the start after too few iterations, the directions that the view does not
+determine, and the noise of the steps. In undetermined directions, H has no curvature, and the start remains. K
+gradients at the final values, with mean g, then measure H d (Kalman).
 
     gain = C H (H C H + Sigma / K)^-1,   to go = gain g,   C <- C - gain H C
 
-The last iterations measure it as well (`LastSteps`). Their noise is part of C, but their total movement m is known, so
-that C is that of the values before them, and d has the mean m in place of 0. The gradient of a step with the values y
-off the end is H (d + y) and noise: minus H y, it is one more at the end, and
+The last iterations measure H d as well (`LastSteps`). Their noise is part of C, but their total movement m is known. C
+is then the covariance of the values before them, and d has the mean m in place of 0. The gradient of a step is H (d +
+y) and noise, where y is the offset of its values from the final ones. After subtracting H y, it is one more gradient at
+the end.
 
     to go = m + gain (g - H m)
 
-C is only as good as the model. If values that were off drove others in the wrong direction at first, or if the
-curvature was smaller on the way, C is too small by any factor, because the remainder of the start falls exponentially.
-Gradients at the end show this: along an eigenvector u of H, of curvature h, the model predicts the variance h^2 c + s
-for u (g - H m), with c that of C and s that of noise. If it is larger than `SURPRISE` standard deviations, c is
-replaced by the observed value,
+C is only as good as the model. Other parameters with wrong values may have driven these in the wrong direction at
+first, or the curvature may have been smaller on the way. C may then be too small by any factor, because the remainder
+of the start falls exponentially. Gradients at the end show this. Along an eigenvector u of H with curvature h, the
+model predicts the variance h^2 c + s for u (g - H m), where c comes from C and s from noise. If the observed value
+exceeds `SURPRISE` standard deviations, c is replaced.
 
     c <- ((u (g - H m))^2 - s) / h^2      at most that of the start
 
-Noise of the target is the same in every gradient: H d + b + noise, with d the offset from the optimum for a target
-without noise. With B the second moment of b, and D the movement of the steps by a constant gradient,
+Noise of the target is the same in every gradient, H d + b + noise. Here d is the offset from the optimum for a target
+without noise, B the second moment of b, and D the movement of the steps by a constant gradient. E, cov(d, g) and cov(g)
+replace C, C H and H C H + Sigma / K.
 
     D <- (1 - eta_t P H) D + eta_t P
     E = C + D B D^T,   cov(d, g) = E H - D B,   cov(g) = H E H - H D B - B D^T H + B + Sigma / K
 
-take the places of C, C H and H C H + Sigma / K. If the run has converged, D = H^-1, no gradient shows the effect of b,
-and H^-1 B H^-1 remains.
+If the run has converged, D = H^-1. No gradient then shows the effect of b, and H^-1 B H^-1 remains.
 
-Momentum is left out, because over many steps the movement is the same. P is that of the end; eta_t contains the ratio
-of earlier step lengths, which are shorter for Adam until the large gradients of the start are forgotten
+Momentum is left out, because over many steps the movement is the same. P is that of the end. eta_t contains the ratio
+of earlier step lengths, which for Adam are shorter until the large gradients of the start are forgotten
 (`Measured.pace`).
 """
 
@@ -82,12 +84,12 @@ class LastSteps:
 class Measured:
     """Parameter of N entries at the end of a run: its values (N,), bounds, scale, and K gradients (K, N).
 
-    - `response` is the movement of an entry by a step per unit of gradient, at the factor 1, and `rates` are the
-      schedule's factors of all iterations.
-    - `pace` is the step length of each iteration divided by that at the end (None: equal).
-    - `last` are the last iterations, if known, and `recent` is the mean square of their gradients, (N,), if the
-      optimiser stores it.
-    - `seen` (N,) are the entries of a texture that some view shows; None for other parameters.
+    - `response` is the movement of an entry by a step per unit of gradient, at the factor 1. `rates` are the schedule's
+        factors of all iterations.
+    - `pace` is the step length of each iteration divided by that at the end, or None if all are equal.
+    - `last` has the last iterations, if known. `recent` (N,) is the mean square of their gradients, if the optimiser
+        stores it.
+    - `seen` (N,) are the entries of a texture that some view shows, or None for other parameters.
     - `start` (N,) are the values before the first iteration.
     - `mean` and `noise`, both (N,), are the gradients' mean and variance.
     """
@@ -119,7 +121,7 @@ class Measured:
 
     @property
     def prior(self) -> float:
-        """Standard deviation of the offset of an entry at the start: between bounds, at most that of a uniform
+        """Standard deviation of the offset of an entry at the start. Between bounds, it is at most that of a uniform
         distribution.
         """
         low, high = self.bounds
@@ -133,12 +135,12 @@ class Measured:
 
     @property
     def touched(self) -> Array:
-        """Entries for which any gradient sample was not 0, (N,)."""
+        """Entries (N,) with a nonzero gradient sample."""
         return np.any(self.gradients, axis=0)
 
     @property
     def at_bound(self) -> Array:
-        """Entries at a bound, (N,): within a step of it, if the gradient does not pull them back.
+        """Entries (N,) at a bound. They are within a step of it, and the gradient does not pull them back.
 
         The gradient of the loss points upwards: at the lower bound, a positive gradient holds the value there.
         """
@@ -152,11 +154,11 @@ class Measured:
 
     @property
     def driven(self) -> Array:
-        """Entries that the run has moved to a bound, (N,): they had gradients, though they may have none there."""
+        """Entries (N,) that the run has moved to a bound. They had gradients on the way, but may have none there."""
         return np.asarray(self.at_bound & (False if self.start is None else self.value != self.start))
 
     def within(self, to_go: Array) -> Array:
-        """Return movements to the optimum, clipped at the bounds, because the curvature does not hold far away."""
+        """Return movements to the optimum, clipped at the bounds, because the curvature is not valid far away."""
         low, high = self.bounds
         return np.clip(to_go, np.minimum(self.value - high, 0), np.maximum(self.value - low, 0)).astype(np.float64)
 
@@ -165,8 +167,8 @@ class Measured:
 class Posterior:
     """Estimated offset of each of M entries from the optimum.
 
-    It has the mean (`to_go`, M), the `variance` (M,), the part of the spread from the target (`of_target`, M), and, if
-    entries were judged together, the covariance (M, M).
+    It has the mean (`to_go`, M), the `variance` (M,), and the part of the spread from the target (`of_target`, M). If
+    entries were judged together, it also has the covariance (M, M).
     """
 
     to_go: Array
@@ -181,7 +183,7 @@ class Posterior:
 
     @property
     def spread(self) -> Array:
-        """Root mean square of the offset, (M,): one standard deviation of a final value around the optimum."""
+        """Root mean square (M,) of the offset, which is one standard deviation of a final value around the optimum."""
         return np.hypot(self.to_go, self.error)
 
 
@@ -191,12 +193,12 @@ def joint(
 ) -> Posterior:  # fmt: skip
     """Return the joint offset of M entries.
 
-    `curvature` is H (M, M), `noise` the covariance of one gradient (M, M), and `gradient` the mean of `samples` of
-    them, one number for all or one for each of the M entries, where the fewer samples are among the more. `response` is
-    the diagonal of P, `scale` the standard deviation of the offset at the start, all (M,), `rates` the eta of all
-    iterations, and `fixed` the B (M, M) of the noise that all gradients share (None: nothing). `came` is the known
-    movement (M,) after these iterations. Each entry is in units of its scale, so that matrices of different units are
-    well-conditioned.
+    `curvature` is H (M, M), and `noise` the covariance of one gradient (M, M). `gradient` is the mean of `samples`
+    gradients. `samples` is one number for all entries, or one for each of the M entries, where the fewer samples are
+    among the more. These arrays are (M,): `response`, the diagonal of P; `scale`, the standard deviation of the offset
+    at the start; `came`, the known movement after these iterations. `rates` are the eta of all iterations. `fixed` is
+    the B (M, M) of the noise that all gradients share, or None. Each entry is in units of its scale, so matrices of
+    different units are well-conditioned.
     """
     units = np.outer(scale, scale)
     H, Sigma = _positive(curvature * units), _positive(noise * units)
@@ -220,7 +222,7 @@ def joint(
 def _unforeseen(H: Array, E: Array, beside: Array, surprise: Array) -> Array:
     """Return the addition to the covariance E of offsets, in units of the start, if gradients contradict it.
 
-    `surprise` is the difference from the expected gradients, and `beside` the part of its covariance that does not come
+    `surprise` is the difference from the expected gradients. `beside` is the part of its covariance that does not come
     from E.
     """
     values, vectors = np.linalg.eigh(H)
@@ -235,7 +237,7 @@ def alone(
     curvature: Array, response: Array, scale: Array, noise: Array, gradient: Array, samples: int | Array,
     rates: Sequence[float] | Array, fixed: Array | float = 0.0, came: Array | float = 0.0,
 ) -> Posterior:  # fmt: skip
-    """Return the offset of each entry as if all others were known; all arrays are (M,), as in `joint`, and C is the
+    """Return the offset of each entry as if all others were known. All arrays are (M,), as in `joint`, and C is the
     model's.
     """
     h = np.maximum(curvature, 0.0)
@@ -252,8 +254,8 @@ def alone(
 
 
 def _driven(step: Array, curvature: Array) -> Array:
-    """Return the movement by one step per unit of a constant gradient, at most to where curvature compensates
-    for it.
+    """Return the movement by one step per unit of a constant gradient. Curvature limits it where it compensates for the
+    gradient.
     """
     return np.asarray(np.minimum(step, 1 / np.maximum(curvature, 1e-300)))
 
@@ -261,7 +263,7 @@ def _driven(step: Array, curvature: Array) -> Array:
 def _after(H: Array, response: Array, noise: Array, rates: Sequence[float] | Array) -> tuple[Array, Array]:
     """Return the covariance after all steps from a start of unit variances, and the movement by a constant gradient.
 
-    An entry that no step moves stays where it was.
+    An entry that no step moves stays unchanged.
     """
     C, D, moved = np.eye(len(response)), np.zeros_like(H), response > 0
     if not moved.any():
@@ -282,6 +284,6 @@ def _after(H: Array, response: Array, noise: Array, rates: Sequence[float] | Arr
 
 
 def _positive(matrix: Array) -> Array:
-    """Return the nearest symmetric matrix without negative eigenvalues, which come from noise."""
+    """Return the nearest symmetric matrix without negative eigenvalues, which are caused by noise."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

@@ -1,12 +1,12 @@
 """Verdicts on final values, by rules on measurements, and their record. Nothing here depends on scenes.
 
-- `weigh`: from gradients and curvature to spreads and verdicts, in a `CertaintyRecord`
-- `judge_together`: all directions judged together, and which of them compensate for each other
-- `Verdict`, `judge`, `summarise`: verdicts by the rules below
+- `weigh` turns gradients and curvature into spreads and verdicts, in a `CertaintyRecord`.
+- `judge_together` judges all directions together, and finds out which of them compensate for each other.
+- `Verdict`, `judge` and `summarise` apply the rules below.
 
 The first rule that applies to an entry decides. `spread` is the standard deviation of its final value around the
-optimum, `alone` the same with all other parameters known, `to_go` the estimated distance to the optimum, and tau is
-`TOLERANCE` of the entry's scale. All but `spread` refer to the optimum of the loss with the noisy target.
+optimum. `alone` is the same if all other parameters are known. `to_go` is the estimated distance to the optimum. tau is
+`TOLERANCE` of the entry's scale. Except for `spread`, they refer to the optimum of the loss with the noisy target.
 
 | verdict          | condition |
 |---|---|
@@ -18,13 +18,14 @@ optimum, `alone` the same with all other parameters known, `to_go` the estimated
 | `not determined` | `alone` <= `OTHERS` of `spread`: others compensate for it; the most correlated one is named |
 | `below the noise`| otherwise: the gradients do not determine the value to tau |
 
-A parameter whose most correlated partner is `still moving` is not `settled`, because it will move with it.
+If the most correlated partner of a parameter is `still moving`, the parameter is not `settled`, because it will move
+with its partner.
 
-`derivative incomplete` replaces the verdict of a parameter whose derivative lacks a significant share. A run measures
-this before its first iteration (`measure/missing.py`).
+If the derivative of a parameter lacks a significant share, its verdict is `derivative incomplete`. A run measures this
+before its first iteration (`measure/missing.py`).
 
-A parameter of several entries is `settled` if `SETTLED_SHARE` of its visible entries with an effect are; otherwise its
-verdict is that of most of the other entries.
+A parameter of several entries is `settled` if the share `SETTLED_SHARE` of its visible entries with an effect is
+settled. Otherwise its verdict is that of most of the other entries.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ Values = list[float | None] | None
 
 
 class Verdict(str, enum.Enum):
-    """Verdict on a final value; if several verdicts have equally many entries, the first one here counts."""
+    """Verdict on a final value. If several verdicts have equally many entries, the first one here counts."""
 
     STILL_MOVING = "still moving"
     AT_BOUND = "at its bound"
@@ -69,9 +70,9 @@ class Verdict(str, enum.Enum):
 
 
 def judge(own: Measured, spread: Array, of_run: Array, alone: Array, to_go: Array, error: Array) -> list[Verdict]:
-    """Return the verdict of each entry of a parameter, from arrays (N,) in its unit.
+    """Return the verdict on each entry of a parameter. All arrays are (N,), in the parameter's unit.
 
-    `of_run` is the spread without the target's noise, and `error` that of `to_go`.
+    `of_run` is the spread without the target's noise, and `error` the standard error of `to_go`.
     """
     tolerance = TOLERANCE * own.scale
     rules = [
@@ -87,7 +88,7 @@ def judge(own: Measured, spread: Array, of_run: Array, alone: Array, to_go: Arra
 
 
 def shares(verdicts: Sequence[Verdict]) -> dict[Verdict, float]:
-    """Return the share of the entries with each verdict that occurs."""
+    """Return the share of the entries with each verdict."""
     return {verdict: verdicts.count(verdict) / len(verdicts) for verdict in Verdict if verdict in verdicts}
 
 
@@ -107,14 +108,15 @@ def summarise(found: Mapping[Verdict, float]) -> Verdict:
 class ParameterCertainty:
     """Verdict on one parameter, and the share of its entries with each verdict.
 
-    `spread` is one standard deviation of the final value around the optimum, `of_target` the part from the noise of
-    rendered targets, and `to_go` the estimated distance, in the parameter's unit: one number for each entry of a small
-    parameter, otherwise the root mean square over the entries with an effect. They are None if nothing was measured,
-    and for entries at their bounds. `partner` is the parameter that compensates for this one, if any.
+    `spread` is one standard deviation of the final value around the optimum, and `of_target` the part of it from the
+    noise of rendered targets. `to_go` is the estimated distance. All are in the parameter's unit. A small parameter has
+    one number for each entry, another one the root mean square over the entries with an effect. They are None if
+    nothing was measured, and for entries at their bounds. `partner` is the parameter that compensates for this one, if
+    any.
 
-    `moved` is the root mean square movement of the entries since the start, and `reach` the distance of all steps in
-    one direction, None if the step length depends on the gradient (`sgd`); `rate` is the learning rate. `seen` is the
-    share of a texture's texels that some view shows, None for other parameters.
+    `moved` is the root mean square movement of the entries since the start. `reach` is the distance of all steps in one
+    direction, or None if the step length depends on the gradient (`sgd`). `rate` is the learning rate. `seen` is the
+    share of a texture's texels that some view shows, or None for other parameters.
     """
 
     verdict: str
@@ -133,10 +135,11 @@ class ParameterCertainty:
 class CertaintyRecord(Jsonable):
     """Certainty of all parameters, by key, and the costs of the estimate.
 
-    The costs are numbers of gradients, renderings along directions and random probes, `measure_s` seconds without
-    compilation (`compile_s`), and `share`, their ratio to the time of the run's iterations. `iterations`, `scale`,
-    `learning_rate` (of `optimizer`) and `target_spp` are the run's. `target_noise` says whether the spreads include the
-    noise of the targets: `measured` if all of them were rendered, `in part` if some were, else `left out`.
+    The costs are the numbers of gradients, renderings along directions and random probes. `measure_s` is the time in
+    seconds without compilation (`compile_s`), and `share` its ratio to the time of the run's iterations. `iterations`,
+    `scale`, `learning_rate` (of `optimizer`) and `target_spp` are the run's. `target_noise` tells whether the spreads
+    include the noise of the targets: `measured` if all targets were rendered, `in part` if some were, otherwise `left
+    out`.
     """
 
     parameters: dict[str, ParameterCertainty]
@@ -153,7 +156,7 @@ class CertaintyRecord(Jsonable):
     target_spp: int | None = None
 
     def without_derivatives(self, keys: Collection[str]) -> CertaintyRecord:
-        """Return the record with `derivative incomplete` for these parameters, for any derivatives."""
+        """Return the record with `derivative incomplete` for these parameters, if there are any."""
         verdict = Verdict.INCOMPLETE.value
         judged = {key: replace(about, verdict=verdict, shares={verdict: 1.0}, partner=None) if key in keys else about
                   for key, about in self.parameters.items()}  # fmt: skip
@@ -162,9 +165,10 @@ class CertaintyRecord(Jsonable):
 
 @dataclass
 class Coordinates:
-    """Joint posterior of all free directions, by place.
+    """Joint posterior of all free directions, by position.
 
-    It has the spread and the part from the target; without the target, the distance to go and its error; and partners.
+    It has the spread and its part from the target, the distance to go and its error without the target's noise, and
+    partners.
     """
 
     spread: Array
@@ -224,7 +228,7 @@ def judge_together(
 
 
 def _eta(measured: Mapping[str, Measured], keys: Collection[str]) -> Array:
-    """Return the eta of all iterations of these parameters together: the geometric mean of theirs."""
+    """Return the common eta of these parameters for all iterations, which is the geometric mean of theirs."""
     first, paces = next(iter(measured.values())), [measured[key].pace for key in keys]
     found = [np.log(np.maximum(pace, 1e-300)) for pace in paces if pace is not None]
     return np.asarray(first.rates, dtype=np.float64) * np.exp(np.sum(found, axis=0) / len(paces) if found else 0.0)
@@ -233,9 +237,9 @@ def _eta(measured: Mapping[str, Measured], keys: Collection[str]) -> Array:
 def noise_covariance(samples: Array, variance: Array, curvature: Array) -> Array:
     """Return the covariance (M, M) of the noise of one gradient, from (M, K) samples, M variances, and H (M, M).
 
-    Far fewer samples than entries do not determine a covariance. But noise from dL/dI reaches the parameters through
-    the same J as the curvature, so its correlations are those of H times one factor in [0, LIKE] that fits the samples
-    best.
+    With far fewer samples than entries, the samples do not determine a covariance. But noise of dL/dI reaches the
+    parameters through the same J as the curvature. Its correlations are therefore those of H times one factor in [0,
+    LIKE], which is fitted to the samples.
     """
     size = np.sqrt(np.maximum(np.diag(curvature), 0.0))
     alike = np.clip(curvature / np.maximum(np.outer(size, size), 1e-300), -1, 1) * np.outer(size > 0, size > 0)
@@ -249,7 +253,7 @@ def noise_covariance(samples: Array, variance: Array, curvature: Array) -> Array
 
 
 def _partner(row: Array, place: int, chosen: Array, directions: Sequence[Direction]) -> str | None:
-    """Return the parameter whose offset is most correlated with that at `place`, if there is another one."""
+    """Return the parameter whose offset is most correlated with the offset at `place`, if there is another one."""
     others = {other: value for other, value in zip(chosen.tolist(), row, strict=True) if other != place}
     likely = {other: value for other, value in others.items() if value >= LEAST_CORRELATION}
     foreign = {other: value for other, value in likely.items() if directions[other].key != directions[place].key}
@@ -266,10 +270,10 @@ def weigh(
     fixed: Array,
     fixed_diagonal: Gradients,
 ) -> dict[str, ParameterCertainty]:
-    """Return the certainty of each parameter, from the curvature along directions, and by entry for large parameters.
+    """Return the certainty of each parameter, from the curvature along directions and, for large parameters, by entry.
 
-    `pixels` is the number of image values that show a texture, if known; they determine at most as many entries.
-    `fixed` and `fixed_diagonal` are, for the noise of the targets, the same as `curvature` and `diagonal`.
+    `pixels` is the number of image values that show a texture, if known. They determine at most as many entries.
+    `fixed` and `fixed_diagonal` describe the noise of the targets as `curvature` and `diagonal` describe the loss.
     """
     found, result = judge_together(measured, directions, curvature, fixed), {}
     for key, own in measured.items():
@@ -306,7 +310,7 @@ def _large(
     own: Measured, diagonal: Array | None, fixed: Array | None, at: Sequence[int], found: Coordinates,
     pixels: int | None,
 ) -> ParameterCertainty:  # fmt: skip
-    """Judge a large parameter by entry as if the others were known; another parameter may still compensate for all of
+    """Judge a large parameter by entry as if all others were known. Another parameter may still compensate for all of
     it.
     """
     touched, shape = own.touched, own.value.shape

@@ -68,7 +68,10 @@ def show(values: Array, alt: str, *caption: str) -> Picture:
 
 
 def show_map(values: Array, end: float, alt: str, *caption: str, signed: bool = False) -> Picture:
-    """Return values (H, W, 1) from 0, or -`end` if `signed`, to `end` in colours, with a scale below the caption."""
+    """Return values (H, W, 1) as a picture in colours, with a scale below the caption.
+
+    The scale runs from 0 to `end`. If the values are `signed`, it starts at -`end`.
+    """
     grey = fit(values)[:, :, 0]
     last = number(end)
     ends = [f"−{last}", "0", f"{last} or more"] if signed else ["0", f"{last} or more"]

@@ -121,7 +121,9 @@ def quantity(entry: Entry) -> str:
 
 
 def method_label(entry: Entry, with_spp: bool = False) -> str:
-    """Return a method's name as the user wrote it, or integrator and estimator, with its sampling if known."""
+    """Return a method's name as the user wrote it. Without such a name, return integrator and estimator, with their
+    sampling if known.
+    """
     parts = [str(entry.get("label") or label(entry)), str(entry.get("adjoint") or "")]
     parts += [f"{entry['spp']} spp"] if with_spp and entry.get("spp") else []
     return ", ".join(part for part in parts if part)
@@ -203,7 +205,7 @@ def _final_error(run: Run) -> str:
 
 
 def _each(runs: Sequence[Run], make: Callable[[Run], Markup]) -> Markup:
-    """Return the result of `make` for each run below its name, or a line that its data are damaged."""
+    """Return the result of `make` for each run below its name. If its data are damaged, a line says so."""
     made = [(run, guarded(partial(make, run))) for run in runs]
     return Markup().join(lay_out("heading", key(run.name)) + markup for run, markup in made if markup)
 
@@ -229,7 +231,9 @@ def measured(source: Measurements | Maps) -> Markup:
 
 
 def gradcheck(objects: Sequence[Mapping[str, Any]]) -> tuple[Markup, int]:
-    """Return a table of the comparisons, failures first, with incomplete derivatives, and the number of other lines."""
+    """Return a table of the comparisons and the number of other lines. Failures come first. Incomplete derivatives are
+    listed, too.
+    """
     records = [record for entry in objects if (record := record_of(GradcheckRecord, entry)) is not None]
     missing = [found for entry in objects if (found := record_of(MissingRecord, entry)) is not None]
     failed = [failure_line(record) for record in records if record.verdict is Verdict.FAILS]

@@ -163,9 +163,9 @@ def record_parts(run: Run) -> dict[str, Markup]:
 
 
 def guarded(make: Callable[[], Markup]) -> Markup:
-    """Return the result of `make`, or a line that its data are damaged if `make` raises an exception.
+    """Return the result of `make`. If `make` raises an exception, return a line that says that data are damaged.
 
-    Manifests are files that can be damaged or of another version, and one such part must not prevent the others.
+    A manifest can be damaged or of another version. One such part must not prevent the other parts.
     """
     try:
         return make()

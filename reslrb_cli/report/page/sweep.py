@@ -112,7 +112,7 @@ def _by_iteration(runs: Sequence[Run], name: str) -> tuple[Array, Array]:
 
 
 def _by_time(runs: Sequence[Run], name: str) -> tuple[Array, Array]:
-    """Return times in seconds (N,) and the values of each run (runs, N) after its last iteration before each time.
+    """Return times in seconds (N,), and the values of each run (runs, N) after its last iteration before each time.
 
     The times start when all runs have an iteration. A run that has ended keeps its last value.
     """
@@ -196,7 +196,9 @@ def _textures(source: SweepRuns) -> Markup:
 
 
 def _moment(place: int) -> str:
-    """Return the key of a combination's texture for `visible`, where the first one (`final`) sets the exposure."""
+    """Return the key of a combination's texture for `visible`. The first key is `final`, so this texture sets the
+    exposure.
+    """
     return f"final {place}" if place else "final"
 
 

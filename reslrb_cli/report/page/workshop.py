@@ -89,7 +89,7 @@ def _ssim(entry: Mapping[str, Any]) -> float:
 
 
 def setup_facts(setup: Mapping[str, Any]) -> dict[str, str]:
-    """Return the facts of a set-up (`runs/setup.py`) in words, by name."""
+    """Describe a set-up (`runs/setup.py`) in words. Returns the descriptions by name."""
     lens, back = setup["kind"] == "lens", setup["lit_side"] == "back"
     side = "flat back" if lens and back else "relief"
     toward, normal = (np.array(setup[name], dtype=float) for name in ("light_direction", "receiver_normal"))

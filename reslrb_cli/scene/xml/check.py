@@ -85,7 +85,7 @@ def _check_plugin(root: Element, element: Element) -> None:
 
 
 def _check_numbers(element: Element) -> None:
-    """Refuse NaN, infinite colours and positions, and vectors given in two ways or by two or more than three numbers.
+    """Refuse NaN, infinite colours and positions, and vectors with a wrong number of components or two definitions.
 
     Mitsuba would not report their location.
     """
@@ -155,9 +155,9 @@ def check_files(description: Description) -> None:
 
 
 def _wrong_file(name: str, description: Description) -> str | None:
-    """Return what is wrong with a file; None if nothing is.
+    """Return what is wrong with a file, or None.
 
-    Finds missing files, pipes and devices (which might never end), and images that are damaged or too large.
+    The check finds missing files, pipes and devices (which might never end), and images that are damaged or too large.
     """
     path = description.find_file(name)
     if path is None:

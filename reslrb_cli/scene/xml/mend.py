@@ -29,9 +29,9 @@ _LINES, _WARNINGS = 5, 30
 
 @dataclass(frozen=True)
 class Note:
-    """A part of a scene's files that Mitsuba would refuse: what is `wrong`, and what was `done` about it.
+    """A part of a scene's files that Mitsuba would refuse. `wrong` is the problem, and `done` the repair.
 
-    `owner` is the parent of an element that its plugin does not use; None for other notes.
+    If a plugin does not use an element, `owner` is the parent of the element. For other notes, it is None.
     """
 
     element: Element
@@ -162,7 +162,8 @@ def linear(element: Element) -> str:
 
 
 def by_wavelength(spectrum: Element, owner: Element) -> dict[str, str]:
-    """Return the attributes of a <spectrum> element equal to a plugin of `SPECTRA`, as a parameter of `owner`.
+    """Return the attributes of the <spectrum> element that is equivalent to a plugin of `SPECTRA`, as a parameter of
+    `owner`.
 
     Raises ConfigError if the plugin is not a valid spectrum, or is a black body outside of an emitter.
     """
