@@ -52,7 +52,9 @@ def watched(
 
 
 def _notebook() -> Callable[[bytes], None] | None:
-    """Return a function that shows a PNG in the notebook cell, replacing the previous one; None without a notebook."""
+    """Return a function that shows a PNG in the notebook cell, replacing the previous one, or None without a
+    notebook.
+    """
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     if shell is None or getattr(shell, "kernel", None) is None:

@@ -216,7 +216,7 @@ class Run:
 
     @property
     def gradients(self) -> dict[str, Array]:
-        """The gradients of the last iteration, by key; empty before the first iteration.
+        """The gradients of the last iteration, by key. The result is empty before the first iteration.
 
         Each has the shape of its parameter; in a stage of `run.stages`, the shape in that stage. Gradients include
         regularizers and are not clamped. They may contain values that are not finite.

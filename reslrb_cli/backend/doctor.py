@@ -58,7 +58,7 @@ def gpu_bytes(kind: str, most: int) -> int:
 
 
 def of_system(file: str, name: str) -> str | None:
-    """Return the first entry `name` of a system file; None if there is none."""
+    """Return the first entry `name` of a system file, or None if there is none."""
     try:
         found = re.search(rf"^{name}\s*:\s*(.+)$", Path(file).read_text(), re.MULTILINE)
     except OSError:

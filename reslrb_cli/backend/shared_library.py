@@ -43,7 +43,7 @@ def load(path: Path, depth: int = 0) -> ctypes.CDLL:
 
 
 def llvm_version(library: ctypes.CDLL) -> tuple[int, int, int] | None:
-    """Return the version of a loaded libLLVM; None before LLVM 16, which does not report it."""
+    """Return the version of a loaded libLLVM, or None before LLVM 16, which does not report it."""
     if not hasattr(library, "LLVMGetVersion"):
         return None
     parts = [ctypes.c_uint() for _ in range(3)]

@@ -102,7 +102,7 @@ def missing_cuda(variant: str = "cuda_ad_rgb") -> str:
 
 
 def package_version(name: str) -> str | None:
-    """Return the version of an installed package; None if it is not installed."""
+    """Return the version of an installed package, or None if it is not installed."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:

@@ -28,7 +28,9 @@ _SCENE = re.compile(r"(?:\.\./)+scenes/(\w+)/")
 
 
 def examples() -> dict[str, Path]:
-    """Return the configurations by name, e.g. `cornell_floor` or `stiff/lamp`; empty if they are not installed."""
+    """Return the configurations by name, e.g. `cornell_floor` or `stiff/lamp`. The result is empty if they are not
+    installed.
+    """
     configs = FOLDER / "configs"
     found = [*configs.glob("*.yaml"), *configs.glob("*/*.yaml")]
     return {path.relative_to(configs).with_suffix("").as_posix(): path for path in sorted(found)}

@@ -312,7 +312,7 @@ def _propose(scene_file: Path, scene: mi.Scene, index: int, wanted: tuple[str, .
 
 
 def _why_camera(scene: mi.Scene, sensor: mi.Sensor, hides_emitters: bool, file: Path) -> str | None:
-    """Return the reason if only camera paths can render the scene; None if light paths can, too.
+    """Return the reason if only camera paths can render the scene, or None if light paths can, too.
 
     Raises ConfigError, located in the scene's `file`, if no paths can render it.
     """

@@ -33,7 +33,7 @@ FORMATS = (*FLOAT_FORMATS, ".png", ".jpg", ".jpeg")
 
 
 class Exposure(click.ParamType):
-    """A factor above 0; None for `auto`."""
+    """A factor above 0, or None for `auto`."""
 
     name = "FACTOR|auto"
 

@@ -165,7 +165,7 @@ class LogLines(logging.Handler):
 
 
 def tell(error: BaseException) -> tuple[str, int] | None:
-    """Return the line and the exit code for `error`; None for a bug in reslrb, which needs a traceback."""
+    """Return the line and the exit code for `error`, or None for a bug in reslrb, which needs a traceback."""
     if isinstance(error, click.Abort):
         return "interrupted", ExitCode.INTERRUPTED
     if isinstance(error, click.ClickException):

@@ -155,7 +155,7 @@ class Crew:
                 first_s = time.monotonic() - begin
 
     def _next(self, seconds: float) -> Future | None:
-        """Return the next finished future; None if none finishes within this many seconds."""
+        """Return the next finished future, or None if none finishes within this many seconds."""
         try:
             return self._done.get(timeout=seconds)
         except queue.Empty:
@@ -422,7 +422,7 @@ class Crew:
 
 
 def _reply(future: Future) -> Reply | None:
-    """Return the answer; None if it was lost with a worker. Raises the error of a call.
+    """Return the answer, or None if it was lost with a worker. Raises the error of a call.
 
     Until an answer has arrived here, it is lost if its worker ends, and dask computes the call again.
     """

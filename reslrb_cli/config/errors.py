@@ -61,7 +61,7 @@ REMOVED = {
 
 
 def _removed(location: Location, value: Any = None) -> str | None:
-    """Return a replacement for a removed key, or for a removed `value` of a key; None if nothing was removed."""
+    """Return a replacement for a removed key, or for a removed `value` of a key, or None if nothing was removed."""
     names = ".".join([part for part in location if isinstance(part, str)][-2:])
     advice = REMOVED.get(names if value is None else f"{names}: {value}")
     return None if advice is None else f"was removed; {advice}"

@@ -320,7 +320,7 @@ def passes_obstacle(spp: int, per_pass: int | None, pixels: int, splits: bool = 
 
 
 def largest_pass(spp: int, pixels: int) -> int | None:
-    """Return the largest `samples_per_pass` that divides `spp` and fits into a pass; None if there is none."""
+    """Return the largest `samples_per_pass` that divides `spp` and fits into a pass, or None if there is none."""
     most = min(PASS_PATHS // pixels, PASS_SAMPLES, spp)
     return max((n for n in divisors(spp) if n <= most), default=None)
 

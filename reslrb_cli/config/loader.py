@@ -118,8 +118,8 @@ def loads(text: str, path: Path | str, overrides: Sequence[str | Override] = ())
 
 
 def replaces(location: Location, earlier: Mapping[str, Location]) -> str | None:
-    """Return what is wrong with an override at `location` that replaces one of the `earlier` ones; None if it
-    does not.
+    """Return what is wrong with an override at `location` that replaces one of the `earlier` ones, or None if it does
+    not.
     """
     name = next((name for name, other in earlier.items() if other[: len(location)] == location), None)
     return None if name is None else f"replaces what {name} sets; give it first, or remove one of them"

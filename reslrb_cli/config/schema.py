@@ -146,7 +146,7 @@ class Config(Section):
 
     @property
     def drawn_views(self) -> int | None:
-        """Number of views in an iteration; None if only the scene determines it."""
+        """Number of views in an iteration, or None if only the scene determines it."""
         if self.views is None and self.scene.cameras is not None:
             trained = None
         else:
@@ -165,7 +165,7 @@ class Config(Section):
 
     @property
     def shares(self) -> int:
-        """Number of shards of each view's samples; 1 if shards are whole views."""
+        """Number of shards of each view's samples, or 1 if shards are whole views."""
         views, asked, spp = self.drawn_views, self.run.shards, self.run.spp
         if views is None:
             return 1

@@ -78,7 +78,7 @@ class Before:
 
     @staticmethod
     def start(plan: Plan) -> list[Before]:
-        """Return the state at the start of a path; empty if no vertex stays."""
+        """Return the state at the start of a path. The result is empty if no vertex stays."""
         return [Before(SurfacePoint.blank(plan), mi.UInt32(0))] if plan.stays else []
 
     @staticmethod

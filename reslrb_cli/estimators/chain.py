@@ -101,7 +101,7 @@ class ChainBlocks:
 
     @staticmethod
     def of(plan: Plan) -> list[ChainBlocks]:
-        """Return the position at the start; empty if a path cannot have more than one block."""
+        """Return the position at the start. The result is empty if a path cannot have more than one block."""
         return [ChainBlocks(mi.UInt32(0), mi.UInt32(0))] if plan.max_depth - 2 > BLOCK else []
 
     @property

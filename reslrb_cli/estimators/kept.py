@@ -81,7 +81,8 @@ def _index(pointer: mi.BSDFPtr | mi.ShapePtr) -> mi.UInt32:
 
 
 def lobe(plan: Plan, scattering: Scattering | None) -> list[mi.UInt32 | mi.Float | mi.Point2f]:
-    """Return the sampled lobe (1: delta, 2: null) with its random numbers; empty if only smooth lobes matter.
+    """Return the sampled lobe (1: delta, 2: null) with its random numbers. The result is empty if only smooth lobes
+    matter.
 
     Without an event (None), the function returns zeros of the same form.
     """

@@ -373,7 +373,7 @@ class Said:
         return np.array(self.starts).reshape(-1, cells)
 
     def by_block(self) -> Array | None:
-        """Return sums of squares (voices, blocks of the film), float32; None if no path is aimed."""
+        """Return sums of squares (voices, blocks of the film), float32, or None if no path is aimed."""
         rows = len(self.whole) // BINS - 2
         return np.array(self.places[0]).reshape(rows, -1) if self.places else None
 

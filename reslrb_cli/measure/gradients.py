@@ -209,8 +209,8 @@ def choose_step(case: Case, integrator: Any, direction: Direction, seeds: Sequen
 def natural_bounds(kind: str, values: np.ndarray) -> tuple[float, float]:
     """Return plausible bounds for a parameter of this kind (`ParameterInfo.kind`) with these values.
 
-    The bounds are 0 to 1 if all values are in this range, except for emitters; otherwise 0 to infinity if none is
-    negative.
+    The bounds are 0 to 1 if all values are in this range, except for emitters. Otherwise they are 0 to infinity if no
+    value is negative.
     """
     if kind != "emitter" and np.all((values >= 0) & (values <= 1)):
         return 0.0, 1.0

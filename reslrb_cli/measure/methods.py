@@ -116,7 +116,7 @@ class Case:
 
     @property
     def estimator(self) -> str | None:
-        """Name of the estimator with its non-default options, except `capacity`; None for other integrators."""
+        """Name of the estimator with its non-default options, except `capacity`, or None for other integrators."""
         if self.type != "reslrb":
             return None
         name = str(self.options.get("estimator", PLUGIN_ESTIMATOR))

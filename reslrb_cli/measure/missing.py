@@ -93,7 +93,9 @@ class Missing:
         return len(self.ours)
 
     def share(self) -> tuple[float, float] | None:
-        """Return the share and its standard error; None if the differences are not significantly different from 0."""
+        """Return the share and its standard error, or None if the differences are not significantly different
+        from 0.
+        """
         near, far, farthest = np.stack(self.differences, 1)
         whole = extrapolated(near, far)
         missing = whole - np.stack(self.ours)

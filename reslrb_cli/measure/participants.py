@@ -306,7 +306,9 @@ class Participants:
         return OwnIntegrator(**config.integrator.options() | other, allowed=config.allows_code)
 
     def bsdfs_of(self, key: str) -> list[mi.BSDF]:
-        """Return the BSDFs that a parameter belongs to, nested and enclosing ones; empty if it belongs to none."""
+        """Return the BSDFs that a parameter belongs to, nested and enclosing ones. The result is empty if it belongs to
+        none.
+        """
         is_bsdf = key in self.case.params.properties and parameter_kind(self.case.params, key) == "bsdf"
         return bsdfs_of(self._situation, key) if is_bsdf else []
 

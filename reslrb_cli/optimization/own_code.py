@@ -107,7 +107,7 @@ class OwnLoss:
 
 
 def own_losses(config: Config) -> str:
-    """Return the user's losses of an experiment in words; "" if there are none."""
+    """Return the user's losses of an experiment in words, or "" if there are none."""
     own = dict.fromkeys(one.file for one in config.losses if isinstance(one, Custom))
     handed = "function" if config.own_loss is None else _name_of(config.own_loss)
     return ", ".join(f"`{file or handed}`" for file in own)

@@ -104,7 +104,7 @@ def read_state(path: Path) -> tuple[dict[str, Array], dict[str, Any]]:
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
-    """Return the file of the newest state in `folder`, which may be damaged; None if there is no state."""
+    """Return the file of the newest state in `folder`, which may be damaged, or None if there is no state."""
     return next((path for name in (STATE_FILE, PREVIOUS_FILE_NAME) if (path := folder / name).exists()), None)
 
 

@@ -103,7 +103,7 @@ def write_bitmap(path: Path, bitmap: mi.Bitmap) -> None:
 
 
 def load_image(path: Path) -> Array | None:
-    """Return an image written by `write_image`, (H, W, C) float32, linear; None if it is missing or damaged."""
+    """Return an image written by `write_image`, (H, W, C) float32, linear, or None if it is missing or damaged."""
     if not path.is_file():
         return None
     try:
@@ -167,7 +167,9 @@ def _place(letter: str) -> tuple[int, int, str]:
 
 
 def read_layer_names(path: Path) -> set[str]:
-    """Return the layer names of an EXR, reading only its header; empty if there is no file or it is not an EXR."""
+    """Return the layer names of an EXR, reading only its header. The result is empty if there is no file or it is not
+    an EXR.
+    """
     import OpenEXR
 
     try:
@@ -185,7 +187,7 @@ def write_parameters(folder: Path, values: Mapping[str, Array]) -> None:
     """Write parameter values into `folder`.
 
     - `<key>.exr` and `<key>.png` of each texture (H, W, C). The EXR can replace the original texture in the scene file.
-      The PNG is for viewing; for a heightmap, black is the lowest point and white the highest.
+        The PNG is for viewing; for a heightmap, black is the lowest point and white the highest.
     - `parameters.json`: the shape of every parameter, and the values of small parameters that are not textures.
     - `parameters.npz`: the values of all parameters.
     """
@@ -219,7 +221,9 @@ def write_mask(folder: Path, key: str, mask: Array) -> None:
 
 
 def read_parameters(folder: Path) -> dict[str, Array]:
-    """Return the values that `write_parameters` wrote into `folder`, by key; empty if they are missing or damaged."""
+    """Return the values that `write_parameters` wrote into `folder`, by key. The result is empty if they are missing or
+    damaged.
+    """
     try:
         with np.load(folder / PARAMETERS_FILE) as arrays:
             return {key: arrays[key] for key in arrays.files}
@@ -228,7 +232,7 @@ def read_parameters(folder: Path) -> dict[str, Array]:
 
 
 def read_mask(folder: Path, key: str) -> Array | None:
-    """Return the mask that `write_mask` wrote for the parameter `key`; None if it is missing or damaged."""
+    """Return the mask that `write_mask` wrote for the parameter `key`, or None if it is missing or damaged."""
     try:
         mask: Array = np.load(folder / f"{file_stem(key)}.mask.npy")
     except (OSError, ValueError, EOFError):

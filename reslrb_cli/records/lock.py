@@ -108,7 +108,7 @@ class Holder:
 
     @staticmethod
     def from_json(data: Mapping[str, Any] | None) -> Holder | None:
-        """Return the holder recorded in a manifest; None if there is none."""
+        """Return the holder recorded in a manifest, or None if there is none."""
         try:
             return Holder(**data) if data is not None else None
         except TypeError:

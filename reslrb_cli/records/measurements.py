@@ -297,7 +297,7 @@ class Comparison:
 
     @property
     def holds(self) -> bool | None:
-        """Whether the comparison holds; None if it is undecided."""
+        """Whether the comparison holds, or None if it is undecided."""
         return {Verdict.HOLDS: True, Verdict.FAILS: False}.get(self.verdict)
 
 
@@ -323,7 +323,7 @@ class Band:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Band | None:
-        """Return the band of some values; None if there are none."""
+        """Return the band of some values, or None if there are none."""
         return cls(statistics.median(values), min(values), max(values)) if values else None
 
 
@@ -420,7 +420,7 @@ R = TypeVar("R", bound=Line)
 
 
 def record_of(kind: type[R], entry: Mapping[str, Any]) -> R | None:
-    """Return the record of class `kind` in a line that was read back; None if it holds no such record."""
+    """Return the record of class `kind` in a line that was read back, or None if it holds no such record."""
     try:
         found: R = _READERS[kind].validate_python(entry)
     except ValidationError:

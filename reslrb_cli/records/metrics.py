@@ -252,7 +252,7 @@ class NonFiniteTally(_Tally):
             self.by_parameter[key] = self.by_parameter.get(key, 0) + count
 
     def __str__(self) -> str:
-        """Return the words for the last line of a run; empty if all values were finite."""
+        """Return the words for the last line of a run. The result is empty if all values were finite."""
         if not self.iterations:
             return ""
         parameters = ", ".join(f"{key} {count}" for key, count in self.by_parameter.items())
@@ -278,7 +278,7 @@ class ClampTally(_Tally):
             self.bias |= record.clamped.bias
 
     def __str__(self) -> str:
-        """Return the words for the last line of a run; empty if nothing was clamped."""
+        """Return the words for the last line of a run. The result is empty if nothing was clamped."""
         if not self.iterations:
             return ""
         shares = ", ".join(f"{100 * value:.2g} % of that of {key}" for key, value in self.bias.items())
@@ -305,7 +305,7 @@ class RegularizedTally(_Tally):
             self.held_iterations += any(self.held.values())
 
     def __str__(self) -> str:
-        """Return the words for the last line of a run; empty if nothing is regularized."""
+        """Return the words for the last line of a run. The result is empty if nothing is regularized."""
         told = [f"{name} of {key} {value:.3g}" for key, costs in self.costs.items() for name, value in costs.items()
                 if value]  # fmt: skip
         if self.held_iterations:

@@ -245,7 +245,7 @@ class RunFolder:
 
     @property
     def fault(self) -> OSError | None:
-        """The error if the folder is no longer there (`is_there`); None otherwise."""
+        """The error if the folder is no longer there (`is_there`), or None otherwise."""
         if self.is_there:
             return None
         return FileNotFoundError(errno.ENOENT, "has gone while the run went on", str(self.path))

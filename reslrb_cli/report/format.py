@@ -17,7 +17,7 @@ WITHOUT_BORDER = "without the film's border, where light paths lose what camera 
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """Return a number with `digits` significant digits; empty for None."""
+    """Return a number with `digits` significant digits. The result is empty for None."""
     return "" if value is None else f"{value:.{digits}g}"
 
 

@@ -81,7 +81,7 @@ def outcome_of(manifest: Mapping[str, Any], results: Mapping[str, Any], folder: 
 
 
 def _loss_fell(results: Mapping[str, Any]) -> bool | None:
-    """Whether the loss fell, by its trend or by the saved images; None if neither is known."""
+    """Whether the loss fell, by its trend or by the saved images, or None if neither is known."""
     change, ratio = (results.get("loss_trend") or {}).get("change"), image_ratio(results)
     if change is None and ratio is None:
         return None

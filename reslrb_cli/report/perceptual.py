@@ -84,7 +84,7 @@ def color_errors(moments: Mapping[str, Array], true: Array, mask: Array | None) 
 
 
 def _texture(array: Array) -> Array | None:
-    """Return colours (3,) or (H, W, 3) as (H, W, 3); None for other shapes."""
+    """Return colours (3,) or (H, W, 3) as (H, W, 3), or None for other shapes."""
     array = array.reshape(1, 1, 3) if array.shape == (3,) else array
     return array if array.ndim == 3 and array.shape[2] == 3 else None
 
@@ -122,14 +122,16 @@ def image_errors(image: Array, target: Array, exposure: float) -> dict[str, Any]
 
 
 def psnr(first: Array, second: Array) -> float | None:
-    """Return the peak signal-to-noise ratio in dB of values in [0, 1]; None if it is infinite (equal values)."""
+    """Return the peak signal-to-noise ratio in dB of values in [0, 1], or None if it is infinite (equal values)."""
     from skimage.metrics import peak_signal_noise_ratio
 
     return None if np.array_equal(first, second) else float(peak_signal_noise_ratio(first, second, data_range=1.0))
 
 
 def ssim(first: Array, second: Array) -> float | None:
-    """Return the structural similarity (Wang et al. 2004) of values (H, W, C) in [0, 1]; None below the window size."""
+    """Return the structural similarity (Wang et al. 2004) of values (H, W, C) in [0, 1], or None below the
+    window size.
+    """
     from skimage.metrics import structural_similarity
 
     if min(first.shape[:2]) < WINDOW:
@@ -145,7 +147,7 @@ MOMENTS = ("initial", "final")
 def seen_errors(
     folder: Path, results: Mapping[str, Any], views: Sequence[Mapping[str, Any]] | None = None
 ) -> dict[str, Any]:
-    """Return `results.seen` of the manifest of the run in `folder`; empty if nothing can be compared.
+    """Return `results.seen` of the manifest of the run in `folder`. The result is empty if nothing can be compared.
 
     `images` holds, by sensor (`""`, `"-0"`, ...), the `exposure` for viewing the target and the `image_errors` of the
     `initial` and the `final` image. `colors` holds the `color_errors` of surface colours with known true values, by

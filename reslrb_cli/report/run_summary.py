@@ -87,7 +87,7 @@ class Remedy(NamedTuple):
 
 
 def verdict_words(results: Mapping[str, Any], key: str) -> str:
-    """Return the verdict on a parameter and a proposal; empty if nothing was measured.
+    """Return the verdict on a parameter and a proposal. The result is empty if nothing was measured.
 
     Includes the share of entries with this verdict and the share of entries that no view shows.
     """
@@ -135,7 +135,9 @@ def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
 
 
 def spread_words(results: Mapping[str, Any], key: str, sign: str = "+-") -> str:
-    """Return one standard deviation of each entry of a small parameter, or of a typical entry; empty if unknown."""
+    """Return one standard deviation of each entry of a small parameter, or of a typical entry. The result is empty if
+    unknown.
+    """
     spread = _about(results, key).get("spread")
     if not spread:
         return ""
@@ -166,7 +168,7 @@ def certainty_lines(results: Mapping[str, Any]) -> list[str]:
 
 
 def noise_line(results: Mapping[str, Any]) -> str:
-    """Return a line that says that spreads exclude the noise of the target; empty if they include it."""
+    """Return a line that says that spreads exclude the noise of the target. The result is empty if they include it."""
     measured = results.get("certainty") or {}
     if measured.get("target_noise") not in ("left out", "in part"):
         return ""
@@ -175,7 +177,7 @@ def noise_line(results: Mapping[str, Any]) -> str:
 
 
 def measured_line(kind: type[Finding], measured: Mapping[str, Any] | None) -> str:
-    """Return a line about a setting chosen by measurement before the run; empty if there is none."""
+    """Return a line about a setting chosen by measurement before the run. The result is empty if there is none."""
     try:
         return kind.from_json(dict(measured or {})).line(cost=True)
     except TypeError:  # missing, or of another version
@@ -200,7 +202,7 @@ def _parameters(results: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def verdicts_of(results: Mapping[str, Any]) -> dict[str, str]:
-    """Return the verdict on each parameter; empty if nothing was measured."""
+    """Return the verdict on each parameter. The result is empty if nothing was measured."""
     return {key: str(about.get("verdict", SETTLED)) for key, about in _parameters(results).items()}
 
 
@@ -297,7 +299,7 @@ def _reasons(results: Mapping[str, Any]) -> list[str]:
 
 
 def image_ratio(results: Mapping[str, Any]) -> float | None:
-    """Return the loss of the saved images at the end divided by that at the start; None if one is unknown.
+    """Return the loss of the saved images at the end divided by that at the start, or None if one is unknown.
 
     Saved images have less noise than those of the iterations.
     """
@@ -365,7 +367,7 @@ def units_differ(results: Mapping[str, Any]) -> bool:
 
 
 def error_words(results: Mapping[str, Any], key: str, relative: bool) -> str:
-    """Return the error of one parameter at start and end, `0.189 to 0.222`; empty if unknown."""
+    """Return the error of one parameter at start and end, `0.189 to 0.222`. The result is empty if unknown."""
     pair = (results.get("relative_error" if relative else "parameter_rmse") or {}).get(key) or {}
     if pair.get("initial") is None:
         return ""

@@ -69,7 +69,7 @@ class Run:
 
     @property
     def scales(self) -> dict[str, float | None]:
-        """The root mean square of each parameter's true value, by key; None if unknown."""
+        """The root mean square of each parameter's true value, by key, or None if unknown."""
         about = self.results.get("parameters")
         if not isinstance(about, dict):
             return {}
@@ -181,7 +181,7 @@ def _read_file(path: Path, name: str, tell: Tell | None) -> Measurements:
 
 
 def _kind(entry: Mapping[str, Any]) -> str | None:
-    """Return the command that wrote a line; None if unknown."""
+    """Return the command that wrote a line, or None if unknown."""
     if entry.get("kind") in ("point", "method"):
         return "convergence"
     if entry.get("kind") == "missing" or {"reference", "verdict"} <= set(entry):
@@ -190,7 +190,9 @@ def _kind(entry: Mapping[str, Any]) -> str | None:
 
 
 def _record(entry: dict[str, Any]) -> dict[str, Any] | None:
-    """Return a line of `metrics.jsonl` with invalid numbers replaced by None; None if a required number is missing."""
+    """Return a line of `metrics.jsonl` with invalid numbers replaced by None, or None if a required number is
+    missing.
+    """
     if not all(is_number(entry.get(key)) for key in _FIGURES):
         return None
     errors = entry.get("parameter_errors")

@@ -111,7 +111,8 @@ def _row(
 
 
 def best_records(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[SweepBestRecord]:
-    """Return the best combination by loss and by error, if they can be compared; empty for a single combination.
+    """Return the best combination by loss and by error, if they can be compared. The result is empty for a single
+    combination.
 
     Combinations with a run that failed or lacks the value are left out, because their other runs are a biased sample.
     """
@@ -125,7 +126,9 @@ def best_records(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[SweepBest
 
 
 def incomparable(sweep: Sweep, others: Sequence[str]) -> str:
-    """Return the first varied setting that is in `others` or below one of them, except learning rates; "" if none."""
+    """Return the first varied setting that is in `others` or below one of them, except learning rates, or "" if
+    none.
+    """
     keys = [key for key in sweep.keys if not is_rate(key)]
     return next((key for key in keys if any(f"{key}.".startswith((f"{o}.", f"{o}[")) for o in others)), "")
 
@@ -254,7 +257,7 @@ class Verdict:
 
 
 def find_best(values: Mapping[str, Sequence[float]]) -> Verdict | None:
-    """Find the combination with the lowest median and those tied with it; None if there are no values.
+    """Find the combination with the lowest median and those tied with it, or None if there are no values.
 
     Values at the same index have the same seed. A combination is tied if Wilcoxon's signed-rank test of the differences
     from the best finds no difference: two-sided, at level ALPHA divided by the number of other combinations.

@@ -69,7 +69,9 @@ def _brightest(image: Array) -> Array:
 
 
 def shown_exposures(views: Sequence[Mapping[str, Any]] | None) -> dict[str, float]:
-    """Return the exposures of a manifest's `views`, by the suffix of their image names; empty for older runs."""
+    """Return the exposures of a manifest's `views`, by the suffix of their image names. The result is empty for older
+    runs.
+    """
     found = {}
     for view in views or ():
         exposure = view.get("shown")
@@ -79,7 +81,7 @@ def shown_exposures(views: Sequence[Mapping[str, Any]] | None) -> dict[str, floa
 
 
 def exposure_words(exposure: float, target: Array | None = None) -> str:
-    """Return a remark on an exposure; empty for 1, unless it clips many pixels of `target`."""
+    """Return a remark on an exposure. The result is empty for 1, unless it clips many pixels of `target`."""
     words = []
     if exposure != 1:
         times = f"{exposure:.2g} times brighter" if exposure > 1 else f"{1 / exposure:.2g} times darker"
@@ -128,7 +130,7 @@ def write_error_map(folder: Path, suffix: str, image: Array, target: Array, grad
 
 
 def read_comparison(folder: Path, suffix: str) -> dict[str, Array]:
-    """Return the layers that `write_error_map` wrote; empty if they are missing or damaged."""
+    """Return the layers that `write_error_map` wrote. The result is empty if they are missing or damaged."""
     try:
         return read_layers(folder / f"comparison{suffix}.exr")
     except (OSError, ValueError):

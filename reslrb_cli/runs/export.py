@@ -141,7 +141,7 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
 
 
 def exposure_line(run: Path) -> str:
-    """Return a line with the factor by which renderings match the run's photographs; empty if it is 1."""
+    """Return a line with the factor by which renderings match the run's photographs. The result is empty if it is 1."""
     found = {sensor: " ".join(f"{value:.4g}" for value in np.ravel(each)) for sensor, each in exposures(run).items()}
     if set(found.values()) <= {"1"}:
         return ""
@@ -272,7 +272,7 @@ def read_solid(config: Config, plan: Fabrication, params: mi.SceneParameters) ->
 
 
 def read_target(config: Config, sensor: mi.Sensor, needed: bool) -> Array | None:
-    """Return the target image (H, W, C) of a sensor; None if `target.file` does not have the size of the film.
+    """Return the target image (H, W, C) of a sensor, or None if `target.file` does not have the size of the film.
 
     Raises ConfigError in that case if the target is `needed` for tolerances.
     """

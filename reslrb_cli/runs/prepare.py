@@ -301,7 +301,9 @@ class RunProgress:
         self.regularized.add(record)
 
     def best_values(self) -> dict[str, Array]:
-        """Return the best parameters so far, in the form of `problem.values()`; empty if there are none yet."""
+        """Return the best parameters so far, in the form of `problem.values()`. The result is empty if there are none
+        yet.
+        """
         shown = self.problem.selection.shown
         return {
             key: value if isinstance(value, np.ndarray) else shown(key, value)

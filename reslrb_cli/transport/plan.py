@@ -255,7 +255,7 @@ class Plan:
 
     @property
     def sole_bsdf(self) -> mi.BSDFPtr | None:
-        """The only differentiated BSDF (a pointer) if there is just one; otherwise None."""
+        """The only differentiated BSDF (a pointer) if there is just one, or otherwise None."""
         return mi.BSDFPtr(self.only_bsdfs[0]) if len(self.only_bsdfs) == 1 else None
 
     def differentiates(self, bsdf: mi.BSDFPtr) -> mi.Bool:

@@ -21,7 +21,7 @@ Both e and p_D include the choice of the emitter.
     camera walk       start: M = N / p_cam, V = 0.    m = M at the first vertex, V p~ at later ones
       next event      w_N = 1 / (1 + p / p_D + m e c / (p_D g))    g: d^2 for a light at a point, else 1; p = 0 for both
       smooth event    V = (c / p) m,  M = 1 / p         delta event   V *= c,  M = 0
-      light is met    w_H = 1 / (1 + p_D M + e V)       of M and V before the arrival; 1 where it is seen directly
+      light is met    w_H = 1 / (1 + p_D M + e V)       of M and V before the arrival, or 1 where it is seen directly
     light walk        at the first vertex: M = p_D g / (e |cos|),  V = 1 / (e |cos|); V = 0 for delta lights
       connection      w_L = 1 / (1 + p_camA / N (M + V p~))        p_camA: p_cam as a density of area at the vertex
       smooth event    V = (c / p) (M + V p~), then M = 0 for good  delta event   V *= c,  M = 0

@@ -351,5 +351,5 @@ def _certainty(
 
 
 def _numbers(values: Array) -> Values:
-    """Return numbers for JSON; None if nothing is known."""
+    """Return numbers for JSON, or None if nothing is known."""
     return None if np.isnan(values).all() else [None if np.isnan(value) else float(value) for value in values]

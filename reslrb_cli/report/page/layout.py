@@ -31,7 +31,7 @@ def key(text: object) -> Markup:
 
 
 def soft(line: str) -> Markup:
-    """Return a remark; empty for an empty line."""
+    """Return a remark. The result is empty for an empty line."""
     return lay_out("soft", line)
 
 
@@ -100,7 +100,8 @@ _CURVES = {
 def diagram(
     curves: Sequence[Curve], caption: str, label: str, log_x: float | None = None, floors: Sequence[float] = ()
 ) -> Markup:
-    """Return a diagram of curves with the x label `caption` and the y label `label`; empty if no curve has a point.
+    """Return a diagram of curves with the x label `caption` and the y label `label`. The result is empty if no curve
+    has a point.
 
     The y axis is logarithmic if positive values span a large factor. The x axis is logarithmic with base `log_x` if
     that is given and all values are positive. `floors` are drawn as dotted horizontal lines. Labels must not contain $,

@@ -38,7 +38,7 @@ WARM_UP = 5
 
 
 def step_ms(records: Sequence[Mapping[str, Any]], name: str = "step_ms") -> float | None:
-    """Return the median milliseconds of a step, or of the part `name`, without the first steps; None if unknown."""
+    """Return the median milliseconds of a step, or of the part `name`, without the first steps, or None if unknown."""
     known = [record[name] for record in records[WARM_UP:] or records if record.get(name) is not None]
     return statistics.median(known) if known else None
 
@@ -63,7 +63,7 @@ def _wall(manifest: Mapping[str, Any]) -> str:
 
 
 def workers(shared: Mapping[str, Any] | None, elapsed_s: float | None) -> Markup:
-    """Return the time of all iterations by part and by worker; empty without workers."""
+    """Return the time of all iterations by part and by worker. The result is empty without workers."""
     if not shared:
         return Markup()
     time = TypeAdapter(SharedTime).validate_python(shared)
@@ -81,7 +81,7 @@ DAMAGED = "This part cannot be shown: what was recorded of it is damaged."
 
 
 def fabrication(run: Run) -> Markup:
-    """Return the sheet for the workshop of the run's solid; empty without one."""
+    """Return the sheet for the workshop of the run's solid. The result is empty without one."""
     text = _read(run.path / FABRICATION_FILE)
     if not text:
         return Markup()

@@ -187,7 +187,7 @@ def _parse(file: Path, text: str) -> Element:
 
 
 def _version(text: str) -> tuple[int, ...] | None:
-    """Parse a version; None unless it is three numbers, as Mitsuba requires."""
+    """Parse a version, or None unless it is three numbers, as Mitsuba requires."""
     return tuple(map(int, text.split("."))) if re.fullmatch(r"\d+\.\d+\.\d+", text) else None
 
 
