@@ -13,6 +13,8 @@ source_suffix = {".md": "myst-nb", ".ipynb": "myst-nb"}
 exclude_patterns = ["benchmarks/*", "paper/*"]
 
 myst_enable_extensions = ["dollarmath", "colon_fence"]
+# Formulas are ```math blocks, which code hosts show, too
+myst_fence_as_directive = ["math"]
 # Links to headings work as on code hosts
 myst_heading_anchors = 4
 # `$ command` and prices are no formulas
