@@ -24,7 +24,7 @@ IMAGES, PAGE, TEMPLATE = ROOT / "docs" / "images", ROOT / "docs" / "paper.md", P
 PUBLISHED_MS: dict[int, tuple[int | None, int | None]] = {4: (63, 93), 16: (260, 132), 128: (None, 197)}
 #: The depth at which both take the same time in the paper.
 PARITY = 8
-MEANS = "Means of the gradients, compared in standard errors"
+MEANS = "The next table compares the means of the gradients in standard errors."
 
 
 def write(folder: Path | None = None) -> int:
@@ -55,18 +55,18 @@ def _figure1(record: Row) -> str:
     fall, plan = record["noise"], record["plan"]
     few, many, lack = plan["few_spp"], plan["many_spp"], record["naive_at_many_spp_mib"] / 1024
     ratio, low, high, expected = (f"{fall[name]:.2f}" for name in ("ratio", "low", "high", "expected"))
-    about = f"Each process under {plan['limit'] / 2**30:g} GiB of address space:"
+    about = f"Each process may use {plan['limit'] / 2**30:g} GiB of address space."
     noise = (
-        f"From {few} to {many} spp noise falls by {ratio} ({low} to {high}), expected {expected}.\n"
-        f"By its growth naive AD would take about {lack:.1f} GiB at {many} spp."
+        f"From {few} to {many} spp, the noise falls by {ratio} ({low} to {high}). We expect {expected}.\n"
+        f"Naive AD would take about {lack:.1f} GiB at {many} spp, extrapolated from fewer samples."
     )
-    return "\n\n".join([_gradients(record, about), f"{MEANS}:", _comparisons(record["comparisons"]), noise])
+    return "\n\n".join([_gradients(record, about), MEANS, _comparisons(record["comparisons"]), noise])
 
 
 def _figure5(record: Row) -> str:
     film, left_out = "{}x{}".format(*record["film"]), f"dL/dI is 0 in {record['left_out']:.1%} of the pixels"
-    about = f"Film {film}, paths of length {record['max_depth']}; {left_out}:"
-    means = f"{MEANS}; the exact estimators at equal seeds, in relative L2:"
+    about = f"The film has {film} pixels, and the paths have length {record['max_depth']}. {left_out}."
+    means = f"{MEANS} The exact estimators are compared at equal seeds, by their\nrelative L2 distance."
     return "\n\n".join([_gradients(record, about), means, _comparisons(record["comparisons"])])
 
 
@@ -101,8 +101,11 @@ def _figure6(lines: Sequence[Row]) -> str:
     ratios += [[name, *(over(name, depth) for depth in depths)] for name in names[1:]]
     head, film = ["depth", *map(str, depths)], "{width}x{height}, {spp} spp".format_map(rows[0])
     origins = dict.fromkeys(_origin(line) for line in lines if line.get("kind") == "origin")
-    about = f"Film {film}, no roulette; milliseconds of a step, and MiB of arrays at their most:"
-    parts = [about, tables.table(head, cells), f"A step over one of naive AD ({names[0]}):", tables.table(head, ratios)]
+    about = (
+        f"The table shows the milliseconds of a step, and the peak of the arrays in MiB, with {film}, without roulette."
+    )
+    over_naive = f"The next table shows the time of a step, divided by a step of naive AD ({names[0]})."
+    parts = [about, tables.table(head, cells), over_naive, tables.table(head, ratios)]
     return "\n\n".join([*origins, *parts])
 
 

@@ -273,13 +273,14 @@ def extreme_page(lines: Sequence[Mapping[str, Any]]) -> str:
         rows.append([f"`{case}`", CASES[case].about, named, str(own[0]["seeds"]), *cells])
     return (
         "# The extreme suite\n\n"
-        "Scenes in which gradients of light paths often fail, each with its own reference. Written by\n\n"
+        "Scenes in which gradients of light paths often fail, each with its own reference. This command measures\n"
+        "all cases and writes this page.\n\n"
         "    scripts/benchmarks measure extreme\n\n"
-        f"on {origin['device']}, {origin['variant']}.\n\n"
-        "The columns of the estimators contain the largest deviation in standard errors of all comparisons over many\n"
-        f"seeds (limit {z:.1f}, the same for all), the largest relative L2 distance at equal seeds (limit\n"
-        f"{distance:.0e}), and, in bold, each comparison that fails or stays open. [gradcheck.md](gradcheck.md)\n"
-        "explains references and verdicts.\n\n"
+        f"The figures are from {origin['device']}, {origin['variant']}.\n\n"
+        "The columns of the estimators contain two figures. The first is the largest deviation in standard errors\n"
+        f"over many seeds (limit {z:.1f}). The second is the largest relative L2 distance at equal seeds\n"
+        f"(limit {distance:.0e}). Comparisons that fail or stay open are in bold.\n"
+        "[gradcheck.md](gradcheck.md) explains references and verdicts.\n\n"
         f"{table(('case', 'subject', 'references', 'seeds', *estimators), rows)}\n"
     )
 

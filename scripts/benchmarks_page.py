@@ -233,7 +233,9 @@ class Blocks:
         conditions = [f"film {row['width']}x{row['height']}"]
         conditions += [words for key, words in parts.items() if key != SWEPT[name][0]]
         conditions += [f"{row['texels']} texels"] if row.get("texels") else []
-        took = f"This took {record.origin['seconds']:.0f} s at {commit_of(record.origin)}; {', '.join(conditions)}:"
+        took = (
+            f"This took {record.origin['seconds']:.0f} s at {commit_of(record.origin)}. Fixed: {', '.join(conditions)}."
+        )
         return f"    {record.command}\n\n{took}\n\n{bench_details(record, name)}"
 
     def ratios(self, name: str) -> str:

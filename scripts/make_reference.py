@@ -27,20 +27,23 @@ _HEAD = """\
 
 <!-- Written by `python scripts/make_reference.py` from reslrb_cli/config; edit the descriptions there. -->
 
-One YAML file is one experiment. Unknown keys are errors. Paths are relative to the file they stand in, except
-`run.output`, which is relative to the working directory. The file is read as YAML 1.2: `1e-3` is a number, `yes` and
-`no` are text, and text that begins with `*`, `&`, `!`, `%`, `@` or a brace wants quotes: `key: "*.data"`. It names
-regular files only, no pipes or devices.
-[config.schema.json](config.schema.json) is the same as JSON Schema, for editors.
+One YAML file describes one experiment. Unknown keys are errors. Paths are relative to the YAML file, except
+`run.output`, which is relative to the working directory. All paths must be regular files, not pipes or devices.
 
-On the command line `--set KEY=VALUE` changes a value; VALUE is YAML too, and later ones win:
+The file is read as YAML 1.2. `1e-3` is a number, and `yes` and `no` are text. Put quotes around text that begins with
+`*`, `&`, `!`, `%`, `@` or a brace, as in `key: "*.data"`.
+
+[config.schema.json](config.schema.json) contains the same reference as JSON Schema, for editors.
+
+On the command line, `--set KEY=VALUE` changes a value. VALUE is YAML as well. If a key is set twice, the last value
+counts.
 
     --set run.spp=64 --set parameters[0].bounds=[0,1] --set 'integrator={type: prb}'
     --set target.render.parameters.floor.reflectance.value=[0.2,0.4,0.6]
     --set 'parameters[0].key="*.reflectance.data"'
 
-Below `scene.options` and `target.render.parameters` the rest of KEY is one name, dots and all. To change a section's
-`type` where it holds options that the new type does not have, replace the section as a whole.
+The names in `scene.options` and `target.render.parameters` may contain dots. If a section has options that its new
+`type` does not have, replace the whole section.
 
 ## Example
 """
@@ -89,7 +92,7 @@ def _section(name: str, value: dict[str, Any], defs: dict[str, Any], level: int 
         default = members[0]["properties"]["type"]["const"]
         named = all("type" in member.get("required", ()) for member in members)
         yield from (
-            "One of these types:" if named else f"One of these types (`{default}` where `type` is left out):",
+            "Choose one of these types." if named else f"Choose one of these types. The default is `{default}`.",
             "",
         )
         yield from (f"- `{m['properties']['type']['const']}`: {m['description']}" for m in members)
@@ -214,9 +217,16 @@ _PYTHON = f"""\
 {_MARK}
 <!-- From here on written by `python scripts/make_reference.py` from docstrings; edit these. -->
 
-`Experiment` is what `load` takes, `Folder` a path as text or a `Path`, `Array` a NumPy array of float32, `Loss` a
-function as `optimize` says, `Objective` one of an image. `GradcheckRecord` and `Line` are records: attributes of the
-names that a line of `--json` has, and `to_json()`, which is that line.
+The signatures use these types:
+
+- `Experiment`: any argument that `load` accepts
+- `Folder`: a path as text or as a `Path`
+- `Array`: a NumPy array of float32
+- `Loss`: a function as described at `optimize`
+- `Objective`: a function of an image
+
+`GradcheckRecord` and `Line` have one attribute for each field of a `--json` line. Their method `to_json()` returns
+that line.
 """
 
 

@@ -170,7 +170,7 @@ _POINT = must(
 
 
 class MotionSpec(Section):
-    """Motion of shapes and emitters together: scaled, then rotated, then translated."""
+    """Common motion of shapes and emitters. They are scaled, then rotated, then translated."""
 
     of: Names = Field(description="Ids of the shapes and emitters that move together. The first id names the motion.")
     pivot: Annotated[list[float], _POINT] | None = None
@@ -264,8 +264,9 @@ class Regularizer(Choice):
 
 
 class Curvature(Regularizer, json_schema_extra={"required": ["type", "radius"]}):
-    """Hollows of a heightmap that are too narrow for a tool: integral of max(0, k - 1/radius)². k is the larger
-    principal curvature, positive in hollows as seen from outside."""
+    """Hollows of a heightmap that are too narrow for a tool: integral of max(0, k - 1/radius)². Here k is the larger
+    principal curvature. It is positive in hollows, seen from outside.
+    """
 
     type: Literal["curvature"] = "curvature"
     """For a heightmap: integral of max(0, k - 1/radius)². k is the larger principal curvature, positive in hollows."""
@@ -281,8 +282,9 @@ class Slope(Regularizer, json_schema_extra={"required": ["type", "degrees"]}):
 
 class Thickness(Regularizer, json_schema_extra={"required": ["type", "thickness", "least"]}):
     """A plate that is too thin: integral of max(0, least - (thickness + h))², with the heightmap h. After each step,
-    heights are clamped so that the plate keeps a tenth of `least`, and its faces never cross. The run records how many
-    heights are clamped."""
+    heights are clamped so that the plate keeps a tenth of `least`, and its faces never cross. The run records the
+    number of clamped heights.
+    """
 
     type: Literal["thickness"] = "thickness"
     """For a heightmap h: integral of max(0, least - (thickness + h))². After each step, heights are clamped so that the
@@ -311,7 +313,8 @@ _HELD = 0.1
 
 class TotalVariation(Regularizer, json_schema_extra=NEEDS_TYPE):
     """Total variation of a heightmap or a bitmap: integral of sqrt(|gradient|² + epsilon²) - epsilon. The gradient is
-    that of all channels together."""
+    computed over all channels together.
+    """
 
     type: Literal["total_variation"] = "total_variation"
     """For a heightmap or a bitmap: integral of sqrt(g² + epsilon²) - epsilon, with the gradient g of all channels."""

@@ -29,9 +29,9 @@ class Mask(Section):
     """Pixels of a target that the loss leaves out, and weights of the others.
 
     `specular`, `border`, `clipped` and `alpha` apply to targets that are read from files. `specular` and `border` leave
-    out pixels that light tracing cannot render. They matter only if exactly one of two integrators traces from the
-    lights: the one of the run and the one of the target. In this case they also apply to rendered targets. Pixels of a
-    file that are not finite are always left out.
+    out pixels that light tracing cannot render. They matter only if either the run's integrator or the target's
+    integrator traces from the lights, but not both. In this case they also apply to rendered targets. Pixels of a file
+    that are not finite are always left out.
     """
 
     file: ConfigPath | None = None
