@@ -1,4 +1,6 @@
-"""The errors that users see. Each has an exit code and one line that names its location, never a traceback."""
+"""The errors that users see. Each error has an exit code and a one-line message. The message names the location and
+never contains a traceback.
+"""
 
 from __future__ import annotations
 
@@ -103,7 +105,7 @@ class NonFinite(ReslrbError):
 
 
 class MachineError(ReslrbError):
-    """Failure of the machine that no setting causes: a full disk, a removed folder, a driver error."""
+    """Machine failure that no setting causes, for example a full disk, a removed folder or a driver error."""
 
     exit_code = ExitCode.MACHINE
 

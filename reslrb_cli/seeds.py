@@ -14,8 +14,8 @@ def seed(run_seed: int, iteration: int, view: int, purpose: str) -> int:
 
     `iteration` and `view` are the iteration and the sensor that the numbers are drawn for (0 if there is none), and
     `purpose` names the use (`"image"`, `"target"`, ...). The four arguments are hashed together (BLAKE2b). A sum would
-    give neighbouring iterations and views the same seeds and therefore the same noise. Two different uses collide with
-    a probability of 2**-32.
+    give neighbouring iterations and views the same seeds and therefore the same noise. The seeds of two different uses
+    are equal with a probability of 2**-32.
     """
     text = f"{run_seed:d}/{iteration:d}/{view:d}/{purpose}"
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest(), "little")

@@ -12,8 +12,8 @@ Array = np.ndarray[Any, Any]
 def jackknife_variance(without: Array) -> Array:
     """Return the jackknife variance (...) of an estimate. Its square root is the standard error.
 
-    `without` (N, ...) holds the estimates with each of N independent samples left out in turn. Source: Efron, The
-    Jackknife, the Bootstrap and Other Resampling Plans, 1982.
+    `without` (N, ...) holds N estimates. Estimate i leaves out sample i of the N independent samples. Source: Efron,
+    The Jackknife, the Bootstrap and Other Resampling Plans, 1982.
     """
     count = len(without)
     return np.asarray((count - 1) / count * np.sum(np.square(without - without.mean(axis=0)), axis=0))

@@ -53,8 +53,9 @@ logger = logging.getLogger(__name__)
 def held() -> Iterator[Callable[[], bool]]:
     """Delay Ctrl-C and a notebook's interrupt until the end of the block, then raise KeyboardInterrupt.
 
-    An interrupt inside Mitsuba or Dr.Jit would cause a crash or an unrelated error. Yields a function that says whether
-    an interrupt is waiting, for long blocks. Does nothing outside of the main thread and inside another such block.
+    An interrupt inside Mitsuba or Dr.Jit would cause a crash or an unrelated error. Yields a function that returns True
+    if an interrupt is waiting. Long blocks can call the function to stop early. The context manager does nothing
+    outside of the main thread. A nested `held` block also does nothing.
     """
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or before is not signal.default_int_handler:
@@ -77,7 +78,9 @@ def held() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def called() -> Iterator[Callable[[], bool]]:
-    """Do the same as `held`, and rename command-line options in a ConfigError to the arguments of the function."""
+    """Do the same as `held`. Also replace command-line options in the text of a ConfigError by the function's
+    arguments.
+    """
     with held() as stop:
         try:
             yield stop
@@ -139,12 +142,13 @@ def render(
 ) -> dict[int, Array]:
     """Render every view of an experiment and return the images by sensor index.
 
-    Images are (height, width, channels) float32, in linear radiance. The experiment's integrator renders them with
-    `spp` samples per pixel (default: `run.spp`).
+    Images are (height, width, channels) float32, in linear radiance. The experiment's integrator renders the images
+    with `spp` samples per pixel (default: `run.spp`).
 
-    The parameters have their initial values, or for a run folder the recovered values. `values` replaces them by key:
-    each value is an array of the parameter's shape, or a number or list that NumPy converts to one. Parameters that
-    `values` does not name are unchanged. With `initial=False` the scene is rendered as it is in its file.
+    The parameters have their initial values. For a run folder, the parameters have the recovered values. `values` maps
+    keys to replacement values for the parameters. Each value is an array of the parameter's shape, or a number or list
+    that NumPy converts to this shape. Parameters that `values` does not name are unchanged. With `initial=False` the
+    scene is rendered as it is in its file.
 
     Sets the experiment's Mitsuba variant if none is set. Raises ConfigError (also if another variant is set) and
     UnsupportedScene.
@@ -175,8 +179,8 @@ def gradient(
     """Return the loss of an experiment and its gradients by key.
 
     Each gradient is a float32 array with the shape of its parameter. Its unit is the loss per unit of the parameter.
-    The result equals that of the first iteration of a run, including the images that `run.adjoint` selects. The
-    parameters have their initial values, or `values` as for `render`.
+    The result equals the gradient of a run's first iteration. The adjoint image also comes from the samples that
+    `run.adjoint` selects. The parameters have their initial values, or `values` as for `render`.
 
     `spp` replaces `run.spp`. `seed` replaces `run.seed` for the samples only. The target and the measurements before
     the first iteration (`guiding: auto`, ...) still use the experiment's seed. Regularizers contribute to the gradient

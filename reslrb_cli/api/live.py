@@ -28,7 +28,7 @@ def watched(
     """Yield `records` and show the progress.
 
     A bar counts from `done` to `total` iterations. In a notebook, the PNG that `draw` returns is updated now and then.
-    When the loop ends, for whatever reason, both show the last iteration.
+    When the loop ends for any reason, the bar and the figure show the last iteration.
     """
     show = None if draw is None else _notebook()
 

@@ -137,10 +137,11 @@ class Run:
                 self._status = Status.FINISHED
 
     def live(self, figure: bool = True) -> Iterator[Record]:
-        """Iterate with a progress bar and, in a notebook, a live `figure` of loss, errors, and a view and its target.
+        """Iterate with a progress bar. In a notebook, `figure` also shows a live plot of the loss, the errors, and one
+        view beside its target.
 
-        The bar comes from `tqdm.auto`. In a notebook it is a widget if the extra `reslrb[notebook]` is installed. The
-        figure is redrawn now and then, in a small share of the time.
+        The bar comes from `tqdm.auto`. In a notebook, the bar is a widget if the extra `reslrb[notebook]` is installed.
+        The figure is redrawn at intervals. Drawing takes only a small share of the run time.
         """
         from reslrb_cli.api.live import drawn, watched  # imports matplotlib
 
@@ -155,8 +156,8 @@ class Run:
     def close(self) -> None:
         """Stop the run and complete its folder. Does nothing if no loop is active.
 
-        If the folder cannot be completed, the error is raised here. This includes an error from leaving an earlier
-        loop. It is a MachineError if the folder cannot be written to.
+        If the folder cannot be completed, the error is raised here. `close` also raises an error that occurred while an
+        earlier loop was left. If the folder cannot be written to, the error is a MachineError.
         """
         loop = None if self._loop is None else self._loop()
         if loop is not None:
@@ -187,12 +188,14 @@ class Run:
 
     @property
     def folder(self) -> Path | None:
-        """The run folder. It is None before the first loop, which creates it, and for a run that writes nothing."""
+        """The run folder. The value is None before the first loop, because the first loop creates the folder. The value
+        is always None for a run that writes nothing.
+        """
         return self._folder
 
     @property
     def status(self) -> str:
-        """`running` until a loop ends, then `finished`, `interrupted` or `failed`."""
+        """The run's status: `running` until a loop ends, then `finished`, `interrupted` or `failed`."""
         return self._status.value
 
     @property
@@ -218,8 +221,8 @@ class Run:
     def gradients(self) -> dict[str, Array]:
         """The gradients of the last iteration, by key. The result is empty before the first iteration.
 
-        Each has the shape of its parameter; in a stage of `run.stages`, the shape in that stage. Gradients include
-        regularizers and are not clamped. They may contain values that are not finite.
+        Each gradient has the shape of its parameter. In a stage of `run.stages`, gradients have the parameter's shape
+        in this stage. Gradients include regularizers and are not clamped. They may contain values that are not finite.
         """
         course = self._begun.course
         return course.shown(course.state.gradients)
@@ -229,8 +232,8 @@ class Run:
         """The current image of each view, by sensor index.
 
         Images are float32 arrays (height, width, channels) with the exposure of the target. Each access renders the
-        images with separate seeds, so it does not change the run. The sample count is that of the images saved between
-        iterations, at least 64 per pixel. Raises the same errors as a run, such as ConfigError.
+        images with separate seeds, so it does not change the run. The sample count per pixel equals the sample count of
+        images saved between iterations, which is at least 64. Raises the same errors as a run, such as ConfigError.
         """
         course = self._begun.course
         problem = course.problem
@@ -249,7 +252,9 @@ class Run:
 
     @property
     def truth(self) -> dict[str, Array]:
-        """The true parameter values, by key. They are known only if the target is rendered."""
+        """The true parameter values, by key. True values are known if the target is rendered, or if `target.truth` is
+        set.
+        """
         return dict(self._begun.course.problem.truth)
 
     def __repr__(self) -> str:
@@ -274,22 +279,24 @@ def optimize(
 
     `experiment` and `overrides` are the arguments of `load`; `experiment` may also be its result.
 
-    `folder` is the run folder, with the same content as from `reslrb optimize`. If it exists, the run is written to
-    `folder-2` and so on (see `Run.folder`). The setting `run.output` is then ignored, with a warning. Without `folder`,
-    only the caches of kernels and measurements are written.
+    `folder` is the run folder, with the same content as from `reslrb optimize`. If `folder` exists, the run is written
+    to `folder-2` and so on (see `Run.folder`). The setting `run.output` is then ignored, with a warning. Without
+    `folder`, only the caches of kernels and measurements are written.
 
-    `resume` is the folder of a run, which continues exactly where it stopped: in that folder, or in a new one if you
-    give `folder`. `experiment` is then optional; if given, it must be that of the run. `overrides` may change
-    iterations and learning rates. A finished run has no iterations left and logs a warning.
+    `resume` is the folder of an earlier run. The run continues exactly where the earlier run stopped. New results go to
+    the earlier folder, or to `folder` if you give one. With `resume`, `experiment` is optional. If given, `experiment`
+    must agree with the earlier run. `overrides` may change iterations and learning rates. A finished run has no
+    iterations left and logs a warning.
 
     `loss` is your own loss function, `loss(image, target)` or `loss(image, target, weights)`. The arguments are
     `mi.TensorXf` (height, width, channels), and the image is attached. It returns a `mi.Float` of width 1 or a tensor
     with one entry. Pass it again with `resume`. `allow_code` permits running the code files that the experiment names
     (`loss.file`, `integrator.file`).
 
-    Before it returns, `optimize` sets the experiment's Mitsuba variant if none is set, loads and checks all files,
-    makes the target, and measures the settings left to measurement. Raises ConfigError (located by file and key),
-    UnsupportedScene, BackendError and MachineError. Iterating can also raise NonFinite and OutOfMemory.
+    Before returning, `optimize` sets the experiment's Mitsuba variant if none is set. `optimize` loads and checks all
+    files and makes the target. `optimize` also chooses the settings that the experiment leaves to measurement. Raises
+    ConfigError (located by file and key), UnsupportedScene, BackendError and MachineError. Iterating can also raise
+    NonFinite and OutOfMemory.
     """
     put_in, named = overrides_of(overrides), list[Override]()
     if folder is not None:
@@ -340,7 +347,9 @@ def _reopened(
     loss: Loss | None,
     allow_code: bool,
 ) -> tuple[contextlib.ExitStack, PreparedRun, bool]:
-    """Return the stack that holds the lock of a resumed run's folder, the run, and whether iterations are left."""
+    """Return the lock stack and the prepared run for a resumed run, and True if iterations are left. The stack holds
+    the lock of the run folder.
+    """
     with contextlib.ExitStack() as stack:
         earlier = stack.enter_context(open_earlier(folder, wanted, put_in))
         earlier.config = _with_own(earlier.config, loss, allow_code)

@@ -107,7 +107,8 @@ _WITHOUT_METADATA = ["mitsuba", "drjit", "numpy"]
 class Backend:
     """Backend of Dr.Jit.
 
-    `missing` says in one line why it does not work, or is empty. `trial` has the times of a kernel and a ray.
+    `missing` is one line that explains why the backend does not work. `missing` is empty if the backend works. `trial`
+    holds the measured times of one kernel and one ray.
     """
 
     variant: str

@@ -50,7 +50,9 @@ def shipped_plugins() -> frozenset[str]:
 
 
 def is_known(name: str) -> bool:
-    """Whether `name` is a plugin of Mitsuba, or registered in this process; loads no other plugin."""
+    """True if `name` is a Mitsuba plugin, or a plugin registered in this process. The function loads no other
+    plugin.
+    """
     return name in shipped_plugins() or _is_registered(name)
 
 
@@ -75,7 +77,9 @@ def _is_registered(name: str) -> bool:
 
 @functools.cache
 def likely_parameters(name: str) -> list[str]:
-    """Return words in the library of a shipped plugin that may be names of its parameters, for suggestions."""
+    """Return words from a shipped plugin's library file that may be parameter names. Error messages suggest these
+    words.
+    """
     for library in (package_folder() / "plugins").glob(f"{name}.*"):
         words = re.findall(rb"(?<=\0)[a-z][a-z0-9_]{2,40}(?=\0)", library.read_bytes())
         return sorted({word.decode("ascii") for word in words})
@@ -110,7 +114,9 @@ def prefer_own_plugins() -> None:
 
 @contextmanager
 def looking_in(folders: Iterable[Path]) -> Iterator[None]:
-    """Make Mitsuba look for files in `folders`, in order, but for plugins in its own folder first."""
+    """Make Mitsuba look for files in `folders`, in the given order. Mitsuba still looks in its own folder first to find
+    its plugins.
+    """
     import mitsuba as mi
 
     before = mi.file_resolver()

@@ -1,8 +1,8 @@
 """Search for the libLLVM that Dr.Jit should load: the newest one on this machine that works.
 
-Dr.Jit looks only in Debian's folders, and accepts versions under which it ends the process ("Cannot select fminimum",
-LLVM 15 and 16 on AVX-512 machines). The choice is therefore made here, before Dr.Jit is imported, and passed in
-DRJIT_LIBLLVM_PATH.
+Dr.Jit looks for libLLVM only in Debian's folders. Dr.Jit also accepts LLVM versions under which Dr.Jit ends the
+process. An example is "Cannot select fminimum" with LLVM 15 and 16 on AVX-512 machines. The choice is therefore made
+here, before Dr.Jit is imported, and passed in DRJIT_LIBLLVM_PATH.
 """
 
 from __future__ import annotations
@@ -141,7 +141,9 @@ def _major(version: str) -> int:
 
 
 def _folders() -> Iterator[Path]:
-    """Yield the existing folders that may contain a libLLVM, those of the environment first."""
+    """Yield the folders that may contain a libLLVM. The folders of the Python environment come before the folders of
+    the system.
+    """
     yield UNPACKED
     roots = [sys.prefix, os.environ.get("CONDA_PREFIX"), sys.base_prefix]
     yield from (Path(root) / "lib" for root in dict.fromkeys(roots) if root)

@@ -60,7 +60,7 @@ def resident_bytes() -> int:
 def local_bytes() -> int:
     """Return the thread-local bytes that a path can use on the CPU, which is its share of a thread's stack.
 
-    A kernel that needs more overwrites other memory, or crashes the process.
+    A kernel that needs more thread-local memory overwrites other memory or crashes the process.
     """
     stack, _ = resource.getrlimit(resource.RLIMIT_STACK)
     stack = _UNLIMITED_STACK if stack == resource.RLIM_INFINITY else stack

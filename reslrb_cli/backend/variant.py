@@ -48,8 +48,8 @@ def set_variant(name: str = "auto") -> str:
 def keep_variant(name: str, source: object) -> str:
     """Set the variant `name` if none is set, and return the current variant. `auto` accepts any supported variant.
 
-    Raises ConfigError, located in `source`, if another variant is set. Changing it would invalidate the caller's
-    objects.
+    Raises ConfigError, located in `source`, if another variant is set. A change of variant would invalidate the
+    caller's objects.
     """
     mi = sys.modules.get("mitsuba")
     now: str | None = None if mi is None else mi.variant()

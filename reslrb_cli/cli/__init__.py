@@ -130,7 +130,9 @@ def main() -> None:
 
 
 def run() -> None:
-    """Run the program `reslrb`. A signal ends it at once, with cleanup, unless the command handles signals itself."""
+    """Run the program `reslrb`. A signal ends the program at once, with cleanup, unless the command handles signals
+    itself.
+    """
     interrupts = Interrupts(tolerated=0)
     with interrupts:
         try:

@@ -77,8 +77,9 @@ def command(
 
     A step computes image, loss and gradient of every parameter of CONFIG, through its first sensor. Without CONFIG, the
     scene is a Cornell box (--set scene.options.size=64, run.spp=4, ...). Each integrator runs in its own processes. If
-    one runs out of memory, this is recorded as out_of_memory, and the others continue. Ctrl-C keeps finished results.
-    To continue after any interruption, repeat the command with the same --json file.
+    an integrator runs out of memory, its result is recorded as out_of_memory. The measurement of the other integrators
+    continues. Ctrl-C keeps finished results. To continue after any interruption, repeat the command with the same
+    --json file.
     """
     began = time.monotonic()
     from reslrb_cli.backend.installation import load_packages

@@ -17,7 +17,7 @@ from reslrb_cli.errors import BackendError
 def command(as_json: bool) -> None:
     """Show the variant, device, libLLVM and versions in use, and test them.
 
-    Each backend compiles and runs one kernel and traces one ray. The exit code is 3 if none of them works.
+    Each backend compiles and runs one kernel and traces one ray. The exit code is 3 if no backend works.
     """
     report = examine()
     if as_json:

@@ -28,8 +28,8 @@ _SCENE = re.compile(r"(?:\.\./)+scenes/(\w+)/")
 
 
 def examples() -> dict[str, Path]:
-    """Return the configurations by name, e.g. `cornell_floor` or `stiff/lamp`. The result is empty if they are not
-    installed.
+    """Return the configurations by name, e.g. `cornell_floor` or `stiff/lamp`. The result is empty if the example
+    configurations are not installed.
     """
     configs = FOLDER / "configs"
     found = [*configs.glob("*.yaml"), *configs.glob("*/*.yaml")]

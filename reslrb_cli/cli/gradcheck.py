@@ -86,7 +86,7 @@ def run_suite_command(
 ) -> int:
     """Run the named cases, or all cases without names; print a line for each and write the file.
 
-    Cases in the file are not run again. With a `place`, its workers run the cases.
+    Cases in the file are not run again. If `place` is given, the workers at this place run the cases.
     """
     chosen = _estimators(estimators)
     variant = set_variant("auto")
@@ -136,7 +136,9 @@ def _cases_at(place: Place, variant: str) -> contextlib.AbstractContextManager[C
 
 
 def _estimators(text: str | None) -> list[str] | None:
-    """Parse the estimators for a suite. They have no options except `paths`, because the cases have their own."""
+    """Parse the estimators for a suite. Estimators accept no option except `paths`, because the cases set their own
+    options.
+    """
     if text is None:
         return None
     written = []

@@ -62,8 +62,9 @@ def _first_config(
 ) -> str:
     """Return the YAML of a configuration in the file `path`, from the template `first_config.yaml.j2`.
 
-    `options` are the scene file's variables that the user has set, and `variables` all its variables, as text.
-    `sensors` are the ids of the sensors, and `sensor` is the index of the used one. `known` are other template values.
+    `options` holds the scene file's variables that the user has set. `variables` holds all variables of the scene file,
+    as text. `sensors` holds the ids of the sensors. `sensor` is the index of the sensor in use. `known` are other
+    template values.
     """
     first = [proposal for proposal in proposals if proposal.first]
     # Step sizes must be measured if a parameter is unbounded.
@@ -97,7 +98,9 @@ def _comment(text: str) -> list[str]:
 
 
 def _entry(proposal: Proposal, is_scaled: bool) -> str:
-    """Return the entry of a parameter. Unbounded ones get their own rate if step sizes are not measured."""
+    """Return the entry of a parameter. Unbounded parameters get their own learning rate if step sizes are not
+    measured.
+    """
     parts = [f"key: {_text(proposal.info.key)}"]
     parts += [f"bounds: {proposal.bounds}"] if proposal.bounds is not None else []
     parts += [f"resolution: {list(proposal.resolution)}"] if proposal.resolution is not None else []
@@ -189,9 +192,9 @@ def command(
     other recoverable parameters are listed as comments with bounds and current values. --recover selects other
     parameters.
 
-    With --target, the film gets the aspect ratio of the photograph, at a size at which a run takes minutes. A copy of
-    the photograph of this size is written beside the configuration. If there are several sensors, the first one is
-    used, unless --sensor names another.
+    With --target, the film gets the aspect ratio of the photograph, at a size at which a run takes minutes. If the
+    photograph has another size than the film, the command writes a resized copy beside the configuration. If there are
+    several sensors, the first one is used, unless --sensor names another.
     """
     from reslrb_cli.backend.variant import set_variant
 
@@ -252,7 +255,8 @@ def command(
 
 
 def choose_size(film: Size, photo: Photograph | None, fixed: bool = False) -> Size:
-    """Return the (width, height) of a film with which a run takes minutes, with the photograph's or its own ratio.
+    """Return the (width, height) of a film that is small enough for a run of minutes. The film has the photograph's
+    aspect ratio, or without a photograph its own.
 
     A `fixed` film, which is a crop of a larger one, keeps its size. Raises ConfigError if the ratios of the photograph
     and the film differ.

@@ -145,7 +145,7 @@ def parameter_lines(infos: Sequence[ParameterInfo], wanted: Sequence[str], every
 
 
 def moving_lines(movable: Sequence[MovableSummary], everything: bool) -> list[str]:
-    """List the objects that can be moved, by the options that move them."""
+    """List the movable objects, grouped by the options that move the objects."""
     lines = [f"can be moved: {len(movable) or 'nothing'}"]
     if everything:
         return lines + [f"  {line}" for line in table([(item.id, ", ".join(item.by)) for item in movable])]
@@ -226,9 +226,10 @@ def command(
 ) -> int | None:
     """List the parameters of a scene that can be recovered, with their current values, and the contents of the scene.
 
-    PATH is a scene file (XML), a configuration, complete or not, or the folder of a run. The first keys may be used in
-    `parameters` of a configuration; for the others, the reasons are given. If the configuration has `parameters`, the
-    plan of a step lists the features that its kernels contain or leave out, and why.
+    PATH is a scene file (XML), a configuration or a run folder. The configuration may be incomplete. The parameter keys
+    listed first may be used in `parameters` of a configuration. For all other keys, the command gives the reason why a
+    configuration cannot use the key. If the configuration has `parameters`, the plan of a step lists the features that
+    its kernels contain or leave out, and why.
 
     --conditioning measures how different the sensitivities of the parameters are at their initial values: for each
     parameter the root mean square of its values, its gradient and the noise of one step's gradient, the relative change
@@ -318,7 +319,9 @@ def next_step(subject: Subject, summary: SceneSummary) -> str:
 
 
 def measure(subject: Subject, overrides: tuple[str, ...], samples: int) -> Conditioning:
-    """Measure the conditioning of the experiment. It does not depend on the estimator, so `auto` becomes `stack`."""
+    """Measure the conditioning of the experiment. The conditioning does not depend on the estimator, so the estimator
+    `auto` becomes `stack`.
+    """
     from reslrb_cli.optimization.assemble import assemble
     from reslrb_cli.optimization.sensitivity import measure_conditioning
 
@@ -329,7 +332,9 @@ def measure(subject: Subject, overrides: tuple[str, ...], samples: int) -> Condi
 
 
 def select(config: Config, scene: Any) -> Selection | str:
-    """Return the parameters to recover, or the reason why they cannot be. Sets initial values in `scene`."""
+    """Return the parameters to recover, or the reason why the parameters cannot be recovered. Sets initial values in
+    `scene`.
+    """
     from reslrb_cli.scene.parameters import select_parameters
 
     try:
@@ -392,8 +397,8 @@ def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[
 
 
 def sides_of(subject: Subject, options: dict[str, Any], reasons: dict[str, str]) -> dict[str, Any]:
-    """Return `paths` and `light_share` of a run, or the values before a run. Adds explanations to the `reasons` of
-    features.
+    """Return a run's `paths` and `light_share`. Before a run, return the default values. Adds explanations to the
+    `reasons` of features.
     """
     from reslrb_cli.config.integrators import UNDECIDED
     from reslrb_cli.integrators.plan_report import PATHS_FROM

@@ -114,8 +114,9 @@ def command(
 ) -> None:
     """Write an experiment that shapes a lens, or a mirror, whose caustic shows PICTURE in parallel light.
 
-    Run it with `reslrb optimize FOLDER/lens.yaml`. The initial face already casts the picture. The command prints the
-    depth of its relief, and the depth at twice the distance, before anything is rendered.
+    Run it with `reslrb optimize FOLDER/lens.yaml`. The initial face of the lens or mirror already casts the picture.
+    Before any rendering, the command prints the depth of the face's relief. The command also prints the relief depth at
+    twice the distance.
     """
     import numpy as np
 

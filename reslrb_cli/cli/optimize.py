@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 def show_forecast(config: Config) -> None:
     """Measure a few steps of `config` and print the expected time and memory of a run.
 
-    A variant must be set. Writes only the caches of kernels and decisions, which a later run uses.
+    A variant must be set. The function writes only the caches of kernels and decisions. A later run reuses these
+    caches.
     """
     from reslrb_cli.backend.memory import resident_bytes
     from reslrb_cli.measure.missing import check_missing
@@ -173,7 +174,9 @@ def _resume(
 
 
 def _run(begun: PreparedRun, workers: Place | None, quiet: bool) -> int:
-    """Run in the folder. Signals are handled before it is created, so that it always records how the run ended."""
+    """Run in the folder. Signals are handled before the folder is created, so the folder always records how the run
+    ended.
+    """
     if workers is not None:
         from reslrb_cli.cluster.engine import engine_at
 

@@ -1,7 +1,7 @@
 """Options and arguments that commands share, and the loading of configurations and variants.
 
-Commands that measure save their results with `Keeper`: the file of `--json` names the device and the variant, then
-has one object per line, and is updated while the command runs.
+Commands that measure save their results with `Keeper`. The file of `--json` starts with the device and the variant,
+then has one object per line. The file is updated while the command runs.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ def origin_of(variant: str) -> Origin:
 class Keeper:
     """Writer of a JSON file and of a file of samples, so that a killed process loses only seconds of work.
 
-    `origin` is the first line. `final` returns the lines that will not change, and `provisional` the current state of
-    the others. `kept` returns the data for a later session, or None if there is none yet. Without a file, the writer
-    does nothing.
+    `origin` is the first line. `final` returns the lines that will not change. `provisional` returns the current state
+    of all other lines. `kept` returns the data for a later session, or None if there is none yet. Without a file, the
+    writer does nothing.
     """
 
     def __init__(
@@ -75,7 +75,9 @@ class Keeper:
         self._live = LivePage(lambda: self._write(self._final(), self._provisional()), "the file of --json")
 
     def refresh(self) -> None:
-        """Write every few seconds, in a small share of the time. Call this method between steps."""
+        """Write the files every few seconds. Writing takes only a small share of the time. Call this method between
+        steps.
+        """
         if self._file is None:
             return
         if self._file.is_stream:  # a stream gets only final lines
@@ -112,10 +114,11 @@ def measuring(
     kind: type[A], plan: Measurement, json_file: Path | None, began: float, of: str,
     say: Callable[[str], None] = echo,
 ) -> Iterator[tuple[A, Interrupts]]:  # fmt: skip
-    """Yield a session that measures `plan`, and its interrupts. Removes the session's folder and workers at the end.
+    """Yield a session that measures `plan`, and the session's `Interrupts`. Removes the session's folder and workers at
+    the end.
 
     The session continues from the samples of `json_file`, if any. `began` is the `monotonic` time of the command's
-    call. `of` is the unit of `plan.rounds` in the message. Raises ConfigError.
+    call. `of` names the unit of `plan.rounds` in the message. Raises ConfigError.
     """
     from reslrb_cli.measure.processes import abandon_all
 
@@ -187,8 +190,8 @@ def setting_keys() -> list[str]:
 
 
 def _keys(schema: Mapping[str, Any], definitions: Mapping[str, Any], at: str) -> Iterator[str]:
-    """Yield the keys below `at` for each alternative in `schema`. At most 6 levels, because a schema may refer to
-    itself.
+    """Yield the keys below `at` for each alternative in `schema`. The search stops after 6 levels, because a schema may
+    refer to itself.
     """
     if "$ref" in schema:
         schema = definitions[schema["$ref"].rpartition("/")[2]]
@@ -279,7 +282,9 @@ def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def cluster_option(what: str, result: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Add `--cluster` (`cluster`) to a command; its help says `what` the workers do, and the `result`."""
+    """Add the option `--cluster` (argument `cluster`) to a command. In the help text, `what` describes the work of the
+    workers, and `result` describes the result.
+    """
     where = "local:N, N processes on this machine, or tls://HOST:PORT, the workers of a dask scheduler"
     return click.option(
         "--cluster", metavar="WHERE", help=f"{what}: {where}; {result}. Needs `pip install reslrb[cluster]`."
@@ -297,7 +302,9 @@ def allow_code_option(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def allowance(budget_s: float, number: int | None, of: str) -> str:
-    """Return what ends a measurement, in words: its time limit, or a `number` of units `of` work."""
+    """Return text that states when a measurement ends: after a time limit, or after `number` units of work. `of` names
+    the unit.
+    """
     if number is not None:
         return f"{number} {of}{'' if number == 1 else 's'}, without a time limit"
     return f"budget {budget_s:g} s, including loading and compiling"
@@ -311,7 +318,7 @@ def experiment_arguments(function: Callable[..., Any], required: bool = True) ->
 
 
 def optional_experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the same to a command in which CONFIG is optional; `config_file` is None without it."""
+    """Add CONFIG and `--set` to a command in which CONFIG is optional. Without CONFIG, `config_file` is None."""
     return experiment_arguments(function, required=False)
 
 
@@ -326,7 +333,9 @@ def read_config(config_file: Path, overrides: tuple[str, ...]) -> Config:
 
 
 def read_or_box(config_file: Path | None, overrides: tuple[str, ...]) -> Config:
-    """Load the configuration, or that of the built-in Cornell box if no file is given. Raises ConfigError."""
+    """Load the configuration. If no file is given, load the configuration of the built-in Cornell box. Raises
+    ConfigError.
+    """
     if config_file is not None:
         return read_config(config_file, overrides)
     from reslrb_cli.measure.scenes import small

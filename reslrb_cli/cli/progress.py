@@ -81,8 +81,8 @@ class Progress:
     def _fit(self, texts: list[str]) -> None:
         """Choose the longest combination of format and text that leaves room for the bar.
 
-        The lengths of numbers vary between iterations. To avoid flicker, a longer combination is tried again only when
-        the width of the terminal changes.
+        Numbers in the text vary in length between iterations. To avoid flicker, the bar tries a longer combination
+        again only when the terminal's width changes.
         """
         facts = self._bar.format_dict
         full, *short = texts
@@ -111,7 +111,8 @@ class Progress:
 class Reading:
     """Progress bar on standard error for reading long files, which can be called like `records.reading.Tell`.
 
-    As a context manager, it closes the bar. After a long reading, it prints that the page is drawn next.
+    As a context manager, it closes the bar. If reading took long, the exit of the context prints `drawing`, because the
+    page is drawn next.
     """
 
     def __init__(self) -> None:

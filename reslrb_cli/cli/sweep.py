@@ -243,9 +243,9 @@ def call(
 ) -> tuple[int, str]:
     """Run `reslrb` with these arguments in its own process. Returns its exit code and its last line.
 
-    The first signal in `interrupts` is passed on to the process. A second one ends it together with this process.
-    `verbose` shows the output of the process; otherwise its warnings are in its folder. A `fresh` process has no cached
-    kernels or decisions, so that all runs of equal time start equally.
+    The first signal in `interrupts` is passed on to the process. A second signal ends the run's process together with
+    this process. `verbose` shows the output of the process; otherwise its warnings are in its folder. A `fresh` process
+    has no cached kernels or decisions. Runs of equal time therefore start under equal conditions.
     """
     if fresh:
         with tempfile.TemporaryDirectory(prefix="reslrb-sweep-", ignore_cleanup_errors=True) as folder:
@@ -314,7 +314,7 @@ def _show(line: str) -> None:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End the process of a run at once by a second signal, so that its manifest records this."""
+    """End a run's process at once by a repeated signal. The run's manifest then records the end."""
     with contextlib.suppress(OSError, subprocess.TimeoutExpired):
         process.send_signal(signal.SIGTERM)
         process.send_signal(signal.SIGTERM)
@@ -337,7 +337,9 @@ def follow(parent: int) -> None:
 
 
 def _end_with_input() -> None:
-    """End this process when the parent's end closes standard input; for systems without PR_SET_PDEATHSIG."""
+    """End this process when the parent process ends, which closes this process's standard input. Used on systems
+    without PR_SET_PDEATHSIG.
+    """
     os.read(0, 1)
     os._exit(ExitCode.INTERRUPTED)
 

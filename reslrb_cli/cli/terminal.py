@@ -9,9 +9,10 @@ A signal handler never raises an exception. An exception inside Mitsuba or Dr.Ji
 unrelated error, for example in a half-imported module. The first signals therefore only set a flag, which the program
 checks when it is safe to stop. One more signal ends the process at once, after its last message.
 
-Python runs signal handlers in the main thread, between two instructions. It merges two signals that arrive while a
-kernel runs. A separate thread therefore counts the signals, from the descriptor that Python's C code writes to. This
-thread runs while a kernel runs, but not while one is compiled.
+Python runs signal handlers in the main thread, between two instructions. If two signals arrive while a kernel runs,
+Python merges the two signals into one call of the handler. A separate thread therefore counts the signals. The thread
+reads the file descriptor to which Python's C code writes each signal. This thread runs while a kernel runs, but not
+while one is compiled.
 """
 
 from __future__ import annotations
@@ -43,9 +44,9 @@ class Interrupts:
     """Context manager in which `requested` tells whether a signal came.
 
     Signals after `tolerated` ones end the process: a thread calls `last_act`, removes unfinished files, prints
-    `interrupted`, and exits with 130. `notice` is printed at the first tolerated signal. Signals that were ignored at
-    the start of the program (`nohup`) stay ignored. An inner context replaces an outer one. Outside of the main thread,
-    the context does nothing.
+    `interrupted`, and exits with 130. The context prints `notice` at the first tolerated signal. Signals that were
+    ignored at the start of the program (`nohup`) stay ignored. An inner context replaces an outer one. Outside of the
+    main thread, the context does nothing.
     """
 
     def __init__(
@@ -138,7 +139,7 @@ def echo(line: object) -> None:
 
 
 def fill(template: str, filters: Mapping[str, Callable[..., object]], **values: object) -> str:
-    """Fill in a template of `templates/`; escape characters in `values` that are not printable, and line breaks."""
+    """Fill in a template of `templates/`. In `values`, escape line breaks and all characters that are not printable."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     loader = FileSystemLoader(Path(__file__).with_name("templates"))

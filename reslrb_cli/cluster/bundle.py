@@ -91,7 +91,7 @@ def bundle_of(config: Config, values: Values) -> Bundle:
 
 
 def _scene_text(bundle: Bundle, config: Config) -> str:
-    """Return the scene as one file with the bundle's paths."""
+    """Return the scene description as one file. Paths in the file are replaced by the bundle's paths."""
     description = read_description(config.scene.file, option_texts(config.scene.options))
     for element in description.root.walk():
         key = element.file_attribute
@@ -102,7 +102,7 @@ def _scene_text(bundle: Bundle, config: Config) -> str:
 
 
 def _packed(bundle: Bundle | None, value: Any) -> Any:
-    """Return settings with the bundle's paths of files, or with paths as text if there is no bundle."""
+    """Return the settings with file paths replaced by the bundle's paths. Without a bundle, file paths become text."""
     if isinstance(value, Mapping):
         return {key: _packed(bundle, each) for key, each in value.items()}
     if isinstance(value, (list, tuple)):
@@ -122,7 +122,9 @@ def _put(data: dict[str, Any], key: str, value: str) -> None:
 
 
 def unpack(files: Mapping[str, bytes], folder: Path) -> None:
-    """Write files to `folder`, which appears only when it is complete, and may exist already. Raises MachineError."""
+    """Write files to `folder`. The folder appears only when all files are written. If the folder exists already,
+    nothing is written. Raises MachineError.
+    """
     if folder.is_dir():
         return
     try:

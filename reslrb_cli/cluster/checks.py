@@ -34,7 +34,7 @@ Stop = Callable[[], bool]
 
 @dataclass(frozen=True)
 class Steps:
-    """The steps of finite differences, by parameter and way (`sampling.steps_of`)."""
+    """The step sizes of finite differences, for each parameter and each kind of paths (`sampling.steps_of`)."""
 
     steps: Mapping[str, Sequence[Step]]
     #: Only values of this process: NumPy may write numbers differently elsewhere.
@@ -62,7 +62,9 @@ def participants_in(
 
 
 def nothing_in(folder: Path, threads: int, variant: str) -> tuple[Stop, dict[str, float]]:
-    """Return the argument of a case besides its name: a `stop` function that always returns false."""
+    """Return the argument that a case needs besides its name. The argument is a `stop` function that always returns
+    False.
+    """
     set_variant(variant)
     _with_threads(threads)
     return lambda: False, {}
@@ -79,7 +81,7 @@ def _read(folder: Path) -> tuple[Config, Values | None]:
 
 
 def _with_file(case: Listed, put: Callable[[str], str]) -> Listed:
-    """Return an integrator with another path of its code file, if it has one."""
+    """Return the integrator with its code file's path replaced. An integrator without a code file stays unchanged."""
     if case.type != "custom":
         return case
     file, _, name = str(case.options["file"]).rpartition(":")
@@ -120,7 +122,7 @@ def samples_at(
 
 
 def _opening_of(settings: CheckSettings, participants: Participants, variant: str, own: bool) -> tuple[Opening, Bundle]:
-    """Return the data from which workers make the same participants. `own`: the workers belong to this command."""
+    """Return the data from which every worker builds equal participants. `own`: the workers belong to this command."""
     config = settings.config
     built_in = config.scene.file == small.FILE
     values = {key: participants.selection.array(key) for key in participants.selection.keys}

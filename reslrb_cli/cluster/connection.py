@@ -1,5 +1,5 @@
-"""Connections to workers: processes of this machine that dask starts, or a scheduler that others have joined
-(`--cluster`).
+"""Connections to workers for `--cluster`. The workers are processes of this machine that dask starts, or workers that
+have joined an existing scheduler.
 
 All connections use TLS. For `local:N`, dask makes certificates for this run, which are never stored. For
 `tls://HOST:PORT`, the certificates are those of dask's settings `distributed.comm.tls`, with which scheduler and
@@ -156,7 +156,9 @@ def _started(workers: int, folder: Path) -> Iterator[tuple[object, object]]:
 
 
 def _extensions() -> dict[str, Any]:
-    """Return dask's extensions of a scheduler. They exclude the extension that records every call."""
+    """Return dask's extensions of a scheduler. The extension that would record every call is replaced by a version that
+    records nothing.
+    """
     from distributed.scheduler import DEFAULT_EXTENSIONS
     from distributed.spans import SpansSchedulerExtension
 

@@ -2,7 +2,8 @@
 
 dask distributes calls to workers that are ready, and repeats the calls of a worker that died. This module repeats calls
 of slow workers. If a worker does not answer within three times the usual time, another worker is asked, and the first
-answer counts. If it does not answer for much longer, dask restarts it. `worker.py` is the workers' side.
+answer counts. If a worker does not answer for much longer than usual, dask restarts the worker. `worker.py` is the
+workers' side.
 
 All messages pass through the scheduler, so no direct connection to a worker is needed.
 """
@@ -82,8 +83,8 @@ class Spent:
 class _Round:
     """The calls of a round.
 
-    `left` holds the indices without an answer. For each future, `flying` holds its index and the workers that may
-    answer.
+    `left` holds the arguments of the calls without an answer, by index. For each future, `flying` holds its index and
+    the workers that may answer.
     """
 
     function: Callable[..., Any]
@@ -99,18 +100,18 @@ class _Round:
 
     @property
     def name(self) -> str:
-        """The name of a kind of calls with similar durations."""
+        """The name of a group of calls that take similar times."""
         return self.function.__name__ if self.cold is None else f"{self.function.__name__} {self.cold}"
 
     def answerable(self, workers: Mapping[str, Any]) -> set[int]:
-        """Return the indices that one of these workers may answer."""
+        """Return the indices of the calls that at least one of `workers` may answer."""
         return {place for place, allowed in self.flying.values() if not allowed.isdisjoint(workers)}
 
 
 class Crew:
-    """The workers of a client that have loaded `opening`. `files` are sent to workers that lack them.
+    """The workers of a dask client that have loaded `opening`. `files` are sent to workers that lack them.
 
-    `threads` is the number of threads of each worker; None: its share of the cores that it may use.
+    `threads` is the thread count of each worker. None: each worker gets its share of its allowed cores.
     """
 
     def __init__(
@@ -141,7 +142,7 @@ class Crew:
         return [worker for worker in self._heard if worker not in self._late] or [*self._heard]
 
     def start(self) -> None:
-        """Wait until one worker is ready, and some time for the others.
+        """Wait until the first worker is ready. Then wait a limited time for all other workers.
 
         Raises MachineError if no worker is ready. The message lists failures and errors of the experiment.
         """
@@ -200,7 +201,9 @@ class Crew:
             self._opening.pop(worker)[0].release()
 
     def _open(self, workers: Sequence[str], here: Mapping[str, Any]) -> None:
-        """Let workers load the opening, each with its share of the cores that it may use."""
+        """Make workers load the opening. Unless the crew sets a thread count, each worker uses its share of its allowed
+        cores.
+        """
         found: dict[str, tuple[str, tuple[int, ...]]] = {}
         if self._threads is None:
             found = self._scheduler(lambda: self.client.run(whereabouts, on_error="ignore", workers=[*here]))
@@ -231,7 +234,9 @@ class Crew:
         return self._names.get(worker, "a worker")
 
     def _take_opened(self, future: Future) -> bool:
-        """Record that a worker has loaded the opening, or why it has not. Returns False for another kind of future."""
+        """Record that a worker has loaded the opening, or why the worker has not loaded the opening. Returns False if
+        the future does not belong to loading an opening.
+        """
         worker = next((worker for worker, (own, _) in self._opening.items() if own is future), None)
         if worker is None:
             return False
@@ -283,8 +288,9 @@ class Crew:
     ) -> Iterator[tuple[int, Any]]:
         """Yield index and value of each call as they arrive. Raises the errors of calls.
 
-        `cold` names functions whose kernels no worker has compiled. Their first calls include compilation, and do not
-        count as hanging. Raises MachineError or OutOfMemory if workers fail repeatedly, or if there are none.
+        `cold` names functions whose kernels no worker has compiled. The first calls of these functions include
+        compilation, so a slow first call does not count as hanging. Raises MachineError or OutOfMemory if workers fail
+        repeatedly, or if there are none.
         """
         begin = time.monotonic()
         todo = _Round(function, context, dict(enumerate(work)), cold=cold, size=len(work))
@@ -367,14 +373,16 @@ class Crew:
             yield place, answer.value
 
     def _count_loss(self, todo: _Round) -> None:
-        """Count a call without an answer. Raises MachineError if there are too many."""
+        """Count a call without an answer. Raises MachineError if too many answers were lost."""
         todo.losses += 1
         if todo.losses > LOSSES + todo.size:
             left = len(todo.left)
             raise MachineError(f"--cluster: repeated {todo.losses} calls; calls without an answer: {left}")
 
     def _take_fault(self, todo: _Round, fault: Fault, place: int | None) -> None:
-        """Ask other workers and restart this one. Raises MachineError or OutOfMemory if that has failed before."""
+        """Ask other workers and restart this one. Raises MachineError or OutOfMemory if the same call has failed too
+        often.
+        """
         if place is not None:
             todo.faults[place] += 1
             if todo.faults[place] >= FAULTS:
@@ -424,7 +432,7 @@ class Crew:
 def _reply(future: Future) -> Reply | None:
     """Return the answer, or None if it was lost with a worker. Raises the error of a call.
 
-    Until an answer has arrived here, it is lost if its worker ends, and dask computes the call again.
+    If a worker ends before its answer arrives in this process, the answer is lost. Dask then computes the call again.
     """
     try:
         for seconds in GATHER_S:

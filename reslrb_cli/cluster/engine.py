@@ -1,8 +1,8 @@
 """The shards of a run's steps on workers (`crew.Crew`), and the data that workers need for them.
 
-A call depends only on the experiment (files, by their digest), on the values of its parameters and tables (`Standing`),
-on the shard and on its dL/dI. It returns NumPy arrays. The result does not depend on the worker, on repetitions, or on
-the number of workers. Optimiser, checkpoints and page stay in the process of `optimize`.
+A call depends only on the experiment (files by digest), on parameter values and tables (`Standing`), on the shard, and
+on the shard's dL/dI. It returns NumPy arrays. The result does not depend on the worker, on repetitions, or on the
+number of workers. Optimiser, checkpoints and page stay in the process of `optimize`.
 
 The module imports dask, so it is imported only for `--cluster`.
 """
@@ -89,7 +89,7 @@ def _digest(text: str, *mappings: Mapping[str, Array]) -> str:
 def assembled(folder: Path, threads: int, allows_code: bool) -> tuple[Problem, dict[str, float]]:
     """Load the run's problem with its targets and decisions from the experiment's files, and compile its kernels.
 
-    Also returns the seconds that a shard then takes.
+    Also returns the seconds that a shard's functions take after compilation.
     """
     stored = Stored(folder / STATE_FILE)
     with np.load(folder / TARGETS_FILE) as targets:
@@ -169,7 +169,8 @@ class Engine:
 
 @contextlib.contextmanager
 def engine_at(course: RunProgress, place: Place, threads: int | None = None) -> Iterator[Engine]:
-    """Provide the workers at a place with a run's experiment. Each has `threads` threads, or its share of the cores.
+    """Load a run's experiment on the workers at `place`, and provide the workers as an `Engine`. Each worker has
+    `threads` threads. If `threads` is None, each worker gets its share of the cores.
 
     Raises MachineError if there are no workers, or none that can be used.
     """

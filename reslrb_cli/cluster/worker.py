@@ -52,7 +52,8 @@ class Anywhere:
 
 @dataclass(frozen=True)
 class Opening:
-    """The work of workers: `function(folder, threads, *arguments)` builds the state from the files in a folder.
+    """The data from which a worker builds its state. `function(folder, threads, *arguments)` builds the state from the
+    files in a folder.
 
     The function returns the state, and the seconds per call of each function whose kernels it has compiled, by name.
     `digest` is the digest of the files. `asks_for_code` is true if users' own code must run and the workers do not
@@ -105,8 +106,8 @@ class Lacks(Reply):
 
 @dataclass(frozen=True)
 class Fault(Reply):
-    """A failure of a worker's machine. `memory` is true if no memory is left, and `stays` if a restart does not
-    help.
+    """A failure of a worker's machine. `memory` is True if no memory is left. `stays` is True if a restart of the
+    worker does not help.
     """
 
     text: str
@@ -142,7 +143,9 @@ def open_state(opening: Opening, files: Mapping[str, bytes] | None, threads: int
 
 
 def _take_device(name: object) -> None:
-    """Let a worker that is known by its number see only one of its machine's GPUs, in turn."""
+    """Make a worker with a number as its name see only one GPU of its machine. Consecutive numbers use the GPUs in
+    turn.
+    """
     listed = os.environ.get("CUDA_VISIBLE_DEVICES")
     found = listed.split(",") if listed else [str(k) for k, _ in enumerate(Path("/proc/driver/nvidia/gpus").glob("*"))]
     if isinstance(name, int) and len(found) > 1:
@@ -178,7 +181,9 @@ def perform(opening: str, context: str, function: Callable[..., Any], arguments:
 
 
 def _fault(error: Exception) -> Fault:
-    """Return the failure of a worker's machine. Raises the errors of calls in a form that can be sent."""
+    """Return the failure of a worker's machine. Raises other errors of a call in a form that can be sent to another
+    process.
+    """
     me = get_worker().address
     if is_out_of_memory(error):
         return Fault(me, one_line(str(error)), memory=True)

@@ -141,7 +141,7 @@ def mark(name: str) -> Tag:
 
 
 class ByType(Discriminator):
-    """Discriminates the members of a union by their key `type`; `default` applies without it."""
+    """Selects the union member by the key `type` of a mapping. `default` applies if the key `type` is missing."""
 
     def __init__(self, default: str) -> None:
         def tag(value: Any) -> str | None:
@@ -159,7 +159,8 @@ class ByType(Discriminator):
 def by_kind(expected: str, word: str | None = None) -> Discriminator:
     """Discriminate the members of a union by the kind of the value. `expected` describes valid values in errors.
 
-    The tags are `mapping`, `list`, `number`, and `text` for `word`, the only text in the union.
+    The tags are `mapping`, `list`, `number`, and `text`. The tag `text` applies only to the value `word`, which is the
+    only text in the union.
     """
     return Discriminator(
         lambda value: kind_tag(value, word), custom_error_type="wrong", custom_error_message=f"must be {expected}"

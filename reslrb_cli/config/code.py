@@ -1,8 +1,8 @@
 """A user's own Python code, given as FILE.py:NAME: a loss, or an integrator (`type: custom`).
 
-The code runs with the user's rights and without inspection. It therefore runs only if the command line or a Python
-caller allows it (`Config.with_code`), which YAML cannot do, and only when it is needed. Commands that read, show or
-export a run do not need it.
+The code runs with the user's rights and without inspection. The code runs only if needed, and only if the command line
+or a Python caller allows the code (`Config.with_code`). A YAML file cannot allow code. Commands that read, show or
+export a run do not need the user's code.
 """
 
 from __future__ import annotations

@@ -71,7 +71,8 @@ def _removed(location: Location, value: Any = None) -> str | None:
 class Problem:
     """One error: its location in the notation of `--set`, and its description. `explain` says what would be right.
 
-    `unknown` is pydantic's location of an unknown key. The search for its nearest known key takes time.
+    `unknown` is pydantic's location of an unknown key. Only `explain` searches for the nearest known key, because the
+    search takes time.
     """
 
     key: str
@@ -79,7 +80,7 @@ class Problem:
     unknown: tuple[int | str, ...] | None = None
 
     def explain(self) -> str:
-        """Describe the error and what would be right."""
+        """Describe the error, and describe a correct value or key."""
         return self.message if self.unknown is None else _unknown_key(self.unknown)
 
 
@@ -177,7 +178,7 @@ def _type_name(section: type[Section]) -> str | None:
 
 
 def _tag(section: type[Section]) -> str | None:
-    """Return the tag of a section as member of a union."""
+    """Return the tag by which a union identifies a section."""
     return getattr(section, "TAG", None) or _type_name(section)
 
 

@@ -38,8 +38,8 @@ PIXELS = 2**27
 
 
 def as_path(given: object, name: str, what: str) -> Path:
-    """Return the path in the argument `name` of a call. Raises ConfigError for other objects; `what` names valid
-    arguments.
+    """Return the path in the argument `name` of a call. Raises ConfigError for objects that are no path. `what`
+    describes valid arguments in the error message.
     """
     if isinstance(given, (str, os.PathLike)):
         return Path(given)
@@ -47,9 +47,9 @@ def as_path(given: object, name: str, what: str) -> Path:
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open the file `path` to read it. Raises ConfigError, located in it, if it cannot be read.
+    """Open the file `path` to read it. Raises ConfigError, located in the file `path`, if the file cannot be read.
 
-    Refuses pipes, sockets and devices: to read one may take for ever.
+    The function refuses pipes, sockets and devices, because reading a pipe, socket or device may never end.
     """
     try:
         mode = os.stat(path).st_mode  # before it is opened, because opening some devices has side effects

@@ -112,15 +112,15 @@ def load(path: Path | str, overrides: Sequence[str | Override] = ()) -> Config:
 
 
 def loads(text: str, path: Path | str, overrides: Sequence[str | Override] = ()) -> Config:
-    """Return the configuration in a text. `path` names it, and relative paths start at its folder."""
+    """Return the configuration in a text. `path` names the text's origin. Relative paths in the text start at the
+    folder of `path`.
+    """
     parsed = [parse_override(each) if isinstance(each, str) else each for each in overrides]
     return resolve(parse(text, str(path)), path, parsed)
 
 
 def replaces(location: Location, earlier: Mapping[str, Location]) -> str | None:
-    """Return what is wrong with an override at `location` that replaces one of the `earlier` ones, or None if it does
-    not.
-    """
+    """Return an error message if an override at `location` replaces one of the `earlier` overrides, otherwise None."""
     name = next((name for name, other in earlier.items() if other[: len(location)] == location), None)
     return None if name is None else f"replaces what {name} sets; give it first, or remove one of them"
 
@@ -128,7 +128,7 @@ def replaces(location: Location, earlier: Mapping[str, Location]) -> str | None:
 def overrides_of(given: Mapping[str, object] | None) -> list[Override]:
     """Return the overrides of a script: keys as for `--set`, and Python values.
 
-    Raises ConfigError, also if one override replaces another before it.
+    Raises ConfigError for invalid overrides. An override that replaces an earlier override is invalid, too.
     """
     if given is not None and not isinstance(given, Mapping):
         reason = f'is {one_line(repr(given), 60)}, not a mapping such as {{"run.iterations": 5}}'
@@ -147,7 +147,7 @@ def overrides_of(given: Mapping[str, object] | None) -> list[Override]:
 def plain(value: Any, source: object, key: str = "") -> Any:
     """Convert a Python value to plain data as from YAML: paths to text, tuples to lists, NumPy values to Python's.
 
-    Raises ConfigError, located by `source` and `key`, for other objects.
+    Raises ConfigError, located by `source` and `key`, for objects that plain data cannot express.
     """
     if isinstance(value, Mapping):
         for name in value:
@@ -167,7 +167,8 @@ def plain(value: Any, source: object, key: str = "") -> Any:
 
 
 def changed(config: Config, overrides: Sequence[str | Override]) -> Config:
-    """Return the experiment with overrides applied. It keeps its own loss function and the permission to run code.
+    """Return the experiment with overrides applied. The returned experiment keeps the loss function and the permission
+    to run code of `config`.
 
     Raises ConfigError.
     """
@@ -208,7 +209,7 @@ def told(first: Mapping[str, Any]) -> Config:
 def check_code(config: Config, codes: Mapping[str, Custom | Own] | None = None) -> None:
     """Raise ConfigError, located by the key, if users' code must not run. Loads nothing.
 
-    `codes` are the places of code; None: all of the experiment's.
+    `codes` maps keys to the settings that name users' code. None: all code settings of the experiment.
     """
     for key, one in (config.codes if codes is None else codes).items():
         if one.file is None and config.own_loss is None:
@@ -222,7 +223,8 @@ def check_code(config: Config, codes: Mapping[str, Custom | Own] | None = None) 
 def _blame(stages: list[dict[str, Any]], overrides: Sequence[Override], problem: Problem, path: Path) -> str:
     """Return the origin of `problem`: the override that causes it, or the file.
 
-    `stages` hold the file's settings, and those after each override. Uses bisection, since a check takes time.
+    `stages` holds several versions of the settings: first the settings of the file, then the settings after each
+    override. Uses bisection, since a check takes time.
     """
     without, having = 0, len(stages) - 1
     if having == 0 or problem in _validate(stages[0], path)[1]:

@@ -79,9 +79,9 @@ class RelativeL2(Loss, json_schema_extra=NEEDS_TYPE):
 
 class SSIM(Loss, json_schema_extra=NEEDS_TYPE):
     """1 - mean SSIM (Wang et al. 2004) of linear radiance, computed for each channel. Windows have 11x11 pixels and
-    Gaussian weights with a standard deviation of 1.5. They lie within the image, so the image needs at least 11x11
-    pixels. The data range L in SSIM's constants is the largest value of the target. In a window, masked pixels count
-    as equal to the target. Windows centred at masked pixels are left out.
+    Gaussian weights with a standard deviation of 1.5. All windows lie within the image, so the image needs at least
+    11x11 pixels. The data range L in SSIM's constants is the largest value of the target. In a window, masked pixels
+    count as equal to the target. Windows centred at masked pixels are left out.
     """
 
     type: Literal["ssim"] = Field(default="ssim", description="1 - mean SSIM (Wang et al. 2004).")

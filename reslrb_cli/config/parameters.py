@@ -404,7 +404,9 @@ class ParameterSpec(Section):
 
     @property
     def names(self) -> list[str]:
-        """The keys and globs, or the names under which a heightmap or a motion is recorded."""
+        """The keys and globs of the parameters. For a heightmap or a motion, the names under which the run records its
+        values.
+        """
         if self.heightmap is not None:
             return [f"{self.heightmap.mesh[0]}.{HEIGHTMAP}"]
         if self.motion is not None:
@@ -417,7 +419,9 @@ class ParameterSpec(Section):
         return [self.key] if isinstance(self.key, str) else list(self.key or ())
 
     def objects(self) -> list[tuple[str, int | None, str]]:
-        """Return the named keys and ids. Each comes with its option and, in a list, its index."""
+        """Return the named keys and ids. Each key or id comes with the name of its option. If the option is a list,
+        each entry comes with its index, too.
+        """
         lists: list[tuple[str, Any]] = [("key", self.key)]
         lists += [] if self.heightmap is None else [("heightmap.mesh", self.heightmap.mesh)]
         lists += [] if self.motion is None else [("motion.of", self.motion.of)]
@@ -439,7 +443,7 @@ class ParameterSpec(Section):
         return f"{option}.{word}" if isinstance(getattr(self, option, None), ByWord) else option
 
     def settings(self, word: str = "") -> Settings:
-        """Return the settings for the part `word` of a motion, or for any other parameter if `word` is ""."""
+        """Return the settings for the part `word` of a motion. For any other parameter, `word` is ""."""
 
         def of(option: str, default: Any = None) -> Any:
             value = getattr(self, option)

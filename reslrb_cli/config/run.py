@@ -31,7 +31,9 @@ _PATH = re.compile(r"^([/\\~]|[A-Za-z]:[/\\])|(^|[/\\])\.\.?($|[/\\])")
 
 
 def folder_name(name: str) -> str:
-    """Return the folder name for a run's name: all but letters, digits, `.`, `_`, `+` and `=` becomes `-`."""
+    """Return the folder name for a run's name. Each sequence of characters other than letters, digits, `.`, `_`, `+`
+    and `=` becomes `-`.
+    """
     return re.sub(r"[^\w.+=]+", "-", name).strip("-.")
 
 
@@ -57,7 +59,7 @@ _SIZE = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]+)")
 def memory_bytes(value: int | float | str) -> int:
     """Return the bytes of a number of MiB, or of text such as "512 MiB", "2GiB" or "500 MB".
 
-    Raises ValueError if it is neither, or less than one byte.
+    Raises ValueError for other values, and for amounts below one byte.
     """
     number, unit = float("nan"), "mib"
     if isinstance(value, str):
@@ -110,7 +112,7 @@ class CheckpointEvery(Section):
 
 
 def _without_default(schema: dict[str, Any]) -> None:
-    """Remove a default that the loader fills in from outside of the schema."""
+    """Remove a default value from the schema. The loader fills in the default instead."""
     del schema["default"]
 
 

@@ -1,7 +1,7 @@
 """The configuration. One file is one experiment.
 
 The descriptions of the fields give units, defaults and meanings. `scripts/make_reference.py` writes docs/config.md from
-them.
+the descriptions.
 """
 
 from __future__ import annotations
@@ -131,8 +131,10 @@ class Config(Section):
 
     @property
     def adjoint(self) -> Literal["correlated", "independent", "batched"]:
-        """`run.adjoint` of a single step or shard, with `auto` resolved: `batched` if the batches divide the samples
-        and the passes divide the batches. `others` is `independent` for a single shard."""
+        """`run.adjoint` of a single step or shard, with `auto` resolved. `auto` becomes `batched` if `run.batches`
+        divides the sample count and the passes divide each batch. For a shard of a view's samples, `others` becomes
+        `independent`.
+        """
         if self.in_rounds:
             return "independent"
         if self.run.adjoint != "auto" and self.run.adjoint != "others":
@@ -156,7 +158,9 @@ class Config(Section):
 
     @property
     def shards(self) -> int:
-        """`run.shards` with `auto` resolved. For shards of whole views, the largest possible number."""
+        """`run.shards` with `auto` resolved. If shards are whole views, `auto` gives the largest possible number of
+        shards.
+        """
         asked = self.run.shards
         if asked != "auto":
             return asked
@@ -207,7 +211,7 @@ class Config(Section):
         return config
 
     def with_code_as(self, other: Config) -> Config:
-        """Return the same experiment, with the loss function and the permission of `other`."""
+        """Return this experiment with the loss function and the code permission of `other`."""
         config = self.with_code(other._allows_code)
         config._own_loss = other._own_loss
         return config
@@ -256,7 +260,9 @@ class Config(Section):
         return None if obstacle is None else f"{run.spp} {obstacle}"
 
     def with_exposures_fixed(self) -> Config:
-        """Return the experiment with exposures of 1 instead of recovered ones, for uses of the scene alone."""
+        """Return the experiment with exposures of 1 in place of recovered exposures. The result serves uses of the
+        scene alone.
+        """
         target = self.target
         if isinstance(target.exposure, str):
             target = target.model_copy(update={"exposure": 1.0})
@@ -280,7 +286,9 @@ class Config(Section):
         return self.model_copy(update={"run": self.run.model_copy(update={"stages": []})})
 
     def step_options(self, shard: bool = False) -> dict[str, Any]:
-        """Return the sampling options of a gradient step: those of an iteration, or those of a `shard`."""
+        """Return the sampling options of a gradient step. If `shard` is True, return the sampling options of one shard
+        instead.
+        """
         options: dict[str, Any] = {"spp": self.share_spp if shard else self.run.spp, "adjoint": self.adjoint}
         if self.adjoint == "batched":
             options["batches"] = self.run.batches
@@ -294,7 +302,7 @@ class Config(Section):
         return self._source
 
     def __eq__(self, other: object) -> bool:
-        """Return whether all settings are equal. The files that they come from do not matter."""
+        """Return whether all settings are equal. The files from which the settings were read do not matter."""
         return isinstance(other, Config) and self.model_dump() == other.model_dump()
 
     __hash__ = None  # type: ignore[assignment]
@@ -302,7 +310,7 @@ class Config(Section):
     @model_validator(mode="before")
     @classmethod
     def _target_of_views(cls, data: Any) -> Any:
-        """Fill in an empty `target` if views or cameras may supply all targets."""
+        """Fill in an empty `target` if views or cameras may supply all targets themselves."""
         if isinstance(data, dict) and data.get("target") is None:
             scene = data.get("scene")
             if data.get("views") is not None or (isinstance(scene, dict) and scene.get("cameras") is not None):

@@ -26,12 +26,12 @@ _KINDS = ("specular", "border", "clipped", "alpha")
 
 
 class Mask(Section):
-    """Pixels of a target that the loss leaves out, and weights of the others.
+    """The pixels of a target that the loss leaves out, and the weights of all other pixels.
 
     `specular`, `border`, `clipped` and `alpha` apply to targets that are read from files. `specular` and `border` leave
     out pixels that light tracing cannot render. They matter only if either the run's integrator or the target's
-    integrator traces from the lights, but not both. In this case they also apply to rendered targets. Pixels of a file
-    that are not finite are always left out.
+    integrator traces from the lights, but not both. If exactly one of the two integrators traces from the lights,
+    `specular` and `border` also apply to rendered targets. Pixels of a file that are not finite are always left out.
     """
 
     file: ConfigPath | None = None
@@ -131,7 +131,8 @@ class Rendering(Section):
 
 class TargetConfig(Section):
     """Target that the image is compared with: exactly one of `file` and `render`. If all views have their own targets,
-    neither is needed."""
+    neither `file` nor `render` is needed.
+    """
 
     file: ConfigPath | None = None
     """Target image (EXR, PNG, JPG, HDR), relative to the config file. The image is turned by its EXIF orientation,

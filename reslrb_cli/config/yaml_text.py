@@ -110,11 +110,12 @@ def format_location(location: Location) -> str:
 
 
 def parse(text: str, source: str, name_line: bool = True, example: Callable[[str], str] | None = None) -> Any:
-    """Return the plain data in YAML `text`. `source` names it in errors, with the line if `name_line`.
+    """Return the plain data in YAML `text`. `source` names the text in error messages. If `name_line` is True, messages
+    also give the line number.
 
-    The keys of all mappings are text without control characters. `example` shows how a corrected text is written at its
-    origin. Raises ConfigError if the text is not YAML, has tags other than plain data, duplicate keys, or keys that are
-    not text, or is nested too deeply.
+    The keys of all mappings are text without control characters. `example` is a function that shows how to write a
+    corrected text in its original form, for example in a shell command. Raises ConfigError if the text is not YAML, has
+    tags other than plain data, duplicate keys, or keys that are not text, or is nested too deeply.
     """
 
     def at(line: int) -> str:

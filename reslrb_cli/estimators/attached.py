@@ -13,22 +13,24 @@ recursion starts at the last vertex.
 
 Nothing is divided or inverted, so zero factors and the conditioning of the chain do not matter.
 
-Behind a vertex i-1 that is not specular, light goes to all places. There are two ways to differentiate such a segment.
-With `follow`, the sampled direction rotates with surface i-1, so x_i slides over the next surface. With `stay`, the
-integral is over the places x_i, and x_i moves only with its own surface. The factor of the scattering then contains the
-change.
+A vertex i-1 that is not specular scatters light in all directions, so light from this vertex reaches all places. There
+are two ways to differentiate such a segment. With `follow`, the sampled direction rotates with surface i-1, so the hit
+point x_i slides over the next surface. With `stay`, the integral is over the places x_i, and x_i moves only with its
+own surface. The factor of the scattering then contains the change.
 
     s_{i-1} = f_{i-1}(x_{i-2}, x_{i-1}, x_i) |cos_i| / |x_i - x_{i-1}|^2 dA_i / (the same density, detached)
 
-dA_i is the area of a piece of surface i. Vertex i differentiates this factor, except for the dependence of f_{i-1} on
-x_{i-1}. The adjoint of vertex i then gives vertex i-1 a derivative with respect to its place, and none with respect to
-its direction. `Before` stores the data of the previous vertex for this.
+dA_i is the area of a piece of surface i. Vertex i differentiates this factor s_{i-1}. The dependence of the BSDF
+f_{i-1} on x_{i-1} is not differentiated here. The adjoint of vertex i then gives vertex i-1 a derivative with respect
+to position x_{i-1}. The adjoint gives vertex i-1 no derivative with respect to the direction. `Before` stores the
+previous vertex's data for the derivative of s_{i-1} at vertex i.
 
-Source: Worchel et al. 2025, "Radiative Backpropagation with Non-Static Geometry", for this surface-integral form. With
-it, edges that do not move contribute no error. Neither form has the derivative of visibility.
+The surface-integral form comes from Worchel et al. 2025, "Radiative Backpropagation with Non-Static Geometry". With the
+surface-integral form, edges that do not move contribute no error. Neither form has the derivative of visibility.
 
 The stack starts with the first vertex that moves or whose BSDF has a parameter. Earlier vertices depend only on
-parameters of the emitter. The stack is that of `stack.py`, where T behind the last pushed vertex is r_i.
+parameters of the emitter. The stack works as in `stack.py`. Here, T behind the last pushed vertex equals the roulette
+weight r_i.
 """
 
 from __future__ import annotations
@@ -69,8 +71,8 @@ from reslrb_cli.transport.walk import (
 
 @dataclass
 class Before:
-    """Vertex before the current one. `stays` is 1 if it is not specular, so that the current vertex stays at its
-    place.
+    """Vertex before the current one. `stays` is 1 if the previous vertex is not specular. The current vertex then stays
+    at its place on its surface.
     """
 
     point: SurfacePoint
@@ -91,7 +93,7 @@ class Before:
 
 
 def is_staying(before: list[Before]) -> mi.Bool:
-    """Return the lanes in which the vertex after `before` stays at its place."""
+    """Return the lanes in which the vertex after `before` stays at its place on its surface."""
     return before[0].stays != 0 if before else mi.Bool(False)
 
 
@@ -102,7 +104,7 @@ def reach(
     """Return the vertex at the intersection `pi` of `ray`, and a factor (C,) of value 1.
 
     The factor carries the derivatives of s_{i-1} that belong to this vertex. Call the function under `dr.resume_grad()`
-    with a differentiable ray. Set `parameters` to false if gradients are resumed only for the ray.
+    with a differentiable ray. Set `parameters` to False if only gradients of the ray are resumed.
     """
     if not before:
         return find_vertex(ray, pi, active), mi.Spectrum(1)
@@ -161,8 +163,8 @@ class Adjoint:
 class AttachedFrame:
     """Vertex on the stack, with the data to evaluate its segment again, and with P_i and r_{i-1}.
 
-    `connected` is 1 if the sensor was visible. `aperture` holds the sample of the aperture if the sensor has one.
-    `before` is the previous vertex if vertices can stay.
+    `connected` is 1 if the sensor was visible. `aperture` holds the sample of the aperture if the sensor has one. If
+    vertices can stay at their places, `before` holds the previous vertex.
     """
 
     point: SurfacePoint
@@ -219,7 +221,7 @@ class AttachedState:
 class AttachedSweep(VertexHooks):
     """Forward pass: it splats the image and pushes the vertices before number `end`, where paths end.
 
-    If `end` is None, it pushes all vertices.
+    If `end` is None, the pass pushes all vertices.
     """
 
     def __init__(self, p: Pass, ring: Ring, end: mi.UInt32 | None = None) -> None:
@@ -232,7 +234,9 @@ class AttachedSweep(VertexHooks):
         return AttachedState(stack, Before.start(plan))
 
     def wants(self, state: AttachedState, vertex: Vertex) -> mi.Bool:
-        """Return all lanes if there is an image. Otherwise return the lanes behind a differentiated vertex."""
+        """Return all lanes if there is an image. Without an image, return the lanes in which this vertex or an earlier
+        vertex depends on a parameter.
+        """
         return mi.Bool(True) if self.p.block is not None else self._useful(state, vertex)
 
     def goes_on(self, state: AttachedState, vertex: Vertex) -> mi.Bool:

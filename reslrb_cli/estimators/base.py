@@ -1,4 +1,6 @@
-"""Interface of all estimators, and their common step: from the adjoint of a contribution to derivatives at a vertex."""
+"""Interface of all estimators, and the step that all estimators share. The step turns the adjoint of a path
+contribution into derivatives at a vertex.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,8 @@ class Estimator(ABC):
     """Estimator of the gradient of a path's contributions without storing the path.
 
     `forward` splats the image and returns the stored data of each path. `backward` adds the derivatives once dL/dI is
-    known. If dL/dI is known from the start (`Pass.adjoint` in `forward`), an estimator may use it there.
+    known. If dL/dI is known before paths are traced (`Pass.adjoint` in `forward`), an estimator may already use dL/dI
+    in `forward`.
 
     OPTIONS maps the names of the plugin's options to their defaults. The constructor takes these options, and raises
     ValueError for a wrong value.
@@ -170,8 +173,8 @@ def adjoint_of_factor(
     """Return the detached derivative (C,) of the objective with respect to the factor `f * rest` at position `index` of
     the path.
 
-    If no factor is zero, the derivative is adjoint / f. If only this factor is zero, it is adjoint * rest. Otherwise it
-    is 0.
+    If no factor is zero, the derivative is adjoint / f. If only this factor is zero, the derivative is adjoint * rest.
+    Otherwise it is 0.
     """
     f, value, zeros = dr.detach(f), adjoint.value, adjoint.product.zero
     if not zeros:
@@ -189,8 +192,9 @@ def differentiate_passage(
 ) -> mi.Spectrum:  # fmt: skip
     """Return the transmittance (C,) of the masks between a vertex and the sensor, and add its derivative.
 
-    A mask with a transmission of zero ends the segment, so a mask is never the zero factor of a product. The value is
-    only needed beside a zero factor. If neither value nor derivative is needed, nothing is traced.
+    A mask with zero transmission ends the segment. A mask is therefore never the zero factor of a product. The
+    transmittance value is needed only if another factor of the contribution is zero. If neither value nor derivative is
+    needed, nothing is traced.
     """
     if not p.plan.passage_in_gradient:
         return mi.Spectrum(1)
@@ -243,7 +247,7 @@ def vertices(plan: Plan) -> int:
 
 
 def places(plan: Plan, stack_size: int) -> int:
-    """Return the number of vertices that a stack holds: at least one, and at most those of a path."""
+    """Return the capacity of a vertex stack: `stack_size`, but at least one and at most the vertex count of a path."""
     return min(stack_size, max(vertices(plan), 1))
 
 

@@ -4,8 +4,8 @@ All light of a camera path arrives at one place of the film. Therefore delta is 
 before the path is traced. The walk back is that of `stack.py`, where c_j is the contribution of next event estimation
 at vertex j. The emission of a hit emitter does not depend on the BSDF there, so it belongs to the earlier vertices.
 
-The radiance of an emitter is the last factor of a contribution. Its derivative needs no later data, so the forward pass
-adds it. The weights of combined paths have no derivative.
+The radiance of an emitter is the last factor of a contribution. The derivative with respect to an emitter's radiance
+needs no later data. The forward pass therefore adds this derivative. The weights of combined paths have no derivative.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Radiance(CameraHooks):
 
 
 class TrackedRadiance(Radiance):
-    """The same radiance with derivatives of all factors, for naive AD."""
+    """Radiance of camera paths with derivatives of all factors, for naive AD."""
 
     tracked = True
 

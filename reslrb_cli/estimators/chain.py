@@ -6,8 +6,8 @@ derivative of the factors so far.
 
     G_i = sum_{m<i} dlog s_m/dp_m J_{0->m}
 
-A selected connection I stores du_I/dp_I J_{0->I} and dlog c_I/dp_I J_{0->I} + G_I. Together with delta, they give the
-adjoint of the first ray, up to the factor W / (m w_I).
+A selected connection I stores du_I/dp_I J_{0->I} and dlog c_I/dp_I J_{0->I} + G_I. The stored rows and delta give the
+adjoint a_0 of the first ray, up to the factor W / (m w_I).
 
     a_0 = <d delta/du, C_I> du_I/dp_I J_{0->I} + delta C_I (dlog c_I/dp_I J_{0->I} + G_I)
 
@@ -16,13 +16,14 @@ Paths are therefore divided into blocks of BLOCK such vertices. A chain starts w
 probability among the blocks before the connection. The replay takes the adjoint only through this block, multiplied by
 the number of blocks. Radiometric derivatives need no chain, and are added at every vertex.
 
-Replay: it takes a_0 to every vertex through the inverses of the passed Jacobians, and differentiates each segment.
+Replay: the replay carries a_0 to every vertex. At each vertex, the adjoint is multiplied by the inverse of the passed
+Jacobian, and the segment is differentiated.
 
     a_{j+1} = (a_j - delta C_I dlog s_j/dp_j) J_j^{-1}
     dS     += a_{j+1} dp_{j+1}/dtheta + delta C_I ds_j/s_j          at I:   d<delta(u_I), C_I> by c_I and u_I
 
-The product of the inverses is J_{j+1->I} = J_{0->I} J_{0->j+1}^{-1} of the ResLRB paper. Chain and replay compute the
-same J_j to the last bit, so the inverse cancels it for any conditioning.
+The product of the inverses is J_{j+1->I} = J_{0->I} J_{0->j+1}^{-1} of the ResLRB paper. Chain and replay compute
+bitwise equal J_j. The inverse therefore cancels the Jacobian for any conditioning.
 
 Source: the ResLRB paper, Section 2.5. The paper has neither G nor blocks, and regularises the inverse at vertices that
 are not specular. Here, a random sign of the regularisation avoids its bias.
@@ -72,10 +73,10 @@ JACOBIAN_DAMPING = 0.1
 class ChainSlot:
     """Selected connection.
 
-    `number` is its vertex, and `last` the last differentiated vertex up to it, or 0 if there is none. `prefix` (C,) is
-    the path's throughput before this vertex. `u_rows` and `C_rows` are du_I/dp_I J_{0->I} and dlog c_I/dp_I J_{0->I} +
-    G_I. If there may be several blocks, `block` holds the number of the block that J starts with, and the number of
-    blocks so far.
+    `number` is the vertex of the selected connection. `last` is the last differentiated vertex up to this vertex, or 0
+    if there is none. `prefix` (C,) is the path's throughput before this vertex. `u_rows` and `C_rows` are du_I/dp_I
+    J_{0->I} and dlog c_I/dp_I J_{0->I} + G_I. If there may be several blocks, `block` holds two numbers: the block with
+    which J starts, and the block count so far.
     """
 
     w: mi.Float
@@ -93,7 +94,7 @@ class ChainSlot:
 class ChainBlocks:
     """Position of a path in its blocks.
 
-    It holds the number of non-specular vertices passed, and the block that the chain starts with.
+    `passed` is the number of non-specular vertices passed. `chosen` is the block with which the chain starts.
     """
 
     passed: mi.UInt32
@@ -256,7 +257,9 @@ class KeptConnection:
         return KeptConnection(slot, share, PathAdjoint(delta * slot.C.nonzero * share, slot.C), A, row)
 
     def part(self, blocks: list[ChainBlocks]) -> tuple[mi.Bool, mi.Float64]:
-        """Return whether a ray belongs to the block that the chain starts with, and the factor for the other blocks."""
+        """Return the lanes whose ray belongs to the block with which the chain starts. Also return the block count, the
+        factor that accounts for all other blocks.
+        """
         if not blocks:
             return mi.Bool(True), mi.Float64(1)
         chosen, count = self.slot.block
@@ -309,7 +312,7 @@ class ChainReplay(SlotReplay):
     def _differentiate(
         self, vertex: Vertex, before: list[Before], numbers: Numbers, scattering: Scattering, rows: list[mi.Vector4d]
     ) -> None:
-        """Add the derivatives of the vertex's segment. `rows` are the adjoints of its outgoing ray."""
+        """Add the derivatives of the vertex's segment. `rows` are the adjoints of the segment's outgoing ray."""
         p, plan, depth = self.p, self.p.plan, vertex.depth
         here = vertex.active & begins(plan, vertex)
         connected, scattered = mi.Bool(False), mi.Bool(False)
@@ -378,10 +381,11 @@ AXES = 4
 
 @dataclass
 class SegmentJacobian:
-    """Derivatives with respect to p_i, in double precision, because products of many of them are inverted.
+    """Derivatives of a segment with respect to p_i. Double precision is used, because products of many Jacobians are
+    inverted.
 
-    `ray` is dp_{i+1}/dp_i. `damped` tells whether it contains `damping`. `log_s` and `log_c` have a row for each
-    channel, or zeros if the factor is 0. `u` has a row for each film coordinate, in pixels.
+    `ray` is dp_{i+1}/dp_i. `damped` is True in lanes whose Jacobian `ray` contains `damping`. `log_s` and `log_c` have
+    a row for each channel, or zeros if the factor is 0. `u` has a row for each film coordinate, in pixels.
     """
 
     ray: mi.Matrix4d
@@ -424,10 +428,11 @@ def segment_jacobian(
     """Return the Jacobians of a vertex's segment. Lanes without `connected` have no Jacobian of the connection.
 
     Behind a diffuse scattering event, the next ray does not depend on the previous direction, so the Jacobian is
-    singular. The same holds for a vertex that stays on its surface. `damping` makes the Jacobian invertible. Behind a
-    vertex that is not specular, the next ray also rotates with the previous ray, by the fraction `damping`. Behind a
-    vertex that stays, it is also shifted with the previous ray. The sign of each damping term is random, with
-    probability 1/2. The chain before the inverse is linear in each term, so the expected value does not change.
+    singular. The Jacobian is also singular for a vertex that stays at its place on its surface. `damping` makes the
+    Jacobian invertible. Behind a vertex that is not specular, the next ray also rotates with the previous ray, by the
+    fraction `damping`. Behind a vertex that stays, the next ray is also shifted with the previous ray. The sign of each
+    damping term is random, with probability 1/2. The chain before the inverse is linear in each term, so the expected
+    value does not change.
     """
     p = [mi.Float(0) for _ in range(AXES)]
     frame, stays = mi.Frame3f(vertex.ray.d), is_staying(before)
@@ -474,7 +479,7 @@ def segment_jacobian(
 def sign(numbers: Numbers) -> mi.Float:
     """Return 1 or -1 with probability 1/2 each, from the last bit of the BSDF's random number.
 
-    This bit does not affect the direction, and a replay reads the same bit.
+    The last bit does not affect the sampled direction. A replay reads an equal bit.
     """
     return dr.select((mi.UInt32(numbers.bsdf_2d.x * float(1 << 23)) & 1) == 0, mi.Float(1), -1)
 

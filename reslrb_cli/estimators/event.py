@@ -9,8 +9,8 @@ Q_i is the sum of the q_j.
     dS ~ 1/m sum_slots W / (w_i q_j) delta_i C_i df_j/f_j
 
 Reservoir sampling: Chao 1982. A stored event contains enough data to evaluate its BSDF again, and takes about 50 bytes.
-One random number selects both the event of a vertex's own connection and that of its prefix. A path stores only one of
-the two, so they may depend on each other.
+One random number at a vertex makes two selections: the event of the vertex's own connection, and the event of the
+prefix. A path stores only one of the two selected events, so the two selections may depend on each other.
 """
 
 from __future__ import annotations
@@ -64,7 +64,9 @@ class EventSlot:
 
 @dataclass
 class EventState:
-    """Loop state: Q, W, and for each slot the prefix's event, and the selected pair."""
+    """Loop state: Q and W. For each slot also the event selected from the path prefix, and the selected pair of
+    connection and event.
+    """
 
     Q: mi.Float
     W: mi.Float

@@ -1,12 +1,12 @@
-"""Use every connection of a path without additional variance: the image pass stores a sum, and the replay subtracts
-from it.
+"""Use every connection of a path without additional variance. The image pass stores a sum over all connections. The
+replay subtracts each connection's contribution from the sum.
 
     S_0 = sum_i delta_i C_i,   S_j = S_{j-1} - delta_j C_j
     dS  = S_0 dE/E + sum_j [ S_j ds_j/s_j + delta_j C_j dc_j/c_j ]
 
-Source: the ResLRB paper's conclusion, second extension. The sum needs delta. If dL/dI is known only after the image, a
-walk without shadow rays computes the sum first. One bit per vertex stores which connections were visible. Vertices
-beyond the last bit trace their shadow rays again, so memory is constant.
+Source: the second extension that the ResLRB paper proposes in its conclusion. The sum needs delta. If dL/dI is known
+only after the image, a walk without shadow rays computes the sum first. One bit per vertex stores which connections
+were visible. Vertices beyond the last bit trace their shadow rays again, so memory is constant.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class Visibility:
         return Visibility([mi.UInt32(0) for _ in range(min(WORDS, -(-plan_depth // 32)))], mi.UInt32(0))
 
     def with_vertex(self, depth: mi.UInt32, visible: mi.Bool, last: mi.UInt32) -> Visibility:
-        """Return the visibility after adding the connection of vertex `depth`. If it is visible, `last` is set to the
-        last vertex that a replay must visit.
+        """Return the visibility after adding the connection of vertex `depth`. If the connection is visible, `last`
+        becomes the last vertex that a replay must visit.
         """
         index = depth - 1
         bit = mi.UInt32(1) << (index & 31)
@@ -73,10 +73,10 @@ class Visibility:
 class AdjointSum:
     """Sum of delta_i C_i over connections of a path, (C,), as `value` + `rest`.
 
-    `rest` is the rounding error (Knuth's two-sum). With it, subtracting all terms leaves exactly zero, even after a
-    thousand vertices. `behind_zero` is a second sum, of contributions whose prefix has exactly one zero factor. This
-    sum leaves out the zero factor, so it is the derivative with respect to that factor. It is empty if zeros are not
-    tracked.
+    `rest` is the rounding error (Knuth's two-sum). With `rest`, subtracting all terms leaves exactly zero, even after a
+    thousand vertices. `behind_zero` is a second sum, of contributions whose prefix has exactly one zero factor.
+    `behind_zero` leaves out the zero factor, so `behind_zero` is the derivative with respect to the zero factor. It is
+    empty if zeros are not tracked.
     """
 
     value: mi.Spectrum
@@ -134,7 +134,7 @@ class AdjointSum:
 class GatherState:
     """Stored data of a path: visibility and, if delta is known, S_0.
 
-    If delta is known, `latest` is the latest differentiated vertex during the walk.
+    If delta is known, `latest` holds the number of the latest differentiated vertex while the path is traced.
     """
 
     visibility: Visibility
@@ -222,8 +222,8 @@ class Taking(Revisiting):
 def adjoint_of_connection(
     p: Pass, vertex: Vertex, connection: Connection, active: mi.Bool, adjoint: PathAdjoint
 ) -> mi.Spectrum:
-    """Return the derivative (C,) of the objective with respect to a connection's BSDF, and add the derivative of the
-    masks on its way.
+    """Return the derivative (C,) of the objective with respect to the BSDF of a connection. Also add the derivative of
+    the masks between vertex and sensor.
     """
     rest = mi.Spectrum(dr.rcp(stand_in(connection)[0]))
     rest *= differentiate_passage(p, vertex.si, vertex.depth, connection, active, adjoint)
@@ -233,8 +233,9 @@ def adjoint_of_connection(
 def needed(latest: mi.UInt32, depth: mi.UInt32) -> mi.UInt32:
     """Return the last vertex that a replay must visit for a connection from vertex `depth`, or 0 if there is none.
 
-    It is the vertex after the latest differentiated vertex, because the scattering of the latter is sampled there. If
-    the connection starts at the latest differentiated vertex, it is this vertex.
+    The result is the vertex after the latest differentiated vertex, because the path samples the scattering of the
+    latest differentiated vertex there. If the connection starts at the latest differentiated vertex, the result is this
+    vertex.
     """
     return dr.select(latest > 0, dr.minimum(latest + 1, depth), 0)
 

@@ -43,7 +43,7 @@ class SurfacePoint:
         return SurfacePoint([mi.Float(0), mi.Point2f(0), *indices, mi.Point3f(0), mi.Vector3f(0)])
 
     def ray(self) -> mi.Ray3f:
-        """Return the ray that reached the vertex; stored in scenes whose BSDFs read geometry."""
+        """Return the ray that reached the vertex. The ray is stored only in scenes whose BSDFs read geometry."""
         return mi.Ray3f(*self.numbers[-2:])
 
     def hit(self) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f]:

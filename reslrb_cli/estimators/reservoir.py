@@ -53,9 +53,9 @@ from reslrb_cli.transport.walk import Vertex
 
 @dataclass
 class Slot:
-    """Selected connection, 28 bytes. If zero factors are tracked, it takes 12 bytes more.
+    """Selected connection, 28 bytes. If zero factors are tracked, a slot takes 12 bytes more.
 
-    If BSDFs are differentiated, `event` holds c_I in about 50 bytes, so that the replay ends a vertex earlier.
+    If BSDFs are differentiated, `event` stores c_I in about 50 bytes. The replay then ends one vertex earlier.
     """
 
     w: mi.Float  # its selection weight
@@ -115,7 +115,9 @@ class ReservoirSelection(VertexHooks):
 
 
 class ReservoirReplay(SlotReplay):
-    """Replay that differentiates s_j. It ends at the last differentiated vertex before the connections of all slots."""
+    """Replay that differentiates s_j. The replay ends at the last differentiated vertex that any slot needs. For each
+    slot, the needed vertex lies before the slot's connection.
+    """
 
     def __init__(self, p: Pass, slots: list[Slot], adjoints: list[PathAdjoint]) -> None:
         super().__init__(p, [slot.last for slot in slots])

@@ -1,4 +1,4 @@
-"""Weighted reservoir sampling of a path's connections (Chao 1982), and replays up to the selected ones.
+"""Weighted reservoir sampling of a path's connections (Chao 1982), and path replays up to the selected connections.
 
     slot k keeps candidate i with probability w_i / W,   W = sum_i w_i
 
@@ -49,17 +49,20 @@ def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -
 def is_taken(number: mi.Float, w: mi.Float, W: mi.Float) -> mi.Bool:
     """Return whether a candidate of weight `w` takes the slot, with probability w / W. The sum `W` includes `w`.
 
-    A weight that is not finite is always taken, and so are all later ones, so errors are not lost.
+    If the weight sum is not finite, the current candidate and all later candidates are taken. Errors are therefore not
+    lost.
     """
     return (w != 0) & ((number * W < w) | ~dr.isfinite(W))
 
 
 def at_least_share(w: mi.Float, W: mi.Float) -> mi.Float:
-    """Return a candidate's weight, raised to SHARE of the sum W of all earlier weights, unless it is 0.
+    """Return the candidate's weight, raised to at least SHARE times the sum W of all earlier weights. A weight of 0
+    stays 0.
 
-    Connections after a heavy one may be the only ones that depend on some parameter. Their own weight may be a
-    millionth of the heavy one. The minimum weight gives them a probability of at least SHARE. Earlier connections need
-    no minimum, because the heavy connection depends on the same parameters.
+    Connections after a heavy one may be the only ones that depend on some parameter. The weights of connections after a
+    heavy connection may be a millionth of the heavy connection's weight. The minimum weight gives these later
+    connections a selection probability of at least SHARE. Connections before a heavy connection need no minimum weight,
+    because the heavy connection depends on their parameters, too.
     """
     least = SHARE * W
     return dr.select((w != 0) & (w < least), least, w)  # a comparison, so that NaN is kept
@@ -73,18 +76,20 @@ def inverse_probability(W: mi.Float, slot: Chosen, capacity: int) -> mi.Float:
 
 
 def slot_adjoint(p: Pass, W: mi.Float, slot: Chosen, capacity: int) -> PathAdjoint:
-    """Return the sensitivity of the objective to a slot's connection, multiplied by the slot's inverse probability."""
+    """Return the objective's sensitivity to a slot's connection. The sensitivity is multiplied by the slot's inverse
+    selection probability.
+    """
     delta = p.delta(slot.u, slot.w != 0)
     return PathAdjoint(delta * slot.C.nonzero * inverse_probability(W, slot, capacity), slot.C)
 
 
 def chosen_by(numbers: list[mi.Float], w: mi.Float, W: mi.Float, this: S, slots: list[S]) -> list[S]:
-    """Return the slots after the candidate `this`. Each slot has its own random number."""
+    """Return the slots after offering the candidate `this` to each slot. Each slot has its own random number."""
     return [dr.select(is_taken(number, w, W), this, slot) for number, slot in zip(numbers, slots, strict=True)]
 
 
 class SlotReplay(VertexHooks):
-    """Replay up to the vertex `last`, the last one that any slot differentiates."""
+    """Replay up to the vertex `last`, which is the last vertex that any slot differentiates."""
 
     replaying = True
     connects = False
@@ -104,12 +109,12 @@ class SlotReplay(VertexHooks):
 
 @dataclass
 class Event:
-    """One factor of a path: the BSDF value f towards the local direction `wo`. `index` is its vertex, or 0 for
-    emission.
+    """One factor of a path: the BSDF value f towards the local direction `wo`. `index` is the vertex of the factor.
+    `index` is 0 for emission.
 
     The whole factor is `rest` times f, without the transmittance of masks. `rest` is stored only if zero factors are
-    tracked. If masks may stand between the vertex and the sensor, `own` tells whether the event belongs to a
-    connection, and holds the sample of the aperture.
+    tracked. Needed if masks may stand between vertex and sensor: `own` holds True for an event of a connection, and the
+    sample of the sensor's aperture.
     """
 
     index: mi.UInt32

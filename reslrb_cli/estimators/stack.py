@@ -1,8 +1,10 @@
-"""Use every connection of a path without additional variance, in one traversal: push vertices, then walk back.
+"""Use every connection of a path without additional variance, in one traversal. The forward pass pushes vertices on a
+stack. The walk back then visits the vertices in reverse order.
 
-P_j is the throughput before vertex j. s_j is the factor of its scattering, and c_j that of its connection; both are f =
-bsdf * cos times numbers without a derivative. B_j is the contribution of all later connections to the objective, per
-unit of throughput behind s_j. delta_j is dL/dI at the film position of c_j. The recursion starts at the last vertex.
+P_j is the throughput before vertex j. s_j is the scattering factor at vertex j, and c_j is the connection factor. s_j
+and c_j are f = bsdf * cos times numbers without a derivative. B_j is the contribution of all later connections to the
+objective, per unit of throughput behind s_j. delta_j is dL/dI at the film position of c_j. The recursion starts at the
+last vertex.
 
     dS     += P_j [ delta_j dc_j + B_j ds_j ]
     B_{j-1} = delta_j c_j + s_j B_j                      B = 0 behind the last vertex
@@ -10,9 +12,9 @@ unit of throughput behind s_j. delta_j is dL/dI at the film position of c_j. The
 
 Nothing is divided, so zero factors need no special treatment.
 
-Only differentiated vertices are pushed. The forward pass combines the vertices between them. Behind the last pushed
-vertex, T is the throughput so far, including roulette, and D the contribution of the vertices since then. Vertex k
-stores both when it is pushed.
+Only differentiated vertices are pushed. Vertices between two pushed vertices are combined in the forward pass. T is the
+throughput, including roulette, since the last pushed vertex. D is the contribution of all vertices since the last
+pushed vertex. Vertex k stores both when it is pushed.
 
     B = (D + T delta_k c_k) + (T s_k) B_k                of the vertex that was pushed before k
 
@@ -68,12 +70,16 @@ class Differentiable(Protocol[A]):
     """Vertex on the stack: a PyTree of arrays."""
 
     def differentiate(self, p: Pass, adjoint: A) -> A:
-        """Add the derivatives of the vertex, given the adjoint behind it. Returns the adjoint before it."""
+        """Add the derivatives of the vertex. `adjoint` is the adjoint behind the vertex. Returns the adjoint
+        before it.
+        """
 
 
 @dataclass(frozen=True)
 class Ring:
-    """Places of vertices on the stack, by vertex number. Place number `size` is for discarded values."""
+    """Places of vertices on the stack, by vertex number. The ring has one extra place with number `size`, which
+    receives discarded values.
+    """
 
     size: int
     wraps: bool
@@ -98,8 +104,8 @@ class StackState:
     """Loop state of the forward pass.
 
     `count` vertices have been pushed, and `needed` of them come before the last contribution. `throughput` is T at the
-    current vertex. If no vertex is left out, it contains only the weight of roulette. `since` is D behind vertex number
-    `needed`. `stack` has an array for each member of a frame.
+    current vertex. If the stack leaves out no vertex, `throughput` contains only the roulette weight. `since` is the
+    contribution D since vertex number `needed`. `stack` has an array for each member of a frame.
     """
 
     stack: list[dr.Local]
@@ -110,7 +116,7 @@ class StackState:
 
     @staticmethod
     def begin(form: Any, ring: Ring, throughput: mi.Float | mi.Spectrum) -> StackState:
-        """Return an empty stack of frames of this form. The form is None if nothing is ever pushed. `throughput`
+        """Return an empty stack of frames of this form. `form` is None if no vertex is ever pushed. `throughput`
         is 1.
         """
         stack = [] if form is None else allocate(form, ring.size)
@@ -126,7 +132,7 @@ class StackState:
         return replace(self, needed=dr.select(active, self.count, self.needed), since=since)
 
     def scaled(self, weight: mi.Float | mi.Spectrum) -> StackState:
-        """Return the state behind a factor of the path."""
+        """Return the state behind a factor of the path, with the throughput multiplied by `weight`."""
         return replace(self, throughput=self.throughput * weight)
 
     def pushed(self, frame: Any, ring: Ring, here: mi.Bool, contributes: mi.Bool) -> StackState:
@@ -198,9 +204,9 @@ def pop(p: Pass, form: Any, ring: Ring, state: StackState, top: mi.UInt32, botto
 class Frame:
     """Vertex on the stack, whose BSDF is evaluated again towards the sensor and along the path.
 
-    `weight_c` (C,) is P_k delta_k c_k / f_c, the weight of the derivative of f_c. `weight_s` (C,) is P_k s_k / f_s,
-    which multiplied by B_k is the weight of the derivative of f_s. B of the vertex pushed before is `own` + `onward`
-    B_k.
+    `weight_c` (C,) is P_k delta_k c_k / f_c, the weight of the derivative of f_c. `weight_s` (C,) is P_k s_k / f_s. The
+    product of `weight_s` and B_k is the weight of the derivative of f_s. B of the previously pushed vertex is `own` +
+    `onward` B_k.
     """
 
     point: SurfacePoint
@@ -242,7 +248,7 @@ def push(
     plan: Plan, state: StackState, ring: Ring, here: mi.Bool, vertex: Vertex, scattering: Scattering,
     connection: Connection | None, weight: mi.Spectrum,
 ) -> StackState:  # fmt: skip
-    """Return the state behind a vertex, after pushing it in lanes `here`.
+    """Return the state behind a vertex. The vertex is pushed in the lanes `here`.
 
     `weight` (C,) is delta times the connection without its BSDF, or 0 if the connection does not count.
     """
@@ -268,7 +274,7 @@ def push(
 
 
 def is_gapless(plan: Plan) -> bool:
-    """Whether all vertices have something to differentiate."""
+    """True if every vertex has something to differentiate, so the stack leaves out no vertex."""
     return plan.differentiate_bsdfs and not plan.only_bsdfs
 
 
@@ -276,8 +282,8 @@ def is_gapless(plan: Plan) -> bool:
 
 
 class LightSweep(VertexHooks):
-    """Forward pass of light paths: it splats the image and pushes the vertices before number `end`, or all vertices for
-    None.
+    """Forward pass of light paths. The pass splats the image and pushes the vertices before number `end`. If `end` is
+    None, the pass pushes all vertices.
 
     `visibility` is the result of an earlier walk, if there was one.
     """

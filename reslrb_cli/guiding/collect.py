@@ -1,31 +1,34 @@
-"""Contributions that guiding learns from, by the cells that light paths start in and pass through.
+"""Light-path contributions from which guiding learns, for each cell in which paths start, and for each cell through
+which paths pass.
 
 Trail: the vertices of a path are stored until the path ends, because the contribution behind each vertex is known only
 then. The first PLACES vertices are stored in thread-local memory. A walk back sums over all later vertices, as in
 `estimators/stack.py`.
 
-Onward: later contributions of light paths by their position and direction, for roulette. `transport/roulette.py`
-defines the cells. Two means over the rays that leave a vertex in a cell are learned: m, the squared later contribution
-at throughput 1, and c, the number of later vertices. A ray that leaves with throughput w survives with probability q =
-min(1, max(LEAST, w s)). The following value of s minimises variance times work.
+`Onward`: contributions of later vertices, for each cell of ray position and ray direction. Roulette uses these
+contributions. `transport/roulette.py` defines the cells. Guiding learns two means over the rays that leave a vertex in
+a cell. m is the mean squared later contribution at throughput 1. c is the mean number of later vertices. A ray that
+leaves with throughput w survives with probability q = min(1, max(LEAST, w s)). The following value of s minimises
+variance times work.
 
     s = sqrt(m W / (c V))        V: mean squared contribution of whole paths; W: mean number of their vertices
 
-Source: Rath et al. 2022, "EARS: efficiency-aware Russian roulette and splitting". Here s is SURE times larger. Nearly
-all contribution of a cell comes from few paths, so most cells are underestimated. Ending a path too early adds much
-more noise than following it too long adds work.
+Source: Rath et al. 2022, "EARS: efficiency-aware Russian roulette and splitting". Here s is SURE times larger. Few
+paths carry nearly all of a cell's contribution, so most cells are underestimated. Ending a path too early adds much
+more noise than following a path too long adds work.
 
-For the same reason, each cell is averaged with the larger cube around it, which has the weight of LEAN rays. That cube
-is averaged with the next larger one, up to the whole scene. No cell has less than FLOOR of the scene's m / c.
+Because most cells are underestimated, each cell is averaged with the larger cube around the cell. The cube has the
+weight of LEAN rays. Each cube is in turn averaged with the next larger cube, up to the whole scene. No cell has less
+than FLOOR of the scene's m / c.
 
-Hearing: contributions of light paths to gradient and image, by the cell that they start in. A separate walk with its
-own random numbers computes them, for each path and each differentiated BSDF.
+`Hearing`: contributions of light paths to gradient and image, for each cell in which paths start. A separate walk with
+its own random numbers computes the contributions, for each path and each differentiated BSDF.
 
     G = sum_i delta_i C_i n_i        n_i: number of factors of C_i from this BSDF
 
-G is the derivative with respect to the logarithm of a factor on all values of the BSDF. For emission, n = 1. If light
-moves, G is the sum of |delta_i C_i|. The tables sum the squares of G p / v, the contribution if all paths started
-uniformly. These squares determine the variance of the sum over all paths.
+G is a derivative with respect to the logarithm of a factor. The factor scales all values of the BSDF. For emission, n =
+1. If light moves, G is the sum of |delta_i C_i|. The tables sum the squares of G p / v. G p / v is a path's
+contribution if all paths started uniformly. These squares determine the variance of the sum over all paths.
 """
 
 from __future__ import annotations
@@ -57,9 +60,10 @@ PLACES = 32  # vertices
 class Trail:
     """Loop state of a path's vertices.
 
-    For each vertex it stores the contribution to each quantity (C,) and to the image, the cell of the outgoing ray, the
-    inverse of the ray's throughput (0 without a ray), and the weight of roulette. Vertices beyond the last place share
-    one place that is never read. `later` is the sum of their contributions.
+    For each vertex, the trail stores the contributions to each quantity (C,) and to the image. The trail also stores
+    the outgoing ray's cell, the inverse of the ray's throughput (0 without a ray), and the roulette weight. Vertices
+    beyond the last place share one place that is never read. `later` is the sum of the contributions of all vertices
+    beyond the last place.
     """
 
     said: list[dr.Local]
@@ -101,8 +105,9 @@ class Trail:
 def walk_back(trail: Trail) -> tuple[mi.Float, mi.Float, mi.Float]:
     """Return the later contributions of all paths in the form of `Said`. Values that are not finite do not count.
 
-    Roulette divides the weight of surviving paths by q. The walk back undoes this: it multiplies the squared
-    contribution by q, and divides the number of vertices by q. The means then equal those without roulette.
+    Roulette divides the weight of surviving paths by q. To undo the roulette weight, the walk back multiplies the
+    squared contribution by q. The walk back also divides the number of vertices by q. With this correction, the means
+    equal the means of paths without roulette.
     """
     squares, followed, left = (dr.zeros(mi.Float, rows * CELLS) for rows in (len(trail.later), 1, 1))
 
@@ -145,8 +150,8 @@ class Walked:
 
     For each cell there are three sums over the paths: squared later contributions at throughput 1 (voices, CELLS),
     number of later vertices, and number of rays. There are also three means over the paths. `said` is the mean squared
-    contribution (voices), `light` the mean squared weight at the emitter, and `length` the mean number of vertices plus
-    one.
+    contribution for each quantity (voices). `light` is the mean weight at the emitter. `length` is the mean number of
+    vertices plus one.
     """
 
     squares: Array
@@ -161,8 +166,8 @@ class Walked:
 class Onward:
     """Sums (4, CELLS) as float32: squared contributions to gradient and image, later vertices, and rays.
 
-    Squares are relative to those of whole paths, and to `light`. The box `box` (2, 3) is divided into cubes. Arrays are
-    never modified.
+    Squared contributions are divided by those of whole paths, and multiplied by the square of `light`. The box `box`
+    (2, 3) is divided into cubes. Arrays are never modified.
     """
 
     box: Array
@@ -208,7 +213,7 @@ class Onward:
         return Onward(box, sums.astype(np.float32), float(frame[6]), float(frame[7]))
 
     def chances(self, share: float) -> Array:
-        """Return s of all cells (CELLS). `share` is the weight of the gradient, and 1 - `share` that of the image.
+        """Return s of all cells (CELLS). `share` is the weight of the gradient. 1 - `share` is the weight of the image.
 
         If no ray has ever left a vertex, all values are infinite, so every path survives.
         """
@@ -223,8 +228,8 @@ class Onward:
 
 
 def _leaning(sums: Array, counts: Array) -> Array:
-    """Return the means (K, CELLS), `sums` divided by `counts`, each averaged with the means of the larger cubes around
-    it.
+    """Return the means (K, CELLS): `sums` divided by `counts`. Each cell's mean is averaged with the means of the
+    larger cubes around the cell.
     """
     total = max(float(counts.sum()), 1.0)
     means = np.broadcast_to((sums.sum(1) / total)[:, None, None, None, None], (len(sums), 1, 1, 1, SHAPE[-1]))

@@ -2,8 +2,8 @@
 
 In some scenes, only a few pixels matter. For example, a wall may be visible to camera paths only in the pixels of a
 mirror, while other pixels show nothing that is differentiated. Before the first iteration, a few camera paths are
-therefore traced through each pixel. Their effect on the gradient of a loss with dL/dI = 1 is recorded for each
-differentiated BSDF, as in `collect.py`.
+therefore traced through each pixel. For each differentiated BSDF, the module records the effect of these paths on the
+gradient, as in `collect.py`. The loss of this gradient has dL/dI = 1.
 
     G = sum_i C_i n_i        n_i: number of factors of contribution C_i from this BSDF;  n = 1 for emission
 
@@ -13,10 +13,10 @@ the pixels.
 
     w_j^2 Var(I_j) (E G_j)^2 / n_j        The sum is least, at equal sums of n_j, for  n_j ~ w_j sd(I_j) E|G_j|.
 
-The variances of several groups are added. Each is divided by the square of the group's whole gradient, sum_j w_j
-E|G_j|, and multiplied by the number K of its entries. Each texel is visible in K times fewer pixels than a colour, so
-its relative variance is K times larger. A rare bright path would attract all others to its pixel. Means are therefore
-over blocks of pixels, and no pixel has more than MOST times the mean.
+The variances of several groups are added. Each group's variance is divided by the square of the group's whole gradient,
+sum_j w_j E|G_j|. The quotient is multiplied by the group's number of entries, K. Each texel is visible in K times fewer
+pixels than a colour, so its relative variance is K times larger. A rare bright path would attract all other paths to
+its pixel. Means are therefore over blocks of pixels. No pixel's density exceeds MOST times the mean.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ LEAST_PATHS, MOST_PART = 1e7, 0.02  # for a run that has time for it, and the re
 class NotedSums:
     """Loop state of the hooks.
 
-    `counts` tells how often the path met each group's BSDFs. `sums` are G (C,) of groups, emission and, last, radiance.
+    `counts` tells how often the path met each group's BSDFs. `sums` holds the sums G (C,) for the groups and for
+    emission. The last entry is the radiance.
     """
 
     counts: list[mi.UInt32]
@@ -98,7 +99,7 @@ def note(samples: Samples) -> NDArray[np.float64]:
 def noted_part(paths: float, spp: float) -> float | None:
     """Return the share of the recorded paths in a run, or None if the run has no time for the measurement.
 
-    `paths` is the number of the run's paths, and `spp` the number through each pixel in all iterations.
+    `paths` is the run's path count. `spp` is the path count per pixel over all iterations.
     """
     part = NOTED_SPP / spp
     return part if paths >= LEAST_PATHS and part <= MOST_PART else None

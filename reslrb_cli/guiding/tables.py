@@ -1,13 +1,16 @@
-"""Tables of the starts of light paths, for each sensor, learned from earlier steps for later ones.
+"""Tables that guide where light paths start, for each sensor. The contributions of earlier steps update the tables for
+later steps.
 
 Cells are sampled by the contributions of the paths that started in them. `collect.py` defines these contributions. The
-variance of a sum over paths depends on the mean square contribution in each cell. It is smallest if cells are sampled
-in proportion to the root of this mean. Each quantity is scaled to a total of 1, so that no parameter dominates another.
+variance of a sum over paths depends on the mean square contribution in each cell. The variance is smallest if each cell
+is sampled in proportion to the square root of its mean square contribution. Each quantity is scaled to a total of 1, so
+that no parameter dominates another.
 
 The resolution of the cells depends on the number of recorded paths. After a few thousand paths, hundreds of cells are
-merged. With more paths, cells are divided, up to the cells of the grid.
+merged. With more recorded paths, merged cells are divided again, until they are the cells of the grid.
 
-`Guiding` holds the tables of one scene. If samples serve image and gradient, half of them are drawn for each.
+`Guiding` holds the tables of one scene. If samples serve image and gradient, half of the samples are drawn for the
+image and half for the gradient.
 """
 
 from __future__ import annotations
@@ -39,10 +42,10 @@ FINE = 2.0  # maximum number of cells per recorded path
 
 
 def most_cells(paths: int) -> float:
-    """Return an upper limit for the number of cells that can be distinguished if each learning walk has this many
-    paths.
+    """Return an upper limit for the number of distinguishable cells. Each learning walk has `paths` paths.
 
-    The total weight of all recorded paths stays below the sum of the geometric series of the past.
+    The weights of past walks form a geometric series. The total weight of all recorded paths stays below the sum of the
+    series.
     """
     return FINE * paths / (1 - KEEP) * (1 - 1e-6)
 
@@ -80,8 +83,9 @@ class Learned:
     ) -> Learned:
         """Return the state after newer paths.
 
-        `heard` (voices, cells) are their contributions, with the image last, and `draws` (cells) their numbers. Each
-        quantity is scaled to a total of 1. `onward` has already learned from the same paths.
+        `heard` (voices, cells) holds the contributions of the newer paths, with the image last. `draws` (cells) holds
+        the number of newer paths per cell. Each quantity is scaled to a total of 1. `onward` already includes the newer
+        paths.
         """
         sums = np.float32(KEEP) * self.sums
         means = np.zeros(grid.cells, np.float32)
@@ -93,7 +97,9 @@ class Learned:
         return Learned(sums, started, self.calls, onward, self._places(film), worse)
 
     def _places(self, heard: Array | None) -> Array:
-        """Return `film` after newer contributions by block (voices, blocks), with the image last."""
+        """Return `film` after an update with the newer contributions to each block (voices, blocks). The last row
+        belongs to the image.
+        """
         if heard is None:
             return self.film
         shape = 2, heard.shape[1]
@@ -110,7 +116,7 @@ class Learned:
     def density(self, grid: Grid, share: float) -> Array:
         """Return the normalised density of the cells (cells,), before the uniform part is added.
 
-        `share` is the weight of the gradient, and 1 - `share` that of the image. Cells with few recorded paths are
+        `share` is the weight of the gradient. 1 - `share` is the weight of the image. Cells with few recorded paths are
         merged.
         """
         if self._densities is None:
@@ -134,11 +140,11 @@ class Learned:
 
 
 def _add(sums: Array, heard: Array, means: Array) -> list[float]:
-    """Add contributions (voices, n), with the image last, to `sums` (2, n). Each quantity is first scaled to a total of
-    1.
+    """Add the contributions `heard` (voices, n) to `sums` (2, n). The last row of `heard` belongs to the image. Each
+    quantity is first scaled to a total of 1.
 
-    `means` (n) are the weights of the places in this total. Returns the mean of `means` for each quantity. A quantity
-    without a finite total is left out.
+    `means` (n) holds the weight of each place in a quantity's total. Returns the mean of `means` for each quantity. A
+    quantity without a finite total is left out.
     """
     found = []
     for voice, said in enumerate(heard.astype(np.float32, copy=False)):
@@ -172,7 +178,9 @@ KNOWN = ("sums", "draws", "film", *NAMES)
 
 
 class Purpose(enum.Enum):
-    """Purpose of samples. Its value is the weight of the gradient in the table; the rest is the weight of the image."""
+    """Purpose of samples. The value is the weight of the gradient in the table. 1 minus the value is the weight of the
+    image.
+    """
 
     IMAGE = 0.0
     GRADIENT = 1.0
@@ -192,7 +200,7 @@ def grid_for(used: Sequence[bool], weights: Sequence[float], sensors: int, paths
     """Return a grid whose tables fit into memory for this number of sensors. If there are more sensors, they share
     tables.
 
-    The grid is not finer than walks of `paths` paths can resolve. If the number of paths is unknown, it is None.
+    The grid is not finer than walks of `paths` paths can resolve. `paths` is None if the number of paths is unknown.
     """
     grids = (make_grid(used, weights, bits) for bits in range(CELL_BITS, LEAST_BITS, -1))
     fitting = (grid for grid in grids if sensors * sensor_bytes(grid) <= MOST_BYTES)
@@ -204,7 +212,7 @@ class Guiding:
     """Grid and tables of one scene, for a light tracer.
 
     `images` tells whether samples that serve only an image are guided. Tables that are `held` do not learn. `lessons`
-    counts how often any table has learned.
+    counts the updates of all tables together.
     """
 
     def __init__(self) -> None:
@@ -228,7 +236,7 @@ class Guiding:
         self._tables.clear()
 
     def grid_of(self, samples: Samples, paths: int | None) -> Grid:
-        """Return the grid for the samples' scene and for walks of this number of paths.
+        """Return the grid for the scene of `samples`, and for walks of `paths` paths.
 
         A coarser grid is replaced by a finer one, and keeps its recorded contributions. A grid for an unknown number of
         paths is replaced if it has not learned yet.
@@ -251,8 +259,8 @@ class Guiding:
     def table(self, number: int, purpose: Purpose, delta: mi.TensorXf | None = None) -> Table:
         """Return the table for samples of sensor `number`.
 
-        If dL/dI `delta` (H, W, C) is known before the samples, it selects some of the film positions that paths are
-        aimed at.
+        `delta` (H, W, C) is dL/dI, if dL/dI is known before the samples. `delta` then selects some of the film
+        positions that paths are aimed at.
         """
         table = self._table(number, purpose)[0]
         if delta is None or table.aim is None:
@@ -278,7 +286,9 @@ class Guiding:
         return self._tables[number, purpose]
 
     def aims(self, number: int, film: Blocks) -> bool:
-        """Whether the paths of a sensor with this film are aimed. They are not if the sensor shares its tables."""
+        """Whether the paths of a sensor with this film are aimed. Paths are not aimed if the sensor shares its tables
+        with other sensors.
+        """
         assert self._emission is not None
         if max(number + 1, self._emission[2]) > self._apart:
             return False
@@ -288,8 +298,8 @@ class Guiding:
     def _aim(
         self, number: int, purpose: Purpose, learned: Learned | None, delta: mi.TensorXf | None = None
     ) -> Aim | None:
-        """Return the film positions that paths of a sensor are aimed at, from recorded contributions and the current
-        dL/dI.
+        """Return the film positions that a sensor's paths are aimed at. Recorded contributions and the current dL/dI
+        determine the positions.
         """
         if number not in self.films:
             return None
@@ -351,7 +361,7 @@ class Guiding:
         return None
 
     def due(self, number: int) -> bool:
-        """Count one more gradient of a sensor, and return whether its table should learn from it."""
+        """Count one more gradient of a sensor. Return true if the sensor's table should learn from this gradient."""
         if self.held:
             return False
         learned = self.learned.get(self._shared(number))
@@ -361,7 +371,7 @@ class Guiding:
         return learned is None or learns_after(calls)
 
     def learn(self, number: int, paths: int, said: Said) -> None:
-        """Update the table of a sensor with the contributions of this number of paths (`collect.py`).
+        """Update a sensor's table with the contributions of `paths` paths (`collect.py`).
 
         These paths are drawn from the table for BOTH, and are used for nothing else.
         """
@@ -388,7 +398,7 @@ def _shares(row: Array, even: Array) -> Array:
 
 
 def learns_after(gradients: int) -> bool:
-    """Whether a table learns from the gradient of this number, counted from 1.
+    """True if a table learns from the gradient with this number. Gradients are counted from 1.
 
     At first, the number of recorded paths doubles each time. Later, the table must check regularly whether the scene
     has changed. After a change, counting starts again.
@@ -397,12 +407,12 @@ def learns_after(gradients: int) -> bool:
 
 
 def learnings(gradients: int) -> int:
-    """Return how often a table has learned after this number of gradients of its sensor."""
+    """Return how many updates a table has had after its sensor's first `gradients` gradients."""
     return min(gradients, EVERY - 1).bit_length() + gradients // EVERY
 
 
 def learning_seed(seed: mi.UInt32 | int) -> mi.UInt32:
-    """Return the seed of the samples that a table learns from, independent of those of a gradient."""
+    """Return the seed of the samples that update a table. The seed is independent of the gradient's seed."""
     result = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(LEARNING_STREAM))[0]
     dr.make_opaque(result)
     return result

@@ -47,7 +47,7 @@ class Reversed:
         raise NotImplementedError
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """Return the image. Adds the gradient of the same samples with dL/dI = `derivative(image)`."""
+        """Return the image. Adds the gradient of the image's own samples, with dL/dI = `derivative(image)`."""
         image = self.image(job)
         self.backward(job, derivative(image))
         return image
@@ -144,7 +144,7 @@ _MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
 class WalkAd(LightTracer, Reversed):
-    """The same light paths under naive AD, for comparisons at equal seeds."""
+    """Naive AD of the light paths that `reslrb` traces, for comparisons at equal seeds."""
 
     OPTIONS: ClassVar[Mapping[str, Any]] = {
         **LightTracer.OPTIONS,

@@ -1,8 +1,9 @@
-"""Facts about a scene, its sensors and its differentiated parameters. A light tracer finds them once and keeps them.
+"""Facts about a scene, its sensors and its differentiated parameters. A light tracer determines each fact once and
+keeps the result.
 
 `Preparation` has the options and the facts of the last scene. Facts of a scene (`AboutScene`) and of a set of
-parameters (`AboutParameters`) are separate objects. Another scene or another set gets new objects, so a reused tracer
-gives the results of a new one. `Renewal` updates plans after shapes have moved.
+parameters (`AboutParameters`) are separate objects. A new scene or a new parameter set gets new objects. A reused
+tracer therefore gives the results of a new tracer. `Renewal` updates plans after shapes have moved.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ from reslrb_cli.transport.sobol import make_coordinates
 def _has_singular(key: str, value: dr.ArrayBase, least: float) -> bool:
     """Whether a factor that depends on this parameter is at most `least` somewhere.
 
-    The factor is near 0 if the parameter is near 0. If 1 - x is a factor, too, it is also near 0 at x = 1.
+    The factor is near 0 if the parameter is near 0. For a parameter x that also enters as the factor 1 - x, 1 - x is
+    near 0 at x = 1.
     """
     flat = dr.detach(value.array if dr.is_tensor_v(value) else dr.ravel(value))
     singular = flat <= least
@@ -47,7 +49,7 @@ def _has_singular(key: str, value: dr.ArrayBase, least: float) -> bool:
 
 
 class Renewal:
-    """Updates of the plans of one scene before tracing. Only plans that have changed are updated."""
+    """Updates of one scene's plans before tracing. Only plans that have changed are updated."""
 
     def __init__(self, scene: mi.Scene) -> None:
         graph = SceneGraph.of(scene)
@@ -81,7 +83,9 @@ def _vertices(mesh: mi.Mesh) -> tuple[mi.Float, mi.Float]:
 
 
 def resolve_sensor(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:
-    """Return a sensor of the scene, given as itself or as its index. Raises ValueError for an invalid index."""
+    """Return a sensor of the scene. `sensor` is the sensor itself or its index. Raises ValueError for an invalid
+    index.
+    """
     if not isinstance(sensor, Integral):
         return sensor
     index, count = int(sensor), len(scene.sensors())
@@ -115,7 +119,7 @@ class AboutParameters:
 
 @dataclass
 class AboutScene:
-    """Facts of one scene. It holds the sensors, so that no other sensor gets the address of a freed one."""
+    """Facts of one scene. The object holds the sensors, so no other sensor gets the address of a freed sensor."""
 
     sensors: list[mi.Sensor]
     #: Plans of images, by sensor and kind of paths.
@@ -135,7 +139,7 @@ class AboutScene:
 
 
 class Preparation:
-    """Options of a light tracer, and facts of one scene: the last one."""
+    """Options of a light tracer, and facts about the last scene."""
 
     def __init__(
         self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion, guided: bool = False,
@@ -185,9 +189,9 @@ class Preparation:
     ) -> Plan:  # fmt: skip
         """Return the plan to differentiate `params` in this scene. For None, nothing is differentiated.
 
-        `spp` is the number of samples per pixel of a pass, if the plan is for one. With `image`, the plan is for the
-        image of a step that differentiates `params`. It has the same paths as the gradient, and no derivatives. Raises
-        UnsupportedScene.
+        `spp` is the number of samples per pixel of one pass, if the plan is for a pass. With `image`, the plan is for
+        the image of a step that differentiates `params`. The image's plan has the gradient's paths, but no derivatives.
+        Raises UnsupportedScene.
         """
         self._turn_to(scene)
         if self.guiding is not None and spp is not None:
@@ -277,7 +281,8 @@ class Preparation:
     def _look_through(self, params: mi.SceneParameters) -> AboutParameters:
         """Return the facts about the currently differentiated parameters, and whether zeros must be tracked.
 
-        The owner of a parameter never changes. Whether it tracks derivatives or is zero may change.
+        The owner of a parameter never changes. A parameter may start or stop tracking derivatives, and may become zero
+        or nonzero.
         """
         with dr.resume_grad():  # with suspended gradients, nothing shows that it tracks them
             values = {key: entry_value(params, key) for key in params.properties}
@@ -311,15 +316,15 @@ class Preparation:
     def _meet(self, spp: int, differentiated: bool) -> None:
         """Make the cells as fine as passes of `spp` samples per pixel can resolve.
 
-        The first pass, and gradients with more samples, refine the cells. Images with more paths do not, because tables
-        do not learn from them.
+        The first pass, and gradients with more samples, refine the cells. Images with more paths do not refine the
+        cells, because tables do not learn from images.
         """
         if self.expected is None and (self._found.met == 0 or (differentiated and spp > self._found.met)):
             self._found.met = spp
             self._found.plans.clear()  # they contain the grid
 
     def _turn_to(self, scene: mi.Scene) -> None:
-        """Start with new facts about another scene."""
+        """Start new facts if `scene` differs from the last scene."""
         sensors = scene.sensors()
         if self._scene is None or self._scene[0] != scene.ptr or self._found.sensors != sensors:
             # The scene's own integrator does not hold the scene, because neither would be freed. It holds the scene's
@@ -345,8 +350,8 @@ class Preparation:
 def settle(scene: mi.Scene) -> None:
     """Make textures and emitters set up their data (padded storage, distributions) now instead of at their first use.
 
-    If they did so during tracing, the kernels of the first step would be split, and the second step would compile new
-    ones. Raises UnsupportedScene for an emitter that Mitsuba cannot sample, such as a spot with a checkerboard.
+    Data set-up during tracing would split the kernels of the first step. The second step would then compile new
+    kernels. Raises UnsupportedScene for an emitter that Mitsuba cannot sample, such as a spot with a checkerboard.
     """
     with dr.suspend_grad():
         for texture in SceneGraph.of(scene).of_type(mi.Texture):

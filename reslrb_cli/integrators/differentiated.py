@@ -1,9 +1,10 @@
 """Differentiated parameters, and the features of a walk that their derivatives need, mainly for moving light.
 
 `Motion` has the options of attached derivatives, and `attach` adds them to a plan. The values `follow` and `stay` of
-`attached_sampling` (`estimators/attached.py`) differ only if moving light is scattered by a surface that is not
-specular and then reaches another visible surface. `bounces` finds out whether this happens. In a caustic of few
-segments, it does not: light ends where it lands first.
+`attached_sampling` (`estimators/attached.py`) differ in only one case. A surface that is not specular scatters moving
+light, and the light then reaches another visible surface. `bounces` tests whether moving light reaches a visible
+surface after nonspecular scattering. In a caustic of few segments, moving light does not bounce, because paths end
+where light first lands.
 """
 
 from __future__ import annotations
@@ -124,7 +125,9 @@ def stays(plan: Plan, sampling: str, bsdfs: Iterable[mi.BSDF]) -> tuple[bool, bo
 
 
 def attach(plan: Plan, which: Differentiated, motion: Motion, scene: mi.Scene, sensor: mi.Sensor) -> Plan:
-    """Return the plan with attached derivatives if requested. Raises UnsupportedScene if they do not exist."""
+    """Return the plan with attached derivatives if requested. Raises UnsupportedScene if attached derivatives are
+    requested but do not exist.
+    """
     moves = bool(which.shapes or which.emitters)
     if motion.attached is False and moves:
         raise UnsupportedScene(
@@ -168,7 +171,9 @@ SEED = 0xB0A2CE
 
 
 def bounces(plan: Plan, scene: mi.Scene, sensor: mi.Sensor) -> bool:
-    """Whether any of a fixed number of paths bounces. `plan` has attached derivatives with vertices that stay."""
+    """True if at least one of a fixed number of light paths bounces. `plan` has attached derivatives, and its vertices
+    stay at their places.
+    """
     width, height = sensor.film().size()
     spp = max(PATHS // int(width * height), 1)
     with dr.suspend_grad():
@@ -179,7 +184,9 @@ def bounces(plan: Plan, scene: mi.Scene, sensor: mi.Sensor) -> bool:
 
 @dataclass
 class Bounced:
-    """Loop state: whether the path has met anything that moves, has then bounced, and has then been seen."""
+    """Loop state of a path, in three flags. The path has met something that moves, has bounced afterwards, and has been
+    seen after the bounce.
+    """
 
     moved: mi.Bool
     bounced: mi.Bool

@@ -73,8 +73,8 @@ class RecordedObjective(Hooks):
 class Tangent:
     """Derivatives along the parameters' tangents.
 
-    The state has the derivative of the product of the factors so far (C,). If light moves, it also has the derivatives
-    of the ray's origin and direction. `before` is the previous vertex if vertices stay at their places.
+    The state has the derivative of the product of the factors so far (C,). If light moves, the state also has the
+    derivatives of the ray's origin and direction. `before` is the previous vertex if vertices stay at their places.
     """
 
     d_product: mi.Spectrum
@@ -126,7 +126,7 @@ class TangentSplat(Hooks):
         return replace(state, d_product=dP * scattering.weight + P * tangent_of_scattering(scattering, df_s))
 
     def _attached(self, state: Tangent, vertex: Vertex, connection: Connection, scattering: Scattering) -> Tangent:
-        """Return the tangent behind a vertex if light moves.
+        """Return the tangent after a vertex, for moving light.
 
         The tangents of the segment's ray are known. One propagation computes the derivatives with respect to the ray
         and to the scene's parameters together.
@@ -160,14 +160,14 @@ class TangentSplat(Hooks):
 
 @dataclass
 class CameraTangent:
-    """Derivatives (C,) along the parameters' tangents: of the product of the factors so far, and of the radiance."""
+    """Derivatives (C,) of the factor product so far and of the radiance, along the parameters' tangents."""
 
     d_product: mi.Spectrum
     d_radiance: mi.Spectrum
 
 
 class CameraTangents(CameraHooks):
-    """Hooks for camera paths with the same product rule. They sum the radiance."""
+    """Hooks for camera paths with the product rule of `TangentSplat`. They sum the radiance."""
 
     def __init__(self, samples: Samples) -> None:
         self.samples = samples

@@ -2,7 +2,7 @@
 (`dr.freeze`).
 
 Tracing a step in Python takes milliseconds, whatever the size of the image. There is a recording for each kind of call.
-Dr.Jit makes another one if inputs change in more than their values.
+Dr.Jit makes another recording if inputs differ in more than their values.
 """
 
 from __future__ import annotations
@@ -55,9 +55,10 @@ class Recordings:
         """Call `function(samples, *inputs)`, from a recording if there is one. Its results are evaluated.
 
         `function` must depend only on its inputs and, for values that are no Dr.Jit arrays, on `kind`. The derivatives
-        that it adds to parameters must be proportional to the first of `inputs`. Calls that cannot be recorded are made
-        directly. For example, a second living scene takes part in indirect calls, but is no input. Calls that were
-        recorded too often are also made directly. Raises UnsupportedScene if a recording no longer fits.
+        that `function` adds to parameters must be proportional to the first of `inputs`. Calls that cannot be recorded
+        are made directly. For example, a call cannot be recorded while a second scene is alive. The second scene takes
+        part in indirect calls, but is not an input. Calls that were recorded too often are also made directly. Raises
+        UnsupportedScene if a recording no longer fits.
         """
         s = samples
         # Sensors that share a recording would remake it at every change of sensor. The key holds the sensor, so no
@@ -100,9 +101,9 @@ def _record(
 ) -> Any:  # fmt: skip
     """Return a recording, or None if the call cannot be recorded.
 
-    Dr.Jit detects a call that cannot be recorded only after it has computed everything and added derivatives. The
-    recording is therefore tried with zeros as first input, which add none. The trial is repeated until the recording is
-    used. All later work then has the same kernels from the first step on.
+    Dr.Jit detects a call that cannot be recorded only after it has computed everything and added derivatives. The first
+    trial of a recording therefore uses zeros as first input. Zeros add no derivatives. The trial is repeated until the
+    recording is used. After the trial, all work has the same kernels from the first step on.
     """
     recorded = dr.freeze(plain, limit=KEPT)
     if inputs:

@@ -1,7 +1,7 @@
-"""Integrators by users, loaded from a file, with errors in one line.
+"""User-defined integrators that are loaded from a file. Each error message has one line.
 
-They need Mitsuba's `render` and `render_backward`, which `mi.ad.integrators.common.ADIntegrator` and `RBIntegrator`
-provide for classes with `sample`.
+User-defined integrators need Mitsuba's methods `render` and `render_backward`. `mi.ad.integrators.common.ADIntegrator`
+and `RBIntegrator` provide both methods for classes with `sample`.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class OwnIntegrator(Reversed):
     ) -> None:  # fmt: skip
         """Prepare the class FILE.py:CLASS. It is constructed from a `mi.Properties` with these options and `arguments`.
 
-        The class receives only those of the first three options that it reads. `paths` are for checks (`config.Own`).
-        Code runs only if `allowed`.
+        Of `max_depth`, `rr_depth` and `hide_emitters`, the class receives only those options that it reads. `paths` are
+        for checks (`config.Own`). Code runs only if `allowed`.
         """
         self.file, self.name, self.allowed = code_file(file), file.rpartition(":")[2], allowed
         self._options = {"max_depth": max_depth, "rr_depth": rr_depth, "hide_emitters": hide_emitters}

@@ -17,7 +17,9 @@ PIXELS = "camera paths by pixel"
 
 @dataclass(frozen=True)
 class PlanRow:
-    """Feature of a plan: whether the scene and its parameters need it, and why."""
+    """Feature of a plan. `needed` is true if the scene and its parameters need the feature, and `reason`
+    explains why.
+    """
 
     feature: str
     needed: bool

@@ -20,7 +20,7 @@ class Job:
 
     `seed` is an opaque UInt32, and `spp` the number of samples per pixel. `params` is the scene's `mi.traverse`, and
     its entries that track derivatives are differentiated. It is None for an image without derivatives. `plans` stores
-    facts about scene and parameters for one step. Jobs that are derived from one another share it.
+    facts about scene and parameters for one step. Jobs that are derived from one another share `plans`.
     """
 
     scene: mi.Scene
@@ -48,7 +48,7 @@ class StepIntegrator(Protocol):
         ...
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """Return the image. Adds the gradient of the same samples with dL/dI = `derivative(image)`."""
+        """Return the image. Adds the gradient of the image's own samples, with dL/dI = `derivative(image)`."""
         ...
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
@@ -86,7 +86,9 @@ def halves_of(image: mi.TensorXf) -> tuple[mi.TensorXf, mi.TensorXf]:
 
 
 def whole_of(image: mi.TensorXf) -> mi.TensorXf:
-    """Return the image (H, W, C) of a set of samples. If the set has two halves (2, H, W, C), this is their mean."""
+    """Return the image (H, W, C) of a set of samples. If the set has two halves (2, H, W, C), the returned image is the
+    mean of the halves.
+    """
     if len(image.shape) == 3:
         return image
     first, second = halves_of(image)

@@ -88,7 +88,8 @@ class LightTracer:
         self, *, guided: bool | None = None, images: bool | None = None, low_discrepancy: bool | None = None,
         light_share: float | None = None,
     ) -> Self:  # fmt: skip
-        """Return the same tracer without facts of any scene, and with other ways of sampling. None keeps a value.
+        """Return a copy of the tracer with no facts about any scene, and with other sampling options. None keeps a
+        value.
 
         `guided` turns guiding on or off, and `images` the guiding of images. `low_discrepancy` selects low-discrepancy
         or independent numbers. `light_share` selects paths from both sides with this share of light paths. Images then
@@ -101,9 +102,9 @@ class LightTracer:
         return other
 
     def shared_out(self, noted: Mapping[str, NDArray[np.float32]]) -> Self:
-        """Return the same tracer without facts of any scene, and with camera paths distributed by these densities.
+        """Return a copy of the tracer with no facts about any scene. The densities `noted` distribute its camera paths.
 
-        The densities (`note_pixels`) have the number of the sensor as key.
+        The keys of the densities (`note_pixels`) are sensor numbers.
         """
         other = self.afresh()
         other.preparation.shares_out = True
@@ -113,13 +114,13 @@ class LightTracer:
     def to_measure(self) -> Self:
         """Return this tracer or, if it is guided, a tracer with its own tables.
 
-        Measurements before a run must not update the tables of the run. Otherwise these tables would depend on whether
-        an earlier run has measured.
+        Measurements before a run must not update the tables of the run. Otherwise the run's tables would depend on
+        whether an earlier run has made the measurement.
         """
         return self if self.preparation.guiding is None else self.afresh()
 
     def expect(self, spp: int) -> None:
-        """Set the sample count of passes that tables learn from, before the first pass.
+        """Set the sample count of the passes that tables learn from. Call this method before the first pass.
 
         A run calls this method, so that it has the same cells whether it starts or resumes.
         """
@@ -129,7 +130,7 @@ class LightTracer:
         """Use light paths, camera paths, or both. `light_share` is the share of light paths; with 0 or 1, only one kind
         remains.
 
-        With `whole`, light paths alone have the same film border as the other kinds.
+        With `whole`, light paths alone have the film border of the other kinds of paths.
         """
         one_of("paths", paths, PATHS)
         if not 0 <= light_share <= 1:
@@ -146,11 +147,11 @@ class LightTracer:
         return self.preparation.plan(scene, sensor, params)
 
     def passes(self, job: Job, purpose: Purpose | None = None, delta: mi.TensorXf | None = None) -> list[Samples]:
-        """Return the samples of a job. If its `spp` is 0, the sensor's own sample count is used.
+        """Return the samples of a job. If the job's `spp` is 0, the job uses the sensor's own sample count.
 
         `purpose` selects the table of guided samples. None selects the table for the gradient, or for the image if
-        there is no gradient. If `delta` is given, it guides the samples as well. It is dL/dI (H, W, C), and must come
-        from other samples. Raises ValueError for a negative `spp`.
+        there is no gradient. If `delta` is given, `delta` also guides the samples. `delta` is dL/dI (H, W, C), and must
+        come from other samples. Raises ValueError for a negative `spp`.
         """
         if job.spp < 0:
             raise ValueError(f'"spp" must be 0 (the sensor\'s own sample count) or more, not {job.spp}')
@@ -174,7 +175,7 @@ class LightTracer:
     def _shares(self, job: Job, plan: Plan) -> Callable[[int], PixelShares | None] | None:
         """Return the distribution of the job's camera paths, or None for a uniform distribution.
 
-        If it is unknown, it is measured once for the differentiated parameters.
+        The tracer measures an unknown distribution once, for the differentiated parameters.
         """
         preparation = self.preparation
         if plan.paths == "light" or not preparation.shares_out:
@@ -188,8 +189,8 @@ class LightTracer:
         return preparation.shares(number, known[number], (int(size[0]), int(size[1]))) if number in known else None
 
     def note_pixels(self, job: Job, curvature: NDArray[np.floating] | None = None) -> NDArray[np.float32]:
-        """Return the density of camera paths over the pixels (H, W) of a job's sensor, with mean 1, for the current
-        scene.
+        """Return the density (H, W) of camera paths over the pixels of a job's sensor, for the current scene. The mean
+        density is 1.
 
         `curvature` (H, W) is the curvature of the loss (`pixels.py`). The job's seed and samples do not matter.
         """
@@ -331,7 +332,7 @@ class Reslrb(LightTracer):
         return light if plan.paths == "light" else max(light, stack_bytes(plan, self.estimator.stack_size))
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """Return the image. Adds the gradient of the same samples with dL/dI = `derivative(image)`."""
+        """Return the image. Adds the gradient of the image's own samples, with dL/dI = `derivative(image)`."""
         with dr.suspend_grad():
             parts = self.passes(job, Purpose.BOTH)
             traced = Trace(parts, *self.launch("trace", parts, partial(trace_image, self.estimator)))
@@ -348,9 +349,9 @@ class Reslrb(LightTracer):
         self.learn(job, gradient)
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
-        """Return the image. Adds the gradient for `gradient`, a dL/dI (H, W, C) that is known before the image.
+        """Return the image. Adds the gradient for a given dL/dI, `gradient` (H, W, C). dL/dI is known before the image.
 
-        If the estimator supports it, one set of samples is traced once for both.
+        If the estimator supports a common traversal, one set of samples is traced once for image and gradient.
         """
         with dr.suspend_grad():
             parts = self.passes(job, Purpose.BOTH, gradient)
@@ -440,9 +441,9 @@ def trace_image(estimator: Estimator, samples: list[Samples]) -> tuple[mi.Tensor
 
 
 def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointImage, done: bool = False) -> None:
-    """Add the derivatives of the objective. `adjoint` is its derivative with respect to the film.
+    """Add the derivatives of the objective. `adjoint` is the objective's derivative with respect to the film.
 
-    With `done`, the derivatives of camera paths have already been added in their only traversal.
+    With `done`, the only traversal of the camera paths has already added their derivatives.
     """
     differentiate_visible_emission(samples, adjoint)
     for side in samples.sides():
@@ -475,7 +476,7 @@ def replay_all(
 def fused(
     estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, params: mi.SceneParameters | None = None
 ) -> mi.TensorXf:
-    """Return the image, and add the gradient for a dL/dI that is known before the image."""
+    """Return the image, and add the gradient. dL/dI is known before the image."""
     film = samples[0].film
     block = film.block()
     differentiate_passes(samples, estimator, block, film.adjoint(gradient), params)
@@ -486,7 +487,8 @@ def differentiate_passes(
     samples: list[Samples], estimator: Estimator, block: mi.ImageBlock | None, adjoint: AdjointImage,
     params: mi.SceneParameters | None,
 ) -> None:  # fmt: skip
-    """Trace samples with known dL/dI. Adds their derivatives and, if there is a block, their contributions to it.
+    """Trace samples with known dL/dI. Adds the samples' derivatives. If there is a block, also adds the samples'
+    contributions to the block.
 
     The data of a path stay within the kernel, and take no memory.
     """

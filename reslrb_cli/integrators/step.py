@@ -10,9 +10,9 @@
 With `halves`, each set of samples has two halves, and images are (2, H, W, C). A loss that multiplies an image by
 itself takes both halves, because their noise is independent (`Halves`).
 
-Entries of dL/dI that are not finite are set to 0, and counted (`Refused`). One NaN in dL/dI would make the gradient of
-everything on the paths of its pixel NaN, and some estimators would lose the NaN. The kernel that computes dL/dI also
-counts these entries, so only readers of the count wait for it.
+Entries of dL/dI that are not finite are set to 0, and counted (`Refused`). One NaN in dL/dI would make the gradients of
+everything on its pixel's paths NaN. Some estimators would lose the NaN. The kernel that computes dL/dI also counts
+these entries, so only readers of the count wait for it.
 """
 
 from __future__ import annotations
@@ -48,8 +48,9 @@ NONE = 0xFFFFFFFF
 class Refused:
     """Entries of dL/dI that were not finite.
 
-    It holds their number and the flat index of the first one, as arrays of width 1. It also holds the shape of dL/dI,
-    which is (H, W, C), or (2, H, W, C) with halves.
+    `count` is the number of entries that are not finite. `first` is the flat index of the first non-finite entry.
+    `count` and `first` are arrays of width 1. It also holds the shape of dL/dI, which is (H, W, C), or (2, H, W, C)
+    with halves.
     """
 
     count: mi.UInt32 = field(default_factory=lambda: dr.zeros(mi.UInt32, 1))
@@ -69,7 +70,9 @@ class Refused:
         return type(gradient)(dr.select(bad, 0, flat), gradient.shape)
 
     def entry(self) -> tuple[int, int, int] | None:
-        """Return pixel (x, y) and channel of the first such entry, or None. Waits for the step."""
+        """Return pixel (x, y) and channel of the first entry that is not finite, or None if all entries are finite.
+        Waits for the step.
+        """
         index = int(self.first[0])
         if index == NONE:
             return None
@@ -81,8 +84,8 @@ class Refused:
 class StepResult:
     """Result of a step besides gradients: the image (H, W, C) and the loss (width 1), both detached.
 
-    Entries of dL/dI that are not finite count as 0. `refused` has their number and the first of them. `seen` is the
-    image that the objective received, (2, H, W, C) with halves.
+    Entries of dL/dI that are not finite count as 0. `refused` holds the number of non-finite entries, and the index of
+    the first one. `seen` is the image that the objective received, (2, H, W, C) with halves.
     """
 
     image: mi.TensorXf
@@ -115,7 +118,7 @@ def make_integrator(type: str, **options: Any) -> StepIntegrator:
 
 
 def interface_of(integrator: StepIntegrator | mi.Integrator) -> StepIntegrator:
-    """Return the step interface of a plugin, or of an object that already is one."""
+    """Return the step interface of a plugin. An object that already is a step interface is returned unchanged."""
     if not isinstance(integrator, mi.Integrator):
         return integrator
     tracer: StepIntegrator | None = getattr(integrator, "tracer", None)  # of the plugins that are created here
@@ -147,7 +150,7 @@ class Halves:
             self.work.backward(half, own)
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """Return the images. Adds the gradient of the same samples with dL/dI = `derivative(images)`."""
+        """Return the images. Adds the gradient of the images' own samples, with dL/dI = `derivative(images)`."""
         first, second = half_jobs(job)
         images: list[mi.TensorXf] = []
 
@@ -166,7 +169,7 @@ class Halves:
         return images[0]
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
-        """Return the images. Adds the gradient of the same samples for a dL/dI that is known before the images."""
+        """Return the images. Adds the gradient of the images' own samples. dL/dI is known before the images."""
         parts = zip(half_jobs(job), _apart(gradient), strict=True)
         return _both(*(self.work.known(half, own) for half, own in parts))
 
@@ -289,7 +292,8 @@ def given_step(
     seed: int, spp: int, params: mi.SceneParameters | None = None, on_samples: OnSamples | None = None,
     halves: bool = False,
 ) -> None:  # fmt: skip
-    """Add the gradient by the samples of `seed`. `gradient` is dL/dI, (H, W, C) or, with halves, (2, H, W, C).
+    """Add the gradient estimated from the samples with the seed `seed`. `gradient` is dL/dI, (H, W, C) or, with halves,
+    (2, H, W, C).
 
     `gradient` must be finite and come from other samples. The other arguments are those of `gradient_step`.
     """
@@ -304,7 +308,9 @@ def _check_number(name: str, value: object, least: int, most: int) -> None:
 
 
 def _differentiate(work: StepIntegrator, job: Job, gradient: mi.TensorXf, on_samples: OnSamples | None) -> None:
-    """Add the gradient of samples with a known dL/dI. Their image is rendered only if `on_samples` needs it."""
+    """Add the gradient of samples with a known dL/dI. An image of the samples is rendered only if `on_samples` needs
+    the image.
+    """
     if on_samples is None:
         work.backward(job, gradient)
     else:

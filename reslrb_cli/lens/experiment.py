@@ -1,7 +1,7 @@
 """The files that `reslrb lens` writes for a face: the scene, its mesh, and the configuration that refines the face.
 
-The module contains only text and arrays, in millimetres, with the axes of `surface.py`. The lamp of parallel light has
-the size of the face as seen along the light, so its beam exactly covers the face. A light with the sun's angular
+The module contains only text and arrays, in millimetres, with the axes of `surface.py`. The lamp for parallel light has
+the size of the face as seen along the light. The beam therefore exactly covers the face. A light with the sun's angular
 diameter consists of `SUNS` such lamps. A point light is a spot whose cone ends at the face's corners. The mount around
 the face is black. The camera is a point on the receiver's normal, and throws no shadow.
 """
@@ -39,7 +39,7 @@ _LEAST = 0.02
 def leaving(surface: Surface) -> float:
     """Return the light that leaves the face, in mm^2.
 
-    It is for parallel light of irradiance 1, or for a point light of intensity 1.
+    The value is for parallel light of irradiance 1, or for a point light of intensity 1.
     """
     setting = surface.setting
     h, (ny, nx) = surface.heights, surface.heights.shape

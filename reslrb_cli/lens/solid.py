@@ -89,7 +89,7 @@ class Solid:
 
 
 def as_sheet(name: str, points: Array, triangles: Indices, smooth: bool = False) -> Sheet:
-    """Convert a mesh to a grid. Its vertices (n, 3) and triangles (m, 3) may have either orientation.
+    """Convert a mesh to a grid. The mesh has vertices (n, 3) and triangles (m, 3), in either orientation.
 
     Raises ConfigError, with the key `fabrication.faces`, if the mesh is no grid or no height field.
     """
@@ -132,7 +132,8 @@ def _areas(points: Array, triangles: Indices) -> Array:
 
 
 def make_solid(sheets: Sequence[Sheet], plan: Fabrication) -> Solid:
-    """Make the solid. The first of `sheets` is its front, and the second one, or a plane, its back.
+    """Make the solid. The first of `sheets` is the front of the solid. The second sheet, if given, is the back.
+    Otherwise, the back is a plane.
 
     Raises ConfigError, with a key below `fabrication`, if the faces cross or have another size than requested.
     """
@@ -189,8 +190,8 @@ class _Building:
         return self.add(np.column_stack([at[:, :2] * scale, np.full(len(at), z)]))
 
     def add_face(self, sheet: Sheet, plan: Fabrication, side: int) -> Indices:
-        """Add a face with its rim, and return the loop around both. Its outside is towards +z or -z, depending on
-        `side`.
+        """Add a face with its rim. Return the loop of vertices around face and rim. The face's outside is towards +z or
+        -z, depending on `side`.
         """
         points, triangles = sheet.points, sheet.triangles
         if plan.outline == "round":

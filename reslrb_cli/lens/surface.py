@@ -1,4 +1,5 @@
-"""The face of a lens or mirror whose caustic shows a picture: rays by Snell's law, heights by `transport.py`.
+"""Face of a lens or mirror whose caustic shows a picture. Rays follow Snell's law, and `transport.py` computes the
+heights.
 
 Lengths are in millimetres. The face is z = h(x, y) near the plane z = 0, with its normal towards the receiver. Light
 reaches a lens from z < 0 through a plane face at z = -thickness, and a mirror from z > 0. The central ray meets the
@@ -187,8 +188,8 @@ def on_receiver(picture: Array, through: bool) -> Array:
     """Convert `picture` (row 0 at the top) to the receiver's axes, with row 0 at the least y and columns along x. The
     conversion is its own inverse.
 
-    An observer who looks at the receiver from the light's side, with y up, has x to the left. An observer behind the
-    receiver has x to the right.
+    For an observer who looks at the receiver from the light's side, with y up, x points to the left. An observer behind
+    the receiver has x to the right.
     """
     return picture[::-1] if through else picture[::-1, ::-1]
 
@@ -198,8 +199,8 @@ def shape_surface(
 ) -> Surface:
     """Return the face whose caustic shows `picture` (rows, columns), a luminance with row 0 at the top.
 
-    The grid has `cells` along its longer side. Raises ConfigError, with the setting as key and a remedy, if there is no
-    such face.
+    The grid has `cells` along its longer side. Raises ConfigError if no face can show the picture. The error names the
+    setting and a remedy.
     """
     _check(picture, setting)
     rays = Rays(setting)
@@ -254,7 +255,7 @@ def _depth(h: Array, inside: NDArray[np.bool_]) -> float:
 
 
 def _twice(setting: Setting, target: Array, shape: tuple[int, int]) -> float:
-    """Return the relief (mm) at twice the distance, from a grid of at most 64 cells."""
+    """Return the relief (mm) for twice the receiver's distance. The grid has at most 64 cells per side."""
     far = replace(setting, distance=2 * setting.distance)
     coarse = min(1.0, transport.TRIAL / max(shape))
     small = (max(8, round(shape[0] * coarse)), max(8, round(shape[1] * coarse)))
@@ -282,8 +283,8 @@ def _start(rays: Rays) -> Array:
 
 
 def is_even(picture: Array) -> bool:
-    """Whether a picture has only one colour. One level of 8 bits counts as one colour, and so does dithering between
-    two levels.
+    """Whether a picture has only one colour. Variation within one 8-bit level counts as one colour. Dithering between
+    two 8-bit levels also counts as one colour.
     """
     return bool(picture.max() - picture.min() <= 0.02 * picture.max())
 
@@ -329,11 +330,11 @@ def _check(picture: Array, setting: Setting) -> None:
 
 
 def _reaches(setting: Setting) -> bool:
-    """Whether the face can send light from its corners and centre to those of the picture, on the front of the
-    receiver.
+    """True if the face can send light from its corners and centre to the picture's corners and centre. The light must
+    reach the receiver's front.
 
-    N, proportional to n_i d_i - n_t d_t, points to the light's side of the face only if n_i d_i . d_t > n_t. Refraction
-    therefore turns light by less than arccos(1 / n).
+    The face normal N is proportional to n_i d_i - n_t d_t. N has a positive component along the refracted direction d_t
+    only if n_i d_i . d_t > n_t. Refraction therefore turns light by less than arccos(1 / n).
     """
     rays = Rays(setting)
     x, y = (a.ravel() for a in transport.grid((3, 3), (1.5 * setting.size[0], 1.5 * setting.size[1])))

@@ -7,9 +7,9 @@ gradient g, to the picture: T(x, h, g). The following equation conserves light.
     nu(T(x)) det DT(x) = mu(x),                                                                                     (1)
 
 mu is the light that arrives on the aperture, and nu the picture, with equal totals. The aperture's edges are mapped to
-the picture's edges. For T = g this is optimal transport with squared distance (Brenier). With T from Snell's law, h is
-the surface itself, so nothing needs to be integrated afterwards (`surface.py`). The logarithm of (1) is solved on grids
-from coarse to fine. Each Newton step uses GMRES, preconditioned by the Laplacian, which SciPy's cosine transform
+the picture's edges. For T = g this is optimal transport with squared distance (Brenier). With T from Snell's law, the
+potential h is the surface height. No integration is needed afterwards (`surface.py`). The logarithm of (1) is solved on
+grids from coarse to fine. Each Newton step uses GMRES, preconditioned by the Laplacian, which SciPy's cosine transform
 inverts.
 """
 
@@ -98,8 +98,8 @@ def resized(values: NDArray[Any], shape: tuple[int, int], between: bool = False)
     """Return `values` (ny, nx, ...) resampled to another number of rows and columns, within the range of the old
     values.
 
-    Each new cell is the mean over its area, so the sum times the cell's area is preserved. With `between`, an axis with
-    more new cells than old ones is interpolated linearly between the old cells' centres instead.
+    Each new cell is the mean over its area, so the sum times the cell's area is preserved. With `between`, an axis that
+    gains cells is interpolated linearly between the centres of the old cells.
     """
     for axis, (old, new) in enumerate(zip(values.shape, shape)):  # noqa: B905  # `values` may have channels as well
         if old != new:
@@ -109,7 +109,7 @@ def resized(values: NDArray[Any], shape: tuple[int, int], between: bool = False)
 
 
 def _shares(old: int, new: int, between: bool) -> Array:
-    """Return the share (new, old) that each new cell takes of each old cell on a line. Rows sum to 1."""
+    """Return weights (new, old) along one axis. A weight is the share of an old cell in a new cell. Rows sum to 1."""
     if between:
         at = np.clip((np.arange(new) + 0.5) * (old / new) - 0.5, 0, old - 1)
         return np.asarray(np.maximum(1 - np.abs(at[:, None] - np.arange(old)), 0))
@@ -122,7 +122,9 @@ def _shares(old: int, new: int, between: bool) -> Array:
 
 
 def _shrunk(picture: Array, part: float) -> Array:
-    """Return `picture` reduced to `part` of its rows and columns. A larger `part` than 1 returns it unchanged."""
+    """Return `picture` reduced to `part` of its rows and columns. If `part` is larger than 1, the function returns
+    `picture` unchanged.
+    """
     ny, nx = picture.shape
     return picture if part >= 1 else resized(picture, (max(2, round(ny * part)), max(2, round(nx * part))))
 
@@ -185,7 +187,7 @@ def solve(
 
 @dataclass
 class _State:
-    """h on a grid, its slopes at the edges, and data for Newton steps."""
+    """Potential h on a grid, with its slopes at the edges and data for Newton steps."""
 
     h: Array
     slopes: list[Array]
@@ -340,8 +342,8 @@ class _Equation:
 
 
 def _dim(mu: Array, fade: float, dim: float) -> Array:
-    """Return mu (ny, nx) with a little light outside of the aperture, which decreases per cell. T is then determined
-    there, too.
+    """Return mu (ny, nx) with some light added outside of the aperture. The added light decreases with the distance
+    from the aperture in cells. T is then determined there, too.
     """
     lit = mu > 0
     if lit.all():
@@ -398,10 +400,10 @@ def _newton(
 def _started(
     state: _State, optics: Optics, nu: Array, target: tuple[float, float], contrast: float, blur: float
 ) -> _Equation:
-    """Return the equation at a state without folds. The state is first smoothed and mixed with the even map until T
-    folds nowhere.
+    """Return the equation at a state without folds. First, the function smooths the state and mixes it with the even
+    map until T folds nowhere.
 
-    Convex functions stay convex under both operations, and the even map moves points away from the edges.
+    Convex functions stay convex under smoothing and mixing. The even map moves points away from the edges.
     """
     h, slopes = state.h, list(state.slopes)
     even, even_slopes = _even(state.start, state.h.shape, state.size)
@@ -472,8 +474,8 @@ def _told(state: _State, optics: Optics, picture: Array, target: tuple[float, fl
 def pushed(T: Array, light: Array, shape: tuple[int, int], target: tuple[float, float], fine: int = 4) -> Array:
     """Return the picture (shape) that T makes of the light, with mean 1, filtered by a tent.
 
-    `light` (ny, nx) arrives at T (2, ny, nx). Each cell sends `fine`^2 equal shares, with T linear between centres.
-    Each share falls on the four nearest pixels.
+    `light` (ny, nx) arrives at T (2, ny, nx). Each cell sends `fine`^2 equal shares of light. T is linear between the
+    cell centres. Each share of light is split over the four nearest pixels.
     """
     ny, nx = light.shape
     at = np.meshgrid(
@@ -489,7 +491,8 @@ def splat(column: Array, row: Array, share: Array, shape: tuple[int, int]) -> Ar
     """Add shares of light at positions in pixels, each to the four nearest pixels. Shares outside of the picture are
     lost.
 
-    At an edge, a tent is folded back, as in `through_tent`. If nothing is lost, the mean is 1.
+    At an edge of the picture, the outer part of the tent is folded back inside, as in `through_tent`. If nothing is
+    lost, the mean is 1.
     """
     result = np.zeros(shape)
     inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])

@@ -69,12 +69,14 @@ def allowed_errors(
 ) -> dict[str, dict[str, Any]]:
     """Return the deviation at which SSIM has fallen by `ALLOWED_LOSS`, for each measured kind of deviation.
 
-    `found` are the figures of each image by name, as from `tolerances`. `kind` is `lens` or `mirror`. `deviations` are
-    the measured amounts: `distance` in mm, `index`, and `turn` in degrees. The result has the keys of `TOLERANCES`.
+    `found` holds the figures of each image, by image name, as returned by `tolerances`. `kind` is `lens` or `mirror`.
+    `deviations` are the measured amounts: `distance` in mm, `index`, and `turn` in degrees. The result has the keys of
+    `TOLERANCES`.
 
-    Each entry has the `value`, its `unit` and the stated `tolerance`. `at_least` is true if SSIM falls less even at the
-    measured deviation. `passes` tells whether the tolerance is met. It is None if this is unknown, because the measured
-    deviation is smaller than the tolerance and SSIM falls less.
+    Each entry has the `value`, its `unit` and the stated `tolerance`. `at_least` is true if SSIM falls by less than
+    `ALLOWED_LOSS` even at the measured deviation. `passes` tells whether the tolerance is met. `passes` is None if the
+    answer is unknown. In this case, the measured deviation is smaller than the tolerance, and SSIM falls less than
+    `ALLOWED_LOSS`.
     """
     planned = found.get("as planned")
     if planned is None:
@@ -101,21 +103,22 @@ def allowed_errors(
 def allowed_error(fall: float, deviation: float) -> float:
     """Return the deviation at which SSIM has fallen by `ALLOWED_LOSS`, at most `deviation`.
 
-    SSIM is assumed to fall linearly by `fall` at `deviation`. Nothing larger was measured.
+    The function assumes a linear fall of SSIM, by `fall` at `deviation`. Nothing larger was measured.
     """
     return deviation * min(1.0, ALLOWED_LOSS / fall) if fall > 0 else deviation
 
 
 def shown_ssim(entry: Mapping[str, Any]) -> float:
-    """Return the SSIM that the sheet shows. It refers to the original picture if that is known, otherwise to the
-    target.
+    """Return the SSIM that the sheet shows. The SSIM refers to the original picture if that picture is known, otherwise
+    to the target.
     """
     value = entry.get("ssim_of_picture")
     return float(entry["ssim"] if value is None else value)
 
 
 def blacks(image: Array, picture: Array) -> dict[str, float]:
-    """Return the mean brightness of the darkest 5 % of a `picture` (H, W), and of the same pixels of an `image`.
+    """Return the mean brightness of the darkest 5 % of a `picture` (H, W). Also return the mean brightness of the same
+    pixels of an `image`.
 
     Both images are divided by their means.
     """
@@ -144,7 +147,9 @@ def unlit_corners(image: Array, picture: Array) -> list[str]:
 
 
 def light_warnings(dark: Mapping[str, float], corners: list[str]) -> list[str]:
-    """Return a sentence if black comes out grey, and one if `corners` are unlit. `dark` is a result of `blacks`."""
+    """Return a warning sentence if black comes out grey. Return another sentence if `corners` are unlit. `dark` is a
+    result of `blacks`.
+    """
     lines = []
     if dark["picture"] <= BLACK and dark["image"] > dark["picture"] + GREY:
         lines.append(f"Black parts of the picture come out at {100 * dark['image']:.0f} % of the mean brightness "

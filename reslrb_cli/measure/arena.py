@@ -1,4 +1,4 @@
-"""Workers that take turns, from start to end: the common part of `bench` and `convergence`.
+"""Workers that take turns, from start to end. `bench` and `convergence` share this code.
 
 Only one worker computes at a time, so drift of the machine affects all workers alike. An additional worker, the
 referee, can make the common reference. If the referee fails, nothing is measured.
@@ -38,7 +38,9 @@ def in_turn(workers: Sequence[Item], round: int) -> list[Item]:
 
 
 def start_process(first: dict[str, Any], does: str) -> Process:
-    """Start a process. It runs the function that `load` returns for the name `does`. `first` is its first message."""
+    """Start a process. The process runs the function that `load` returns for the name `does`. `first` is its first
+    message.
+    """
     imports = "from reslrb_cli.measure.arena import load\nfrom reslrb_cli.measure.workers import run"
     return Process(first, python_command(f"{imports}\nrun(lambda: load({does!r}))"))
 
@@ -47,7 +49,8 @@ class Arena(Generic[Measured, Worker]):
     """Running workers, `members`. Their files go to `folder`, which the caller removes.
 
     `facts` come from the referee. `spent_s` is the part of the budget that is already spent. Measurements of an
-    `earlier` session count, and are continued. Raises ConfigError if they belong to another measurement.
+    `earlier` session count, and are continued. Raises ConfigError if the earlier measurements belong to another
+    measurement.
     """
 
     #: Maximum number of rounds.
@@ -81,9 +84,9 @@ class Arena(Generic[Measured, Worker]):
         self._end = now() + self._budget_s
 
     def _set_up(self, earlier: Earlier | None) -> int:
-        """Set up the parts that only one kind of session has, with the data of an earlier session.
+        """Set up the parts that only one kind of session has. The parts start from the data of an earlier session.
 
-        Returns the number of depths that share the time. Raises ConfigError.
+        Returns the number of depths among which the time is divided. Raises ConfigError.
         """
         raise NotImplementedError
 
@@ -108,8 +111,8 @@ class Arena(Generic[Measured, Worker]):
         return sum(member.peak_mib for member in self._alive()) * MIB > MEMORY_SHARE * self.plan.memory
 
     def _take_rounds(self, workers: Callable[[], Sequence[Stepping]], first: int, before: int) -> Iterator[int]:
-        """Yield the number of completed rounds after each round. Rounds start at number `first`, and `before` were
-        completed earlier.
+        """Yield the number of completed rounds after each round. Rounds start at number `first`. Earlier sessions
+        completed `before` rounds.
         """
         tight, done = self._tight(), 0
         self._pace.begin_rounds(before)
@@ -124,8 +127,8 @@ class Arena(Generic[Measured, Worker]):
         return (seconds + self.AFTERWARDS_S) / (1 - self.AFTERWARDS)
 
     def _ask_referee(self, plan: Plan, question: dict[str, Any] | None = None) -> dict[str, Any] | None:
-        """Return an answer of the referee, or its first message. Returns None if the budget is spent. Raises Refused if
-        the referee ended.
+        """Return the referee's answer to `question`. Without a question, return the referee's first message. Returns
+        None if the budget is spent. Raises Refused if the referee ended.
         """
         assert self._referee is not None, "it is started first"
         if question is not None:
@@ -138,7 +141,9 @@ class Arena(Generic[Measured, Worker]):
         return answer
 
     def _open(self, member: Contestant) -> dict[str, Any] | None:
-        """Return a worker's first message, after it has loaded its scene. Returns None if it ended, or time was up."""
+        """Return a worker's first message, after it has loaded its scene. Returns None if the worker ended, or if the
+        time was up.
+        """
         opening = member.answer(self._stop, self._pace.over)
         self._warn(opening or {})
         return opening
@@ -189,7 +194,9 @@ class Arena(Generic[Measured, Worker]):
 
 
 def load(does: str) -> Begin:
-    """Return the function that starts a process, by name. Imports happen here and in that function."""
+    """Return the function that starts a process, by name. `load` and the returned function import their modules
+    themselves.
+    """
     if does == "measured_steps":
         from reslrb_cli.measure.stepper import begin_steps
 

@@ -1,14 +1,15 @@
 """Time and memory of a step against path depth, or another quantity, for several integrators side by side.
 
 `sweep` selects the quantity: depth, number of samples, size of the film or of textures. At each value, every case
-(`BenchRun`) has its own process, and all processes exist at once (`Bench`). Each takes a cold step, then steps until no
-new kernel is compiled. Then follow rounds of one step each, in an order that changes from round to round. The steps of
-a round share a seed, and ratios are taken within a round.
+(`BenchRun`) has its own process, and all processes exist at once (`Bench`). Each process takes a cold step. Further
+steps follow until no new kernel is compiled. Then rounds follow. In each round, every process takes one step, and the
+order of the processes changes from round to round. The steps of a round share a seed, and ratios are taken within a
+round.
 
 A case that runs out of memory is tried again at greater depths, so every record is an observation. A case of the
 default list that does not support the scene is left out, with the reason. The budget includes loading and compiling.
-Once it is spent, cases that still compile are left out, and the output says how long they would have taken. Cases that
-have compiled take at least one round.
+Once the budget is spent, cases that still compile are left out. The output says how much time these cases would have
+taken. Each case that has compiled takes part in at least one round.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ TIMES = ("step_ms", "kernel_ms", "codegen_ms", "tracing_ms")
 
 @dataclass(frozen=True)
 class BenchResult:
-    """A record, its baseline, and data beyond the record.
+    """Record of a case, with its ratios to the baseline and data beyond the record.
 
     `value` is the value of the varied quantity. `kernel_ratio` and `step_ratio` are times divided by those of the
     baseline, round by round. They are None if either time is missing.
@@ -85,7 +86,7 @@ class BenchRun(Stepping):
 
 
 def results(runs: Sequence[BenchRun], value: int, sweep: Sweep) -> list[BenchResult]:
-    """Return the results of the cases at one value."""
+    """Return the results of all cases at one value of the varied quantity."""
     return [_result(run, value, sweep, runs) for run in runs if run.done]
 
 
@@ -118,7 +119,9 @@ def _result(run: BenchRun, value: int, sweep: Sweep, runs: Sequence[BenchRun]) -
 
 
 def _ratio(run: BenchRun, baseline: BenchRun, key: str) -> Spread | None:
-    """Return ratios of the common rounds. Returns None if there are none, or if one of the runs has ended."""
+    """Return ratios of the common rounds. Returns None if the runs have no common rounds, or if one of the runs has
+    ended.
+    """
     both = [(step[key], baseline.steps[round][key]) for round, step in run.steps.items() if round in baseline.steps]
     ratios = [own / its for own, its in both if its and run.end is None and baseline.end is None]
     return Spread.of(ratios) if ratios else None
@@ -160,8 +163,8 @@ class Bench(Arena[Sweep, BenchRun]):
         return BenchRun(process=None, may_refuse=may_refuse, case=case, config=self.plan.at(case, value))
 
     def results(self, done: bool | None = None) -> list[BenchResult]:
-        """Return the results in the order of the sweep: of all values, only of finished values, or only of unfinished
-        ones.
+        """Return the results in the order of the sweep. `done` selects finished values (true), unfinished values
+        (false), or all values (None).
         """
         return [
             result
@@ -216,7 +219,7 @@ class Bench(Arena[Sweep, BenchRun]):
                 return
 
     def _begin(self, value: int) -> None:
-        """Start the cases at one value with their earlier measurements. Cases that ended at this value are not
+        """Start the cases at one value, and continue their earlier measurements. Cases that ended at this value are not
         started.
         """
         plan, before = self.plan, {run.case.label: run for run in self.runs.get(value, ())}
@@ -248,7 +251,7 @@ class Bench(Arena[Sweep, BenchRun]):
         return self._take_rounds(self._alive, first, min((len(run.steps) for run in self._alive()), default=0))
 
     def _needed(self, left: int) -> str:
-        """Describe the time that the remaining values would have taken, including the value that has just ended."""
+        """Describe the time that the remaining values would have taken. The value that has just ended is included."""
         late, warm = sum(run.late for run in self.members), len(self._alive())
         if warm == 0:
             return "; nothing had compiled by then, so allow several times as much"

@@ -5,26 +5,26 @@ Welch's test of each entry compares two means over N and M independent samples.
     t = (mean_a - mean_b) / sqrt(s_a^2 / N + s_b^2 / M)
 
 t is converted to the standard normal z of the same probability, with the degrees of freedom of Welch and Satterthwaite.
-A small number of samples then does not look like a bias.
+With this conversion, a small number of samples does not look like a bias.
 
-The gradient of a small parameter is compared entry by entry, and that of a large one by tiles and projections. The
-gradient of a texel on few paths has noise far from normal, so thousands of its z scores would raise false alarms. A
-large texture is therefore compared in tiles. Each tile is a sum over texels, per channel. Other large parameters are
-compared in runs of consecutive entries. Errors that cancel within a tile show in projections on random signs. A
-projection includes every texel, and its noise is closer to normal. The last entry is the sum of all entries, in which
-small errors add up.
+The gradient of a small parameter is compared entry by entry. The gradient of a large parameter is compared by tiles and
+projections. A texel that few paths reach has a gradient with noise far from normal. Thousands of texel z scores would
+raise false alarms. A large texture is therefore compared in tiles. Each tile is a sum over texels, per channel. Other
+large parameters are compared in runs of consecutive entries. Errors that cancel within a tile show up in projections on
+random signs. Each projection includes every texel, and the projection's noise is closer to normal. The last entry is
+the sum of all entries, in which small errors add up.
 
 Samples are (N, P): N seeds, P entries. Gradients are compared over many seeds by z scores (`compare_expectations`), or
 at equal seeds by relative L2 (`compare_equal_seeds`). With equal seeds on both sides, the test of expectations uses the
-differences a - b. This is valid for any common noise, and more powerful if there is more of it. z is the normal deviate
-with the same probability as t.
+differences a - b. The paired test is valid for any noise that both sides share. More shared noise makes the test more
+powerful. z is the normal deviate with the same probability as t.
 
     t_k = mean_k(a - b) / sqrt(var_k(a - b) / N + floor_k^2)
 
 Two criteria must hold. First, the largest |z| must be below Sidak's threshold for all entries of all rows of a table.
 Second, the root mean square of a row's z must be below a limit for nu normal deviates. nu is the row's effective number
-of independent entries (Satterthwaite). r^2 is the mean squared correlation of the entries' samples, corrected for
-chance.
+of independent entries (Satterthwaite). r^2 is the mean squared correlation between the samples of different entries,
+corrected for chance.
 
     nu = E / (1 + (E - 1) r^2)
 """
@@ -45,10 +45,11 @@ ALPHA = 1e-4
 
 
 def z_scores(a: np.ndarray, b: np.ndarray, rounding: float = 1e-5) -> np.ndarray:
-    """Return standard normal scores of mean(a) - mean(b) along axis 0, for each of the other entries.
+    """Return a standard normal score of mean(a) - mean(b) for each entry. Means are taken along axis 0, and the other
+    axes hold the entries.
 
-    `rounding` is the relative error of floating point. It is added to the standard error, so that entries without
-    noise, such as a directly visible lamp, can be compared.
+    `rounding` is the relative error of floating point. The rounding error is added to the standard error. Entries
+    without noise, such as a directly visible lamp, can then be compared.
     """
     mean_a, mean_b = a.mean(0), b.mean(0)
     var_a, var_b = a.var(0, ddof=1) / len(a), b.var(0, ddof=1) / len(b)
@@ -63,7 +64,7 @@ def z_scores(a: np.ndarray, b: np.ndarray, rounding: float = 1e-5) -> np.ndarray
 
 
 def paired_z_scores(difference: np.ndarray, floor: Any = 0.0, bias: Any = 0.0) -> np.ndarray:
-    """Return standard normal scores of mean(difference) along axis 0 against zero, for each of the other entries.
+    """Return a standard normal score of mean(difference) against zero for each entry. The mean is taken along axis 0.
 
     The estimates have equal seeds and share some noise. `difference` is (N, ...). `floor` is the rounding error, and is
     added to the standard error. `bias` is a known error such as truncation, and is subtracted from the difference of
@@ -152,8 +153,8 @@ def parts(samples: np.ndarray, shape: tuple[int, ...], tiles: int) -> np.ndarray
 
 
 def overall(samples: np.ndarray) -> np.ndarray:
-    """Return the entries (N, E) that include all P values: their sum and, for many values, projections on random
-    signs.
+    """Return the entries (N, E) that include all P values. The entries are the sum and, for many values, projections on
+    random signs.
     """
     size = samples.shape[1]
     if size == 1:
@@ -208,12 +209,12 @@ class Family:
 
     @property
     def z_max_limit(self) -> float:
-        """Limit that the largest |z| of a correct table exceeds with probability `alpha`."""
+        """Limit for the largest |z| of a table. A correct table exceeds the limit with probability `alpha`."""
         return sidak(self.entries, self.alpha)
 
     def z_rms_limit(self, independent: float) -> float:
-        """Return the limit of the root mean square of a row's z. In a correct table, any row exceeds it with
-        probability `alpha`.
+        """Return the limit of the root mean square of a row's z. The probability that at least one row of a correct
+        table exceeds the limit is `alpha`.
         """
         return z_rms_limit(independent, float(-np.expm1(np.log1p(-self.alpha) / self.rows)))
 
@@ -224,10 +225,11 @@ def compare_expectations(
 ) -> Comparison:  # fmt: skip
     """Compare the means of (N, P) samples with those of a reference.
 
-    `reference` is (N, P) at the same seeds if `paired`, otherwise (M, P) at other seeds, or (P,) for exact values. If
-    the `shape` of the parameter is given, z scores belong to its parts (`entries`) instead of single values. `bias` is
-    the possible error of the reference in its units, as a number or one for each entry. Only larger differences count.
-    `bias` cannot be used with other seeds. `rounding` is relative to the entries, and added to the standard error.
+    If `paired`, `reference` is (N, P) at the same seeds. Otherwise `reference` is (M, P) at other seeds, or (P,) for
+    exact values. If the parameter's `shape` is given, z scores belong to parts of the parameter (`entries`) instead of
+    single values. `bias` is the possible error of the reference, in the reference's units. `bias` is one number, or a
+    number for each entry. Only larger differences count. `bias` cannot be used with other seeds. `rounding` is relative
+    to the entries, and added to the standard error.
     """
     problem = _problem(ours, reference)
     if problem is not None:
@@ -299,7 +301,7 @@ def _alikeness(ours: np.ndarray, reference: np.ndarray) -> tuple[float | None, f
 def tail_weight(samples: np.ndarray) -> float:
     """Return the share of the variance of (N, E) samples that comes from single samples.
 
-    It is 0 for normal deviates, and 1 if one sample has all of the variance.
+    The share is 0 for normal deviates, and 1 if one sample has all of the variance.
     """
     count = len(samples)
     squares = np.square(samples - samples.mean(0))
@@ -314,7 +316,9 @@ def tail_weight(samples: np.ndarray) -> float:
 def _entries(
     ours: np.ndarray, reference: np.ndarray, shape: tuple[int, ...] | None, joined: bool, rounding: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return both sides (N, E) in the finest division of the parameter whose samples are close enough to normal."""
+    """Return both sides (N, E) in the finest division of the parameter for which the samples are close enough to
+    normal.
+    """
     if shape is None:
         return ours, reference
     for tiles in divisions(shape):

@@ -1,8 +1,8 @@
 """Check of an experiment's gradients: each estimator is compared with every valid reference.
 
 The objective is sum(G * I) with a fixed random image G, partly negative, so that all integrators estimate the same
-gradient. The loss of the configuration would bias each estimate through the noise of its image. Comparisons are made at
-equal seeds, each as soon as its samples are available.
+gradient. The configuration's loss would bias each estimate, because each estimate's image has noise. Comparisons are
+made at equal seeds, each as soon as its samples are available.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class GradientMaps:
 
 @dataclass(frozen=True)
 class CheckResult:
-    """A record, with `maps` if the parameter is a texture and the reference has all its texels."""
+    """Record of a comparison. `maps` is present if the parameter is a texture and the reference has all its texels."""
 
     record: GradcheckRecord
     maps: GradientMaps | None = None
@@ -74,7 +74,9 @@ class Row:
 
 
 class Gradcheck:
-    """The check of one experiment with the scene of `participants`. It continues an `earlier` session, if given."""
+    """Check of one experiment's gradients, with the scene of `participants`. The check continues an `earlier` session,
+    if one is given.
+    """
 
     def __init__(
         self, settings: CheckSettings, now: Callable[[], float] = time.monotonic, earlier: Earlier | None = None
@@ -165,8 +167,8 @@ class Gradcheck:
             say(f"the minimum number of seeds takes {enough}; allow this with --budget")
 
     def _needs(self, row: Row) -> list[Name]:
-        """Return the names of the samples for a comparison: those of the estimator and, unless it is exact, of the
-        reference.
+        """Return the sample names that a comparison needs. The samples are those of the estimator and, unless the
+        reference is exact, of the reference.
         """
         naive = row.way.named("walk_ad")
         if row.key is None:
@@ -248,7 +250,9 @@ class Gradcheck:
 
 
 def _draws_plainly(config: Config) -> bool:
-    """Whether paths equal those of naive AD at equal seeds: no guiding, and no quasi-random sequence."""
+    """True if paths equal those of naive AD at equal seeds. Guiding and a quasi-random sequence make the paths
+    differ.
+    """
     options = config.integrator.options()
     usual = {"guiding": "off", "sequence": "independent", "pixels": "even"}
     return all(options.get(name, value) == value for name, value in usual.items())

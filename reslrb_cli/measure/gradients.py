@@ -9,10 +9,10 @@ steps therefore give the truncation error of the smaller step (Richardson 1911).
 
     D(h) - F' ~ (D(r h) - D(h)) / (r^2 - 1)
 
-Paths that change discontinuously cause noise that grows as h shrinks. It shows in the variation of D(r h) - D(h)
-between seeds. If light moves, rounding of the scene can be equal for all seeds. A change that does not shrink with h is
-therefore not truncation, and counts in full. The step with the smallest sum of errors is chosen, and its truncation
-error is stored.
+Paths that change discontinuously cause noise that grows as h shrinks. The noise appears as variation of D(r h) - D(h)
+between seeds. If light moves, rounding errors of the scene can be equal for all seeds. A change that does not shrink
+with h is therefore not truncation, and counts in full. The step with the smallest sum of errors is chosen, and its
+truncation error is stored.
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ WAVES = 1.5
 
 
 def moves_light(params: mi.SceneParameters, key: str) -> bool:
-    """Whether a parameter moves shapes or lights. Motions and heightmaps, which `params` lacks, always do."""
+    """Whether a parameter moves shapes or lights. Motions and heightmaps always move shapes or lights. `params` does
+    not contain motions or heightmaps.
+    """
     if key not in params.properties:
         return True
     kind = parameter_kind(params, key)
@@ -71,8 +73,9 @@ def smooth_weights(height: int, width: int, channels: int = 3) -> np.ndarray:
 def smooth_rows(key: str, value: Any, extent: float, count: int, seed: int = 3) -> list[np.ndarray]:
     """Return directions in which a parameter moves smoothly, each a row. A step is a fraction of a direction.
 
-    Vertices are displaced by waves in all directions, heightmaps by waves over their texels. For small parameters (a
-    position, a rotation), all entries move. `extent` is the scene's size.
+    Vertices move along random directions, with amplitudes that form a wave over the vertex positions. Heightmap texels
+    change by waves over the texel grid. For small parameters (a position, a rotation), all entries move. `extent` is
+    the scene's size.
     """
     random, found, name = np.random.default_rng(seed), [], key.rpartition(".")[2]
     shape = np.shape(value)
@@ -149,10 +152,10 @@ class Direction:
 def directions(case: Case, key: str, bounds: tuple[float, float], count: int, seed: int = 3) -> list[Direction]:
     """Return up to `count` directions that change only the parameter `key` and stay within its `bounds`.
 
-    In the first direction all entries grow, so nothing cancels. In the others, signs are random. If an entry is too
-    close to a bound for the largest step, differences are one-sided, and every entry moves away from its nearer bound.
-    Entries are 0.5 to 1 times the width of the bounds. If the bounds are infinite, they are 0.5 to 1 times the
-    parameter's size.
+    In the first direction all entries grow, so nothing cancels. In the others, signs are random. If the largest step
+    would take an entry beyond a bound, differences are one-sided. Every entry then moves away from its nearer bound.
+    Entries are 0.5 to 1 times the width of the bounds. With infinite bounds, entries are 0.5 to 1 times the parameter's
+    size.
     """
     random, found = np.random.default_rng(seed), []
     values, (low, high) = case.initial[key], bounds
@@ -169,8 +172,8 @@ def directions(case: Case, key: str, bounds: tuple[float, float], count: int, se
 
 
 def all_directions(case: Case, selection: Selection, moving: int, others: int) -> dict[str, list[Direction]]:
-    """Return directions by parameter. A parameter that moves light gets `moving` smooth directions, another one
-    `others`.
+    """Return directions by parameter. A parameter that moves light gets `moving` smooth directions. Any other parameter
+    gets `others` directions.
     """
     box, found = case.scene.bbox(), {}
     extent = float(np.linalg.norm(np.array(box.max - box.min)))
@@ -187,7 +190,7 @@ def all_directions(case: Case, selection: Selection, moving: int, others: int) -
 
 
 def choose_step(case: Case, integrator: Any, direction: Direction, seeds: Sequence[int], spp: int) -> Direction:
-    """Return the direction with the step of the smallest estimated error. This needs at least two seeds."""
+    """Return `direction` with the step whose estimated error is the smallest. This needs at least two seeds."""
     samples = {
         step: np.array([replace(direction, step=step).difference(case, integrator, seed, spp) for seed in seeds])
         for step in STEPS
@@ -209,8 +212,8 @@ def choose_step(case: Case, integrator: Any, direction: Direction, seeds: Sequen
 def natural_bounds(kind: str, values: np.ndarray) -> tuple[float, float]:
     """Return plausible bounds for a parameter of this kind (`ParameterInfo.kind`) with these values.
 
-    The bounds are 0 to 1 if all values are in this range, except for emitters. Otherwise they are 0 to infinity if no
-    value is negative.
+    The bounds are 0 to 1 if all values are in this range, except for emitters. Otherwise, the bounds are 0 to infinity
+    if no value is negative.
     """
     if kind != "emitter" and np.all((values >= 0) & (values <= 1)):
         return 0.0, 1.0
@@ -218,7 +221,7 @@ def natural_bounds(kind: str, values: np.ndarray) -> tuple[float, float]:
 
 
 def extrapolated(near: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """Combine differences D(h) and D(2 h) of a step and of twice the step, so that the error of order h^2 cancels.
+    """Combine the differences D(h), `near`, and D(2 h), `far`, so that the error of order h^2 cancels.
 
     E(h) = (4 D(h) - D(2 h)) / 3 (Richardson 1911).
     """
@@ -335,7 +338,9 @@ class Case:
         return image[:, :, : self.weights.shape[2]]
 
     def weighted(self, image: np.ndarray) -> float:
-        """Return the objective of an image, or its derivative if `image` is the derivative of an image."""
+        """Return the objective of an image. If `image` is the derivative of an image, return the objective's
+        derivative.
+        """
         return float(np.sum(image[:, :, : self.weights.shape[2]] * np.array(self.weights)))
 
     def along(self, direction: np.ndarray, tangent: Callable[[], Any]) -> np.ndarray:
@@ -361,8 +366,8 @@ class Case:
         )
 
     def directions(self, count: int, seed: int = 3) -> np.ndarray:
-        """Return random directions (count, P) in the space of parameters. Entries have sizes of 0.5 to 1 and either
-        sign.
+        """Return random directions (count, P) in the space of parameters. Entries have magnitudes from 0.5 to 1 and
+        random signs.
         """
         random, shape = np.random.default_rng(seed), (count, self.size)
         return random.uniform(0.5, 1.0, shape) * random.choice([-1.0, 1.0], shape)
@@ -371,7 +376,8 @@ class Case:
                    ) -> float:  # fmt: skip
         """Return the finite difference of the objective along `direction`, at common random numbers.
 
-        `sides` is `both`, or at the edge of the domain `up` or `down`. All three have an error of second order.
+        `sides` is `both` for central differences. At the edge of the domain, `up` or `down` selects one-sided
+        differences. All three have an error of second order.
         """
         nodes = {"both": (1, -1), "up": (0, 1, 2), "down": (0, -1, -2)}[sides]
         coefficients = {"both": (0.5, -0.5), "up": (-1.5, 2, -0.5), "down": (1.5, -2, 0.5)}[sides]

@@ -1,7 +1,7 @@
 """The methods that measurements compare (`Case`), and the plans of measurements. Does not import Mitsuba.
 
-A list of methods looks like `ptracer,reslrb:reservoir(capacity=4)`. `Sweep` is the plan of `bench`, `Plan` that of
-`convergence`.
+A list of methods looks like `ptracer,reslrb:reservoir(capacity=4)`. `Sweep` is the plan of the command `bench`. `Plan`
+is the plan of the command `convergence`.
 """
 
 from __future__ import annotations
@@ -35,13 +35,17 @@ PATHS_OPTIONS = ("paths", "light_share")
 
 
 def records_of(paths: str, light_share: Any) -> dict[str, Any]:
-    """Return `paths` and `light_share` for records. The share is None unless there are both kinds and it is known."""
+    """Return `paths` and `light_share` for records. `light_share` is None unless `paths` is `both` and the share is a
+    number.
+    """
     known = paths == "both" and isinstance(light_share, (int, float))
     return {"paths": paths, "light_share": float(light_share) if known else None}
 
 
 def paths_in_records(config: Config) -> dict[str, Any]:
-    """Return `paths` and `light_share` of an integrator for records; `auto` if the run measures them."""
+    """Return an integrator's `paths` and `light_share` for records. `paths` is `auto` if the run chooses the kinds of
+    paths by measurement.
+    """
     options = config.integrator.options()
     usual = "light" if isinstance(config.integrator, LightTracerOptions) else "camera"
     return records_of(str(options.get("paths", usual)), options.get("light_share", UNDECIDED["light_share"]))
@@ -69,8 +73,8 @@ _ITEM = re.compile(r"(?P<type>\w+)(?::(?P<estimator>\w+))?(?:\((?P<options>.*)\)
 
 @dataclass(frozen=True)
 class Case:
-    """One integrator with its options, but without a depth. `label` is the user's text, and `source` the option with
-    it.
+    """One integrator with its options, but without a depth. `label` is the user's text for the integrator. `source` is
+    the command-line option that contains the text.
     """
 
     label: str
@@ -81,8 +85,8 @@ class Case:
     def at(self, config: Config, max_depth: int, known: bool, auto: bool = False) -> Config:
         """Return the experiment with this integrator at this depth. Raises ConfigError if the integrator is invalid.
 
-        `known` tells whether dL/dI is known before the image, so that `run.adjoint` has no effect. `auto` permits the
-        value `auto` of options, as in whole runs.
+        `known` tells whether dL/dI is known before the image, so that `run.adjoint` has no effect. If the argument
+        `auto` is True, options may have the value `auto`, as in whole runs.
         """
         blame = f"{self.source} {self.label}"
         adjoint = {name: value for name, value in self.options.items() if name in ADJOINT}
@@ -131,10 +135,10 @@ class Case:
 
 
 def parse_cases(text: str, source: str = _OPTION, deep: bool = True) -> list[Case]:
-    """Parse a list of cases. Raises ConfigError if one has a wrong format or is given twice.
+    """Parse a list of cases. Raises ConfigError if a case has a wrong format or is listed twice.
 
-    `source` is the command-line option of the list. `deep` tells whether the measurement varies depths. `Case.at`
-    checks the options of the cases.
+    `source` is the command-line option of the list. `deep` is True if the measurement varies the maximum depth.
+    `Case.at` checks the options of the cases.
     """
     return _parse(text, source, "", "integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)]", deep)
 
@@ -154,7 +158,8 @@ def parse_own(text: str) -> list[Case]:
 
 
 def all_estimators(config: Config) -> list[Case]:
-    """Return every estimator of `reslrb`. The configuration's estimator has the options given there.
+    """Return every estimator of `reslrb`. The estimator that the configuration selects keeps the options from the
+    configuration.
 
     All estimators use light paths. If `paths` is `auto`, a case with both kinds of paths is added.
     """
@@ -299,14 +304,14 @@ class Sweep(Measurement):
 
     @property
     def baseline(self) -> Case:
-        """`ptracer` if it is among the cases, else the first case."""
+        """The first `ptracer` case in the list, or the first case if the list has no `ptracer`."""
         return next((case for case in self.cases if case.type == "ptracer"), self.cases[0])
 
     def _options(self) -> dict[str, Any]:
         return {"values": list(self.values), "objective": self.objective, "sweep": self.swept}
 
     def may_refuse(self, case: Case) -> bool:
-        """Whether the measurement continues without this case if it refuses the scene."""
+        """True if the measurement continues without `case` when that integrator does not support the scene."""
         return self.default and case != self.baseline
 
     def at(self, case: Case, value: int) -> Config:
@@ -402,7 +407,7 @@ class Plan(Measurement):
         return self.reference.at(self.config, self.config.integrator.max_depth, True, auto=True)
 
     def settled_reference(self, paths: str) -> Case:
-        """Return the reference, with these `paths` if its own are `auto`."""
+        """Return the reference case. If its option `paths` is `auto`, the argument `paths` replaces `auto`."""
         if self.reference.options.get("paths") != "auto":
             return self.reference
         own: dict[str, Any] = {} if paths == "light" else {"paths": paths}
@@ -413,7 +418,9 @@ class Plan(Measurement):
         return replace(self.reference, label=f"{kind}({text})" if text else kind, options=options)
 
     def independent_config(self, name: str) -> Config:
-        """Return the experiment with a stock integrator. `ptracer` has no roulette, because naive AD would be wrong."""
+        """Return the experiment with a stock integrator. `ptracer` runs without Russian roulette, because naive AD with
+        roulette would be wrong.
+        """
         depth = self.config.integrator.max_depth
         roulette = depth < 0 or self.config.integrator.rr_depth <= depth
         options = {"rr_depth": NEVER} if name == "ptracer" and roulette else {}

@@ -1,7 +1,7 @@
 """Missing terms of derivatives: attached gradients lack silhouettes, shadow edges, and light that leaves the film.
 
-Finite differences of the image at common random numbers contain these terms (`Missing`). F_k is the difference and g_k
-the attached gradient along direction k of K.
+Finite differences of the image at common random numbers contain the terms that attached gradients lack (`Missing`). F_k
+is the finite difference along direction k, and g_k is the attached gradient along direction k. There are K directions.
 
     m_k = F_k - g_k,   share = sqrt(sum_k m_k^2 / sum_k F_k^2)
 
@@ -9,9 +9,10 @@ E(h) (`extrapolated`) combines two steps and cancels the leading error of a diff
 around which E changes least is used. Larger steps have truncation errors. Smaller steps have rounding errors, or errors
 of paths that change discontinuously. Rounding errors of the scene's geometry are the same for all seeds. The remaining
 change of E counts as an error if it exceeds the noise. The contribution of noise to the squares is subtracted. The
-standard error is that of the mean over seeds. `MissingCheck` is `gradcheck --missing` on an experiment.
+reported standard error is the error of the mean over seeds. `MissingCheck` is `gradcheck --missing` on an experiment.
 
-`check_missing` measures the same share before a run's first iteration, with the run's samples and one or two steps.
+`check_missing` measures the missing share before a run's first iteration. The measurement is limited to a part of the
+run's samples, and uses one or two finite-difference steps.
 """
 
 from __future__ import annotations
@@ -64,10 +65,10 @@ HALVINGS = 8
 
 @dataclass
 class Missing:
-    """Samples of the derivatives of one parameter along K directions: N times `ours` (K,), and N times `differences`
-    (3, K).
+    """Samples of one parameter's derivatives along K directions, for N seeds. `ours` has N arrays (K,), and
+    `differences` has N arrays (3, K).
 
-    The three differences use the direction's step, twice this step and four times this step.
+    The three differences use one, two and four times the direction's step.
     """
 
     directions: list[Direction]
@@ -105,9 +106,9 @@ class Missing:
 
 
 def share_of(whole: np.ndarray, missing: np.ndarray, left: np.ndarray) -> tuple[float, float] | None:
-    """Return the share of `missing` in `whole`, both (N, K) samples, and its standard error.
+    """Return the share of `missing` in `whole`, and the share's standard error. Both arguments are samples (N, K).
 
-    Returns None if `whole` is not significantly different from 0. `left` (K,) has the squares of errors of `whole` that
+    Returns None if `whole` is not significantly different from 0. `left` (K,) has the squared errors of `whole` that
     are equal for all seeds.
     """
     mean, error = _mean(whole)
@@ -292,9 +293,9 @@ def check_missing(problem: Problem, warn: Callable[[str], None]) -> list[Missing
 def measure_missing(problem: Problem) -> list[MissingRecord]:
     """Measure the missing share of each parameter that moves light, with at most `run.measuring` of the run's samples.
 
-    The parameters keep their values. A parameter without enough time has a record without a share. Heightmaps with an
-    unknown share are left out, because their rims hardly move. The function restores the scene, and leaves no
-    gradients.
+    The parameters keep their values. If the sample limit is too low for a measurement, the parameter's record has no
+    share. Heightmaps with an unknown share are left out, because their rims hardly move. The function restores the
+    scene, and leaves no gradients.
     """
     selection, kind = problem.selection, problem.config.integrator.type
     moving = [key for key in selection.keys if key not in selection.factors and moves_light(selection.params, key)]
@@ -332,8 +333,8 @@ class _Short:
         return self.problem.selection.params
 
     def _directions(self, key: str) -> list[np.ndarray]:
-        """Return the directions of a parameter. A small parameter has one for each entry, and a large one has two
-        smooth directions.
+        """Return the directions of a parameter. A small parameter has one direction for each entry. A large parameter
+        has two smooth directions.
         """
         case = self._cases[0]
         size, value = case.initial[key].size, case.values.value(key)
@@ -360,7 +361,7 @@ class _Short:
         return list(records.values())
 
     def _look_longer(self, key: str, short: list[np.ndarray]) -> MissingRecord:
-        """Measure the share with more seeds, and with the longer step if the two steps agree."""
+        """Measure the share with more seeds. If the short and the long step agree, use the long step."""
         long = [self._difference(key, LONG, seed) for seed in seeds(FEWEST)]
         change, noise = _mean(np.array(long) - np.array(short))
         agree = np.square(change).sum() <= NOTHING**2 * np.square(noise).sum()
@@ -374,8 +375,8 @@ class _Short:
         return record
 
     def _record(self, key: str, samples: list[np.ndarray] | None) -> MissingRecord:
-        """Return the record of a parameter with these (K,) samples of differences, or without a share if there are none
-        (None).
+        """Return the parameter's record from samples (K,) of differences. If `samples` is None, the record has no
+        share.
         """
         share = None
         if samples is not None:
@@ -399,7 +400,7 @@ class _Short:
                        for case in self._cases], axis=0)  # fmt: skip
 
     def _weigh(self, spp: int) -> bool:
-        """Set dL/dI of the loss as the weights of the cases. Returns whether any weight is not zero."""
+        """Set the weights of each view's case to dL/dI of the run's loss. Returns whether any weight is not zero."""
         problem, weights = self.problem, []
         for case, view in zip(self._cases, self._views, strict=True):
             gradient = problem.image_gradient(view, problem.render(view.sensor, spp, 0, "missing"))

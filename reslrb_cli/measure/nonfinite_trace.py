@@ -1,8 +1,9 @@
 """Search for the origin of a value that is not finite: the path, its vertex and the factor, or the pixel of the loss.
 
-`find_offenders` traces the paths of the step again from their seeds, and `SearchHooks` checks every factor. It also
-checks the factor's derivative along one direction, in which all entries of the parameters grow equally. A derivative
-that is not finite in some direction is not finite in this one.
+`find_offenders` traces the paths of the step again from their seeds, and `SearchHooks` checks every factor. For each
+factor, `SearchHooks` also checks the derivative along one direction. All entries of all parameters grow equally along
+this direction. If the derivative along some direction is not finite, the derivative along the direction of equal growth
+is not finite either.
 """
 
 from __future__ import annotations
@@ -61,11 +62,11 @@ class PathVertex:
 
 @dataclass(frozen=True)
 class Offender:
-    """The first value of a view that is not finite, in the order of paths and of their vertices.
+    """The first non-finite value of a view, in the order of paths and of their vertices.
 
-    `quantity` names the value. `value` has one number per channel, or none for a derivative of the loss. `pixel` (x, y)
-    is its place on the film. `where` is None for a derivative of the loss. `image` and `target` are the values that the
-    loss compares there. They are None for a path.
+    `quantity` names the value. `value` has one number per channel. For a derivative of the loss, `value` is empty.
+    `pixel` (x, y) is its place on the film. `where` is None if the non-finite value is a derivative of the loss.
+    `image` and `target` are the two values that the loss compares at `pixel`. They are None for a path.
     """
 
     sensor: int
@@ -78,9 +79,11 @@ class Offender:
 
 
 class Witness(Guiding):
-    """A wrapper of another guide. It continues learning, and records the tables from which samples are drawn.
+    """A wrapper of another guide. The wrapper continues to update the tables, and records the tables from which samples
+    are drawn.
 
-    `drawn` has the tables of the samples so far, in order, without samples that were only drawn for learning.
+    `drawn` has the tables of all samples so far, in order. Tables of samples that were drawn only for learning are left
+    out.
     """
 
     def __init__(self, other: Guiding) -> None:
@@ -102,8 +105,8 @@ class Witness(Guiding):
 
 
 def purposes(problem: Problem, view: View) -> list[tuple[int, str, Purpose]]:
-    """Return the purposes of a step's or shard's samples, in order. Each has the index in `sample_sets`, a word, and
-    the purpose.
+    """Return the purpose (image, gradient, or both) of each sample set of a step or shard, in order. Each item has the
+    set's index in `sample_sets`, a word for the set's label, and the purpose.
     """
     options = problem.config.step_options(shard=True)
     gradient = Purpose.GRADIENT if problem.on_samples(view) is None else Purpose.BOTH
@@ -154,7 +157,9 @@ class Suspect:
         return Suspect(mi.UInt32(0), mi.UInt32(0), mi.Point3f(0), mi.UInt32(0), mi.Spectrum(0))
 
     def otherwise(self, other: Suspect, active: Any) -> Suspect:
-        """Return this suspect. In `active` lanes without one, return `other` if its value is not finite."""
+        """Return this suspect. In `active` lanes where this suspect is empty, return `other` if the value of `other` is
+        not finite.
+        """
         take: Suspect = dr.select((self.kind == 0) & active & is_bad(other.value), other, self)
         return take
 
@@ -176,9 +181,10 @@ def reaches(film: Film, u: Any, pixel: tuple[int, int] | None) -> Any:
 class Search:
     """Loop state.
 
-    `first` is the first suspect of the path so far. `found` is the first suspect of the first connection with a suspect
-    that reached the film, at position `u`. A connection that reaches the wanted pixel (`there`) takes precedence.
-    `largest` is the largest contribution, which lands at `largest_u`.
+    `first` is the first suspect of the path so far. `found` belongs to the first connection that reaches the film and
+    has a non-finite value. `found` is the first non-finite value on that path, and `u` is the connection's film
+    position. A connection that reaches the wanted pixel (`there`) takes precedence. `largest` is the largest
+    contribution, which lands at `largest_u`.
     """
 
     first: Suspect
@@ -241,7 +247,9 @@ class SearchHooks(Hooks):
 
 
 class CameraSearch(CameraHooks):
-    """The same for camera paths: checks each factor before an emitter, and the emission."""
+    """Checks camera paths as `SearchHooks` checks light paths. Checks each factor before an emitter, and the
+    emission.
+    """
 
     def __init__(self, samples: Samples) -> None:
         self.samples = samples
@@ -299,7 +307,9 @@ Array = np.ndarray[Any, Any]
 
 @dataclass
 class Found:
-    """The offender of the first path with one, whether it reaches the wanted pixel, and the largest contribution."""
+    """The search result. `offender` belongs to the first path with a non-finite value. `there` is True if this path
+    reaches the wanted pixel. `largest` is the largest contribution.
+    """
 
     offender: Offender | None
     there: bool
@@ -364,7 +374,9 @@ def _seen_emission(samples: Samples) -> Iterator[tuple[Suspect, mi.Spectrum, mi.
 
 
 def _first(bad: Array, there: Array) -> tuple[int | None, bool]:
-    """Return the first bad lane, and whether it is `there`. A lane that is `there` takes precedence."""
+    """Return the first lane that `bad` marks, and True if `there` marks this lane, too. A lane that is `there` takes
+    precedence.
+    """
     lanes = np.flatnonzero(bad)
     preferred = np.flatnonzero(bad & there)
     if preferred.size:
@@ -402,7 +414,9 @@ def _shape_name(scene: Any, index: int) -> str | None:
 
 
 def find_offenders(problem: Problem, iteration: int) -> list[Offender]:
-    """Return the first value that is not finite of each view that has one. The parameters are those of `problem`."""
+    """Return the first non-finite value of each view, for views that have one. The parameters are those of
+    `problem`.
+    """
     found: list[Offender] = []
     apart = problem.config.shards != 1
     views = {view.sensor: view for view in problem.views}
@@ -423,7 +437,8 @@ def find_offenders(problem: Problem, iteration: int) -> list[Offender]:
 
 
 def _of_view(problem: Problem, view: View, step_seed: int, word: str) -> Offender | None:
-    """Return the same for one view, from its samples or from the samples of the shard named `word`.
+    """Return the first non-finite value of one view, or None. The search covers the view's samples, or the samples of
+    the shard named `word`.
 
     With `adjoint: others`, dL/dI is computed from an image of the shard's own samples instead of the mean image of the
     other shards.
@@ -516,7 +531,7 @@ class TracedStep:
 
 
 def _take_step(problem: Problem, view: View, step_seed: int) -> TracedStep:
-    """Repeat the view's step as the run took it. Leaves no gradients."""
+    """Repeat the gradient step that the run took for this view. Leaves no gradients."""
     optimizer, keys = problem.optimizer, problem.selection.keys
     step = gradient_step(
         problem.integrator, problem.scene, view.sensor, view.objective,
@@ -530,8 +545,8 @@ def _take_step(problem: Problem, view: View, step_seed: int) -> TracedStep:
 
 
 def _of_step(step: TracedStep, view: View, largest: Offender | None) -> Offender | None:
-    """Return the explanation if no path has an offender: the loss, an overflow of sums, or paths that were not
-    checked.
+    """Return another cause if no path has a non-finite value. Possible causes are the loss, an overflow of sums, and
+    paths that were not checked.
     """
     image, target = step.image, np.array(view.target)
     if step.refused is not None:

@@ -1,13 +1,14 @@
 """Diagnosis of a user's own integrator that `gradcheck` found wrong, derived from measurements.
 
 The integrator is compared with `reslrb` with the same kind of paths, as a ratio r with its standard error. For
-gradients, both are projected on the reference's own direction u. For images, r is the ratio of their sums.
+gradients, r compares the projections of both gradients on u, the direction of the reference's gradient. For images, r
+is the ratio of their sums.
 
     r = E<g, u> / E<G, u>,      u from other seeds of G than the denominator
 
 Ratios are measured for paths of 1, 2, 3, ... segments without Russian roulette, and for each parameter. Images are
-linear in emission. At each seed, sum(dL/dE E) therefore equals the image if both passes trace the same paths and add
-the same terms. Each measurement rules out possible faults, and the message names the remaining ones. The message
+linear in emission. If both passes trace the same paths and add the same terms, sum(dL/dE E) equals the image weighted
+by dL/dI at each seed. Each measurement rules out possible faults, and the message names the remaining ones. The message
 reports measurements, and is no proof.
 """
 
@@ -72,7 +73,7 @@ class Ratio:
         return not np.isfinite(self.value) or abs(self.value - 1) > max(ERRORS * self.error, LEAST)
 
     def same(self, other: Ratio) -> bool:
-        """Whether the ratio agrees with another within the errors."""
+        """True if both ratios agree within their errors."""
         return abs(self.value - other.value) <= max(ERRORS * np.hypot(self.error, other.error), LEAST)
 
     def __str__(self) -> str:
@@ -97,7 +98,7 @@ def look_into(
 
 
 def _cost(check: Gradcheck, label: str, stop: Callable[[], bool]) -> str:
-    """Compare noise and time of a gradient with those of `reslrb` with the same paths."""
+    """Compare a gradient's noise and time with the noise and time of `reslrb`, which uses the same kinds of paths."""
     parts = check.participants
     ours = _ours(parts, label)
     figures, measured = [], SEEDS
@@ -133,7 +134,7 @@ def _ours(parts: Participants, label: str, **other: int) -> StepIntegrator:
 
 
 class Looking:
-    """The measurements for one integrator, `label`, that failed."""
+    """Measurements that search for the faults of one integrator, `label`, that failed the check."""
 
     def __init__(
         self, parts: Participants, label: str, stop: Callable[[], bool], say: Callable[[str], None]
@@ -185,9 +186,9 @@ class Looking:
     ) -> tuple[Ratio, float] | None:
         """Return the ratio of sum(dL/dE E) to the image, which must be 1 because images are linear in emission.
 
-        Also returns how much the ratio varies between seeds. At each seed, both terms have the same paths. Returns None
-        if some light is not given by a number (`.value`, `scale`). The paths have `depth` segments, and the image is
-        `seen`. `even` sets dL/dI to 1 in all pixels and channels.
+        Also returns how much the ratio varies between seeds. At each seed, the image and the derivative sum use the
+        same paths. Returns None if the emission of some emitter is not given by a number (`.value`, `scale`). The paths
+        have `depth` segments, and the image is `seen`. `even` sets dL/dI to 1 in all pixels and channels.
         """
         depth = self.depth if depth is None else depth
         keys = self._lamps()
@@ -200,7 +201,7 @@ class Looking:
     def _by_emission(
         self, keys: list[str], max_depth: int, seen: int | None = None, even: bool = False, **other: int
     ) -> tuple[Array, Array]:
-        """Return sum(dL/dE E) and the image that must equal it, at each seed."""
+        """Return sum(dL/dE E) and the weighted image for each seed. Both values must be equal."""
         depths = max_depth, max_depth if seen is None else seen
         own, image = (self.parts.own_with(self.label, max_depth=n, **other) for n in depths)
         case = Case(self.parts.case.scene, keys, self.parts.case.sensor)
@@ -236,7 +237,9 @@ class Looking:
         return keys if set(kinds) <= SCALING and len(keys) == kinds.count("SmoothDiffuse") else []
 
     def _of_length(self, at: int, sums: Callable[..., tuple[Array, Array]]) -> Ratio:
-        """Return the ratio for paths of exactly `at` segments. `sums` has both terms of the ratio for each depth."""
+        """Return the ratio of estimate to correct value for paths of exactly `at` segments. `sums` returns the samples
+        of the ratio's two terms for a maximum depth.
+        """
         own, reference = sums(max_depth=at, rr_depth=NEVER)
         if at > 1:
             shorter = sums(max_depth=at - 1, rr_depth=NEVER)
@@ -244,8 +247,8 @@ class Looking:
         return _over(own, reference)
 
     def _limited(self, at: int, sums: Callable[..., tuple[Array, Array]], before: Ratio) -> str:
-        """Describe an upper limit on values. It exists if darker lamps or surfaces make paths of `at` segments less
-        wrong than `before`.
+        """Describe an upper limit on values. The limit probably exists if darker lamps or surfaces bring the ratio for
+        paths of `at` segments closer to 1 than `before`.
         """
         if not np.isfinite(before.value):
             return ""
@@ -283,7 +286,7 @@ class Looking:
     # ---------------------------------------------------------------------------------------------------------
 
     def sentence(self, failing: Iterable[GradcheckRecord]) -> str:
-        """Return the sentence that says where to look."""
+        """Return a message that names the part of the user's integrator to check."""
         if self.parts.attached:
             return (
                 "wrong if light moves: check derivatives of silhouettes, of shadow edges, and of the direction of "
@@ -338,8 +341,8 @@ class Looking:
         return f"its image holds; it has {_list(wrong)} of the reference's gradient{beside}"
 
     def _narrowed(self, wrong: dict[str, Ratio]) -> list[str]:
-        """Return the faults that the measurements leave: different passes, roulette, derivatives from some depth on, or
-        lobes.
+        """Return messages about the faults that the measurements do not rule out. Possible faults are passes that
+        differ, roulette, derivatives from some path length on, and BSDF lobes.
         """
         worst = max(wrong, key=lambda key: abs(wrong[key].value - 1) / max(wrong[key].error, 1e-12))
         passes = self._of_passes(wrong)
@@ -398,8 +401,8 @@ class Looking:
         return "; ".join(filter(None, said))
 
     def _right_if_even(self) -> bool:
-        """Whether only the use of dL/dI is wrong in the differentiated pass. With a constant dL/dI, everything is then
-        right.
+        """True if the differentiated pass is wrong only in its use of dL/dI. If only the use of dL/dI is wrong, a
+        constant dL/dI gives right results.
         """
         found = self.emission(even=True)
         return found is not None and not found[0].wrong and found[1] <= SAME_PATHS
@@ -413,7 +416,9 @@ class Looking:
         return not 0 <= self.depth <= self._options["rr_depth"]
 
     def _from_depth(self, ratio: Callable[[int], Ratio | None]) -> tuple[int | None, bool]:
-        """Return the shortest length of wrong paths, and whether shorter paths were measured as right."""
+        """Return the shortest path length at which the ratio is wrong, and True if shorter paths were measured as
+        right.
+        """
         seen = False
         for depth in range(1, self.deepest + 1):
             found = ratio(depth)
@@ -460,8 +465,8 @@ def _segments(depth: int, hides: bool, before: bool = True) -> str:
 
 
 def _over(own: Array, reference: Array) -> Ratio:
-    """Return the ratio of two means with its standard error. It is 1 if both are zero, and infinite if only the
-    reference is zero.
+    """Return the ratio of two means with its standard error. The ratio is 1 if both means are zero. The ratio is
+    infinite if only the reference is zero.
     """
     if not reference.any():
         return Ratio(np.inf if own.any() else 1.0, 0.0)

@@ -118,7 +118,9 @@ def settings_of(
 
 @dataclass(frozen=True)
 class Way:
-    """The kinds of paths and the share of light paths. They determine what is visible and what naive AD must trace."""
+    """The kinds of paths and the share of light paths. The kinds of paths determine which light is visible, and which
+    paths naive AD must trace.
+    """
 
     paths: str = "light"
     light_share: float = 0.5
@@ -140,7 +142,7 @@ class Way:
         return {} if self.paths == "light" else {"paths": self.paths} | share
 
     def named(self, name: str) -> str:
-        """Return the name of an item for these paths. `name` is its name for light paths."""
+        """Return an item's name with a suffix for the kinds of paths. `name` is its name for light paths."""
         words = {"light": "", "camera": ", paths: camera", "both": f", paths: both, light_share: {self.light_share:g}"}
         return name + words[self.paths]
 
@@ -240,7 +242,9 @@ class Participants:
         self.exact = {key: value for key, value in known.items() if value is not None}
 
     def _able(self, settings: CheckSettings, configs: dict[str, Config], problem: Problem) -> list[Listed]:
-        """Return the estimators that can take part. Raises ConfigError if a named one cannot, or if none can."""
+        """Return the estimators that can take part. Raises ConfigError if an estimator that the user named cannot take
+        part, or if no estimator can take part.
+        """
         listed = self._with_paths(settings, configs, problem)
         others = [case for case in listed if case.type == "reslrb" and not _attaches(case)]
         able = [case for case in listed if case not in others]
@@ -301,19 +305,21 @@ class Participants:
         return {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
 
     def own_with(self, label: str, **other: int) -> StepIntegrator:
-        """Return the user's own integrator of this label with `other` depths."""
+        """Return the user's own integrator with the label `label`. The arguments `other` replace its depths."""
         config = self._configs[label]
         return OwnIntegrator(**config.integrator.options() | other, allowed=config.allows_code)
 
     def bsdfs_of(self, key: str) -> list[mi.BSDF]:
-        """Return the BSDFs that a parameter belongs to, nested and enclosing ones. The result is empty if it belongs to
-        none.
+        """Return the BSDFs that a parameter belongs to, nested and enclosing ones. The list is empty if the parameter
+        belongs to no BSDF.
         """
         is_bsdf = key in self.case.params.properties and parameter_kind(self.case.params, key) == "bsdf"
         return bsdfs_of(self._situation, key) if is_bsdf else []
 
     def of_own(self, key: str, way: Way) -> list[Reference]:
-        """Return the references for a user's own integrator: all that the scene allows for the gradient of `key`."""
+        """Return all references that the scene allows for the gradient with respect to `key`, as computed by a user's
+        own integrator.
+        """
         if self._situation.moved:  # our derivatives of camera paths hold only if nothing moves
             return [Reference.FINITE_DIFFERENCE]
         stock = self.stock[way.named(key)]
@@ -322,8 +328,8 @@ class Participants:
         return [*found, Reference.WALK_AD, Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE]
 
     def sampled(self, label: str, reference: Reference) -> str:
-        """Return the integrator whose gradients represent those of `label` in comparisons with this reference
-        (`ALIKE`).
+        """Return the label of the integrator whose gradients represent the gradients of `label` in comparisons with
+        `reference`. `ALIKE` has the settings that differ.
         """
         alike = _alike(label, reference)
         return alike if alike in self.integrators else label
@@ -352,7 +358,7 @@ class Participants:
         return value_shape(self.case.values.value(key))
 
     def choose_steps(self, of: str) -> None:
-        """Choose the steps of the finite differences of a parameter. `of` is its name by way."""
+        """Choose the finite-difference step for each direction of a parameter. `of` is its name by way."""
         _, way = self._of[of]
         image, pilot = self.integrators[way.named(DIFFERENCED)], seeds(PILOT_SEEDS, 9)
         self.directions[of] = [choose_step(self.case, image, d, pilot, self.spp) for d in self.directions[of]]
@@ -360,9 +366,10 @@ class Participants:
     def sample(self, kind: str, of: str, seed: int) -> np.ndarray:
         """Return one sample as a flat array. `kind` is `gradient`, `image`, `differences` or `tangents`.
 
-        A gradient contains all parameters, from a step as in the experiment. An image is black along the border if its
-        reference loses no light there. `of` is the label of an integrator. For `differences` and `tangents`, the sample
-        has the derivatives along the directions of a parameter, and `of` is its name by way. Tangents are forward
+        A `gradient` sample covers all parameters. The sample comes from one gradient step, as in the experiment. Images
+        are black along the film's border if some image references or estimators lose light there, but not all. `of` is
+        the label of an integrator. For `differences` and `tangents`, the sample has the derivatives along a parameter's
+        directions. `of` is then the parameter's name with its kinds of paths (`Way.named`). Tangents are forward
         derivatives, which are equal for all estimators of the same paths.
         """
         if kind == "gradient":
@@ -399,7 +406,7 @@ class Participants:
 
 
 def _attaches(case: Listed) -> bool:
-    """Whether this is one of our estimators with attached derivatives."""
+    """True if the case is an estimator of `reslrb` with attached derivatives."""
     return case.type == "reslrb" and case.options["estimator"] in ATTACHED
 
 
@@ -408,5 +415,7 @@ def _alike(label: str, reference: Reference) -> str:
 
 
 def _samples(film: tuple[int, int], most: int, multiple: int | None) -> int:
-    """Return the samples per pixel of one gradient: about PATHS paths, at most those of a step of the run."""
+    """Return the samples per pixel for one gradient. The gradient has about PATHS paths, and at most the samples of a
+    run's step.
+    """
     return multiple_of(max(min(PATHS // (film[0] * film[1]), most), 1), multiple)

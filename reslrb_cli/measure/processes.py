@@ -53,7 +53,7 @@ class Stopped(Exception):
 
 
 class Refused(ReslrbError):
-    """A process could not start, for a reason that holds for all processes."""
+    """A process could not start. The reason holds for all processes."""
 
     def __init__(self, line: str, exit_code: int) -> None:
         super().__init__(line)
@@ -175,9 +175,10 @@ def last_words(text: str) -> str:
 
 @dataclass(kw_only=True)
 class Contestant:
-    """One of several workers that are compared. `process` is None if none is running, and `peak_mib` is its memory.
+    """One of several workers that are compared. `process` is None if no worker runs. `peak_mib` is the worker's peak
+    memory in MiB.
 
-    A failure ends the measurement, unless the worker may refuse.
+    A refusal (`Refused`) ends the measurement, unless `may_refuse` is True.
     """
 
     process: Any
@@ -189,7 +190,7 @@ class Contestant:
 
     @property
     def alive(self) -> bool:
-        """Whether the process can take more questions."""
+        """True if the process can answer more questions."""
         return self.process is not None and self.end is None and self.refusal is None and not self.late
 
     def ask(
@@ -202,7 +203,9 @@ class Contestant:
         return self.answer(stop, over)
 
     def answer(self, stop: Callable[[], bool], over: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
-        """Wait for the next answer, as `ask` does. A process sends the first answer without a question."""
+        """Wait for the next answer, as `ask` does. After its start, a process sends its first answer without waiting
+        for a question.
+        """
         try:
             result: dict[str, Any] = self.process.answer(lambda: stop() or over())
             return result
@@ -278,10 +281,11 @@ NO_TIME = "the budget was spent; allow more with --budget"
 
 
 class Pace:
-    """Divides the time among depths. Each depth gets GROWTH times as much as the one before.
+    """Divides the time among depths. Each depth gets GROWTH times as much time as the previous depth.
 
-    Unused time of one depth goes to the others. While there is time, each depth gets at least MIN_ROUNDS rounds, and at
-    most `most`. With `rounds`, time does not count. Rounds of earlier sessions count.
+    Time that one depth leaves unused goes to the remaining depths. While there is time, each depth gets at least
+    MIN_ROUNDS rounds. The maximum is `most` rounds. With `rounds`, time does not count. Rounds of earlier sessions
+    count.
     """
 
     def __init__(

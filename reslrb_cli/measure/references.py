@@ -1,10 +1,12 @@
 """Stock integrators as references: `ptracer`, `path` and `prb` for images, `ptracer` and `prb` for gradients.
 
-Each public function after `of_gradient` checks one reference. It returns the reason against it, or None if it is valid.
+The functions `ptracer_image`, `path_image`, `prb_image`, `ptracer_gradient` and `prb_gradient` check one reference
+each. A function that checks a reference returns the reason against the reference, or None if the reference is valid.
 The section Baselines of docs/method.md explains the reasons.
 
-Light tracing loses light along the film's border, from samples just outside of the film. `divides_by_film` tells which
-images have no such loss. `known_gradient` recognises scenes with a known gradient in closed form.
+Light tracing loses light along the film's border, from samples just outside of the film. `divides_by_film` is True for
+images that lose no light along the film's border. `known_gradient` recognises scenes with a known gradient in closed
+form.
 """
 
 from __future__ import annotations
@@ -29,8 +31,8 @@ CAMERA_PATHS = (Reference.PRB, Reference.PATH)
 
 
 def divides_by_film(paths: str) -> bool:
-    """Whether images by these paths (`loading.paths_of`) lose no light along the film's border, like images of
-    `path`.
+    """True if images by paths of the kind `paths` (`loading.paths_of`) lose no light along the film's border, like
+    images by `path`.
     """
     return paths != "light"
 
@@ -38,8 +40,8 @@ def divides_by_film(paths: str) -> bool:
 def known_gradient(at: Situation, sensor: mi.Sensor, key: str, weights: np.ndarray) -> np.ndarray | None:
     """Return the gradient of sum(image * weights) by `key` as a flat array, or None if there is no closed form.
 
-    There is one for the furnace, a sphere around the sensor with constant emission and constant diffuse reflectance.
-    `weights` are (H, W, C).
+    The furnace has a closed form. The furnace is a sphere around the sensor, with constant emission and constant
+    diffuse reflectance. `weights` are (H, W, C).
     """
     shapes, emitters = at.graph.shapes(), at.scene.emitters()
     if len(shapes) != 1 or len(emitters) != 1 or shapes[0].class_name() != "Sphere" or weights.shape[2] != 3:
@@ -82,7 +84,8 @@ class Situation:
     """The conditions for references: a scene and a sensor, the maximum depth, and whether emitters are hidden.
 
     `attached` tells whether derivatives are attached. `moved` has the recovered parameters that move light. `paths`
-    (`light`, `camera`, `both`) are those of the estimator. A valid reference contains exactly the same light.
+    (`light`, `camera`, `both`) are the kinds of paths that the estimator traces. A valid reference contains exactly the
+    same light.
     """
 
     scene: Any
@@ -101,7 +104,7 @@ class Situation:
         cls, scene: Any, sensor: Any, params: Any, max_depth: int, hide_emitters: bool, attached: bool = False,
         moved: tuple[str, ...] = (), paths: str = "light",
     ) -> Situation:  # fmt: skip
-        """Return the situation of a loaded scene, whose `mi.traverse` is `params`."""
+        """Return the `Situation` of a loaded scene. `params` is the result of `mi.traverse` for the scene."""
         graph, needs, view = SceneGraph.of(scene), scene_needs(scene, sensor), look(scene, sensor)
         return cls(scene, params, graph, needs, view, max_depth, hide_emitters, attached, moved, paths)
 
@@ -123,21 +126,21 @@ class Situation:
 
 
 def choose(reasons: Mapping[Reference, str | None]) -> tuple[Reference | None, str]:
-    """Return the first reference without a reason against it, and a text with the reasons against the others."""
+    """Return the first valid reference, or None. Also return a text with the reasons against all invalid references."""
     refused = [f"not {name.value}: {reason}" for name, reason in reasons.items() if reason is not None]
     return next((name for name, reason in reasons.items() if reason is None), None), "; ".join(refused)
 
 
 def of_image(at: Situation) -> dict[Reference, str | None]:
-    """Return the reason against each stock integrator as reference of the image. The one with an equal border comes
-    first.
+    """Return the reason against the use of each stock integrator as the image's reference. The reason is None for a
+    valid reference. The integrator that treats the film's border like the estimator comes first.
     """
     return _alike_first(at, {Reference.PTRACER: ptracer_image(at), Reference.PRB: prb_image(at)})
 
 
 def of_gradient(at: Situation, key: str) -> dict[Reference, str | None]:
-    """Return the reason against each stock integrator as reference of the gradient with respect to `key`, in the same
-    order.
+    """Return the reason against each stock integrator as reference for the gradient with respect to `key`. The
+    integrators have the order of `of_image`.
     """
     return _alike_first(at, {Reference.PTRACER: ptracer_gradient(at, key), Reference.PRB: prb_gradient(at, key)})
 
@@ -148,7 +151,9 @@ def _alike_first(at: Situation, reasons: dict[Reference, str | None]) -> dict[Re
 
 
 def ptracer_image(at: Situation) -> str | None:
-    """Return the reason against stock light tracing without roulette as reference of the image, or None."""
+    """Return the reason against stock light tracing (`ptracer`) without roulette as reference for the image, or
+    None.
+    """
     if any(_is_turned(emitter) for emitter in at.scene.emitters()):
         return "it has wrong emission from a rotated environment map"
     if at.needs.has_null:
@@ -181,14 +186,14 @@ def ends(max_depth: int) -> bool:
 
 
 def path_image(at: Situation) -> str | None:
-    """Return the reason against `path` as reference of the image, or None."""
+    """Return the reason against the integrator `path` as reference for the image, or None."""
     if at.needs.has_null and (at.needs.environment is None or at.hide_emitters):
         return "it loses light reflected by masks if nothing is behind them"
     return prb_image(at)
 
 
 def prb_image(at: Situation) -> str | None:
-    """Return the reason against `prb` as reference of the image, or None."""
+    """Return the reason against the integrator `prb` as reference for the image, or None."""
     if any(emitter.class_name() == "DirectionalArea" for emitter in at.scene.emitters()):
         return "camera paths cannot find a `directionalarea` emitter"
     if at.has_pointlike and at.needs.has_null:
@@ -206,7 +211,9 @@ def prb_image(at: Situation) -> str | None:
 
 
 def ptracer_gradient(at: Situation, key: str) -> str | None:
-    """Return the reason against stock light tracing under naive AD as reference of the gradient by `key`, or None."""
+    """Return the reason against stock light tracing (`ptracer`) with naive AD as reference for the gradient with
+    respect to `key`, or None.
+    """
     reason = ptracer_image(at)
     if reason is not None:
         return reason
@@ -225,7 +232,9 @@ def ptracer_gradient(at: Situation, key: str) -> str | None:
 
 
 def _ptracer_motion(at: Situation, keys: tuple[str, ...]) -> str | None:
-    """Return the reason against stock light tracing as reference of the gradient by moving parameters, or None."""
+    """Return the reason against stock light tracing (`ptracer`) as reference for the gradient with respect to
+    parameters that move light, or None.
+    """
     for key in keys:
         node = at.params.properties[key][2]
         if not isinstance(node, mi.Shape) or node.is_emitter():
@@ -238,7 +247,9 @@ def _ptracer_motion(at: Situation, keys: tuple[str, ...]) -> str | None:
 
 
 def prb_gradient(at: Situation, key: str) -> str | None:
-    """Return the reason against path replay backpropagation as reference of the gradient by `key`, or None."""
+    """Return the reason against path replay backpropagation (`prb`) as reference for the gradient with respect to
+    `key`, or None.
+    """
     if moves_light(at.params, key):
         return "it has no derivatives of moving light"
     reason = prb_image(at)
@@ -270,7 +281,7 @@ def _is_turned(emitter: Any) -> bool:
 
 
 def _is_mirrored(shape: mi.Shape) -> bool:
-    """Whether most faces of a mesh point against its normals, as if `to_world` mirrored it."""
+    """True if most faces of a mesh point against the mesh's vertex normals, as after a mirroring `to_world`."""
     params = mi.traverse(shape)
     if "vertex_normals" not in params or not shape.has_vertex_normals():
         return False

@@ -1,5 +1,5 @@
-"""Stored samples. If an earlier call with the same experiment and settings has taken a sample, it is not taken
-again.
+"""Stored samples. A sample is not taken again if an earlier call with the same experiment and settings has taken the
+sample.
 """
 
 from __future__ import annotations
@@ -102,7 +102,9 @@ class Earlier:
         return {tuple(name): self.arrays[f"samples/{number}"] for number, name in enumerate(self.head["samples"])}
 
     def other(self, reason: str) -> ConfigError:
-        """Return the error for samples of another measurement, which must not be overwritten."""
+        """Return the error for stored samples of another measurement. The samples of another measurement must not be
+        overwritten.
+        """
         advice = "remove the file, or use another one"
         return ConfigError("--json", "", f"{self.source} belongs to another measurement: {reason}; {advice}")
 
@@ -115,7 +117,9 @@ def head(kind: str, settings: Mapping[str, Any], **content: Any) -> dict[str, An
 def kept(
     kind: str, settings: Mapping[str, Any], samples: Mapping[Any, Sequence[np.ndarray]], **content: Any
 ) -> Kept | None:
-    """Return the data to store for samples, by `Name`, in the order of their seeds, or None if there are none."""
+    """Return the data to store for `samples`, or None if there are no samples. `samples` maps each `Name` to samples in
+    the order of their seeds.
+    """
     import numpy as np  # the help of a command does not need it
 
     taken = {name: rows for name, rows in samples.items() if len(rows)}

@@ -78,13 +78,13 @@ MEMORY = 2**30
 class Sampling:
     """Samples by kind and name. `now` is the clock for the budget, which starts at the beginning.
 
-    The budget includes loading and compilation. Its rest is divided among the remaining samples, and unused time of one
-    name goes to the others. A sample that has started is always finished. The first sample of a name includes
-    compilation. It is not started if it would probably take longer than the rest, judged by earlier samples of its
-    kind, or by those of other kinds.
+    The budget includes loading and compilation. The remaining budget is divided among the remaining samples. Time that
+    one name leaves unused goes to the other names. A sample that has started is always finished. The first sample of a
+    name includes compilation. The first sample of a name is skipped if it would probably exceed the remaining time.
+    Earlier samples of the same kind, or else of other kinds, predict the duration.
 
-    Samples of an `earlier` session count, and new seeds follow its seeds. If there is no budget, `engine` takes the
-    samples. With a budget, this process takes them, because the budget is its own time.
+    Samples of an `earlier` session count. New samples use the seeds that follow. If there is no budget, `engine` takes
+    the samples. With a budget, this process takes the samples, because the budget limits the time of this process.
     """
 
     engine: Engine = staticmethod(serially)
@@ -112,7 +112,7 @@ class Sampling:
         self._first_s: dict[tuple[str, bool], float] = {}  # longest duration of a first sample, by kind
 
     def expect(self, names: Iterable[Name]) -> None:
-        """Announce names, so that each gets its share of the time."""
+        """Announce names before sampling, so that each name gets its share of the time."""
         self._expected = list(dict.fromkeys(names))
         self._to_do = list(self._expected)
 
@@ -121,7 +121,8 @@ class Sampling:
         return resume_store.kept(KIND, settings, self._samples, steps=steps_of(self.participants, self._chosen))
 
     def take(self, name: Name, stop: Callable[[], bool], say: Callable[[str], None]) -> bool:
-        """Take the samples of `name` unless this was done. Returns whether there are enough for a comparison.
+        """Take the samples of `name`, unless an earlier call has taken the samples. Returns True if there are enough
+        samples for a comparison.
 
         After `stop()`, the method ends with the samples taken so far.
         """
@@ -169,8 +170,8 @@ class Sampling:
             say(f"{kind} {name[1]}: seeds {len(samples)}, {now - begin:.1f} s, of which the first {first_s:.1f} s")
 
     def needed_s(self) -> float | None:
-        """Return the estimated time for the minimum number of all samples, including finished samples, or None if there
-        are none.
+        """Return the estimated total time for the minimum number of samples of every name. The total includes finished
+        samples. Return None if there are no samples yet.
         """
         if not self._first_s:
             return None
@@ -185,10 +186,11 @@ class Sampling:
         return self._first_s.get(_kind(name), max(self._first_s.values(), default=0.0))
 
     def _ends(self, name: Name, now: float) -> list[tuple[float, float]]:
-        """Return the times at which sampling of `name` ends, each with the number of samples for which it applies.
+        """Return the times at which sampling of `name` ends. Each time comes with the sample count below which the time
+        applies.
 
-        Samples that a comparison needs may take all the time. Later samples leave time for the first samples of all
-        remaining names. Samples beyond the minimum get a share of the rest.
+        Samples that a comparison needs may use all the remaining time. Samples beyond the minimum for a comparison
+        leave time for the first samples of all remaining names. Samples beyond the minimum get a share of the rest.
         """
         kept = self._end - sum(self._expected_s(other) for other in self._to_do)
         own = self._share(name)
@@ -199,8 +201,8 @@ class Sampling:
         return LARGE_SHARE if self._is_cheap(name) else SMALL_SHARE
 
     def _is_cheap(self, name: Name) -> bool:
-        """Whether more than LEAST_SEEDS are taken. This applies to estimators and stock references, which have the most
-        noise.
+        """Whether more than LEAST_SEEDS are taken. Estimators and stock references get more than LEAST_SEEDS, because
+        their samples have the most noise.
         """
         return name[0] == "image" or (name[0] == "gradient" and not name[1].startswith("walk_ad"))
 
@@ -225,6 +227,8 @@ class Sampling:
 
 
 def _kind(name: Name) -> tuple[str, bool]:
-    """Return the kind of samples with similar compile times, and whether it is naive AD."""
+    """Return the kind of the samples `name`, and True for gradients by naive AD. Samples with the same result have
+    similar compile times.
+    """
     kind, of = name
     return kind, kind == "gradient" and of.startswith(NAIVE)

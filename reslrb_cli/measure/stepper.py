@@ -123,8 +123,8 @@ class Steps:
         return gradients, times
 
     def told(self, answer: dict[str, Any], cold: bool, release: bool) -> dict[str, Any]:
-        """Return the answer for a step. For a `cold` step it includes the peak of Dr.Jit's arrays. `release` frees the
-        allocator's cache.
+        """Return the answer for a step. For a `cold` step, the answer includes the peak memory of Dr.Jit's arrays.
+        `release` frees the allocator's cache.
         """
         if cold:
             answer["peak_mib"] = peak_mib(dr.backend_v(mi.Float))
@@ -160,8 +160,8 @@ class Stepper(Steps):
         self._given = image if objective == "fixed" else lambda seen: dr.mean(dr.square(whole_of(seen) - image).array)
 
     def step(self, round: int, cold: bool, release: bool) -> dict[str, Any]:
-        """Take one step and measure it. A `cold` step is also measured for memory. Other steps are taken twice, and the
-        second counts.
+        """Take one step and measure it. For a `cold` step, memory is measured as well. Every step that is not `cold`
+        runs twice, and only the second run is timed.
 
         `release` frees the allocator's cache afterwards.
         """

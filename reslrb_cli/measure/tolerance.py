@@ -36,7 +36,7 @@ _DIRECTIONS = [(0.0, 0.0), *((np.cos(a) * (7 / 12) ** 0.5, np.sin(a) * (7 / 12) 
 def closed_by_ball(heights: Array, pitch: Sequence[float], radius: float) -> Array:
     """Return heights (ny, nx) as a ball-end cutter of this `radius` leaves them, by their grey closing with the ball.
 
-    `pitch` is the distance of columns and of rows, in the unit of the heights.
+    `pitch` has the spacing of columns and the spacing of rows, in the unit of the heights.
     """
     relief = float(np.ptp(heights))
     widest = radius if relief >= radius else (2 * radius * relief - relief**2) ** 0.5  # parts that can touch
@@ -53,8 +53,8 @@ def figures(image: Array, target: Array) -> dict[str, float]:
     """Compare luminances (H, W) within the picture: SSIM, L1 and contrast (standard deviation over mean).
 
     Also returns the target's `contrast`, and the share of the film's light that falls into the picture. The picture is
-    the bounding rectangle of the target's nonzero pixels. Both images are divided by their mean there. SSIM is computed
-    by scikit-image, with the target's maximum as data_range.
+    the bounding rectangle of the target's nonzero pixels. Each image is divided by its mean within the picture. SSIM is
+    computed by scikit-image, with the target's maximum as data_range.
     """
     from skimage.metrics import structural_similarity
 
@@ -79,12 +79,13 @@ def picture_within(target: Array) -> tuple[slice, slice]:
 def where_light_goes(
     scene: mi.Scene, sensor: mi.Sensor, plan: Fabrication, target: Array, seed: int = 0
 ) -> dict[str, float]:
-    """Return the shares of the front face's light that go `inside` the picture, `beside` it on the film, and `beyond`.
+    """Return three shares of the light from the front face. The light goes `inside` the picture, `beside` the picture
+    on the film, or `beyond`.
 
-    `beyond` is elsewhere on the receiver, or past it. The shares are those of `RAYS` rays from the lamps, with
-    Mitsuba's own BSDF samples and reflections in the glass. The picture consists of the nonzero pixels of the luminance
-    `target` (H, W). Light reflected back to the lamp, and light past the lens, do not count. If no light leaves the
-    lens, all shares are 0.
+    `beyond` is light that lands elsewhere on the receiver, or misses the receiver. The shares are estimated with `RAYS`
+    rays from the lamps. Mitsuba samples the BSDFs, and reflections in the glass are included. The picture consists of
+    the nonzero pixels of the luminance `target` (H, W). Light reflected back to the lamp, and light past the lens, do
+    not count. If no light leaves the lens, all shares are 0.
     """
     rows, columns = picture_within(target)
     shapes = {shape.id(): shape for shape in scene.shapes()}
@@ -138,8 +139,8 @@ def shift_between(image: Array, reference: Array) -> Array:
 
 
 class OpticalBench:
-    """Scene of a lens or mirror whose parts can be changed. `plan` describes it, and `params` are the scene's
-    parameters.
+    """Scene of a lens or mirror whose parts can be changed. `plan` describes the lens or mirror. `params` are the
+    scene's parameters.
     """
 
     def __init__(
@@ -189,8 +190,8 @@ class OpticalBench:
         return self.moved(ids, mi.ScalarTransform4f().rotate(list(axis), degrees))
 
     def farther(self, part: float) -> dict[str, Any]:
-        """Return the parameters of receiver and camera, moved away by the fraction `part` of the receiver's
-        distance.
+        """Return the parameters of receiver and camera after a move away from the origin. The move is the fraction
+        `part` of the receiver's distance.
         """
         key = f"{self.plan.receiver}.to_world"
         middle = np.ravel(self.params[key] @ mi.Point3f(0)).astype(float)
@@ -213,7 +214,7 @@ class OpticalBench:
         return [*self.plan.faces, *(["back"] if "back" not in self.plan.faces else [])]
 
     def tooled(self, sheets: Sequence[Sheet], radius: float) -> dict[str, Any]:
-        """Return the faces as a ball-end cutter of this radius leaves them."""
+        """Return the vertex positions of the faces as a ball-end cutter of this `radius` leaves the faces."""
         values = {}
         for sheet, side in zip(sheets, (1, -1), strict=False):
             pitch = [float(np.diff(line).mean()) for line in (sheet.x, sheet.y)]
@@ -256,8 +257,8 @@ def tolerances(
     """Return the `figures` of the `planned` scene and of each error, by name, against the luminance `target` (H, W).
 
     `shift` (columns, rows; pixels) is the shift of the whole picture due to a rotation, which is removed first.
-    `original` (H, W) is the picture before its dark parts were raised. If it is given, `ssim_of_picture` is the SSIM
-    with it. `keep` receives the name and the luminance (H, W) of each image.
+    `original` (H, W) is the picture before its dark parts were raised. If `original` is given, `ssim_of_picture` is the
+    SSIM of the image and `original`. `keep` receives the name and the luminance (H, W) of each image.
     """
     plan, both = bench.plan, bench.solid_parts()
     found: dict[str, dict[str, Any]] = {}

@@ -1,7 +1,7 @@
 """Worker processes as seen from inside: measuring processes that `processes.py` starts and controls.
 
 A worker (`run`) reads one JSON object per line from standard input, and answers each with one line on standard output.
-The first object describes the case, and each later one asks for a step. Other output goes to standard error.
+The first JSON object describes the case. Each later object asks for one step. Other output goes to standard error.
 """
 
 from __future__ import annotations

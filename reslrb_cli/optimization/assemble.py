@@ -1,5 +1,5 @@
-"""From a configuration to its problem, loaded and checked, with targets and decisions. Also the coarser problem of a
-stage.
+"""Assembly of a configuration's problem. The problem is loaded and checked, its targets are made, and its open settings
+are decided. Also the coarser problem of a stage.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ def assemble(
     """Load and check the experiment of `config`, make the targets, and decide open settings. A variant must be set.
 
     All checks happen before anything is rendered. `say` is called with lines about slow work. `cache` has measurements
-    of earlier runs, or is None to store nothing. With `to_run`, everything for an optimisation is prepared: exposures
-    are checked, and the entries that light and sensor reach are known. With `settled`, nothing is measured again, and
-    the result is the problem of a resumed run before its first iteration. Raises ConfigError and UnsupportedScene.
+    of earlier runs, or is None to store nothing. With `to_run`, prepare everything for an optimisation. Then exposures
+    are checked, and the parameter entries that light and sensor reach are found. With `settled`, measure nothing again.
+    The result is the problem of a resumed run before its first iteration. Raises ConfigError and UnsupportedScene.
     """
     if to_run:
         check_code(config)
@@ -114,7 +114,8 @@ def check_passes(source: str, spp: int, multiple: int | None) -> None:
 
 
 def set_values(problem: Problem, values: Mapping[str, Any]) -> Problem:
-    """Return the problem before its first iteration. `values` are arrays for some of its parameters, with their shapes.
+    """Return the problem before its first iteration. `values` has arrays for some of the problem's parameters. Each
+    array has the parameter's shape.
 
     Raises ConfigError, located by `values` and the key.
     """
@@ -216,8 +217,9 @@ def _check_values(selection: Selection, values: Mapping[str, Array]) -> None:
 def at_stage(problem: Problem, number: int, values: Mapping[str, Array] | None = None) -> Problem:
     """Return the problem of a stage with its own resolution or film: another scene with coarser maps and targets.
 
-    It samples like `problem`, but without learned state. `values` are those of its parameters, in its resolution. For
-    None, the current values of `problem` are resampled. Raises ValueError for wrong shapes.
+    The stage's problem samples like `problem`, but has no learned state. `values` are the values of the stage's
+    parameters, in the stage's resolution. For None, the current values of `problem` are resampled. Raises ValueError
+    for wrong shapes.
     """
     config, film = problem.config.without_stages(), _film_at(problem, number)
     scene = config.scene if film is None else config.scene.model_copy(update={"size": film})
@@ -273,7 +275,7 @@ def _film_at(problem: Problem, number: int) -> tuple[int, int] | None:
 def _specs_at(problem: Problem, number: int) -> list[ParameterSpec]:
     """Return the parameters of a stage, with globs replaced by the selected keys.
 
-    Raises ConfigError if the stage should make parameters coarser, but no parameter can be.
+    Raises ConfigError if the stage asks for coarser parameters, but no parameter can be made coarser.
     """
     config, selection, share = problem.config, problem.selection, problem.config.stage(number).resolution
     specs: list[ParameterSpec] = []
@@ -304,7 +306,9 @@ def _specs_at(problem: Problem, number: int) -> list[ParameterSpec]:
 
 
 def _is_grid(problem: Problem, key: str, spec: ParameterSpec) -> bool:
-    """Whether a heightmap's mesh is a flat grid with a vertex at each texel, so that both can be coarser."""
+    """True if a heightmap's mesh is a flat grid with a vertex at each texel. Then both mesh and heightmap can be made
+    coarser.
+    """
     assert spec.heightmap is not None
     height, width = problem.selection.array(key).shape[:2]
     points, uv = problem.selection.deformation.laid_over(key)
@@ -320,10 +324,11 @@ def _is_grid(problem: Problem, key: str, spec: ParameterSpec) -> bool:
 
 
 def resized(problem: Problem, key: str, value: Array) -> Array:
-    """Return a value of a parameter from another problem, or a change of it, in the resolution of `problem`.
+    """Return another problem's value of a parameter, in the resolution of `problem`. The value may also be a change of
+    a value.
 
-    Heights are resampled by cubic splines at their positions in space. They cover a grid from edge to edge, with a
-    vertex for each height. Textures are resampled bilinearly, and smoothed first if they shrink.
+    Heights are resampled by cubic splines at their positions in space. On a flat grid with a vertex for each height,
+    the heights cover the grid from edge to edge. Textures are resampled bilinearly, and smoothed first if they shrink.
     """
     shape, selection = problem.selection.array(key).shape, problem.selection
     if value.shape == shape:
@@ -352,7 +357,9 @@ def _places(new: int, old: int, edge_to_edge: bool) -> Array:
 
 
 def _see_coarsely(view: View, whole: View, film: mi.Film) -> None:
-    """Give a view with a smaller film the target of the full film, by weighted means over pixels."""
+    """Give a view with a smaller film the full film's target. Each coarse pixel is a weighted mean of the full film's
+    pixels that the coarse pixel covers.
+    """
     target, weights = np.array(whole.target, dtype=np.float64), whole.fixed
     if weights is None:
         weights = np.ones(target.shape[:2]) if whole.weights is None else np.array(whole.weights)[:, :, 0]

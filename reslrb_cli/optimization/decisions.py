@@ -42,7 +42,7 @@ class MemoryPlan(Jsonable):
     exceeded: bool = False
 
     def check(self, peak: float) -> str | None:
-        """Record the allocator's peak in MiB. Returns a warning the first time that it exceeds the budget."""
+        """Record the allocator's peak in MiB. Returns a warning when the used memory first exceeds the budget."""
         self.peak_mib = peak
         used, before = peak * MIB + self.expected_bytes.scratch, self.exceeded
         self.exceeded = used > self.budget_bytes
@@ -58,11 +58,12 @@ Need = tuple[float, float]
 
 @dataclass
 class Allowance:
-    """Seconds that all measurements before the first iteration may take, a share of the run's time `run_s`.
+    """The time in seconds that all measurements before the first iteration may take. The limit is the fraction `share`
+    of the run's time `run_s`.
 
     The run consists of the compilation of kernels (`compile_s`, for one step) and iterations of `iteration_s`. Two
-    first steps with few samples give these times. The run would take these steps as well, so they do not count as
-    `spent_s`.
+    first steps with few samples determine `compile_s` and `iteration_s`. The run would take the two first steps as
+    well. Therefore, the first steps do not count as `spent_s`.
     """
 
     share: float
@@ -75,12 +76,12 @@ class Allowance:
 
     @property
     def left_s(self) -> float:
-        """Seconds that are neither spent nor reserved."""
+        """Seconds of the limit that are neither spent nor reserved."""
         running = 0.0 if self.since_s is None else time.perf_counter() - self.since_s
         return max(self.share * self.run_s - self.spent_s - self.aside_s - running, 0.0)
 
     def affords(self, *needs: Need) -> bool:
-        """Whether there is time for all of these measurements."""
+        """True if the remaining time suffices for all measurements in `needs`."""
         return self._seconds(needs) <= self.left_s
 
     def _seconds(self, needs: Sequence[Need]) -> float:
@@ -95,11 +96,13 @@ class Allowance:
         self.aside_s, self.since_s = 0.0, None
 
     def iterations_left(self, kernels: float) -> float:
-        """Return the remaining time in iterations, after compiling the kernels of this number of steps."""
+        """Return how many iterations fit into the remaining time, after the compilation of kernels for `kernels`
+        steps.
+        """
         return max(self.left_s - kernels * self.compile_s, 0.0) / max(self.iteration_s, 1e-9)
 
     def note(self) -> str:
-        """Return a note for options that there is no time to measure."""
+        """Return a note for options that remain unmeasured for lack of time."""
         return f"not measured (over {100 * self.share:.3g} % of this run)"
 
     def line(self) -> str:
@@ -132,7 +135,7 @@ class Scaled(Sensitivity):
     """Sensitivity of a parameter, and the resulting scale.
 
     `own_length` is `length` in the optimiser's variable. `first_step` is the initial movement of the value by one
-    learning rate, in the scene's units. Both are None if the parameter was not scaled.
+    learning rate, in the scene's units. `own_length` and `first_step` are None if the parameter was not scaled.
     """
 
     own_length: float | None = None

@@ -48,10 +48,11 @@ def quantity(params: Any, key: str) -> str:
 class ErrorMeter:
     """Errors of parameters relative to true values, over the entries that light and sensor reach.
 
-    `truth` and `masks` are those of a `Problem`, and `quantities` those of the parameters (`quantity`). If a texture
-    and its true value have different resolutions, both are resampled bilinearly to the finer grid. A cell counts if the
-    texel of the parameter at its centre counts. The error of a coarse texture therefore includes detail that the
-    texture cannot show. The error of a fine texture includes its noise.
+    `truth` and `masks` are the fields of a `Problem`. `quantities` has the quantity of each parameter (`quantity`). If
+    a texture and its true value have different resolutions, both are resampled bilinearly to the finer grid. A cell of
+    the finer grid counts if the mask includes the parameter's texel at the cell's centre. The error of a coarse texture
+    therefore includes detail of the true value that the coarse texture cannot show. The error of a fine texture
+    includes its noise.
     """
 
     def __init__(
@@ -83,7 +84,7 @@ class ErrorMeter:
         """Return the root mean square error over the entries of all parameters, or None if units differ or nothing is
         known.
 
-        `errors` is the result of the method `errors`.
+        The argument `errors` is the result of the method `errors`.
         """
         count = sum(self._truth[key].size for key in errors)
         if not count or not self.one_unit:
@@ -91,13 +92,15 @@ class ErrorMeter:
         return float(np.sqrt(sum(self._truth[key].size * error**2 for key, error in errors.items()) / count))
 
     def relative(self, errors: Mapping[str, float]) -> dict[str, float]:
-        """Return the errors divided by the root mean square of the true values, if that is not 0."""
+        """Return each error divided by the root mean square of the true values. Parameters with true values of 0 are
+        left out.
+        """
         return {key: error / self.scales[key] for key, error in errors.items() if key in self.scales}
 
 
 def comparison_grid(shape: tuple[int, ...], true_shape: tuple[int, ...]) -> tuple[int, int] | None:
-    """Return the (height, width) for comparing a texture with its true value. Returns None for equal shapes, and for
-    other parameters.
+    """Return the (height, width) for comparing a texture with its true value. Returns None if both shapes are equal, or
+    if the parameter is not a texture.
     """
     if len(true_shape) != 3 or shape[:2] == true_shape[:2]:
         return None

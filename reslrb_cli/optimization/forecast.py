@@ -1,8 +1,9 @@
-"""Forecast of the memory and time of a run. It is measured with a few of the run's steps, and a target of few samples.
+"""Forecast of the memory and time of a run. The forecast is measured with a few of the run's steps, and with a target
+of few samples.
 
 If a step takes long, two sizes of steps with fewer samples per pixel are measured instead. Time and memory are a
 constant plus a part proportional to the samples, so two sizes determine them. Memory is allocated in powers of two, so
-this line is not exact. If full steps do not take long, two of them measure the memory.
+this line is not exact. If full steps do not take long, the memory is measured with two full steps.
 """
 
 from __future__ import annotations
@@ -60,8 +61,8 @@ class Steps:
 
 
 def measure_steps(problem: Problem) -> Steps:
-    """Measure the steps of the run. For a run with stages, return the mean over its iterations, and the sum of all
-    starts.
+    """Measure the steps of the run. For a run with stages, return the mean step time over the run's iterations. The
+    start times are summed over all stages.
     """
     config, stages = problem.config, Stages(problem)
     numbers = [config.stage_number(each / config.run.iterations) for each in range(config.run.iterations)]
@@ -102,7 +103,9 @@ def _peak(problem: Problem, spp: int) -> int:
 
 @contextmanager
 def trial(problem: Problem, spp: int) -> Iterator[Problem]:
-    """Provide the problem before its first iteration, with `spp` samples per pixel. Restores the scene afterwards."""
+    """Provide the problem as before its first iteration, with `spp` samples per pixel. Restores the scene
+    afterwards.
+    """
     run = problem.config.run
     enough = {"spp": spp, "iterations": max(run.iterations, WARM_UP + MOST), "stages": [], "max_seconds": None}
     config = problem.config.model_copy(update={"run": run.model_copy(update=enough)})
@@ -143,10 +146,10 @@ def _measure(problem: Problem, spp: int) -> Steps:
 
 
 def _with_learning(times: Sequence[float], learned: Sequence[int], mean: float) -> float:
-    """Return the seconds of an iteration in which tables learn `mean` times.
+    """Return the duration in seconds of an iteration in which the tables learn `mean` times.
 
-    `times` are those of early iterations, and `learned` tells how often tables learned in them. This is more often than
-    later.
+    `times` are the durations of early iterations. `learned` is the number of table updates in each of the iterations.
+    This is more often than later.
     """
     plain = [seconds for seconds, count in zip(times, learned, strict=True) if count == 0]
     if not plain or sum(learned) == 0:
@@ -164,8 +167,8 @@ class Forecast(Steps):
     """Measured steps, and the resulting forecast of the run.
 
     `parts` has bytes by part, which sum to `peak`. `scratch` is thread-local memory, and `free` the free memory. The
-    other fields are seconds before and after the iterations. `kept` tells whether a run finds the decisions in the
-    cache. They took `measuring_s` now.
+    fields `before_s`, `measuring_s`, `target_s`, `images_s` and `verdicts_s` are seconds outside the iterations. `kept`
+    tells whether a run finds the decisions in the cache. They took `measuring_s` now.
     """
 
     parts: dict[str, int]
@@ -181,7 +184,7 @@ class Forecast(Steps):
 
     @property
     def elapsed_s(self) -> float:
-        """Seconds of the iterations, as `elapsed_s` in `metrics.jsonl`, with cached kernels."""
+        """Seconds that all iterations take with cached kernels, like `elapsed_s` in `metrics.jsonl`."""
         return self.iterations * self.iteration_s + self.start_s
 
     @property
@@ -239,7 +242,7 @@ def make_forecast(
 
 
 def with_short_target(config: Config) -> Config:
-    """Return the experiment with a target that has at most the samples of four steps."""
+    """Return the experiment with a rendered target that has at most the sample count of four steps."""
     render = config.target.render
     if render is None:
         return config

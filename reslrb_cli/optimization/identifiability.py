@@ -3,11 +3,12 @@
 There are two checks: which entries of a parameter affect the images (`find_reached`), and whether the images
 distinguish exposures from parameters (`check_exposures`).
 
-For the second check, D_k is the change of all views' images with the logarithm of parameter k. All entries of the
-parameter change together: (J((1 + h) x_k) - J(x_k)) / h, at common random numbers. Images have their exposure, without
-masked pixels. For an exposure, D_k consists of the images of its views. For example, if all emission is unknown, the
-sum over the lamps equals the D_k of the exposure. In general, there are combinations without effect if the matrix of
-cosines has an eigenvalue near 0. Its eigenvector gives the values in the combination.
+In the second check, D_k is the change of all views' images per change of the logarithm of parameter k. All entries of
+the parameter change together: (J((1 + h) x_k) - J(x_k)) / h, at common random numbers. The images include their
+exposure and exclude masked pixels. For an exposure, D_k consists of the images of its views. For example, if all
+emission is unknown, the sum over the lamps equals the D_k of the exposure. In general, some combination has no effect
+if the matrix of cosines has an eigenvalue near 0. The eigenvector of an eigenvalue near 0 shows which exposures and
+parameters form the combination.
 
     G_kl = <D_k, D_l> / (|D_k| |D_l|)
 """
@@ -51,9 +52,10 @@ PART = 0.1
 def find_reached(problem: Problem) -> Problem:
     """Return the problem with its `masks`, for parameters with known true values.
 
-    An entry counts as reached if light reaches it: the gradient of the image's sum with respect to it, over `REACH_SPP`
-    samples per pixel, is not 0 in some channel. For a texel, some sensor must also see its centre. A texel that only
-    illuminates others is determined by interreflection alone.
+    An entry counts as reached if light reaches the entry. The test uses the gradient of the image's sum with respect to
+    the entry, over `REACH_SPP` samples per pixel. The gradient must be nonzero in some channel. A texel counts as
+    reached only if some sensor also sees the texel's centre. Interreflection alone determines a texel that only
+    illuminates other surfaces.
     """
     if not problem.truth:
         return problem
@@ -90,7 +92,7 @@ def _visible(problem: Problem, key: str, pixels: Sequence[Array | None] = ()) ->
 
 
 def sensitivity(problem: Problem) -> dict[str, Array]:
-    """Return for each parameter which of its entries affect the mean image, as booleans with the parameter's shape."""
+    """Return booleans for each parameter, in the parameter's shape. True entries affect the mean image."""
     run, integrator, multiple = problem.config.run, unrecorded(problem.integrator), samples_per_pass(problem.config)
     # A recording takes as long as some passes, and there is usually only one.
     paths_per_pass = MOST_PATHS if isinstance(integrator, LightTracer) else PATHS_PER_PASS
@@ -114,8 +116,8 @@ def sensitivity(problem: Problem) -> dict[str, Array]:
 def check_exposures(problem: Problem) -> None:
     """Raise ConfigError if the images cannot distinguish an exposure from parameters. The message names them.
 
-    Takes one image of each view for every parameter. If no exposure is recovered, does nothing. The problem must have
-    its targets, and is not changed.
+    Renders one image of each view for every parameter. Does nothing if the run recovers no exposure. The problem must
+    already have its targets. The function does not change the problem.
     """
     found = find_ambiguous(problem) if problem.selection.factors else None
     if found is None:

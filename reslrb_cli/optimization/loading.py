@@ -46,8 +46,8 @@ BETWEEN_SPP = 64
 def passes(spp: int, pixels: int, multiple: int | None, paths_per_pass: int = PATHS_PER_PASS) -> Iterator[int]:
     """Yield the samples per pixel of each pass. They sum to `spp`.
 
-    `multiple` is the integrator's `samples_per_pass`. It divides `spp` and the samples of every pass. None sets no such
-    limit.
+    `multiple` is the integrator's `samples_per_pass`. `multiple` divides both `spp` and the sample count of every pass.
+    None sets no such limit.
     """
     unit = multiple or 1
     most = max(paths_per_pass // (pixels * unit), 1) * unit
@@ -95,7 +95,8 @@ def load_configured(
     selects: bool = True,
     warn: bool = True,
 ) -> mi.Scene:
-    """Load the scene of `config`. `look` is called with its description before it is built. Raises ConfigError.
+    """Load the scene of `config`. `look` is called with the scene's description before the scene is built. Raises
+    ConfigError.
 
     With `selects`, textures of 8 or 16 bits that the parameters select are read as floating point. With `warn`,
     doubtful parts of the scene cause warnings.
@@ -137,8 +138,8 @@ def choose_sensors(config: Config, scene: mi.Scene) -> list[int]:
 def are_upright(config: Config) -> bool:
     """Whether images of views are rotated by their EXIF orientation.
 
-    Cameras of a file refer to pixels as they are stored. COLMAP ignores orientations on purpose, because all images of
-    one camera must have one projection.
+    Cameras read from a file refer to pixels in their stored orientation. COLMAP ignores orientations on purpose,
+    because all images of one camera must have one projection.
     """
     return config.scene.cameras is None
 
@@ -147,7 +148,8 @@ def paths_of(integrator: Integrator, scene: mi.Scene, sensors: list[int], moves:
     """Return which paths render the images of `integrator`: `light`, `camera`, or `both`. If anything `moves`, it is
     `light`.
 
-    If measurement decides this, the result is `both`, or the only kind that can render the scene.
+    If a measurement chooses the kind of paths, the result is `both`. If only one kind can render the scene, the result
+    is the usable kind.
     """
     if isinstance(integrator, Own):
         return integrator.paths
@@ -192,7 +194,8 @@ def _warn_of_clipping(config: Config, sensor: mi.Sensor, scene: mi.Scene) -> Non
 
 
 def make_configured(config: Config, integrator: Integrator, paths: str) -> StepIntegrator:
-    """Make the `integrator` of `config`, or of its target, with these `paths` (`paths_of`).
+    """Make the `integrator` of `config`, or of the target in `config`, with the kind of `paths` that `paths_of`
+    returns.
 
     Options that a run decides by measurement (`guiding`, `sequence`, ...) are off.
     """

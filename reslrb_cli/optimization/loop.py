@@ -71,12 +71,12 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
 
     An iteration consists of a step and an update. The step computes image, loss and gradient of every sensor, and the
     loss is the mean over the sensors. Equal states lead to equal states. If the problem has other values than `state`,
-    it is first set to `state`. Afterwards it has the values of the returned state.
+    it is first set to `state`. After the iteration, the problem has the values of the returned state.
 
-    Values that are not finite reach no parameter. `nonfinite` describes the reaction, and when a run ends
-    (`State.end`). `on_nonfinite` is called before the update, while the scene is unchanged. `optimizer.scale: auto`
-    measures before the first iteration, and `elapsed_s` includes this time. The schedule follows the iterations or the
-    time (`run.max_seconds`), whichever is further.
+    Values that are not finite reach no parameter. The module `nonfinite` describes how the run reacts to non-finite
+    values, and when a run ends (`State.end`). `on_nonfinite` is called before the update, while the scene is unchanged.
+    `optimizer.scale: auto` measures before the first iteration, and `elapsed_s` includes this time. The schedule
+    follows either the iteration count or the elapsed time (`run.max_seconds`), whichever has progressed further.
     """
     config, optimizer, iteration = problem.config, problem.optimizer, state.iteration
     if optimizer.stands_at is not state:
@@ -154,7 +154,8 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
 def iterate(
     stages: Stages, state: State, on_nonfinite: Told = lambda found: None, watch: Watch | None = None
 ) -> Iterator[tuple[State, Record]]:
-    """Make the iterations from `state` to the last of the run, each by `step` with the problem of its stage.
+    """Make all remaining iterations of the run, starting at `state`. `step` makes each iteration, with the problem of
+    the iteration's stage.
 
     `watch` has seen the earlier iterations, and decides which iteration is the last. It is None without such a test.
     Raises NonFinite if the run fails.
@@ -195,7 +196,9 @@ def _findings(
 
 
 class Split:
-    """Clock for the time of a step up to image and loss, if the integrator has a moment in which both are known."""
+    """Clock for the part of a step's time that ends when image and loss are known. Some integrators have no moment at
+    which both are known.
+    """
 
     def __init__(self) -> None:
         self.primal_ms: float | None = 0.0
@@ -208,7 +211,7 @@ class Split:
         self._start = time.perf_counter()
 
     def image(self) -> None:
-        """Record that image and loss of the view are evaluated, or launched."""
+        """Record that the view's image and loss are evaluated, or that their kernels are launched."""
         dr.sync_thread()
         if self.primal_ms is not None and self._start is not None:
             self.primal_ms += 1e3 * (time.perf_counter() - self._start)

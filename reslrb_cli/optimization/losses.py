@@ -1,8 +1,8 @@
 """Losses between an image and its target, by functions that Dr.Jit differentiates.
 
-Each takes the image I (H, W, C), attached to the AD graph, and the target T of the same shape, both in linear radiance.
-Optional weights have the same shape and a mean of 1. A loss is an array of width 1. It is a mean over pixels and
-channels, so it depends neither on the resolution nor on the number of masked pixels.
+Each loss takes the image I and the target T, both (H, W, C) in linear radiance. I is attached to the AD graph. Optional
+weights have the same shape and a mean of 1. A loss is an array of width 1. A loss is a mean over pixels and channels.
+The value depends neither on the resolution nor on the number of masked pixels.
 
 `weighted` and `fitted` modify losses: a weighted sum, and the loss of the image multiplied by the best factor.
 """
@@ -41,8 +41,9 @@ def relative_l2(
 ) -> mi.Float:
     """Return mean (I - T)² / (T² + ε), with ε in squared units of radiance.
 
-    The denominator uses the target, a constant, so the gradient is that of the loss itself. If it used the (detached)
-    noisy image, the noise of a pixel would be in numerator and denominator at once.
+    The denominator uses the target, which is constant. The computed gradient is therefore the gradient of the complete
+    loss. With the detached noisy image in the denominator, a pixel's noise would appear in numerator and denominator at
+    once.
     """
     return _mean(dr.square(image - target) / (dr.square(target) + epsilon), weights)
 
@@ -56,11 +57,11 @@ def ssim(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = 
 
         SSIM = (2 μ_I μ_T + C_1) (2 σ_IT + C_2) / ((μ_I² + μ_T² + C_1) (σ_I² + σ_T² + C_2)),  C_k = (K_k L)²
 
-    SSIM is computed for each channel and window. A window is a Gaussian with a standard deviation of 1.5 pixels, 11
-    pixels wide, and the variances are those of the window itself. The result equals scikit-image's with
-    `gaussian_weights=True, use_sample_covariance=False`. The mean is over the windows that lie within the image, each
-    with the weight of its central pixel. A masked pixel must be the same in both images, which `View.judge` ensures. L
-    is the largest value of the target. Raises ValueError for smaller images.
+    SSIM is computed for each channel and window. SSIM's windows are Gaussian, with a standard deviation of 1.5 pixels
+    and a width of 11 pixels. Variances within a window are population variances, without the sample correction. The
+    result equals scikit-image's with `gaussian_weights=True, use_sample_covariance=False`. The mean is over the windows
+    that lie within the image, each with the weight of its central pixel. A masked pixel must be the same in both
+    images, which `View.judge` ensures. L is the largest value of the target. Raises ValueError for smaller images.
     """
     if min(image.shape[:2]) < SSIM_SIDE:
         raise ValueError(f"SSIM needs images of {SSIM_SIDE}x{SSIM_SIDE} pixels, not {image.shape[1]}x{image.shape[0]}")
@@ -140,9 +141,9 @@ def best_scale(
     """Return s = <I, T> / <I, I>, of width 1, attached. I is the mean of two images (H, W, C) with the same expected
     value.
 
-    If one of the products is not positive, as for black images, s is 1, without a derivative. <I, I> is computed as the
-    product of the two images, whose noise is independent. Its derivative is 2 <I, dI>, which the noise of I does not
-    bias if dI has other samples. With `across`, the derivative is <I_a, dI_b> + <I_b, dI_a>.
+    If <I, T> or <I, I> is not positive, as for black images, s is 1 without a derivative. <I, I> is computed as the
+    product of the two images, which have independent noise. The derivative of <I, I> is 2 <I, dI>. The noise of I does
+    not bias the derivative if dI has other samples. With `across`, the derivative is <I_a, dI_b> + <I_b, dI_a>.
     """
     image, square = 0.5 * (halves[0] + halves[1]), _product(*halves, weights)
     if not across:
@@ -165,10 +166,10 @@ def fitted(
     C).
 
     Its derivative is s l(s I) + L_s ds/dI, where l is the derivative of the loss. L_s = <l(s I), I> contains the image
-    twice. It is computed as the mean of <l(s I_a), I_b> and <l(s I_b), I_a>, so the derivative of a quadratic loss
-    contains no product of noise with itself. For one image given twice, it is the exact derivative. With `across`, the
-    derivative with respect to I_a uses I_b in place of I, and vice versa. No path of a half then uses a delta that
-    contains it.
+    twice. L_s is computed as the mean of <l(s I_a), I_b> and <l(s I_b), I_a>. The derivative of a quadratic loss
+    therefore contains no product of noise with itself. If both halves are the same image, the result is the exact
+    derivative. With `across`, the derivative with respect to the half I_a uses the half I_b in place of I. The
+    derivative with respect to I_b uses I_a. No path of a half then uses a dL/dI to which the path itself contributes.
     """
     first, second = halves_of(image)
     factor = best_scale((first, second), target, weights, across)

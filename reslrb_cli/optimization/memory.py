@@ -1,8 +1,8 @@
 """Memory of a run: the needs of a step, passes that keep a budget, and limits.
 
 Sizes in the configuration and the scene file are checked before anything is built (`check_announced`,
-`check_described`). Films and textures of a hundred million entries would take a minute to make. The estimates are lower
-bounds, so nothing is refused that fits into the machine.
+`check_described`). Films and textures of a hundred million entries would take a minute to make. The memory estimates
+are lower bounds, so the checks refuse nothing that fits into the machine's memory.
 """
 
 from __future__ import annotations
@@ -91,7 +91,8 @@ def standing() -> int:
 def estimate(problem: Problem, integrator: Reslrb, samples: int, fixed: int) -> Estimate:
     """Estimate the memory of a step whose passes have `samples` samples per pixel. `fixed` is allocated before it.
 
-    `fixed` does not contain the targets, which may not exist yet, but the `fixed` part of the result does.
+    The argument `fixed` does not contain the targets, which may not exist yet. The `fixed` part of the result contains
+    the targets.
     """
     paths = images = targets = scratch = 0
     pixels = pixels_of(problem.scene, problem.sensors)
@@ -115,9 +116,10 @@ def estimate(problem: Problem, integrator: Reslrb, samples: int, fixed: int) -> 
 
 
 def choose_samples(problem: Problem, integrator: Reslrb, samples: int, budget: int, fixed: int) -> tuple[int, Estimate]:
-    """Return the largest divisor of `samples` that fits into the budget, and its estimate.
+    """Return the largest divisor of `samples` whose memory fits into the budget, and the divisor's memory estimate.
 
-    If none fits, returns 0 and the estimate of the smallest one. `samples` are those of a batch, or of a step.
+    If no divisor fits, returns 0 and the estimate for the smallest divisor. `samples` is the sample count of a batch,
+    or of a step.
     """
     pixels = max(pixels_of(problem.scene, problem.sensors))
     for size in reversed([size for size in divisors(samples) if passes_obstacle(samples, size, pixels) is None]):
@@ -128,10 +130,10 @@ def choose_samples(problem: Problem, integrator: Reslrb, samples: int, budget: i
 
 
 def fit_memory(problem: Problem) -> Problem:
-    """Return `problem` with passes that keep `run.memory_budget`. Without a budget, the passes do not change.
+    """Return `problem` with passes that keep within `run.memory_budget`. Without a budget, the passes do not change.
 
     The problem needs no targets. Raises ConfigError if one sample per pixel exceeds the budget. Without a budget,
-    raises it if a step exceeds the free memory.
+    raises ConfigError if a step exceeds the free memory.
     """
     config, integrator, budget = problem.config, problem.integrator, problem.config.run.budget_bytes
     if not isinstance(integrator, Reslrb):
@@ -184,10 +186,11 @@ def check_announced(config: Config) -> None:
 
 
 def check_described(config: Config, description: Description) -> None:
-    """Raise ConfigError if the scene's film is too large for the samples of a step, or a step too large for the free
-    memory.
+    """Raise ConfigError if the scene's film is too large for the sample count of a step. Also raise ConfigError if a
+    step needs more than the free memory.
 
-    The used sensors are not known yet, so the smallest film counts. Large steps that fit are logged.
+    The check uses the scene's smallest film, because the sensors of the run are not known yet. Large steps that fit are
+    logged.
     """
     film = min(film_sizes(description), key=lambda size: size.cropped, default=None)
     if film is None or not film.cropped:
@@ -264,14 +267,16 @@ def _check_samples(config: Config, pixels: int) -> None:
 
 
 def free_for(needed: int) -> int:
-    """Return the free bytes. For small needs they are not queried, because a GPU's driver takes a while."""
+    """Return the free bytes. For small needs, the function does not query the free bytes, because a query of a GPU
+    driver takes a while.
+    """
     return needed if needed < SMALL else free_bytes(mi.variant())
 
 
 def check_memory(problem: Problem, integrator: Reslrb) -> None:
     """Raise ConfigError if a step takes more memory than is free.
 
-    With a `memory_budget`, passes keep the budget, so only a single pass is checked.
+    With a `memory_budget`, the function checks nothing, because the passes keep within the budget.
     """
     config = problem.config
     if config.run.memory_budget is not None:

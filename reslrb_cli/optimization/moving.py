@@ -1,8 +1,8 @@
 """Experiments whose parameters move light: losses at the film's border, and checks of unsupported parameters.
 
-A splat that moves across the film's border leaves or enters the film. No sample sees this, because nothing outside is
-traced. The missing part of the derivative depends on the share of moving light that lands at the border
-(`border_share`). If it is large, a warning is printed before the optimisation (`warn_of_border`).
+A splat that moves across the film's border leaves or enters the film. No sample records splats that cross the border,
+because nothing outside the film is traced. The missing part of the derivative depends on the share of moving light that
+lands at the border (`border_share`). If it is large, a warning is printed before the optimisation (`warn_of_border`).
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def is_at_border(samples: Samples, u: mi.Point2f) -> mi.Bool:
     """Return whether film position `u` (in pixels, relative to the crop window) is within the filter's radius of the
     border.
 
-    Sensors see no light beyond the crop window, so this is its border.
+    The border is the edge of the crop window, because sensors record no light beyond the crop window.
     """
     radius, size = samples.film.film.rfilter().radius(), samples.film.size
     inside = dr.minimum(dr.minimum(u.x, int(size.x) - u.x), dr.minimum(u.y, int(size.y) - u.y))
@@ -121,12 +121,12 @@ def warn_of_border(problem: Problem, warn: Callable[[str], None]) -> None:
 
 
 def is_attached(problem: Problem) -> bool:
-    """Whether the parameters of `problem` move surfaces or lights, or are treated as such."""
+    """True if the parameters of `problem` move surfaces or lights, or if the integrator option `attached` is true."""
     return moves_anything(problem.config, problem.selection)
 
 
 def moves_anything(config: Config, selection: Selection) -> bool:
-    """Whether the selected parameters move surfaces or lights, or are treated as such."""
+    """True if the selected parameters move surfaces or lights, or if the integrator option `attached` is true."""
     attached = config.integrator.options().get("attached", "auto")
     return attached is True or bool(where_moved(selection.params, selection.scene_keys))
 

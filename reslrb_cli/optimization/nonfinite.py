@@ -34,8 +34,8 @@ class RefusedAt:
 class Findings:
     """Values of one iteration that were not finite.
 
-    They can be its loss, entries of dL/dI by sensor, and entries of gradients and updates by parameter. `lost` are the
-    parameters whose gradient has no finite entry, and `own` are the user's losses.
+    Non-finite values can be the iteration's loss, entries of dL/dI for each sensor, or entries of gradients and updates
+    for each parameter. `lost` lists the parameters whose gradient has no finite entry. `own` names the user's losses.
     """
 
     iteration: int
@@ -51,7 +51,7 @@ class Findings:
 
     @property
     def total(self) -> int:
-        """Number of all such values; a loss counts as one."""
+        """Number of all non-finite values. A non-finite loss counts as one value."""
         return int(self.loss) + sum(at.count for at in self.refused.values()) + sum(self.by_parameter.values())
 
     @property
@@ -61,7 +61,7 @@ class Findings:
 
     @property
     def whose_loss(self) -> str:
-        """Loss in words, by the user's name for it."""
+        """Description of the loss for messages, with the user's name for a custom loss."""
         return f"the loss (your own {self.own})" if self.own else "the loss"
 
     def __str__(self) -> str:

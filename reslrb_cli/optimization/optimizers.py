@@ -24,13 +24,13 @@ A clamp for outliers in gradients (`clamp_gradients`) reduces variance, and adds
     r_e = max(m_e, mean of m over the parameter's entries)
     g_e  is clamped to [-k r_e, k r_e]
 
-Rare large values of a Monte Carlo gradient belong to its mean. The removed part R = g - clamped g is therefore a bias,
-unless it cancels over iterations. Its relative size is measured over the iterations so far.
+Rare large values contribute to the mean of a Monte Carlo gradient. The removed part R = g - clamped g is therefore a
+bias, unless it cancels over iterations. The relative size of the bias is measured over the iterations so far.
 
     bias = sum_e |sum of R_e| / sum_e |sum of g_e|      inner sums over the iterations so far
 
-The mean over the entries is part of r_e, because an entry on few paths may have had only zeros. Absolute values are
-used, because squares of large gradients overflow.
+r_e includes the mean over the parameter's entries, because an entry that few paths reach may have had only zero
+gradients. Absolute values are used, because squares of large gradients overflow.
 """
 
 from __future__ import annotations
@@ -108,7 +108,8 @@ class Variable:
     """Variable v of the optimiser for a parameter x: x = T(length * S v), with x within its bounds.
 
     S is 1 or a `Smoother`. The optimiser receives the gradient `gain` times dL/dv. `length` and `gain` are 1 until they
-    are measured (`sensitivity.py`). They reach kernels as data, so new values compile nothing.
+    are measured (`sensitivity.py`). `length` and `gain` reach kernels as data, so new values do not require new
+    kernels.
     """
 
     transform: Transform | None
@@ -165,11 +166,12 @@ OPTIMIZERS: dict[str, Callable[..., Any]] = {
 
 
 class Optimizer:
-    """Optimiser that holds and updates the parameters. The values that it returns receive gradients.
+    """Optimiser that holds and updates the parameters. Gradients accumulate in the values that the optimiser returns.
 
-    `rates`, `bounds`, `transforms` and `smoothers` have the parameters' keys. A rate of None is `learning_rate`, and
-    bounds of None are no bounds. Transforms and smoothers may be missing. Values and gradients are those of the scene.
-    A parameter with a `Variable` is moved through it. Raises KeyError for an unknown `type`.
+    `rates`, `bounds`, `transforms` and `smoothers` have the parameters' keys. A rate of None stands for
+    `learning_rate`. Bounds of None set no bounds. Transforms and smoothers may be missing. Values and gradients are
+    those of the scene's parameters, not those of the optimiser's variables. A parameter with a `Variable` is moved
+    through it. Raises KeyError for an unknown `type`.
     """
 
     def __init__(
@@ -241,8 +243,8 @@ class Optimizer:
     def step(self, factor: float, skip: Collection[str] = ()) -> dict[str, int]:
         """Update all parameters except those in `skip`, with learning rates times `factor`, and clamp them.
 
-        Even a finite gradient can make an update overflow. Such a parameter keeps its old value and state. Returns the
-        number of non-finite entries of updates by key.
+        Even a finite gradient can make an update overflow. A parameter whose update overflows keeps its old value and
+        its old optimiser state. Returns the number of non-finite entries of updates by key.
         """
         self.stands_at = None
         # Dr.Jit makes the rate opaque, so a changing rate compiles no new kernel.
@@ -279,9 +281,9 @@ class Optimizer:
     def response(self, key: str) -> np.ndarray[Any, Any]:
         """Return the movement of each entry of the scene's value per unit of its gradient, as a flat array.
 
-        The movement is that of a step with a rate of 1 and the current moments. It is the sum over many steps, which
-        includes momentum. The next step is this movement times the schedule's factor and the parameter's rate (`rate`).
-        It is 0 if no step was taken.
+        The movement is that of a step with a learning rate of 1 and the current moments. The movement includes
+        momentum, because the response to a gradient is summed over many steps. The next step is this movement times the
+        schedule's factor and the parameter's rate (`rate`). It is 0 if no step was taken.
         """
         own, extra = self._own[key], self._own[key].state[key][3]
         value = np.array(dr.detach(own[key]), dtype=np.float64).ravel()
@@ -298,8 +300,8 @@ class Optimizer:
         return result if variable.smoother is None else result * variable.smoother.gain
 
     def squares(self, key: str) -> tuple[Any, float] | None:
-        """Return the running mean of the squared gradients, as the optimiser stores it, and its decay, or None if it
-        has none.
+        """Return the running mean of the squared gradients, as the optimiser stores the mean, and the mean's decay.
+        Return None if the optimiser stores no such mean.
         """
         own, extra = self._own[key], self._own[key].state[key][3]
         return (extra[2], own.beta_2) if isinstance(own, dropt.Adam) else None
@@ -316,9 +318,11 @@ class Optimizer:
         return self._rates[key]
 
     def first_step(self, key: str) -> float | None:
-        """Return the root mean square movement of the scene's current value by a step with the parameter's rate.
+        """Return the root mean square change of the scene's current value by one step with the parameter's learning
+        rate.
 
-        The larger of the movements upwards and downwards counts. Returns None if it depends on the gradient.
+        The larger of the movements upwards and downwards counts. Returns None if the step length depends on the
+        gradient.
         """
         if isinstance(self._own[key], dropt.SGD):
             return None
@@ -336,8 +340,8 @@ class Optimizer:
     def moments(self) -> dict[str, dict[str, Any]]:
         """Return the optimiser's data for each parameter besides its value.
 
-        The data are arrays in Dr.Jit's order. If there is a variable, they include it as `variable`. No step changes
-        these arrays, so they are not copied.
+        The data are arrays in Dr.Jit's order. If a parameter has a `Variable`, the data include the value of the
+        optimiser's variable as `variable`. No step changes these arrays, so they are not copied.
         """
         found = {}
         for key, own in self._own.items():
@@ -349,7 +353,7 @@ class Optimizer:
     def restore(
         self, values: Mapping[str, Any], units: Mapping[str, tuple[float, float]], moments: Mapping[str, Any]
     ) -> None:
-        """Continue from values of the scene, and from the results of `units` and `moments`."""
+        """Continue from stored values of the scene, and from earlier results of `units` and `moments`."""
         for key, own in self._own.items():
             kept = moments[key]
             if key in units:
@@ -379,7 +383,9 @@ def _leaf(value: Any) -> Any:
 
 
 def clamp(value: Any, bounds: tuple[float, float] | None) -> Any:
-    """Project `value` onto `bounds` (low, high) after an update. None, or an infinite side, sets no bound."""
+    """Project `value` onto `bounds` (low, high) after an update. Bounds of None, or an infinite bound on one side, set
+    no limit.
+    """
     return value if bounds is None else dr.clip(value, bounds[0], bounds[1])
 
 
@@ -396,8 +402,9 @@ def clamp_gradients(
 ) -> tuple[Clamped, dict[str, int], dict[str, dict[str, Any]]]:
     """Clamp the finite gradients of these parameters in place at `factor` (k) times their usual size.
 
-    `iterations` and `known` (SUMS) are the earlier iterations and sums of each parameter. Returns the effect with its
-    bias so far, and both of them updated. `iterations` itself is not changed.
+    `iterations` is the number of earlier iterations for each parameter. `known` has each parameter's earlier sums
+    (`SUMS`). Returns the clamp's effect, including the bias so far, and updated copies of `iterations` and `known`.
+    `iterations` itself is not changed.
     """
     after, sums = dict(iterations), {key: dict(each) for key, each in known.items()}
     counts, sizes = {}, {}

@@ -22,10 +22,10 @@ from reslrb_cli.errors import ConfigError
 class OwnLoss:
     """A user's loss: `loss(image, target)`, or `loss(image, target, weights)`.
 
-    Both images are (H, W, C). `weights` is None or has the same shape with a mean of 1. Without a parameter `weights`,
-    masked pixels are the same in both images, and the other weights must be equal. The function returns an array of
-    width 1, or a tensor of one entry. The file is loaded when the loss is first called or tried. For a function that
-    was passed in Python, errors are located by its name.
+    Both images are (H, W, C). `weights` is None or has the same shape with a mean of 1. If the function has no
+    parameter `weights`, masked pixels have equal values in both images. The weights of all unmasked pixels must then be
+    equal. The function returns an array of width 1, or a tensor of one entry. The file is loaded when the loss is first
+    called or tried. For a function that was passed in Python, errors are located by its name.
     """
 
     def __init__(self, config: Config, key: str, spec: Custom) -> None:

@@ -1,11 +1,13 @@
-"""Smooth steps: the optimiser's variable is rougher than the parameter by a Laplacian ("large steps").
+"""Smooth gradient steps ("large steps"). The parameter is a smoothed version of the optimiser's variable, and a
+Laplacian defines the smoothing.
 
     x = S v,   S = (1 - l^2 Δ)^-1,   dL/dv = S dL/dx            Nicolet, Jacobson and Jakob 2021, eq. 9 to 12
 
-S is symmetric, and a step of gradient descent is S^2 dL/dx. Details finer than l therefore move less, by the fourth
-power of their size over l. Refracting surfaces need this. Their light depends on the surface's second derivatives, so
-the curvature of a loss grows with the fourth power of the frequency. Without S, the finest ripple of the map limits the
-step. l is a fraction of the longer side, so it does not depend on the resolution.
+S is symmetric, and a step of gradient descent is S^2 dL/dx. A step therefore moves details finer than l less. The
+reduction is the fourth power of the detail's size divided by l. Refracting surfaces need this. The light from
+refracting surfaces depends on the surface's second derivatives. The curvature of a loss therefore grows with the fourth
+power of the spatial frequency. Without S, the finest ripple of the map limits the step. l is a fraction of the longer
+side, so it does not depend on the resolution.
 
     maps, textures      Δ by differences of neighbours, no flow through the edges: diagonal in the cosine transform
     vertices of a mesh  Δ of its graph, in units of its mean edge: a sparse LU decomposition, made once
@@ -30,7 +32,8 @@ Array = NDArray[np.float64]
 class Smoother:
     """S of one parameter and its inverse, on Dr.Jit arrays of the parameter's type.
 
-    S^2 responds to a gradient of one entry, also at this entry. `gain` is the mean of this response over the entries.
+    The diagonal of S^2 is each entry's response to a gradient of the entry alone. `gain` is the mean of this response
+    over the entries.
     """
 
     operator: MapOperator | MeshOperator
@@ -58,7 +61,7 @@ class Smoother:
 
 
 class MapOperator:
-    """S on textures and heightmaps (height, width, channels) with at least two texels. `length` is l."""
+    """S for textures and heightmaps (height, width, channels) with at least two texels. `length` is l."""
 
     def __init__(self, shape: tuple[int, ...], length: float) -> None:
         texels = length * max(shape[:2])  # l in texels, which are square
@@ -114,7 +117,9 @@ class MeshOperator:
         return self._spread(self._solve.solve(self._gathered(value) / self._sizes[:, None]), value)
 
     def adjoint(self, gradient: Array) -> Array:
-        """Return the gradient with respect to v, distributed over the vertices of each position."""
+        """Return the gradient with respect to v. Vertices at one position receive equal shares of the position's
+        gradient.
+        """
         return self._spread(self._solve.solve(self._gathered(gradient)) / self._sizes[:, None], gradient)
 
     def roughen(self, value: Array) -> Array:
@@ -122,7 +127,7 @@ class MeshOperator:
         return self._spread(self._matrix @ (self._gathered(value) / self._sizes[:, None]), value)
 
     def _gathered(self, value: Array) -> Array:
-        """Return the sums over the vertices of each position."""
+        """Return, for each distinct position, the sum of the values over all vertices at the position."""
         total = np.zeros((len(self._sizes), 3))
         np.add.at(total, self._one, value.reshape(-1, 3))
         return total

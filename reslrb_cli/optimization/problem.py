@@ -36,8 +36,9 @@ from reslrb_cli.seeds import seed
 def saved_spp(problem: Problem, between: bool) -> int:
     """Return the samples per pixel of the initial and the final image.
 
-    It is `run.final_spp`, or the next larger number that passes divide. Images `between` only show progress, and have a
-    multiple of the run's own number.
+    The sample count is `run.final_spp`, or the next larger number that the samples per pass divide. Images between the
+    first and the last iteration (`between`) only show progress. The sample count of these images is a multiple of
+    `run.spp`.
     """
     run, unit = problem.config.run, problem.samples_per_pass or 1
     if between:
@@ -54,7 +55,7 @@ class Problem:
 
     `truth` has the known true values, with textures in the resolution of the scene file. `masks` has the entries of
     these parameters that light and sensor reach, as booleans. A mask is (H, W) for textures, and otherwise has the
-    parameter's shape. `quantities` are those of the parameters (`errors.quantity`).
+    parameter's shape. `quantities` has the physical quantity of each parameter (`errors.quantity`).
     """
 
     config: Config
@@ -102,10 +103,10 @@ class Problem:
             view.follow(self.scene)
 
     def afresh(self, values: Mapping[str, Array]) -> Problem:
-        """Return the problem before its first iteration with these values, in the form of `values`, and without learned
-        state.
+        """Return the problem as before its first iteration, with the given parameter values and without learned state.
+        The argument `values` has the form of the result of the method `values`.
 
-        Both problems share a scene, which then has these values.
+        The original problem and the returned problem share one scene. The scene then has the given values.
         """
         self.selection.set_arrays(values)
         integrator = self.integrator
@@ -118,7 +119,7 @@ class Problem:
         return fresh
 
     def gradients(self) -> dict[str, Any]:
-        """Return the gradient of each parameter that steps have accumulated since it was last cleared."""
+        """Return each parameter's gradient, as steps have accumulated the gradient since the last clearing."""
         self.selection.collect()
         return {key: self.optimizer.gradient(key) for key in self.selection.keys}
 
@@ -207,7 +208,9 @@ class Problem:
 
     @property
     def measured_s(self) -> float:
-        """Seconds that this run has spent on decisions by measurement, without those of earlier runs."""
+        """Seconds that this run has spent on measurements that decide settings. The time of earlier runs does not
+        count.
+        """
         made = (self.sides, self.guided, self.sequence, self.pixels)
         return sum(each.measure_s + each.compile_s for each in made if each is not None and not each.cached)
 
@@ -247,7 +250,9 @@ class Problem:
         return float(np.mean(losses))
 
     def on_samples(self, view: View) -> OnSamples | None:
-        """Return a callback for the samples of a view's step. A recovered exposure gets its gradient from them."""
+        """Return a callback that receives the samples' image and dL/dI in a view's step. A recovered exposure gets its
+        gradient from the samples of the view's step.
+        """
         key = view.exposure.key
         if not key:
             return None
@@ -305,8 +310,8 @@ def make_optimizer(config: Config, selection: Selection) -> Optimizer:
 
 
 def _handed(value: Any, array: Array) -> Any:
-    """Return an array as a Dr.Jit array like `value`. It is a sum, because kernels depend on the alignment of NumPy's
-    memory.
+    """Return an array as a Dr.Jit array like `value`. The Dr.Jit array is the sum of the array and 0, because kernels
+    depend on the alignment of NumPy's memory.
     """
     return type(value)(np.ascontiguousarray(array, dtype=np.float32)) + dr.opaque(mi.Float, 0)
 

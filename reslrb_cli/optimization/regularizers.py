@@ -48,7 +48,8 @@ class Span:
         return self.unit / count
 
     def weights(self, count: int, first: float, last: float) -> Array:
-        """Return the length that each of the nodes first, first + 1, ..., last (in texels of `count`) represents.
+        """Return the length that each node represents. The nodes are first, first + 1, ..., last, in texels of an axis
+        with `count` texels.
 
         Neighbouring nodes share the distance between them evenly, and the outermost nodes get the rest. The sum is the
         length of the surface.
@@ -64,8 +65,8 @@ Spans = tuple[Span, Span]
 
 
 def make_cost(regularizer: Regularizer, spans: Spans) -> Cost:
-    """Return the cost of a map (H, W, C): `weight` times the integral. Raises TypeError for a regularizer of other
-    parameters.
+    """Return the cost of a map (H, W, C): `weight` times the integral. Raises TypeError for a regularizer that does not
+    apply to maps.
     """
     if isinstance(regularizer, Curvature):
         limit = 1 / regularizer.radius
@@ -86,7 +87,8 @@ def make_cost(regularizer: Regularizer, spans: Spans) -> Cost:
 
 @dataclass(frozen=True)
 class Plate:
-    """Plate between two free faces, given by maps h and g of heights outwards. g belongs to the parameter `other`.
+    """Plate between two free faces. The maps h and g are the outward heights of the two faces. g belongs to the
+    parameter `other`.
 
     `across` (texels of h, texels of g) interpolates g at the texels of h, and `back` interpolates h at the texels of g.
     """
@@ -110,7 +112,9 @@ class Plate:
         return np.asarray(self.settings.thickness + h + there.reshape(h.shape))
 
     def held(self, h: Array, g: Array) -> tuple[Array, Array]:
-        """Return h and g, raised equally where the plate is thinner than `thinnest`, at the texels of both maps."""
+        """Return h and g after raising both equally where the plate is thinner than `thinnest`. The function tests the
+        texels of both maps.
+        """
         least, thickness = self.settings.thinnest, self.settings.thickness
         h = h + np.maximum(least - self.thickness(h, g), 0) / 2
         between = thickness + g + (self.back @ h.ravel()).reshape(g.shape)
@@ -216,7 +220,9 @@ _STENCILS: tuple[tuple[dict[tuple[int, int], float], int, int], ...] = (
 
 
 def _inner(function: Callable[[list[Array]], tuple[Array, list[Array]]], spans: Spans) -> Cost:
-    """Return the integral of a function of hx, hy, hxx, hxy and hyy, which also returns its derivatives."""
+    """Return the integral of a function of a map's derivatives hx, hy, hxx, hxy and hyy. The function also returns its
+    own derivatives.
+    """
 
     def cost(h: Array) -> tuple[float, Array]:
         gradient = np.zeros_like(h)
@@ -276,11 +282,11 @@ def _hollow(d: list[Array], limit: float) -> tuple[Array, list[Array]]:
 
 
 def mesh_laplacian(positions: Array, faces: Array) -> tuple[csr_matrix, Array]:
-    """Return L and 1/A of a mesh with these positions (N, 3) and faces (M, 3). At the rim, and without an area, 1/A is
-    0.
+    """Return L and 1/A of a mesh with these positions (N, 3) and faces (M, 3). At vertices on the mesh's rim, and at
+    vertices without an area, 1/A is 0.
 
     Vertices at the same position count as one. A mesh that is cut open along texture seams therefore has no rim there.
-    Rows and columns are those of the first of these vertices.
+    Vertices at one position use the row and column of the first vertex at the position.
     """
     _, first, same = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     joined = first[same.ravel()][faces]
@@ -320,7 +326,7 @@ def mesh_cost(weight: float, positions: Array, faces: Array) -> Cost:
 def spans_of(positions: Array, texcoords: Array) -> Spans:
     """Return the axes of a map over a mesh with these vertex positions (N, 3) and texture coordinates (N, 2).
 
-    Units are those of the best plane map from texture coordinates to positions.
+    The best plane map from texture coordinates to positions defines the unit of each axis.
     """
     slopes, _ = _laid(positions, texcoords)
     low, high = np.clip(texcoords.min(axis=0), 0, 1), np.clip(texcoords.max(axis=0), 0, 1)

@@ -1,8 +1,9 @@
 """Results of a run: its best parameters, whether its loss fell, and values and errors at start and end.
 
 `Best` has the best parameters so far. The loss of an iteration is mostly noise, so the smallest loss would be the
-luckiest one. If views are held out, the best parameters have the smallest held-out loss, which always uses the same
-samples. Otherwise they are the parameters at the end of WINDOW iterations, namely those with the smallest mean loss.
+luckiest one. With held-out views, the best parameters have the smallest held-out loss. The held-out loss always uses
+the same samples. Without held-out views, the best parameters come from the end of WINDOW consecutive iterations. Among
+all windows, the one with the smallest mean loss counts.
 
 `got_worse` tells whether an error, which is known exactly, ended above its start. `find_trend` does the same for the
 loss.
@@ -73,10 +74,11 @@ WORSE, WORSE_IF_SHORT = 0.01, 0.1
 
 
 def got_worse(errors: Sequence[float], final: float) -> bool:
-    """Whether an error ended above its start: both the last error, `final`, and all errors of the last tenth before it.
+    """True if a parameter's error ended above its start. Both the last error, `final`, and all errors of the last tenth
+    before `final` must be above the start.
 
     Errors are known exactly, but fluctuate with the noise of the gradients. A short run must therefore end well above
-    its start.
+    its initial error to count as worse.
     """
     if not errors:
         return False
@@ -99,7 +101,7 @@ class Images:
 
 
 class Results:
-    """Results of one run of `problem`, whose parameters must have their initial values at construction.
+    """Results of one run of `problem`. The parameters must have their initial values when the object is constructed.
 
     Call `add` for each iteration, and `end` afterwards. `to_json` works at any time. Unknown values are null.
     """

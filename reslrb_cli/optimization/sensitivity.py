@@ -10,13 +10,14 @@ first step, for all entries of one parameter x. I(x) is the image at common rand
     curvature = (L(I + D) - 2 L(I) + L(I - D)) / h²,           L the loss of an image
 
 `change` is the relative change of the image per unit of the parameter. `curvature` is the Gauss-Newton curvature, where
-D is scaled up to the resolution of single precision. `length` is the movement of the parameter that would explain image
-or target, by least squares over the pixels that it changes. For the only light of a scene, this is its intensity. For a
-wall, it is the albedo, independent of the wall's share of the picture. h is chosen so that the image changes by about 3
-%. Then neither rounding nor curvature dominates.
+D is scaled up to the resolution of single precision. `length` is the change of the parameter that would explain the
+image or the target. The change is a least-squares fit over the pixels that the parameter affects. For the only light of
+a scene, this is its intensity. For a wall, `length` is the albedo, regardless of the wall's share of the picture. h is
+chosen so that the image changes by about 3 %. With an image change of about 3 %, neither rounding nor curvature
+dominates the differences.
 
-Units for one common learning rate (`rescale`): step lengths from `Sensitivity.length` make all parameters equally fast.
-Gradients are divided by the root mean square of a sample, so Adam's absolute epsilon has no effect.
+`rescale` measures units for one common learning rate. Step lengths from `Sensitivity.length` make all parameters move
+equally fast. Gradients are divided by the root mean square of a sample, so Adam's absolute epsilon has no effect.
 
 Units for gradient descent (`measure_curvatures`, `scale: curvature`): lambda is the largest curvature of the loss in
 the optimiser's variable v. Power iteration computes it from differences of gradients at common random numbers. h
@@ -24,9 +25,9 @@ changes the image by about 3 %.
 
     H d = (g(v + h d) - g(v - h d)) / (2 h),   d <- H d / |H d|,   lambda = |H d|
 
-The gradient is divided by lambda and by the number of parameters. If the blocks of a positive matrix have norm 1, its
-norm is at most their number. A rate of 1 is Newton's step along the steepest direction. Descent converges below a rate
-of 2, while the curvature is that of the start.
+The gradient is divided by lambda and by the number of parameters. If the diagonal blocks of a positive matrix have norm
+1, the matrix norm is at most the number of blocks. A rate of 1 is Newton's step along the steepest direction. Gradient
+descent converges for learning rates below 2, while the curvature stays as at the start.
 """
 
 from __future__ import annotations
@@ -77,12 +78,12 @@ def take_gradient(problem: Problem) -> dict[str, Array]:
 
 
 def finite(values: Array) -> Array:
-    """Return the values, with 0 for those that are not finite."""
+    """Return the values, with non-finite values replaced by 0."""
     return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def unrecorded(integrator: Any) -> Any:
-    """Return the integrator without recordings. For a few steps, a recording does not pay."""
+    """Return the integrator without recordings. For only a few steps, a recording costs more than it saves."""
     if not isinstance(integrator, LightTracer):
         return integrator
     return integrator.with_options(samples_per_pass=integrator.samples_per_pass, freeze=False)
@@ -138,7 +139,7 @@ class Conditioning:
 
 
 def measure_conditioning(problem: Problem, samples: int) -> Conditioning:
-    """Measure every parameter of `problem` at its current value. The problem needs its targets, and `samples` is at
+    """Measure every parameter of `problem` at its current value. The problem needs its targets. `samples` must be at
     least 2.
     """
     run = problem.config.run
@@ -211,7 +212,9 @@ def _probe(
 
 
 def _second_difference(problem: Problem, base: Sequence[Array], difference: Sequence[Array], factor: float) -> float:
-    """Return L(I + D) - 2 L(I) + L(I - D), over the views by their shares. D is `factor` times the difference."""
+    """Return L(I + D) - 2 L(I) + L(I - D), summed over the views. Each view is weighted by its share of the loss. D is
+    `factor` times the difference.
+    """
     total = 0.0
     for image, change, view in zip(base, difference, problem.trained, strict=True):
         for side, times in ((1, 1), (0, -2), (-1, 1)):
@@ -235,7 +238,8 @@ def see_images(problem: Problem, spp: int | None = None, round: int = 0, purpose
 
 
 def rescale(problem: Problem) -> list[Scaled]:
-    """Measure all parameters and return the result. The optimiser then moves each parameter in units of it.
+    """Measure all parameters and return the result. The optimiser then moves each parameter in units of the measured
+    length.
 
     A parameter without an effect on the image keeps its units.
     """
@@ -265,8 +269,8 @@ POWER_ITERATIONS = 8
 
 
 def measure_curvatures(problem: Problem) -> list[Scaled]:
-    """Measure the steepest curvature of all parameters and return it. Gradient descent then moves each parameter in
-    units of it.
+    """Measure the steepest curvature of all parameters and return it. Gradient descent then scales each parameter's
+    steps by the inverse of the measured curvature.
 
     A parameter without an effect on the image keeps its units.
     """
@@ -327,7 +331,9 @@ def _steepest(problem: Problem, key: str, v: Any, gradient: Array, base: Sequenc
 
 
 def _gradient_at(problem: Problem, key: str, v: Any) -> Array:
-    """Return dL/dv as a flat array, for the optimiser's variable `v` of `key`, always from the same samples."""
+    """Return dL/dv as a flat array, at the value `v` of the optimiser's variable for `key`. Every call uses the same
+    samples.
+    """
     optimizer = problem.optimizer
     variable = optimizer.variable(key)
     optimizer.set_value(key, variable.to_scene(v))
@@ -345,7 +351,9 @@ def _like(value: Any, row: Array) -> Any:
 
 
 def own_length(transform: Transform | None, bounds: Bounds, value: Any, length: float) -> float:
-    """Convert `length`, a length of the scene's `value`, to the optimiser's variable, as a mean over the entries."""
+    """Convert `length` from the unit of the scene's `value` to the unit of the optimiser's variable. The result is a
+    mean over the entries.
+    """
     if transform is None:
         return length
     low, high = bounds or (-math.inf, math.inf)
@@ -359,7 +367,8 @@ def own_length(transform: Transform | None, bounds: Bounds, value: Any, length: 
 
 
 def step_line(row: Scaled, transform: str, learning_rate: float) -> str:
-    """Return a line for the user about one parameter. `transform` and `learning_rate` are those of its configuration.
+    """Return a line for the user about one parameter. `transform` and `learning_rate` come from the parameter's
+    configuration.
 
     A step is in units of the optimiser's variable. For the first step, the line also has the movement of the parameter.
     """

@@ -9,13 +9,14 @@ with respect to the parameters.
 
     I = sum of w_s I_s,    gradient = sum over s of w_s J_s^T dL/dI
 
-With one round, each share takes dL/dI from its own samples, as `run.adjoint` says. With two rounds (`others`), each
-share takes dL/dI at the mean image of the other shares, (I - w_s I_s) / (1 - w_s). No path then uses a delta that
-contains it. For an L2 loss, this is the sum over all pairs of different shares, and unbiased. Images and gradients are
-added in the order of the shards, in double precision.
+With one round, each share computes dL/dI from its own samples, as `run.adjoint` specifies. With two rounds (`others`),
+each share evaluates dL/dI at the mean image of the other shares, (I - w_s I_s) / (1 - w_s). No path then uses a dL/dI
+to which the path itself contributes. For an L2 loss, the gradient with two rounds is the sum over all pairs of
+different shares. The gradient is unbiased. Images and gradients are added in the order of the shards, in double
+precision.
 
-Tables of guided emission do not change while shards are computed. If an update is due, they learn once per step from
-separate samples, with dL/dI at the mean image of all shards.
+Tables of guided emission do not change while shards are computed. If a table update is due, the tables learn once per
+step from separate samples. The update uses dL/dI at the mean image of all shards.
 """
 
 from __future__ import annotations
@@ -76,8 +77,9 @@ class Task:
 class ShardGradient:
     """Result of a shard.
 
-    `gradients` has the gradient of each parameter (float32). For each part there are its loss, the refused entries of
-    dL/dI (count, flat index of the first, shape) and, if requested, the image, (H, W, C) or (2, H, W, C) with halves.
+    `gradients` has the gradient of each parameter (float32). For each part, the result has the loss and the refused
+    entries of dL/dI. Refused entries are given by their count, the flat index of the first, and the shape. If
+    requested, the result also has the part's image, (H, W, C) or (2, H, W, C) with halves.
     """
 
     gradients: dict[str, Array]
@@ -127,7 +129,8 @@ def shard_image(problem: Problem, task: Task) -> Array:
 
 
 def shard_gradient(problem: Problem, task: Task, delta: Array | None = None) -> ShardGradient:
-    """Return the gradient of a shard, with its own dL/dI or, for one view, with `delta` in the shape of `shard_image`.
+    """Return the gradient of a shard. The shard computes its own dL/dI, or a shard of one view uses `delta` in the
+    shape of `shard_image`.
 
     Previously accumulated gradients are lost.
     """
@@ -276,7 +279,7 @@ def _mean(found: Sum) -> mi.TensorXf:
 
 
 def _delta(problem: Problem, task: Task, image: Array, means: dict[int, Sum], refused: dict[int, Refused]) -> Array:
-    """Return dL/dI for a share of a view, at the mean image of the other shares."""
+    """Return dL/dI for one share of a view, evaluated at the mean image of the view's other shares."""
     [part] = task.parts
     view = next(view for view in problem.views if view.sensor == part.sensor)
     others = _tensor(means[part.sensor].without(image, task.weight))
@@ -285,7 +288,7 @@ def _delta(problem: Problem, task: Task, image: Array, means: dict[int, Sum], re
 
 
 def _count(refused: Refused, count: int, first: int, shape: tuple[int, ...]) -> None:
-    """Add the refused entries of a shard. The first entry is that of the first shard with refused entries."""
+    """Add the refused entries of a shard. The first refused entry comes from the first shard with refused entries."""
     if count and int(refused.first[0]) == NONE:
         refused.first, refused.shape = dr.opaque(mi.UInt32, first), shape
     refused.count = dr.opaque(mi.UInt32, int(refused.count[0]) + count)
@@ -295,14 +298,14 @@ def _count(refused: Refused, count: int, first: int, shape: tuple[int, ...]) -> 
 
 
 def _due(problem: Problem, guiding: Guiding, iteration: int) -> list[int]:
-    """Count the iteration, and return the sensors whose tables learn in it."""
+    """Count the iteration for the guiding tables, and return the sensors whose tables learn in the iteration."""
     sensors = [view.sensor for view, _ in problem.drawn(iteration)]
     problem.integrator.plan(problem.scene, problem.scene.sensors()[sensors[0]])  # creates the grid
     return [sensor for sensor in sensors if guiding.due(sensor)]
 
 
 def _teach(problem: Problem, iteration: int, view: View, image: Sum) -> None:
-    """Update the tables of a view, with dL/dI at its mean image."""
+    """Update the guiding tables of a view, with dL/dI at the view's mean image."""
     config = problem.config
     _, gradient = derivative_of(view.objective, _mean(image), Refused())
     sensor, own = problem.scene.sensors()[view.sensor], seed(config.run.seed, iteration, view.sensor, "image")

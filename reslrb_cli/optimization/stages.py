@@ -1,15 +1,16 @@
 """Stages of a run (`run.stages`): the problem of each iteration, and the transition from one stage to the next.
 
-A stage with its own resolution or film has its own problem. It is made from the run's problem (`at_stage`), with
-resampled values. The last stage is the run as configured, with the run's own problem. When the problem changes, the
-optimiser restarts, because its moments belong to other maps, and the suitable step length depends on the resolution.
+A stage with its own resolution or film has its own problem. The stage's own problem is made from the run's problem
+(`at_stage`), with resampled values. The last stage is the run as configured, with the run's own problem. When the
+problem changes, the optimiser restarts. The old moments belong to other maps, and the suitable step length depends on
+the resolution.
 
-A coarse stage adds the change of its own values c to the run's values x. R and P convert between the two resolutions,
-and x0 are the run's values at the start of the stage.
+A coarse stage adds the change of the stage's own values c to the run's values x. R converts from the run's resolution
+to the stage's resolution, and P converts back. x0 are the run's values at the start of the stage.
 
     x = x0 + P (c - R x0)
 
-Details too fine for the stage therefore stay unchanged (Brandt 1977, the full approximation scheme).
+Details too fine for the stage therefore stay unchanged. The method is the full approximation scheme (Brandt 1977).
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ Array = np.ndarray[Any, Any]
 
 
 class Stages:
-    """Problems of one run's stages. Besides the run's own problem `whole`, only one is kept at a time.
+    """Problems of one run's stages. Only one stage problem is kept at a time, besides the run's own problem `whole`.
 
     `State.stage` is the stage of a state. Before the first iteration, a state belongs to the run's own problem.
     """
@@ -64,7 +65,9 @@ class Stages:
         return self.whole.config.stage(number).grain == self.whole.config.stage(self.last).grain
 
     def at(self, number: int) -> Problem:
-        """Return the problem of a stage. If it was not the current one, it gets the values of `whole`."""
+        """Return the problem of a stage. If the stage's problem was not current before the call, the problem gets the
+        values of `whole`.
+        """
         if number == self._number:
             return self._now
         if self.is_whole(number):

@@ -7,7 +7,7 @@
     `begin_as`, `decide_as` and `reach_as` assemble a problem from it.
 
 Dr.Jit and Mitsuba change some data in place: the parameters of the scene, the optimiser's leaves, and the tables of
-guided emission. These data follow from a state, and `put` writes them.
+guided emission. A state determines all data that are changed in place. `put` writes the data of a state.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from reslrb_cli.records.tree import PASSING, Array, Arrays, Stored, entry, expec
 
 @dataclass(frozen=True)
 class State:
-    """State at the start of an iteration. For a new run, it is the default with `standing`.
+    """State at the start of an iteration. For a new run, `standing` without a state returns the initial state.
 
     - `iteration` is the number of finished iterations. `standstill` is the number of the last consecutive iterations in
         which something was skipped.
@@ -112,7 +112,8 @@ def put(problem: Problem, state: State) -> str | None:
 def load(problem: Problem, stored: Stored, whole: Problem) -> State:
     """Set `problem` to the stored state and return the state. `whole` is the run's own problem.
 
-    `problem` is the problem of the state's stage. Raises ConfigError if the state belongs to another experiment.
+    `problem` is the problem that belongs to the stored state's stage. Raises ConfigError if the state belongs to
+    another experiment.
     """
     told, optimizer, keys = stored.read(State), problem.optimizer, problem.selection.keys
     for key, (length, _) in told.units.items():
@@ -137,7 +138,7 @@ def guiding_of(problem: Problem) -> Guiding | None:
 def noted_of(problem: Problem) -> dict[str, Array]:
     """Return the recorded densities of camera paths over the pixels (H, W), by the number of the sensor.
 
-    They are the argument of `LightTracer.shared_out`.
+    The recorded densities are the argument of `LightTracer.shared_out`.
     """
     given = problem.integrator.preparation.given if isinstance(problem.integrator, Reslrb) else {}
     return {str(number): density for number, density in given.items()}
@@ -235,7 +236,7 @@ def decide_as(problem: Problem, stored: Stored) -> Problem:
 
 
 def reach_as(problem: Problem, stored: Stored) -> Problem:
-    """Restore the entries that light and sensor reach, for parameters with known true values."""
+    """Restore the masks of the entries that light and sensor reach, for parameters with known true values."""
     shapes = {key: problem.selection.array(key).shape for key in problem.truth}
     asked = {key: expected(shape[:2] if len(shape) == 3 else shape) for key, shape in shapes.items()}
     return replace(problem, masks={key: stored.take(f"mask/{key}", mask) for key, mask in asked.items()})

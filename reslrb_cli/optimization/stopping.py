@@ -3,8 +3,9 @@
 A flat loss ends a run early (`run.stop`) or lowers its learning rate (`optimizer.schedule: plateau`). The losses are
 divided into windows of `patience` iterations, and tested at the end of each window. A loss is flat if the test shows
 that it falls by less than `relative` per window (`trend.stands`). If views are held out, the held-out loss is tested.
-It has fewer values, always from the same samples. Windows start after the stages of `run.stages`, and again after the
-rate has been lowered. A run with a plateau ends only at its lowest rate.
+The held-out loss has fewer values than the training loss. All held-out values use the same samples. Windows start after
+the stages of `run.stages`, and again after the rate has been lowered. A run with a plateau ends only at its lowest
+rate.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ FACTOR = 0.5
 
 
 def lowered(optimizer: AnyOptimizer, drops: int) -> float:
-    """Return the factor of the rate after this number of drops of a plateau; 1 with other schedules."""
+    """Return the factor on the learning rate after `drops` reductions at a plateau. The factor is 1 with other
+    schedules.
+    """
     if optimizer.schedule != "plateau":
         return 1.0
     return max(FACTOR**drops, optimizer.final_fraction)
@@ -36,8 +39,8 @@ OUT_OF_TIME = "the time is up"
 
 
 def time_share(limit_s: float | None, state: State) -> float:
-    """Return the share of a run's time that has passed since its first iteration, which compiles, or 0 without a
-    limit.
+    """Return the elapsed share of a run's time, or 0 without a limit. The first iteration does not count, because it
+    compiles kernels.
     """
     if limit_s is None or not state.iteration:
         return 0.0
@@ -62,13 +65,15 @@ class Watch:
         self._values: dict[int, float] = {}
 
     def add(self, record: Record) -> None:
-        """Add an iteration, including those of a resumed run."""
+        """Add the record of one iteration. Earlier iterations of a resumed run must be added, too."""
         loss = record.held_out if self.held_out else record.loss
         if loss is not None and math.isfinite(loss):
             self._values[record.iteration] = loss
 
     def after(self, state: State, record: Record) -> State:
-        """Add the record, and return the state after the iteration with the current decisions."""
+        """Add the record. Return the state after the iteration, with the current decisions about stopping and the
+        learning rate.
+        """
         self.add(record)
         stop, optimizer, done = self.config.run.stop, self.config.optimizer, state.iteration
         began = max(self._first, state.since)
@@ -86,8 +91,8 @@ class Watch:
         return math.ceil(stages[-1].until * iterations) + 1 if stages else 0
 
     def _stands(self, asked: StopRule, began: int, done: int) -> str:
-        """Return a message about a flat loss after `done` iterations. It is "" if the loss is not flat, or if no window
-        ends.
+        """Return a message about a flat loss after `done` iterations. The message is "" if the loss is not flat, or if
+        no window ends after `done` iterations.
         """
         span = asked.patience
         if (done - began) % span:

@@ -1,7 +1,7 @@
 """Target images, and the pixels that a view's loss excludes.
 
-Excluded pixels are counted by kind, and the others have weights (`mask_of`). Images are read from files, or rendered
-with the true values of the parameters (`make_targets`).
+Excluded pixels are counted for each kind of exclusion. All other pixels have weights (`mask_of`). Images are read from
+files, or rendered with the true values of the parameters (`make_targets`).
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ WORDS = {
 def mask_of(config: Config, wanted: Wanted, scene: mi.Scene, photo: Photo | None, lacking: bool) -> Masked:
     """Find the pixels of a view that its mask excludes.
 
-    `photo` is the file of the target, or None for a rendered target. `lacking` is true if only one of target and image
-    contains the light that light paths cannot find. Raises ConfigError for a wrong file of weights.
+    `photo` is the file of the target, or None for a rendered target. `lacking` is true if the light that light paths
+    cannot find is in the target or in the image, but not in both. Raises ConfigError for a wrong file of weights.
     """
     mask, sensor, found = wanted.mask, scene.sensors()[wanted.sensor], Masked()
     width, height = (int(n) for n in sensor.film().crop_size())
@@ -131,7 +131,9 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
 
 
 def _say_few(remarks: Sequence[str], say: Callable[[str], None]) -> None:
-    """Pass remarks on views to `say`: if there are many, only the first ones and the number of the others."""
+    """Pass remarks on views to `say`. If there are many remarks, pass only the first ones and the number of the
+    remaining remarks.
+    """
     for line in remarks[:FEW_REMARKS]:
         say(line)
     if len(remarks) > FEW_REMARKS:
@@ -139,7 +141,9 @@ def _say_few(remarks: Sequence[str], say: Callable[[str], None]) -> None:
 
 
 def _check_light(problem: Problem, say: Callable[[str], None]) -> None:
-    """Raise ConfigError if all targets are black. If only some are black, name them by `say`."""
+    """Raise ConfigError if all targets are black. If only some targets are black, report their sensors through
+    `say`.
+    """
     black = [view.sensor for view in problem.views if not np.any(np.array(view.target))]
     if not black:
         return

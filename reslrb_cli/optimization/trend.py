@@ -2,16 +2,18 @@
 
 Losses of iterations have heavy tails: one bright path can multiply a loss by ten. No test therefore uses a plain mean.
 
-`stands` proves that a loss is flat, which is more than not detecting a fall. A window of iterations has one level, its
-interquartile mean (`levels_of`). A line through the levels of the last k windows has a slope, whose standard error has
-k - 2 degrees of freedom. The loss is flat if the upper bound for the fall per window is below `relative`. The standard
-error comes from the spread of the levels, so losses may be correlated over less than a window.
+`stands` proves that a loss is flat. A proof is stronger than a test that merely detects no fall. Each window of
+iterations has one level, which is the interquartile mean of the window's losses (`levels_of`). A line through the
+levels of the last k windows has a slope, whose standard error has k - 2 degrees of freedom. The loss is flat if the
+upper bound for the fall per window is below `relative`. The standard error comes from the spread of the levels. The
+losses may therefore be correlated over less than a window.
 
 The test is repeated after every window, for several k, and a run stops at the first success. The j-th test therefore
-has the share 2 / (j (j - 1)) of `CHANCE`, in equal parts for its k. The shares sum to 1 from j = 3 on. At most 5 % of
-runs stop although their loss falls by `relative` per window, however long they are.
+uses the share 2 / (j (j - 1)) of `CHANCE`. The tested values of k divide the share equally. The shares sum to 1 from j
+= 3 on. At most 5 % of runs stop although their loss falls by `relative` per window, for runs of any length.
 
-`find_trend` tests the ranks of all losses, in ten parts (Conover and Iman 1981), by the same line.
+`find_trend` tests the ranks of all losses (Conover and Iman 1981). The test fits a line to ten parts of the series, as
+in `stands`.
 
 - It rose, or fell, if the line does, or if the last tenth of the iterations is significantly on that side of the first
     tenth. Both need the levels of these tenths to agree.
@@ -78,8 +80,8 @@ class Change(str, enum.Enum):
 
 @dataclass(frozen=True)
 class Trend:
-    """Level of a series at its start and at its end, and the change in its second half alone (None if it is too
-    short).
+    """Level of a series at its start and at its end. `late` is the change in the second half alone, or None if the half
+    is too short.
     """
 
     start: Level
@@ -120,7 +122,8 @@ def find_trend(values: Sequence[float]) -> Trend | None:
 
 
 def stands(levels: Array, relative: float, number: int) -> Array:
-    """Return for each series of levels (..., J) the number of last windows over which it is flat, or 0.
+    """Return the number of last windows over which each series of levels (..., J) is flat. The number is 0 for a series
+    that is not flat.
 
     There is one level per window. A series is flat if its fall from one window to the next is significantly less than
     the share `relative`. `number` is the number of windows of the run so far, each of which was tested.

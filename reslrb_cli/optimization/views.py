@@ -90,8 +90,9 @@ class Exposure:
 class Wanted:
     """Settings of the view through `sensor`: the file of its target (None for a rendered one), and its mask.
 
-    `file_key` and `mask_key` are their places in the configuration. `exposure` is a number, or the settings of its
-    recovery, with its key. `part` is the view's weight in the loss, relative to the others.
+    `file_key` and `mask_key` are their places in the configuration. `exposure` is a number, or names how the run
+    recovers the exposure. `exposure_key` is the key of the recovered exposure. `part` is the view's weight in the loss,
+    relative to the others.
     """
 
     sensor: int = 0
@@ -162,7 +163,9 @@ def _held_out(config: Config, scene: mi.Scene, sensors: list[int]) -> set[int]:
 
 
 def _view_specs(config: Config, sensors: list[int]) -> list[ViewSpec]:
-    """Return the settings of each view: `views`, or those of `target` for the scene's sensor or cameras."""
+    """Return the settings of each view. The source is `views`, if configured. Otherwise, `target` gives the settings
+    for the scene's sensor or cameras.
+    """
     if config.views is not None:
         return config.views
     return [ViewSpec.model_construct(sensor=sensor, target=config.target.file) for sensor in sensors]
@@ -173,7 +176,8 @@ class Masked:
     """Masked pixels of one view, boolean (H, W) by kind. `left_out` has the excluded pixels. A pixel may have several
     kinds.
 
-    `weights` (H, W) come from a file, or are None without one. `stay` has the pixels of kinds that are only counted.
+    `weights` (H, W) come from a weights file. Without such a file, `weights` is None. `stay` counts the pixels of kinds
+    that are reported but not excluded.
     """
 
     left_out: dict[str, Array] = field(default_factory=dict)
@@ -231,7 +235,9 @@ class View:
         return self.made
 
     def see(self, target: Array, weights: Array | None = None) -> None:
-        """Set a target (H, W, C). It must be finite where its weights (H, W) are not 0. Excluded entries become 0."""
+        """Set a target (H, W, C). The target must be finite wherever its weights (H, W) are not 0. Excluded entries
+        become 0.
+        """
         if weights is not None and not np.all(weights == 1):
             target = np.where(np.isfinite(target), target, 0)
         self.made = to_tensor(target)
@@ -256,12 +262,12 @@ class View:
     def compare(self, image: mi.TensorXf) -> mi.Float:
         """Return the loss of an image, of width 1, attached. Alpha is dropped, and the view's exposure is applied.
 
-        The image is (H, W, C), or (2, H, W, C) with two halves of its samples, which `fitted` uses.
+        The image has the shape (H, W, C), or (2, H, W, C) for two halves of its samples. `fitted` uses the two halves.
         """
         return self.judge(self.exposure.applied(first_channels(image, self.target.shape[2])))
 
     def judge(self, image: mi.TensorXf) -> mi.Float:
-        """Return the loss of an image with its exposure applied, and the target's channels."""
+        """Return the loss of an image. The exposure is already applied, and the image has the target's channels."""
         target = self.target
         loss = functools.partial(fitted, self.loss, across=self.across) if self.fits else self.loss
         if not self.fits:
@@ -293,8 +299,8 @@ class View:
         return float(best_scale(halves_of(exposed), self.target, self.weights)[0])
 
     def exposed(self, seen: mi.TensorXf) -> tuple[Array, Array, float]:
-        """Return an image as in `compare` (H, W, C), the same image with the exposure of its target, and its
-        `scale`.
+        """Return three results for an image as in `compare`. The results are the image (H, W, C), the image with the
+        exposure of its target, and the image's `scale`.
         """
         image, scale = np.array(whole_of(seen)), self.scale(seen)
         exposure = Exposure(self.exposure.fixed * scale) if self.fits else self.exposure

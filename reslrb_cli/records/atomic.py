@@ -59,7 +59,7 @@ def unfinished_folder(parent: Path, lock: bool = True) -> Iterator[Path]:
     """Yield a new folder in `parent`. Unless the block renames it, the folder is removed at the end.
 
     The folder is locked, because other processes remove old unlocked folders. With `lock=False`, the block must lock
-    it.
+    the folder itself.
     """
     path = parent / f"{FOLDER_PREFIX}{secrets.token_hex(8)}"
     unfinished.add(path)

@@ -69,7 +69,8 @@ def save_checkpoint(
     """Write the state after `iteration` updates into `folder`, atomically and durably.
 
     The entries are `iteration`, `parameter/<key>`, `others` by name, and `values` as JSON. The earlier state becomes
-    `previous.npz`, unless `name` is another file name. Raises OSError, and then both earlier states still exist.
+    `previous.npz`, unless `name` is another file name. Raises OSError if writing fails. Both earlier states then still
+    exist.
     """
     entries: dict[str, Array] = {"iteration": np.array(iteration)}
     entries |= {f"parameter/{key}": value for key, value in parameters.items()}
@@ -104,10 +105,10 @@ def read_state(path: Path) -> tuple[dict[str, Array], dict[str, Any]]:
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
-    """Return the file of the newest state in `folder`, which may be damaged, or None if there is no state."""
+    """Return the file of the newest state in `folder`, or None if there is no state. The file may be damaged."""
     return next((path for name in (STATE_FILE, PREVIOUS_FILE_NAME) if (path := folder / name).exists()), None)
 
 
 def entries_below(arrays: Mapping[str, Array], prefix: str) -> dict[str, Array]:
-    """Return the arrays whose names start with `prefix`, by the rest of their names."""
+    """Return the arrays whose names start with `prefix`. The returned names lack `prefix`."""
     return {name.removeprefix(prefix): arrays[name] for name in arrays if name.startswith(prefix)}

@@ -20,7 +20,8 @@ class StepTimes:
 
     `wall_ms` is the wall time. `kernel_ms` is the execution time of kernels and `codegen_ms` the time of their
     generation and compilation, both from `dr.kernel_history`. `new_kernels` counts kernels that no earlier step of the
-    same clock launched. `cache_hit` does not tell this, because it is also true for kernels from the disk cache.
+    same clock launched. The history's `cache_hit` cannot replace `new_kernels`, because `cache_hit` is also true for
+    kernels from the disk cache.
     """
 
     wall_ms: float = 0.0
@@ -30,7 +31,9 @@ class StepTimes:
 
 
 class StepClock:
-    """Clock for steps. It also sums up the time of an optimisation, without the time for writing files."""
+    """Clock for steps. The clock also adds up the time of an optimisation. The time for writing files does not
+    count.
+    """
 
     def __init__(self, elapsed_s: float = 0.0) -> None:
         self.elapsed_s = elapsed_s
@@ -69,7 +72,8 @@ class StepClock:
 class WorkerTime:
     """Work of one worker: the calls that it answered and the seconds that it computed.
 
-    `again` counts its calls that other workers received, too, because it did not answer for a long time.
+    `again` counts the worker's calls that other workers also received, because the worker did not answer for a long
+    time.
     """
 
     calls: int = 0
@@ -82,11 +86,13 @@ class WorkerTime:
 
 @dataclass(frozen=True)
 class SharedTime:
-    """Seconds of the computation shared by workers, by part, and the work of each worker, by name.
+    """Times in seconds of a computation shared by workers, split into parts. `workers` holds the work of each worker by
+    name.
 
     `wall_s` is the time from the first call of a round to its last answer. `computing_s` is the mean time in which a
-    worker computes, and `waiting_s` the mean time in which it waits for the slowest worker. The rest is `sending_s`,
-    which includes distributing the calls. `places` are the places of the workers, as given to `--cluster`.
+    worker computes, and `waiting_s` the mean time in which it waits for the slowest worker. `sending_s` is the
+    remaining time, which includes distributing the calls. `places` are the places of the workers, as given to
+    `--cluster`.
     """
 
     places: tuple[str, ...] = ()
@@ -97,7 +103,7 @@ class SharedTime:
 
     @property
     def sending_s(self) -> float:
-        """The time that is neither computing nor waiting."""
+        """The part of `wall_s` that is neither `computing_s` nor `waiting_s`."""
         return max(self.wall_s - self.computing_s - self.waiting_s, 0.0)
 
     def __add__(self, other: SharedTime) -> SharedTime:

@@ -83,10 +83,11 @@ def _times(gain: float | None, low: float | None, high: float | None, note: str)
 class PaidRecord(Finding):
     """Measured gain of an alternative sampling method.
 
-    The gradient's efficiency is 1 / (variance * time). `gain` is its ratio with and without the method, with a 95 %
-    interval from `low` to `high`. `image_gain`, `image_low` and `image_high` are the same for the image, if the
-    gradient's samples serve both. Values that were not measured are None. If the method is off despite its gain, `note`
-    gives the reason. `rounds` steps of each kind took `share` of the time of 200 iterations.
+    The gradient's efficiency is 1 / (variance * time). `gain` is the efficiency with the method divided by the
+    efficiency without the method. `low` and `high` are the ends of its 95 % interval. `image_gain`, `image_low` and
+    `image_high` are the corresponding values for the image, if the gradient's samples also serve the image. Values that
+    were not measured are None. If the method is off despite its gain, `note` gives the reason. `rounds` is the number
+    of measured steps of each kind. `share` is the cost of measuring, relative to the time of 200 iterations.
     """
 
     gain: float | None = None
@@ -109,10 +110,10 @@ class PaidRecord(Finding):
 
 @dataclass(frozen=True, kw_only=True)
 class PathsRecord(PaidRecord):
-    """Choice of `paths` (light, camera, both). With both, `light_share` is the share of light paths.
+    """Choice of `paths` (light, camera, both). If `paths` is `both`, `light_share` is the share of light paths.
 
-    The gain compares the choice with the best other share. `note` tells whether this share was tried before or after
-    it.
+    `gain` compares the chosen share of light paths with the best other share. `note` tells whether the other share was
+    tried before or after the chosen share.
     """
 
     paths: str
@@ -147,8 +148,8 @@ class GuidedRecord(PaidRecord):
 class SequenceRecord(PaidRecord):
     """Choice of low-discrepancy numbers, for both gradients and images.
 
-    `alone` is true if they were measured as a replacement for guided emission, which had been chosen before. The gain
-    is then relative to guided emission.
+    `alone` is true if low-discrepancy numbers were measured as a replacement for guided emission. An earlier decision
+    had chosen guided emission. If `alone` is true, `gain` is relative to guided emission.
     """
 
     low_discrepancy: bool

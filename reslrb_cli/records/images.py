@@ -60,7 +60,8 @@ FORMATS = {".exr": "OpenEXR", ".hdr": "RGBE", ".pfm": "PFM", ".png": "PNG", ".jp
 
 
 def write_image(stem: Path, image: Array, shown: Array | None = None) -> None:
-    """Write an (H, W, C) image of linear values as `<stem>.exr`, and the image or `shown` as `<stem>.png`.
+    """Write an (H, W, C) image of linear values as `<stem>.exr`. Write `shown` as `<stem>.png`, or the image if `shown`
+    is None.
 
     The suffix is appended to `stem` and replaces nothing, because parameter keys contain dots.
     """
@@ -79,9 +80,9 @@ def finite_range(arrays: Iterable[Array]) -> tuple[float, float]:
 def write_file(path: Path, image: Array, linear: bool) -> None:
     """Write an (H, W, C) image of linear values atomically, in the format given by the suffix of `path`.
 
-    With `linear`, values are written unchanged. Otherwise they are clipped to [0, 1] and converted to 8-bit sRGB, using
-    the first three channels, or the first one of fewer than three. Raises OSError, and RuntimeError if the format does
-    not support the channels.
+    With `linear`, values are written unchanged. Without `linear`, values are clipped to [0, 1] and converted to 8-bit
+    sRGB. The file gets the first three channels, or only the first channel if there are fewer than three. Raises
+    OSError, and RuntimeError if the format does not support the channels.
     """
     if linear:
         write_bitmap(path, mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32)))
@@ -221,8 +222,8 @@ def write_mask(folder: Path, key: str, mask: Array) -> None:
 
 
 def read_parameters(folder: Path) -> dict[str, Array]:
-    """Return the values that `write_parameters` wrote into `folder`, by key. The result is empty if they are missing or
-    damaged.
+    """Return the values that `write_parameters` wrote into `folder`, by key. The result is empty if the values are
+    missing or damaged.
     """
     try:
         with np.load(folder / PARAMETERS_FILE) as arrays:

@@ -1,7 +1,7 @@
 """Locks on run folders, and the identity of the process that uses a folder.
 
-The lock is a kernel lock (`flock`) on the folder itself. It leaves no file and ends with its process in any case. Some
-network file systems have no locks, or none that other machines see. There, the recorded process decides.
+The lock is a kernel lock (`flock`) on the folder itself. The lock leaves no file behind and always ends with its
+process. Some network file systems have no locks, or none that other machines see. There, the recorded process decides.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ _own: set[tuple[int, int]] = set()
 
 
 class InUse(Exception):
-    """Lock held by another process or by another part of this one."""
+    """Error for a lock that another process, or another part of this process, holds."""
 
 
 class FolderLock:
     """Lock on a folder, from its construction until `release` or the end of the process.
 
     The lock stays on the folder when it is renamed. Several holders can have a `shared` lock if nobody has an exclusive
-    one. `real` is False if the file system has no locks; nothing is locked then. Raises InUse, and OSError if there is
-    no such folder (a link does not count).
+    one. `real` is False if the file system has no locks. In this case, nothing is locked. Raises InUse, and OSError if
+    there is no such folder (a link does not count).
     """
 
     def __init__(self, folder: Path, wait_s: float = WAIT_SECONDS, shared: bool = False) -> None:
@@ -66,7 +66,7 @@ class FolderLock:
                 return True
 
     def is_of(self, folder: Path) -> bool:
-        """Whether `folder` is the locked folder, which may have been moved or removed since."""
+        """True if `folder` is the locked folder. The locked folder may have been moved or removed since locking."""
         try:
             return self._descriptor is not None and os.path.samestat(os.fstat(self._descriptor), os.lstat(folder))
         except OSError:
@@ -92,8 +92,8 @@ class FolderLock:
 class Holder:
     """Process that uses a run folder, as recorded in the manifest.
 
-    `boot` identifies one boot of a machine, or is None if the system does not provide it. It differs between machines,
-    and containers on one machine share it. `locked` says whether the process has a lock.
+    `boot` identifies one boot of a machine, or is None if the system does not provide it. `boot` differs between
+    machines. Containers on one machine share one `boot`. `locked` says whether the process has a lock.
     """
 
     host: str
@@ -117,7 +117,7 @@ class Holder:
     def is_gone(self, folder: Path) -> bool:
         """Whether this process, which used `folder`, has certainly ended.
 
-        False if that is unknown, such as for a process on another machine without common locks.
+        False if the process's end is uncertain, for example for a process on another machine without common locks.
         """
         here = Holder.here(locked=False)
         same_kernel = self.host == here.host or (self.boot is not None and self.boot == here.boot)

@@ -111,7 +111,7 @@ class Manifest:
         self.write(folder)
 
     def end_for_good(self, folder: Path, status: Status) -> None:
-        """Do the same as `end` from another thread of a process about to exit, and block all later writes."""
+        """Do the same as `end`, from another thread of a process that is about to exit, and block all later writes."""
         _WRITING.acquire(timeout=LAST_WAIT_SECONDS)  # and never released
         self.status, self.error, self.ended = status, None, now()
         _write(folder, self.content())

@@ -1,7 +1,7 @@
 """Files of measurements, JSON with one object per line.
 
-`LineFile` writes a file that is current and complete at every moment, however the process ends. The first line is an
-`Origin`, which says where the file comes from. `read_lines` reads such files. The file `NAME.samples.npz` holds the
+`LineFile` writes a file that is current and complete at every moment, no matter how the process ends. The first line is
+an `Origin`, which says where the file comes from. `read_lines` reads such files. The file `NAME.samples.npz` holds the
 samples behind the figures, so that a measurement can be continued.
 """
 
@@ -53,7 +53,7 @@ class Lines:
 def read_lines(path: Path, tell: Tell | None = None) -> Lines:
     """Read a file of JSON lines. Raises ConfigError, located in the file, if it cannot be read.
 
-    A last line without a line end is still being written or was interrupted. If it is incomplete, it is left out and
+    A last line without a line end is still being written or was interrupted. An incomplete last line is left out and
     does not count as damaged.
     """
     found, done = Lines(), 0
@@ -99,9 +99,10 @@ def _without_collecting() -> Iterator[None]:
 
 
 class LineFile:
-    """JSON file with one object per line, rewritten as a whole each time; an existing file stays until the first write.
+    """JSON file with one object per line. Each write replaces the whole file. An existing file stays until the first
+    write.
 
-    A pipe or any other file that is not regular receives each final line once, when it is known.
+    A pipe, or another file that is not regular, receives each final line once, as soon as the line is known.
     """
 
     def __init__(self, path: Path) -> None:
@@ -191,7 +192,7 @@ def are_kept(arrays: Mapping[str, np.ndarray]) -> bool:
 
 
 def write_samples(path: Path, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write `head`, JSON values, and the arrays atomically. Raises OSError."""
+    """Write the JSON values `head` and the arrays into one file, atomically. Raises OSError."""
     import numpy as np  # imported late, because the help of a command does not need it
 
     content: dict[str, Any] = {_HEAD: np.array(json.dumps(head)), **arrays}
@@ -199,7 +200,9 @@ def write_samples(path: Path, head: Mapping[str, Any], arrays: Mapping[str, np.n
 
 
 def read_samples(path: Path) -> Kept:
-    """Read the result of `write_samples`. Raises ConfigError, located in the file, if it is anything else."""
+    """Read the result of `write_samples`. Raises ConfigError, located in the file, if `write_samples` did not write the
+    file.
+    """
     from reslrb_cli.records.checkpoint import open_archive
 
     with open_archive(path) as archive:
@@ -214,9 +217,10 @@ PAGE_SECONDS, PAGE_SHARE = 5.0, 20.0
 
 
 class LivePage:
-    """Page, or another file named by `what`, that is rewritten from time to time, between iterations.
+    """Page that is rewritten from time to time, between iterations. `what` names the page or another file.
 
-    If the page cannot be written, the run continues without it. Writing the last page at the end reports the reason.
+    If the page cannot be written, the run continues without it. The final write at the end of the run reports the
+    reason of the failure.
     """
 
     def __init__(

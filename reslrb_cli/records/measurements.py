@@ -52,10 +52,11 @@ class BenchRecord(Line):
     - `peak_mib` is the peak memory of the allocator in that step, including the scene.
     - `scratch_bytes` is the thread-local memory of a path.
     - `texels` is the texel count of all textures that are parameters.
-    - `paths` are the paths of the integrator (`light`, `camera`, `both`). With both, `light_share` is the share of
-        light paths.
+    - `paths` are the paths of the integrator (`light`, `camera`, `both`). If `paths` is `both`, `light_share` is the
+        share of light paths.
 
-    Values that were not measured are None. If `status` is not ok, this holds for all of them.
+    Values that were not measured are None. If `status` is not `ok`, no value was measured, and all measured values are
+    None.
     """
 
     integrator: str
@@ -119,7 +120,8 @@ class PointRecord(Line):
 
     `parameter` is a parameter key, `all` (all parameters together) or `image`. Errors are in L2 over all entries,
     relative to the norm of the estimated quantity. `relative_rmse` is the root mean square over `repeats` averages. The
-    error of the reference, `reference_rmse`, is subtracted. If it is larger, `relative_rmse` is None.
+    error of the reference, `reference_rmse`, is subtracted. If `reference_rmse` exceeds the measured error,
+    `relative_rmse` is None.
     """
 
     KIND: ClassVar[str] = "point"
@@ -178,7 +180,8 @@ class MethodRecord(Line):
 class ReferenceRecord(Line):
     """Reference for the errors: the mean of `repeats` steps, with the relative standard error `reference_rmse`.
 
-    `bias_z` is its largest deviation from an independent reference, as in a `MethodRecord`, or None without one.
+    `bias_z` is the reference's largest deviation from an independent reference, as in a `MethodRecord`. Without an
+    independent reference, `bias_z` is None.
     """
 
     KIND: ClassVar[str] = "reference"
@@ -223,8 +226,8 @@ class Reference(str, enum.Enum):
 class Kind(str, enum.Enum):
     """Kind of comparison.
 
-    `equal_seeds`: by relative L2, if both sides compute the same numbers except for rounding. `expectation`: by z
-    scores over many seeds. `image`: by z scores of the image instead of the gradient.
+    `equal_seeds` compares by relative L2, for two sides that compute equal numbers except for rounding. `expectation`
+    compares by z scores over many seeds. `image` compares images instead of gradients, by z scores.
     """
 
     EQUAL_SEEDS = "equal_seeds"
@@ -369,17 +372,17 @@ class MissingRecord(Line):
 
     @property
     def is_incomplete(self) -> bool:
-        """Whether so much is missing that the recovered values are unreliable."""
+        """True if so much of the derivative is missing that the recovered values are unreliable."""
         return self.is_unknown or (self.share or 0) > max(NOTHING * (self.standard_error or 0), NOTICED)
 
     @property
     def is_for_the_most_part(self) -> bool:
-        """Whether more than half is missing, by two standard errors."""
+        """True if the missing share exceeds one half by more than two standard errors."""
         return self.share is not None and self.share - 2 * (self.standard_error or 0) > HALF
 
     @property
     def is_known(self) -> bool:
-        """Whether the share is known well enough, so that more seeds would hardly change the verdict."""
+        """True if the missing share is known so well that more seeds would hardly change the verdict."""
         return self.standard_error is not None and (self.standard_error < KNOWN or self.is_for_the_most_part)
 
     def percent(self) -> str:
@@ -420,7 +423,9 @@ R = TypeVar("R", bound=Line)
 
 
 def record_of(kind: type[R], entry: Mapping[str, Any]) -> R | None:
-    """Return the record of class `kind` in a line that was read back, or None if it holds no such record."""
+    """Return the record of class `kind` in `entry`, a line that was read back. Return None if the line holds no such
+    record.
+    """
     try:
         found: R = _READERS[kind].validate_python(entry)
     except ValidationError:

@@ -1,7 +1,7 @@
 """The metrics of a run, `metrics.jsonl`: one JSON object per line, one line per iteration.
 
-A resumed run keeps the lines of the iterations in its checkpoint and drops the others. The tallies sum over a whole
-run: non-finite values, clamped gradients, and regularizers.
+A resumed run keeps the lines of the iterations that its checkpoint contains. All later lines are dropped. The tallies
+sum over a whole run: non-finite values, clamped gradients, and regularizers.
 """
 
 from __future__ import annotations
@@ -63,7 +63,8 @@ Figure = Annotated[float, WrapValidator(_nan_for_null)]
 
 @dataclass(frozen=True)
 class Clamped:
-    """Effect of clamping on the gradients of an iteration: the number of changed entries, and two shares by parameter.
+    """Effect of clamping on the gradients of one iteration. `entries` is the number of changed entries. `share` and
+    `bias` hold one share for each parameter.
 
     `share` is the share of the gradient that was removed (sum of absolute values). `bias` is the share removed from the
     sum of the gradients of all iterations so far.
@@ -182,7 +183,8 @@ def mend(folder: Path) -> None:
 
 
 def read_records(folder: Path, count: int, last: Record | None) -> tuple[list[Record], int]:
-    """Return the first `count` records in `folder`, which are those of a checkpoint, and their size in bytes.
+    """Return the first `count` records in `folder`, and their size in bytes. A checkpoint contains the iterations of
+    the returned records.
 
     `last` is the last record, stored in the checkpoint. It replaces a line lost to a full disk. Raises ConfigError,
     located by file and line, if other records are missing or damaged.
@@ -200,7 +202,9 @@ def read_records(folder: Path, count: int, last: Record | None) -> tuple[list[Re
 
 
 def cut_back(folder: Path, records: list[Record], size: int) -> None:
-    """Cut the file in `folder` back to `records`; its first `size` bytes hold all of them, or all except the last."""
+    """Cut the metrics file in `folder` back to `records`. The file's first `size` bytes hold all records, or all except
+    the last.
+    """
     path = folder / METRICS_FILE
     if not records:
         path.unlink(missing_ok=True)

@@ -123,7 +123,8 @@ LEFT_SECONDS = 60.0
 def check_output(source: object, output: Path, name: str, force: bool) -> None:
     """Raise a ConfigError (key `run.output` or `run.name`) if a run folder cannot be made in `output`.
 
-    Makes a folder and removes it, because permissions do not apply to root. Raises MachineError for a full disk.
+    The check makes a folder and removes the folder again, because permissions do not apply to root. Raises MachineError
+    for a full disk.
     """
     ancestor = next(path for path in (output, *output.absolute().parents) if os.path.lexists(path))
     if not ancestor.is_dir():
@@ -159,8 +160,8 @@ class RunFolder:
 
         If the name is taken, the folder is `<name>-2/` and so on. With `force`, it replaces the run of that name, but
         removes only files that a run writes. The folder appears under its name only when it is complete. Raises
-        ConfigError if `force` would replace a folder that is not a run folder or is in use, and MachineError for a full
-        disk.
+        ConfigError if `force` would replace a folder that is not a run folder or is in use. Raises MachineError for a
+        full disk.
         """
         try:
             output.mkdir(parents=True, exist_ok=True)
@@ -238,14 +239,16 @@ class RunFolder:
 
     @property
     def is_there(self) -> bool:
-        """Whether the folder still exists under its name and is not another one, such as that of a later run."""
+        """True if the folder still exists under its name. A different folder of the same name, such as that of a later
+        run, does not count.
+        """
         if self.lock is None:
             return self.path.is_dir()
         return self.lock.is_of(Path(os.path.realpath(self.path)))
 
     @property
     def fault(self) -> OSError | None:
-        """The error if the folder is no longer there (`is_there`), or None otherwise."""
+        """The error if the folder is no longer there (`is_there`). None if the folder is there."""
         if self.is_there:
             return None
         return FileNotFoundError(errno.ENOENT, "has gone while the run went on", str(self.path))

@@ -1,7 +1,7 @@
 """Sweeps, runs of one experiment with several settings and seeds: the plan in `sweep.json`, and records of the results.
 
-The folder of a sweep holds that file, one configuration per combination of settings in `configs/`, and one folder per
-run, named by its settings and seed.
+A sweep's folder holds `sweep.json` and the subfolder `configs/`, with one configuration per combination of settings.
+The folder also holds one run folder per run, named by its settings and its seed.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Sweep:
     """Plan of a sweep: every combination with every seed, and the failed runs by name.
 
     `config` is the configuration file and `overrides` the values of `--set`, both as the user wrote them. `codes` holds
-    the digests of the user's code files by path, `files` those of all other files.
+    the digests of the user's code files by path. `files` holds the digests of all other files.
     """
 
     config: str
@@ -200,9 +200,10 @@ class SweepRowRecord(Line):
     """Result of one combination: median, minimum and maximum over its finished runs. `runs` of its `of` runs are
     finished.
 
-    `loss_ratio` and `error_ratio` are the median divided by that of the first comparable combination. Their 95 %
-    interval comes from a bootstrap over the seeds. Combinations that differ only in learning rates are compared at
-    their best rate, and only that one has a ratio. Ratios are None for fewer than 5 seeds.
+    `loss_ratio` and `error_ratio` are the combination's median divided by the median of the first comparable
+    combination. Their 95 % interval comes from a bootstrap over the seeds. Combinations that differ only in learning
+    rates are compared at their best rate. Only the combination with the best rate has a ratio. Ratios are None for
+    fewer than 5 seeds.
     """
 
     KIND: ClassVar[str] = "sweep_row"
@@ -224,12 +225,14 @@ class SweepRowRecord(Line):
 
 @dataclass(frozen=True)
 class SweepBestRecord(Line):
-    """Combination with the lowest median of `of` (`loss` or `error`), over the `seeds` seeds common to all.
+    """Combination with the lowest median of `of`, which is `loss` or `error`. The median is over the `seeds` seeds that
+    all combinations have.
 
-    Combinations that differ only in learning rates are compared at their best rate. Wilcoxon's signed-rank test on
-    pairs of the same seed finds a difference from the combinations in `beats`, and none from those in `tied`. `second`
-    has the next median. `ratio` is the best median divided by that of `second`, with the 95 % interval of a bootstrap
-    over the seeds. It is None for fewer than 5 seeds. `line` is the record in words.
+    Combinations that differ only in learning rates are compared at their best rate. Wilcoxon's signed-rank test
+    compares pairs of runs with equal seeds. The best combination differs significantly from the combinations in
+    `beats`, and not significantly from those in `tied`. `second` has the next median. `ratio` is the best median
+    divided by that of `second`, with the 95 % interval of a bootstrap over the seeds. It is None for fewer than 5
+    seeds. `line` is the record in words.
     """
 
     KIND: ClassVar[str] = "sweep_best"

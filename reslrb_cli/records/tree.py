@@ -45,8 +45,8 @@ def to_array(value: Any) -> Array:
 def like(value: Any, array: Array) -> Any:
     """Convert `array` to the type of `value`, in Dr.Jit's own memory.
 
-    Both must have the same shape (`to_array`). If `value` is a literal, which is part of the kernel code (such as
-    Adam's step count), the result is a literal, too, so that the kernel does not change.
+    `value` and `array` must have the same shape (`to_array`). A literal is part of the kernel code, such as Adam's step
+    count. If `value` is a literal, the result is a literal, too, so the kernel does not change.
     """
     kind = type(value)
     if not dr.is_array_v(value):
@@ -106,7 +106,9 @@ class Stored:
         return ConfigError(self.path, name, f"{message}: not as a run writes it")
 
     def read(self, kind: type[T]) -> T:
-        """Read a tree of this class, checked by the types of its fields; its mappings of arrays are still empty."""
+        """Read a tree of class `kind`, and check the values by the types of the class's fields. The tree's mappings of
+        arrays are still empty.
+        """
         names = [each.name for each in fields(kind) if _ENTRY not in each.metadata]  # type: ignore[arg-type]
         plain = {name: self._values[name] for name in names if name in self._values}
         try:  # as JSON, because strict validation of Python values rejects a mapping for a dataclass

@@ -31,7 +31,7 @@ def method_columns(labels: Sequence[str], parameters: Sequence[str]) -> Columns:
 
 
 def method_cells(record: MethodRecord, parameter: str | None = None) -> tuple[str, ...]:
-    """Return the cells of one record; `parameter` replaces its own parameter if given."""
+    """Return the table cells of one record. `parameter`, if given, is shown instead of the record's own parameter."""
     named = (record.method.label, shorten(parameter or record.parameter, KEY_WIDTH))
     if record.relative_rmse is None:
         return *named, record.message if record.status is BenchStatus.OK else record.status.value
@@ -91,9 +91,10 @@ def result_lines(results: ConvergenceResults) -> list[Line]:
 
 
 def closing_sentence(records: Sequence[MethodRecord]) -> str:
-    """Return a sentence about the best method for this scene, for all parameters together, and its lead.
+    """Return a sentence that names the best method for this scene, for all parameters together. The sentence also gives
+    the method's lead.
 
-    A biased method is always called biased. A lead within the intervals does not count.
+    A biased method is always called biased. A lead counts only if the lead exceeds the intervals.
     """
     together = [record for record in records if record.parameter in ("all", "image") and record.efficiency is not None]
     if not together:

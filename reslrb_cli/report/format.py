@@ -45,7 +45,9 @@ def count(amount: int, what: str) -> str:
 
 
 def shorten(text: str, width: int) -> str:
-    """Return `text` on one line of at most `width` characters, without its middle, because keys differ at both ends."""
+    """Return `text` on one line of at most `width` characters. Long text loses its middle, because keys differ at both
+    ends.
+    """
     text = printable(text)
     if len(text) <= width:
         return text

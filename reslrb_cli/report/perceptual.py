@@ -40,7 +40,7 @@ def to_lab(values: Array) -> Array:
 
 
 def _mean_and_max(differences: Array) -> dict[str, float]:
-    """Return the mean and the maximum of at least one difference."""
+    """Return the mean and the maximum of `differences`, which must not be empty."""
     return {"mean": float(np.mean(differences)), "max": float(np.max(differences))}
 
 
@@ -65,7 +65,8 @@ def is_color(key: str, quantity: str) -> bool:
 
 
 def color_errors(moments: Mapping[str, Array], true: Array, mask: Array | None) -> dict[str, Any]:
-    """Return CIEDE2000 between the colours of a surface and the true ones at each of `moments`, for entries in `mask`.
+    """Return the CIEDE2000 differences between a surface's colours and the true colours, for each of `moments`. Only
+    entries in `mask` count.
 
     Arrays are colours (3,) or textures (H, W, 3). If the resolutions differ, the finer grid is used. The result is
     empty if the arrays hold no colours or the mask is empty.
@@ -106,9 +107,10 @@ SIGMA, WINDOW = 1.5, 11
 def image_errors(image: Array, target: Array, exposure: float) -> dict[str, Any]:
     """Return the errors of an image (H, W, C) of linear values, for the channels shared with `target`, without alpha.
 
-    Both are multiplied by `exposure`, clipped to [0, 1] and encoded in sRGB, as on a screen. `psnr_db` is None if both
-    look the same. `ssim` is None for images smaller than its window. `ciede2000` holds the mean and the maximum over
-    the pixels. `not_finite` is the number of pixels of the image that are not finite; they are treated as black.
+    Image and target are multiplied by `exposure`, clipped to [0, 1] and encoded in sRGB, as on a screen. `psnr_db` is
+    None if both look the same. `ssim` is None for images smaller than its window. `ciede2000` holds the mean and the
+    maximum over the pixels. `not_finite` is the number of pixels of the image that are not finite; they are treated as
+    black.
     """
     colors = 3 if min(image.shape[2], target.shape[2]) >= 3 else 1
     bad = int(np.sum(~np.isfinite(image[:, :, :colors]).all(axis=2)))
@@ -151,7 +153,7 @@ def seen_errors(
 
     `images` holds, by sensor (`""`, `"-0"`, ...), the `exposure` for viewing the target and the `image_errors` of the
     `initial` and the `final` image. `colors` holds the `color_errors` of surface colours with known true values, by
-    key. `results` and `views` are those of the manifest. Missing and damaged files are left out.
+    key. `results` and `views` come from the run's manifest. Missing and damaged files are left out.
     """
     images, exposures = {}, shown_exposures(views)
     for path in sorted((folder / "images").glob("target*.exr")):

@@ -87,7 +87,7 @@ class Remedy(NamedTuple):
 
 
 def verdict_words(results: Mapping[str, Any], key: str) -> str:
-    """Return the verdict on a parameter and a proposal. The result is empty if nothing was measured.
+    """Return the verdict on the parameter `key`, with a proposal. The result is empty if nothing was measured.
 
     Includes the share of entries with this verdict and the share of entries that no view shows.
     """
@@ -107,9 +107,9 @@ def verdict_words(results: Mapping[str, Any], key: str) -> str:
 
 
 def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
-    """Return a proposal for a value that is still moving or that the noise of the target hides.
+    """Return a proposal for a parameter whose value is still moving, or for a value that the target's noise hides.
 
-    None for all other values, and if the records are insufficient.
+    Return None for all other values, and if the records are insufficient.
     """
     about, measured = _about(results, key), results.get("certainty") or {}
     if about.get("verdict") == NOISE and _is_of_target(about) and measured.get("target_spp"):
@@ -168,7 +168,7 @@ def certainty_lines(results: Mapping[str, Any]) -> list[str]:
 
 
 def noise_line(results: Mapping[str, Any]) -> str:
-    """Return a line that says that spreads exclude the noise of the target. The result is empty if they include it."""
+    """Return a line that says that the spreads exclude the target's noise. The result is empty if they include it."""
     measured = results.get("certainty") or {}
     if measured.get("target_noise") not in ("left out", "in part"):
         return ""
@@ -185,13 +185,15 @@ def measured_line(kind: type[Finding], measured: Mapping[str, Any] | None) -> st
 
 
 def _is_of_target(about: Mapping[str, Any]) -> bool:
-    """Whether most of a spread comes from the noise of the target."""
+    """True if most of a spread comes from the target's noise."""
     pairs = zip(about.get("of_target") or (), about.get("spread") or (), strict=False)
     return any(part is not None and whole and part > OF_TARGET * whole for part, whole in pairs)
 
 
 def _rate_setting(measured: Mapping[str, Any], rate: float, factor: float) -> str:
-    """Return the setting for another learning rate, of all parameters or of one that has its own."""
+    """Return the setting for another learning rate. The setting changes the rate of all parameters, or the rate of one
+    parameter that has its own.
+    """
     value = f"{float(f'{factor * rate:.1g}'):g}"
     common = rate == measured.get("learning_rate")
     return f"--set optimizer.learning_rate={value}" if common else f"its own learning_rate: {value}"
@@ -299,7 +301,8 @@ def _reasons(results: Mapping[str, Any]) -> list[str]:
 
 
 def image_ratio(results: Mapping[str, Any]) -> float | None:
-    """Return the loss of the saved images at the end divided by that at the start, or None if one is unknown.
+    """Return the loss of the final saved images divided by the loss of the initial saved images. Return None if either
+    loss is unknown.
 
     Saved images have less noise than those of the iterations.
     """

@@ -103,7 +103,7 @@ class Maps:
 
 @dataclass(frozen=True)
 class SweepRuns:
-    """Sweep, and its runs that have a folder, by name."""
+    """Sweep, and those of its runs that have a folder, by name."""
 
     path: Path
     name: str
@@ -142,7 +142,7 @@ def read_run(folder: Path, name: str | None = None, tell: Tell | None = None) ->
 
 
 def read_sweep_runs(folder: Path, name: str | None = None, tell: Tell | None = None) -> SweepRuns:
-    """Read the sweep in `folder`, and its runs as far as possible. Raises ConfigError, located in its plan."""
+    """Read the sweep in `folder`, and as many of its runs as can be read. Raises ConfigError, located in its plan."""
     sweep = read_sweep(folder)
     names = [run_name(*run) for run in sweep.runs]
     runs = {name: read_run(folder / name, name, tell) for name in names if read_manifest(folder / name) is not None}

@@ -126,17 +126,18 @@ def best_records(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[SweepBest
 
 
 def incomparable(sweep: Sweep, others: Sequence[str]) -> str:
-    """Return the first varied setting that is in `others` or below one of them, except learning rates, or "" if
-    none.
+    """Return the first varied setting that is in `others`, or below a setting in `others`. Learning rates do not count.
+    Return "" if there is none.
     """
     keys = [key for key in sweep.keys if not is_rate(key)]
     return next((key for key in keys if any(f"{key}.".startswith((f"{o}.", f"{o}[")) for o in others)), "")
 
 
 def _paired(sweep: Sweep, runs: Sequence[SweepRunRecord], of: str) -> dict[str, list[float]]:
-    """Return the values of each combination by name, one per seed, over the seeds that all combinations have.
+    """Return each combination's values by the combination's name. Each value belongs to one seed. Only seeds that all
+    combinations have count.
 
-    Combinations that failed or lack values are left out. Empty if the combinations cannot be compared.
+    Combinations that failed or lack values are left out. The result is empty if the combinations cannot be compared.
     """
     errors_known = any(run.error is not None for run in runs)
     if incomparable(sweep, OTHERS[of]) or (of == "loss" and errors_known and incomparable(sweep, OTHER_IMAGE)):
@@ -152,7 +153,8 @@ def _paired(sweep: Sweep, runs: Sequence[SweepRunRecord], of: str) -> dict[str, 
 
 
 def _groups(sweep: Sweep, values: Mapping[str, list[float]]) -> dict[str, list[list[float]]]:
-    """Group combinations that differ only in learning rates; return the values of each group by its best combination.
+    """Group combinations that differ only in learning rates. Return the values of each group by the name of the group's
+    best combination.
 
     The best combination of a group comes first. If only learning rates are varied, each combination is a group.
     """
@@ -214,12 +216,12 @@ CONFIDENCE = 0.95
 
 
 def ratio(own: Sequence[Sequence[float]], base: Sequence[Sequence[float]]) -> Range | None:
-    """Return the ratio of `own` to `base` with its interval. Both sides use the median over seeds, and the best of
-    their rows.
+    """Return the ratio of `own` to `base` with its interval. `own` and `base` use the median over seeds for each row,
+    and then the best row.
 
-    Rows are learning rates, and columns are seeds, the same for all rows. The 95 % interval comes from a bootstrap. It
-    resamples the seeds for all rows together and selects the best rates each time, so it includes the selection effect.
-    Returns None for fewer than LEAST_SEEDS seeds, and if a median is 0 or not finite.
+    Rows are learning rates, and columns are seeds, the same for all rows. The 95 % interval comes from a bootstrap. The
+    bootstrap resamples the seeds for all rows together. Each resample selects the best rates anew, so the interval
+    includes the selection effect. Returns None for fewer than LEAST_SEEDS seeds, and if a median is 0 or not finite.
     """
     seeds = min((len(values) for values in (*own, *base)), default=0)
     if seeds < LEAST_SEEDS or not (own and base):
@@ -244,7 +246,8 @@ ALPHA = 0.05
 
 @dataclass(frozen=True)
 class Verdict:
-    """Combination with the lowest median, those `tied` with it, and those that it `beats`, in order of their medians.
+    """Combination with the lowest median, the combinations `tied` with the best, and the combinations that the best
+    `beats`. `tied` and `beats` are in order of medians.
 
     `too_few` is true if the number of seeds is too small for the test to find any difference; `enough` seeds suffice.
     """
@@ -257,10 +260,12 @@ class Verdict:
 
 
 def find_best(values: Mapping[str, Sequence[float]]) -> Verdict | None:
-    """Find the combination with the lowest median and those tied with it, or None if there are no values.
+    """Find the combination with the lowest median, and the combinations tied with the best. Return None if there are no
+    values.
 
-    Values at the same index have the same seed. A combination is tied if Wilcoxon's signed-rank test of the differences
-    from the best finds no difference: two-sided, at level ALPHA divided by the number of other combinations.
+    Values at the same index have the same seed. Wilcoxon's signed-rank test uses the differences from the best
+    combination. A combination is tied if the test finds no difference. The test is two-sided, at level `ALPHA` divided
+    by the number of other combinations.
     """
     if not values:
         return None
@@ -305,7 +310,9 @@ def notes(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
 
 
 def _outermost(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
-    """Return a line for each best learning rate at the end of the tried range. A better rate may lie beyond."""
+    """Return one line for each best learning rate that lies at an end of the tried range. A better rate may lie
+    beyond.
+    """
     found: dict[str, None] = {}
     rates = [key for key in sweep.keys if is_rate(key)]
     for of in OTHERS if rates else ():
@@ -341,8 +348,8 @@ RATIOS_LINE = "ratios: medians over that of the first line that can be compared,
 
 
 def row_figures(records: Sequence[SweepRowRecord], runs: Sequence[SweepRunRecord]) -> dict[str, str]:
-    """Return the titles of the columns for combinations. Iterations and ratios have columns only if they differ or are
-    known.
+    """Return the titles of the columns for combinations. A column for iterations exists only if the numbers of
+    iterations differ. A column for ratios exists only if a ratio is known.
     """
     found = {"iterations": "iterations"} if len({run.iterations for run in runs if run.is_done}) > 1 else {}
     ratios = {name: title for name, title in RATIOS.items() if any(getattr(record, name) for record in records)}

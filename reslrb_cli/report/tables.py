@@ -64,7 +64,7 @@ _KINDS = {Kind.EQUAL_SEEDS: ", equal seeds"}
 
 
 def cells(record: GradcheckRecord) -> tuple[str, ...]:
-    """Return the cells for the columns of HEAD; numbers that have a limit are followed by it."""
+    """Return one cell for each column of HEAD. If a number has a limit, the cell shows the limit after the number."""
     return (
         parameter_name(record),
         integrator_name(record),
@@ -87,7 +87,9 @@ def parameter_name(record: GradcheckRecord) -> str:
 
 
 def integrator_name(record: GradcheckRecord) -> str:
-    """Return the name of the integrator, such as `reslrb:stack`. The paths are added if they are not light paths."""
+    """Return the name of the integrator, such as `reslrb:stack`. The name includes the kind of paths if the integrator
+    does not use light paths.
+    """
     if record.estimator is None and record.paths != "light":
         return f"{record.integrator}(paths={record.paths})"
     return record.integrator if record.estimator is None else f"{record.integrator}:{record.estimator}"

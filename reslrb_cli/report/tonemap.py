@@ -38,10 +38,10 @@ LEAST_CLIPPED = 0.005
 def exposure_for(image: Array | None, lamps: Array | None = None) -> float:
     """Return the exposure, rounded to two digits, that makes an image (H, W, C) visible, or 1 if none is needed.
 
-    `lamps` (H, W), boolean, marks the pixels that see a lamp. They can be thousands of times brighter than the rest,
-    and are clipped. Otherwise the rest would be nearly black. The level has two criteria. The share of pixels alone
-    would clip a caustic, which holds much of the light in few pixels. The share of light alone, including fireflies,
-    would darken a noisy image.
+    `lamps` (H, W), boolean, marks the pixels that see a lamp. Pixels that see a lamp can be thousands of times brighter
+    than the rest of the image, and are clipped. Without clipping, the rest of the image would be nearly black. The
+    level has two criteria. The pixel share alone would clip a caustic, because a caustic concentrates much of the light
+    in few pixels. The share of light alone, including fireflies, would darken a noisy image.
     """
     level = 0.0 if image is None else _level(image)
     if image is not None and lamps is not None and lamps.shape == image.shape[:2] and (~lamps).mean() >= LEAST_OTHERS:
@@ -53,7 +53,7 @@ def exposure_for(image: Array | None, lamps: Array | None = None) -> float:
 
 
 def _level(image: Array) -> float:
-    """Return the level of an image: the value below which most of its pixels and most of their light lie."""
+    """Return the level of an image. Most of the image's pixels, and most of its light, lie below the level."""
     values = _brightest(image).astype(np.float64)
     values = np.sort(np.maximum(values[np.isfinite(values)], 0))
     if not values.size:
@@ -81,7 +81,9 @@ def shown_exposures(views: Sequence[Mapping[str, Any]] | None) -> dict[str, floa
 
 
 def exposure_words(exposure: float, target: Array | None = None) -> str:
-    """Return a remark on an exposure. The result is empty for 1, unless it clips many pixels of `target`."""
+    """Return a remark on an exposure. The result is empty for an exposure of 1, unless the exposure clips many pixels
+    of `target`.
+    """
     words = []
     if exposure != 1:
         times = f"{exposure:.2g} times brighter" if exposure > 1 else f"{1 / exposure:.2g} times darker"
@@ -130,7 +132,7 @@ def write_error_map(folder: Path, suffix: str, image: Array, target: Array, grad
 
 
 def read_comparison(folder: Path, suffix: str) -> dict[str, Array]:
-    """Return the layers that `write_error_map` wrote. The result is empty if they are missing or damaged."""
+    """Return the layers that `write_error_map` wrote. The result is empty if the values are missing or damaged."""
     try:
         return read_layers(folder / f"comparison{suffix}.exr")
     except (OSError, ValueError):

@@ -174,7 +174,8 @@ def keep_solid(
 def keep_tolerances(config: Config, run: Path, off: dict[str, Any], pictures: dict[str, Array], say: Say) -> None:
     """Add measured tolerances and their pictures to the run folder and update its report.
 
-    If another process uses the folder, or the run has another solid, prints why and changes nothing.
+    If another process uses the folder, or the run has another solid, the function prints the reason and changes
+    nothing.
     """
     from reslrb_cli.report.page import write_report
 
@@ -203,8 +204,8 @@ def _write_pictures(run: Path, pictures: dict[str, Array]) -> None:
 
 
 def pictures_of(solid: Solid) -> dict[str, Array]:
-    """Render views of the solid in grazing light, as if it were plaster. Returns images (H, W, 3) by their names on the
-    workshop's sheet.
+    """Render views of the solid in grazing light, as if it were plaster. Returns images (H, W, 3). The keys are the
+    images' names on the workshop sheet.
     """
     low, high = solid.points.min(axis=0), solid.points.max(axis=0)
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
@@ -274,7 +275,7 @@ def read_solid(config: Config, plan: Fabrication, params: mi.SceneParameters) ->
 def read_target(config: Config, sensor: mi.Sensor, needed: bool) -> Array | None:
     """Return the target image (H, W, C) of a sensor, or None if `target.file` does not have the size of the film.
 
-    Raises ConfigError in that case if the target is `needed` for tolerances.
+    Raises ConfigError instead of returning None if the target is `needed` for tolerances.
     """
     file = config.target.file
     if file is None:
@@ -309,8 +310,8 @@ def measure_loss(
 ) -> tuple[Array, dict[str, Any]]:
     """Return the scene's image and its mean squared difference from `target`, reproducible from the exported scene.
 
-    The image is rendered by Mitsuba's own `integrator` with independent samples. The images of a run may use
-    low-discrepancy samples, which have less noise and therefore a lower loss for the same face.
+    The image is rendered by Mitsuba's own `integrator` with independent samples. A run may render its images with
+    low-discrepancy samples. Low-discrepancy samples have less noise, so the run's loss for the same face is lower.
     """
     spp, seed = config.run.final_spp, 0
     image = np.array(mi.render(scene, integrator=mi.load_dict(dict(integrator)), sensor=sensor, spp=spp, seed=seed))
@@ -373,7 +374,7 @@ def choose_integrator(
     """Choose the Mitsuba integrator that best reproduces the image of the run's `paths` (`loading.paths_of`).
 
     If the choice is not the usual one, the function also returns the reason. `ptracer` traces light paths. Where
-    `ptracer` is wrong, `path` is chosen, which also sees glass and mirrors.
+    `ptracer` is wrong, the function chooses `path`. The integrator `path` also sees glass and mirrors.
     """
 
     own = config.integrator.options()

@@ -97,10 +97,10 @@ def changes(before: Config, now: Config) -> dict[str, Change]:
 
 
 def check_changes(found: Mapping[str, Change], blame: Callable[[str], object], run: Path) -> dict[str, Change]:
-    """Return the changed settings. Settings for the place of the run do not count.
+    """Return the changed settings. Settings that only determine the run's place do not count as changes.
 
-    Raises ConfigError if a setting must not change. The error names the first few such settings. Its location is that
-    of the first one, in the source that `blame` returns for it.
+    Raises ConfigError if a setting must not change. The error names the first few such settings. The error is located
+    at the first such setting, in the source that `blame` returns for this setting.
     """
     wrong = [key for key in found if not MAY_CHANGE.fullmatch(key)]
     if wrong:
@@ -175,7 +175,8 @@ def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
 
 
 def settled_of(problem: Problem, variant: str) -> Settled:
-    """Return the description of the experiment in every checkpoint, from which another process assembles the problem.
+    """Return the description of the experiment that every checkpoint contains. Another process can assemble the problem
+    from the description.
 
     The parameters must have their initial values.
     """
@@ -231,7 +232,7 @@ class RunProgress:
     def compute_with(self, engine: Callable[..., Any], spent: Callable[[], SharedTime] | None = None) -> None:
         """Let `engine` (`shards.Engine`) compute the shards of a run without stages.
 
-        `spent` returns the time spent on that so far.
+        `spent` returns the time that the engine has spent on shards so far.
         """
         self.problem = replace(self.problem, engine=engine)
         self.stages = Stages(self.problem)
@@ -266,7 +267,9 @@ class RunProgress:
         self.state = state
 
     def _counts(self, iteration: int) -> bool:
-        """Whether both this iteration and the previous one, which set its values, used the run's own problem."""
+        """True if this iteration and the previous one both used the run's own problem. The previous iteration set the
+        values of this one.
+        """
         config = self.problem.config
         begun = (max(iteration - 1, 0), iteration)
         return all(self.stages.is_whole(config.stage_number(each / config.run.iterations)) for each in begun)
@@ -301,8 +304,8 @@ class RunProgress:
         self.regularized.add(record)
 
     def best_values(self) -> dict[str, Array]:
-        """Return the best parameters so far, in the form of `problem.values()`. The result is empty if there are none
-        yet.
+        """Return the best parameters so far, in the form of `problem.values()`. The result is empty if there are no
+        best parameters yet.
         """
         shown = self.problem.selection.shown
         return {

@@ -127,7 +127,7 @@ class Recording:
         self.status = self._end(status, failure)
 
     def abandon(self) -> None:
-        """Mark the run as interrupted in the manifest, in a process that is about to exit during an iteration."""
+        """Mark the run as interrupted in the manifest. The process is about to exit during an iteration."""
         if not self.manifest.results and self.course.last is not None:
             self.manifest.results = {"iterations": self.done, "elapsed_s": self.course.last.elapsed_s}
         self._note_shared()
@@ -208,7 +208,7 @@ class Recording:
             logger.warning(f"{found}; {self._where()}")
 
     def _where(self) -> str:
-        """Return a hint how to find the cause of a value that is not finite."""
+        """Return a hint on how to find the cause of a non-finite value."""
         if self.problem.config.codes:
             return "check what your own code returns; `reslrb inspect --nonfinite` does not run it"
         return f"where: reslrb inspect {shlex.quote(os.path.relpath(self.folder.path / 'config.yaml'))} --nonfinite"
@@ -384,7 +384,7 @@ class Recording:
                 self.error_maps[f"error{suffix}"] = about
 
     def _write_image(self, name: str, sensor: int, image: np.ndarray[Any, Any]) -> None:
-        """Write an image of a sensor. Its PNG uses the exposure that suits the target."""
+        """Write an image of a sensor. The PNG file uses the exposure that suits the sensor's target."""
         exposure = shown_exposures(self.manifest.views).get(self._image_name("", sensor), 1.0)
         write_image(self.folder.images / self._image_name(name, sensor), image, image * np.float32(exposure))
 

@@ -77,14 +77,14 @@ class OpenedRun:
 
     @property
     def has_stopped(self) -> bool:
-        """Whether `run.stop` or `run.max_seconds` ended the run, and neither setting has changed."""
+        """True if `run.stop` or `run.max_seconds` ended the run, and both settings are unchanged."""
         ends = ("run.stop", "run.max_seconds")
         return bool(self.stored.read(State).stopped) and not any(key.startswith(ends) for key in self.changed)
 
     def done_line(self, option: str, equals: str) -> str:
         """Return a line that says that the run is complete and which setting would continue it.
 
-        `option` and `equals` show how the user sets it.
+        `option` and `equals` are the parts of the syntax with which the user changes a setting.
         """
         iterations = self.config.run.iterations
         stopped = iterations > self.iteration and self.stored.read(State).stopped
@@ -153,7 +153,9 @@ class OpenedRun:
             yield self.folder
 
     def _put_first(self, folder: RunFolder) -> None:
-        """Cut the metrics back to the state, and make that state the newest one in place of a damaged one."""
+        """Cut the metrics back to the stored state. If the newest state is damaged, replace the damaged state by the
+        stored state.
+        """
         cut_back(folder.path, self.records, self.size)
         if self.stored.path.name == PREVIOUS_FILE_NAME:
             (folder.checkpoint / PREVIOUS_FILE_NAME).replace(folder.checkpoint / STATE_FILE)
@@ -163,9 +165,9 @@ class OpenedRun:
 def open_earlier(run: Path, wanted: Path | Config | None, overrides: Sequence[str | Override]) -> Iterator[OpenedRun]:
     """Open the run in the folder `run` to resume it, and lock it while the block runs.
 
-    `wanted` is a configuration that must agree with the run. By default, it is the `config.yaml` in its folder. Raises
-    ConfigError if the folder holds no run, the run is in use, or the last two states are both damaged. Also raises it
-    if a setting differs that must not change.
+    `wanted` is a configuration that must agree with the run. The default for `wanted` is `config.yaml` in the run's
+    folder. Raises ConfigError if the folder holds no run, the run is in use, or the last two states are both damaged.
+    Raises ConfigError also if a setting that must not change differs.
     """
     with opened(run) as (folder, manifest):
         said: list[str] = []
@@ -193,11 +195,11 @@ def open_earlier(run: Path, wanted: Path | Config | None, overrides: Sequence[st
 
 
 def problem_before_nonfinite(run: Path, say: Say) -> tuple[Problem, int]:
-    """Return the problem at the start of the first iteration with a non-finite value, and the index of the iteration
-    from 0.
+    """Return the problem at the start of the first iteration with a non-finite value. Also return the iteration's
+    index, counted from 0.
 
-    The function sets the run's variant. It locks nothing, so the run may be in progress. Raises ConfigError and
-    UnsupportedScene.
+    The function sets the run's variant. The function does not lock the folder, so the run may be in progress. Raises
+    ConfigError and UnsupportedScene.
     """
     stored = Stored(RunFolder(run).checkpoint / NONFINITE_FILE_NAME)
     settled = stored.read(Settled)

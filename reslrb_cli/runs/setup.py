@@ -100,7 +100,8 @@ def _middles(sensor: mi.Sensor, target: Array, center: Array, normal: Array) -> 
 
 
 def _light(scene: mi.Scene, solid: list[mi.Shape]) -> tuple[Array, Array] | None:
-    """Return the points (n, 3) where light of the lamps first meets the shapes of the solid, and its directions (n, 3).
+    """Return the points (n, 3) where light from the lamps first meets the solid's shapes. Also return the light's
+    directions (n, 3).
 
     Returns None if no ray meets them.
     """

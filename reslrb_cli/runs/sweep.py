@@ -141,8 +141,8 @@ def _with_chosen(
 ) -> Config:
     """Return the experiment with one value of each varied setting. Raises ConfigError.
 
-    A string as the value of `integrator` is a method as in `convergence --integrators`. It keeps the depth and the
-    shared options of the experiment's own integrator.
+    If the value of `integrator` is a string, the string names a method, as in `convergence --integrators`. It keeps the
+    depth and the shared options of the experiment's own integrator.
     """
     methods = [each for each in chosen if each.location == ("integrator",) and isinstance(each.value, str)]
     others = [each for each in chosen if each not in methods]
@@ -173,7 +173,7 @@ def _names(varied: Sequence[Varied]) -> list[str]:
 
 
 def _named(value: Any) -> str:
-    """Return a value as part of a folder name. For a section, it starts with the value of its `type`."""
+    """Return a value as part of a folder name. The name of a section starts with the value of the section's `type`."""
     if isinstance(value, Mapping):
         first = [str(value["type"])] if "type" in value else []
         return "-".join(first + [f"{key}={_named(each)}" for key, each in value.items() if key != "type"])
@@ -183,7 +183,7 @@ def _named(value: Any) -> str:
 
 
 def _bounded(name: str) -> str:
-    """Return a valid folder name that leaves room for a seed and a number after it."""
+    """Return a valid folder name that is short enough to append a seed and a number."""
     most = NAME_BYTES - _SEED_BYTES - len(f"-{MOST_RUNS}")
     return folder_name(name).encode()[:most].decode(errors="ignore")
 
@@ -197,11 +197,12 @@ def opened(
 ) -> Iterator[Sweep]:
     """Open the sweep in `folder`, and lock it while the block runs.
 
-    With a `plan`, this is its sweep, which is started if the folder has none yet. Without a plan, it is the sweep in
-    the folder. `seeds` may add more seeds to it. With `retry`, failed runs count as not done.
+    With a `plan`, the function opens the plan's sweep. If the folder holds no sweep yet, the function starts the sweep.
+    Without a plan, the function opens the sweep that the folder holds. `seeds` may add more seeds to it. With `retry`,
+    runs that failed count as not yet done.
 
-    Raises ConfigError if the folder holds another sweep or anything else. Also raises it if user code is not allowed to
-    run, or has changed since the sweep started.
+    Raises ConfigError if the folder holds another sweep or anything else. Raises ConfigError also if user code is not
+    allowed to run, or has changed since the start of the sweep.
     """
     if plan is not None:
         _make(folder)
@@ -249,7 +250,7 @@ def _unwritable(folder: Path, error: OSError) -> ConfigError | MachineError:
 
 
 def _begin(folder: Path, plan: Plan) -> None:
-    """Write the configurations, then the plan. The plan therefore exists only if all configurations do."""
+    """Write the configurations, then the plan. A written plan therefore implies that all configurations exist."""
     # a sweep that was killed at its start has written only configurations
     if others := sorted(path.name for path in folder.iterdir() if path.name != "configs"):
         reason = f"{folder} contains {one_line(others[0], 60)!r}, but no sweep; give a new or empty folder"
@@ -305,7 +306,9 @@ def _check_files(folder: Path, kept: Sweep, allowed: bool) -> None:
 
 
 def _grown(kept: Sweep, planned: Sequence[int] | None, seeds: int | None) -> Sweep:
-    """Return the sweep extended to more seeds if requested. Raises ConfigError for fewer seeds than there are."""
+    """Return the sweep extended to more seeds if requested. Raises ConfigError if fewer seeds are requested than the
+    sweep has.
+    """
     wanted = len(planned) if planned is not None else seeds
     if wanted is None or wanted == len(kept.seeds):
         return kept
@@ -329,7 +332,7 @@ def command(folder: Path, sweep: Sweep, combination: Combination, seed: int) -> 
     """Return the arguments for `reslrb` that start one run, or resume it if it was interrupted.
 
     User code is allowed, because `opened` has checked the permission. Waits for a killed process that still holds the
-    run folder. Raises ConfigError, located in the folder, if a process keeps using it.
+    run folder. Raises ConfigError, located in the run folder, if a process keeps using the folder.
     """
     folder, name = folder.absolute(), run_name(combination, seed)
     allowed = ["--allow-code"] if sweep.codes else []

@@ -39,7 +39,8 @@ def add_sheet(
 ) -> dict[str, Array]:
     """Add quality, light, set-up and warnings of a solid to `numbers`. Returns the original picture and the caustic.
 
-    `thrown` and `wanted` (H, W) are the luminances of the image of sensor number `sensor` and of its target.
+    `thrown` (H, W) is the luminance of the image of the sensor with index `sensor`. `wanted` (H, W) is the luminance of
+    the sensor's target.
     """
     original = original_of(plan, wanted)
     numbers["thrown"] = figures(thrown, wanted)

@@ -1,1 +1,1 @@
-"""Scenes: loading, contents and needs, the parameters that can be recovered, and images to compare with."""
+"""Scenes: loading, contents, required features, recoverable parameters, and images to compare with."""

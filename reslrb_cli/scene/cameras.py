@@ -52,7 +52,9 @@ class Camera:
 
 
 def read_cameras(file: Path) -> list[Camera]:
-    """Return the cameras of a file, in order. Raises ConfigError, located in it, for missing or unsupported entries."""
+    """Return the cameras of a file, in order. Raises ConfigError, located in the file, if entries are missing or
+    unsupported.
+    """
     cameras = _nerf(file) if file.suffix.lower() == ".json" else _colmap(file)
     if not cameras:
         raise ConfigError(file, "", "has no cameras")

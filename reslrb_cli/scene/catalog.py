@@ -165,7 +165,8 @@ def _encoded_value(array: np.ndarray, texture: mi.Texture) -> Value:
 def entry_value(params: Any, key: str) -> Any:
     """Return the value of an entry of a `mi.traverse` result, or None if there is none, as for an optional texture.
 
-    `params[key]` would mark every entry as changed for `update()`, and fails for missing values.
+    `params[key]` cannot replace the function. `params[key]` would mark every entry as changed for `update()`, and fails
+    for missing values.
     """
     value, value_type, node, _ = params.properties[key]
     return value if value_type is None else params.get_property(value, value_type, node)
@@ -223,8 +224,9 @@ def _storage_bits(value: Any) -> int | None:
 class SensorSummary:
     """Sensor: its film in pixels (`crop` is offset and size), its view, and the needs of light tracing.
 
-    `obstacle` is the reason why light tracing cannot render for it, or None. `camera_obstacle` is the same for camera
-    paths (`prb`). `view` is None if the reason is a part of the scene instead of the view.
+    `obstacle` is the reason why light tracing cannot render the scene for the sensor, or None. `camera_obstacle` is the
+    reason why camera paths (`prb`) cannot render the scene for the sensor, or None. `view` is None if the reason is a
+    part of the scene instead of the view.
     """
 
     index: int

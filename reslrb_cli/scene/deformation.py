@@ -1,12 +1,12 @@
 """Scene parameters as functions of recovered values: motions of shapes and emitters, and heightmaps on meshes.
 
-Obstacles and movables: some shapes and emitters have derivatives with respect to their position, and others have a
-reason against it. Objects of a motion or a heightmap are found by id, together with the scene parameter of their
-position.
+Obstacles and movables: some shapes and emitters have derivatives with respect to their position. For all others, a
+reason explains the missing derivatives. Objects of a motion or a heightmap are found by id, together with the scene
+parameter of their position.
 
 Surroundings: emitters without a position (a constant sky, parallel light) send their rays through a sphere around the
-scene. Mitsuba sets this sphere when the scene is loaded. Shapes that leave it later would be dark, so the sphere is
-kept around moving shapes.
+scene. Mitsuba sets this sphere when the scene is loaded. Shapes that later leave the sphere would be dark. The sphere
+is therefore kept around moving shapes.
 
 Deformation: a mesh has positions p = M(p0 + h n0). p0 and n0 are its own positions and normals, h is its heightmap at
 the vertex's texture coordinates, and M is its motion. c is the pivot, t the translation, R a rotation about each axis,
@@ -14,7 +14,7 @@ and s the scale.
 
     M(p) = c + t + Rz Ry Rx s (p - c)
 
-An analytic shape, and an emitter without a surface, is placed by M after its own `to_world`. For emitters, s scales
+M is applied after the own `to_world` of an analytic shape, or of an emitter without a surface. For emitters, s scales
 only the position. The scene gets values without a graph (leaves). A step adds its gradient to the leaves. `collect`
 propagates the sum to the recovered values once, for any number of views, batches and passes. In forward mode, `push`
 propagates tangents the other way.
@@ -80,7 +80,7 @@ def moving_obstacle(node: mi.Shape | mi.Emitter, key: str) -> str | None:
 
 @dataclass(frozen=True)
 class Movable:
-    """Object with this `id`, and the `key` of the scene parameter of its position.
+    """Object that can move. `id` is the object's id, and `key` the scene parameter of its position.
 
     The parameter is a mesh's `vertex_positions`, the `to_world` of an analytic shape or an emitter, or a point light's
     `position`.
@@ -92,12 +92,12 @@ class Movable:
 
     @property
     def by_vertices(self) -> bool:
-        """Whether it is a mesh, which moves by its vertices."""
+        """True if the object is a mesh. A mesh moves by its vertices."""
         return self.key.endswith(".vertex_positions")
 
     @property
     def is_point(self) -> bool:
-        """Whether it is a point without extent and direction, which cannot be rotated or scaled."""
+        """True if the object is a point, without extent and direction. A point cannot be rotated or scaled."""
         return self.key.endswith(".position")
 
     @property
@@ -106,7 +106,7 @@ class Movable:
         return isinstance(self.node, mi.Shape)
 
     def heightmap_obstacle(self) -> str | None:
-        """Return why no heightmap can displace it, or None if one can."""
+        """Return the reason why no heightmap can displace the object, or None if a heightmap can."""
         if not self.by_vertices:
             why = f"`{self.id}` is a {self.node.class_name()}; a heightmap displaces the vertices of a mesh"
             return (
@@ -119,7 +119,9 @@ class Movable:
         return None
 
     def casts_edges(self, scene: mi.Scene) -> bool:
-        """Whether it can have a silhouette or cast a shadow. Every shape can, except one that encloses all others."""
+        """True if the object can have a silhouette or cast a shadow. Every shape can have a silhouette or cast a
+        shadow, except a shape that encloses all others.
+        """
         others = [shape.bbox() for shape in scene.shapes() if shape.ptr != self.node.ptr]
         return self.is_shape and not all(self.node.bbox().contains(box, strict=True) for box in others)
 
@@ -285,7 +287,8 @@ class Deformation:
 
     def add_motion(self, items: tuple[Movable, ...], pivot: Sequence[float] | None, words: Sequence[str]
                    ) -> None:  # fmt: skip
-        """Add a motion of `items` about `pivot`. Without a pivot, it is the centre of their bounding box.
+        """Add a motion of `items` about `pivot`. Without a given `pivot`, the pivot is the centre of the items'
+        bounding box.
 
         The items must not have a motion yet.
         """
@@ -343,7 +346,7 @@ class Deformation:
         return [moved.leaf for moved in self._moved.values()]
 
     def collect(self) -> None:
-        """Add the gradient at the scene's parameters to the gradient of the values, and clear it in the scene."""
+        """Add the gradient at the scene's parameters to the gradient of the values. Clear the gradient in the scene."""
         tracked = self._tracked()
         for moved in tracked:
             dr.set_grad(moved.tracked, dr.grad(moved.leaf))
@@ -398,7 +401,9 @@ class Deformation:
 
 
 class _Lookup(dr.CustomOp):
-    """Weighted sum of entries of a buffer. Unlike that of a gather, its derivative keeps non-finite values."""
+    """Weighted sum of entries of a buffer. The sum's derivative keeps non-finite values, unlike the derivative of a
+    gather.
+    """
 
     def eval(self, buffer: mi.Float, indices: list[mi.UInt32], weights: list[mi.Float]) -> mi.Float:
         self.indices, self.weights, self.size = indices, weights, dr.width(buffer)

@@ -29,7 +29,9 @@ Array = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
 
 def replace(owner: Element, new: Element, *instead_of: str) -> None:
-    """Put `new` among the children of `owner`, in place of children with its name or with names in `instead_of`."""
+    """Put `new` among the children of `owner`. Replace children that have the name of `new` or a name in
+    `instead_of`.
+    """
     owner.drop(new.name, *instead_of)
     owner.children.insert(0, new)
 
@@ -95,7 +97,9 @@ class Replacing:
         self._owners = Owners(description.root)
 
     def put(self, key: str) -> None:
-        """Write the value of the scene parameter `key`. Raises ConfigError if the description cannot express it."""
+        """Write the value of the scene parameter `key`. Raises ConfigError if the scene description cannot express the
+        value.
+        """
         node = self.params.properties[key][2]
         if (place := self._owners.place(self.params, key)) is None:
             raise self._fail(key, "the object that it belongs to is not in the scene's files")
@@ -171,7 +175,7 @@ class Replacing:
         return ConfigError(self.source, key, f"cannot be exported: {why}")
 
     def _add_file(self, owner: Element, stem: str, suffix: str, write: Callable[[Path], object]) -> None:
-        """Let `owner` name a file of recovered values in place of its own."""
+        """Make `owner` name a file of recovered values instead of its original file."""
         name = f"{RECOVERED}/{stem}{suffix}"
         self.writers[name] = write
         element = owner.new("string", name="filename", value=name)
@@ -179,7 +183,7 @@ class Replacing:
         replace(owner, element)
 
     def copy_assets(self) -> None:
-        """Copy every file that elements name, and change the elements to name the copies.
+        """Copy every file that the scene's elements name. Change the elements so that they name the copies.
 
         A file in the folder of the scene keeps its relative path. Other files go to a separate folder.
         """
@@ -204,8 +208,8 @@ class Replacing:
 def _free(source: Path, home: Path, taken: set[str]) -> str:
     """Return the path of a copy of `source` in the exported folder.
 
-    It is the path below `home`, or one in the folder for other files. If the path is taken (ignoring case), a number is
-    added before its suffix.
+    A file below `home` keeps its relative path. Any other file gets a path in the folder for other files. If the path
+    is already taken, the copy's name gets a number before the suffix. The comparison ignores case.
     """
     inside = source.is_relative_to(home)
     path = PurePosixPath(*source.relative_to(home).parts) if inside else PurePosixPath(ELSEWHERE, source.name)
@@ -217,7 +221,9 @@ def _free(source: Path, home: Path, taken: set[str]) -> str:
 
 
 def same_values(a: object, b: object) -> bool:
-    """Whether two values of a parameter agree up to rounding. A grey agrees with the same number in each channel."""
+    """Whether two values of a parameter agree up to rounding. A grey value agrees with a colour if all channels of the
+    colour equal the grey value.
+    """
     x, y = as_numbers(a), as_numbers(b)
     if x is None or y is None:
         return x is y

@@ -43,8 +43,8 @@ def doubts(scene: Any) -> list[str]:
 def _lost_light(scene: Any) -> str | None:
     """Return the problem of a scene that is far from the origin or tiny, with a remedy, or None.
 
-    Mitsuba offsets the origins of rays from their surface by RayEpsilon (1 + max |p|), in the scene's units. If
-    surfaces are closer than this, rays skip them. Light is then lost in corners, in all integrators.
+    Mitsuba offsets the origins of rays from their surface by RayEpsilon (1 + max |p|), in the scene's units. Rays skip
+    surfaces that are closer together than the offset. Light is then lost in corners, in all integrators.
     """
     low, high = bounds(scene)
     size = float(np.linalg.norm(high - low))
@@ -63,8 +63,9 @@ def _lost_light(scene: Any) -> str | None:
 def clipped(scene: Any, sensor: Any) -> tuple[bool, bool]:
     """Return whether any object may be between a sensor and its near clip plane, and beyond its far clip plane.
 
-    The sensor is perspective or thin-lens. Between sensor and near plane, only objects in its view count. The test uses
-    bounding boxes, and triangles near the sensor. A result of false is certain, and a result of true may be wrong.
+    The sensor is perspective or thin-lens. Between the sensor and its near plane, only objects in the sensor's view
+    count. The test uses bounding boxes, and triangles near the sensor. A result of false is certain, and a result of
+    true may be wrong.
     """
     params = mi.traverse(sensor)
     near, far, radius, focus = (
@@ -108,9 +109,9 @@ def _touches(shape: Any, axes: np.ndarray, eye: np.ndarray, middle: np.ndarray, 
 def _coincident(scene: Any) -> str | None:
     """Return the problem of a scene in which rays of a sensor or a light meet two coincident faces, or None.
 
-    Rounding decides which face a ray meets. This does not matter if both faces have one BSDF and face the same way or
-    are both `twosided`. Otherwise, light paths and camera paths show different scenes. The test detects triangles with
-    three common corners, and equal disks and spheres.
+    Rounding decides which face a ray meets. For two faces with one BSDF, the choice of the face does not matter in two
+    cases. Either the faces face the same way, or both are `twosided`. Otherwise, light paths and camera paths show
+    different scenes. The test detects triangles with three common corners, and equal disks and spheres.
     """
     shapes = scene.shapes()
     twins = _twin_faces(shapes) | _twin_shapes(shapes)
@@ -134,7 +135,7 @@ _Twins = dict[tuple[int, int], tuple[int, int]]
 
 
 def _twin_faces(shapes: Sequence[Any]) -> _Twins:
-    """Return the coincident triangles of meshes for which the choice matters."""
+    """Return the coincident mesh triangles for which the choice of the triangle that a ray meets matters."""
     meshes = [index for index, shape in enumerate(shapes) if shape.is_mesh() and shape.face_count()]
     if not meshes:
         return {}
@@ -171,7 +172,7 @@ def _twin_faces(shapes: Sequence[Any]) -> _Twins:
 
 
 def _twin_shapes(shapes: Sequence[Any]) -> _Twins:
-    """Return the coincident disks and spheres for which the choice matters."""
+    """Return the coincident disks and spheres for which the choice of the shape that a ray meets matters."""
     before: dict[tuple[str, bytes], list[int]] = {}
     found: _Twins = {}
     for index, shape in enumerate(shapes):
@@ -193,7 +194,7 @@ def _twin_shapes(shapes: Sequence[Any]) -> _Twins:
 
 
 def _differ(one: Any, other: Any, turned: bool, bent: bool) -> bool:
-    """Whether it matters which of two coincident faces a ray meets.
+    """True if the choice of the face that a ray meets matters, for two coincident faces.
 
     `turned` tells whether their normals are opposite, and `bent` whether their shading normals differ from their
     normals.

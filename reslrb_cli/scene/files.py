@@ -27,7 +27,7 @@ def option_texts(options: Mapping[str, Any]) -> dict[str, str]:
 
 
 def files_of(config: Config) -> dict[str, Path]:
-    """Return every file that an experiment reads, by its setting.
+    """Return every file that an experiment reads. The keys are the settings that lead to the files.
 
     A setting may lead to more than one file: `scene.file (images/wood.png)`. Missing files are left out; loading the
     experiment reports them. Raises ConfigError if a scene, cameras or a run cannot be read.
@@ -57,7 +57,7 @@ def files_of(config: Config) -> dict[str, Path]:
 
 
 def _paths(value: Any, key: str) -> Iterator[tuple[str, Path]]:
-    """Yield the paths among settings, each with its key in the form of `--set`."""
+    """Yield the paths in the settings, each with its key in the syntax of `--set`."""
     if isinstance(value, Path):
         yield key, value
     elif isinstance(value, Mapping):

@@ -65,7 +65,7 @@ class SceneGraph:
         return any(item.class_name() == "Instance" for item in self.objects)
 
     def is_shown(self, shape: Any) -> bool:
-        """Whether rays may meet a shape. They never meet a shape in a group without instances."""
+        """Whether rays may meet a shape. Rays never meet a shape in a group without instances."""
         return self.has_instances() or any(item.class_name() != "ShapeGroupPlugin" for item in self.parents[shape])
 
     def find_lamps(self, scene: mi.Scene) -> tuple[Lamp, ...]:
@@ -96,7 +96,9 @@ class SceneGraph:
         return list(found)
 
     def owning_bsdfs(self, item: Any) -> list[Any]:
-        """Return the outermost BSDFs that use this object. Other objects than BSDFs and textures use them."""
+        """Return the outermost BSDFs that use this object. An outermost BSDF has a user that is neither a BSDF nor a
+        texture.
+        """
         found = ((bsdf, self.parents.get(bsdf, [])) for bsdf in self.bsdfs_above(item))
         return [bsdf for bsdf, parents in found if not all(isinstance(p, (mi.BSDF, mi.Texture)) for p in parents)]
 
@@ -110,10 +112,10 @@ class SceneGraph:
 
 @dataclass(frozen=True)
 class Lamp:
-    """Emitting shape. `emitter` is its emitter, and `index` the number of the emitter in `scene.emitters()`.
+    """Emitting shape. `emitter` is the shape's emitter, and `index` its place in `scene.emitters()`.
 
-    `parallel` tells whether light leaves only along the normal (`directionalarea`). `texture` is the texture that its
-    points are sampled from, or None if they are uniform over its area.
+    `parallel` tells whether light leaves only along the normal (`directionalarea`). `texture` is the texture from which
+    points on the shape are sampled. `texture` is None if points are uniform over the shape's area.
     """
 
     shape: mi.Shape
@@ -129,10 +131,10 @@ class Lamp:
 
     @cached_property
     def surrounds(self) -> bool:
-        """Whether it is a sphere that emits inwards with constant radiance.
+        """True if the shape is a sphere that emits inwards with constant radiance.
 
         Mitsuba samples points of such a sphere uniformly. If rounding puts the vertex outside of the sphere, it uses
-        the density of a cone instead. This happens for all vertices on the sphere.
+        the density of a cone instead. Rounding can affect all vertices on the sphere.
         """
         return self.is_sphere and self.texture is None and not self.parallel and self.shape.has_flipped_normals()
 
@@ -207,7 +209,8 @@ POINTS = 16
 
 
 def small_lamps(scene: mi.Scene, sensor: mi.Sensor, lamps: Iterable[Lamp]) -> tuple[Lamp, ...]:
-    """Return the lamps that `sensor` sees directly as less than a pixel. If there are more than MOST, return none.
+    """Return the lamps in direct view of `sensor` that are smaller than a pixel. Return no lamps if the number of lamps
+    smaller than a pixel exceeds `MOST`.
 
     Lamps that emit only along their normal are never visible.
     """
@@ -262,7 +265,7 @@ def triangles(mesh: mi.Mesh) -> np.ndarray:
 
 
 def face_normals(corners: np.ndarray) -> np.ndarray:
-    """Return normals (F, 3) of triangles (F, 3, 3). Their length is twice the area of the triangle."""
+    """Return normals (F, 3) of triangles (F, 3, 3). A normal's length is twice the area of its triangle."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 

@@ -16,7 +16,8 @@ from reslrb_cli.scene.xml.read import Description, Element
 
 
 def make_grid(description: Description, id: str, size: tuple[int, int], place: Place) -> None:
-    """Replace the rectangle `id` of a description by a mesh with `size` vertices along its edges, before it is built.
+    """Replace the rectangle `id` of a description by a mesh, before the scene is built. `size` has the vertex counts
+    along the rectangle's edges.
 
     The shape is a `rectangle`, a mesh of four vertices that form a parallelogram, or a mesh that is a flat grid over a
     parallelogram. Its position and its material do not change. Raises ConfigError at `place` for any other shape.
@@ -56,8 +57,9 @@ Corners = tuple[np.ndarray, np.ndarray, np.ndarray, bool]
 def _corners_of(element: Element, description: Description) -> Corners | None:
     """Return the parallelogram of a mesh's file, or None for other meshes.
 
-    It is given by a corner, the ends of its edges along u and along v, and whether v is to the right of u, seen from
-    outside. If four vertices have no texture coordinates, u is chosen so that the mesh is to its left.
+    The result contains a corner, and the ends of the corner's edges along u and along v. The result also tells whether
+    v is to the right of u, seen from outside. If four vertices have no texture coordinates, u is chosen so that the
+    mesh is to its left.
     """
     name = element.find("filename")
     path = None if name is None else description.find_file(name.value)
@@ -83,10 +85,10 @@ def _corners_of(element: Element, description: Description) -> Corners | None:
 
 
 def _corners_of_grid(mesh: mi.Mesh) -> Corners | None:
-    """Return the parallelogram of a mesh with more vertices, whose texture coordinates are proportional to their
-    positions.
+    """Return the parallelogram of a mesh with more than four vertices. The mesh's texture coordinates are proportional
+    to its positions.
 
-    Returns None if the mesh does not cover all of it.
+    Returns None if the mesh does not cover the whole parallelogram.
     """
     if mesh.vertex_count() < 4 or not mesh.has_vertex_texcoords():
         return None

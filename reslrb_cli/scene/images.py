@@ -2,9 +2,9 @@
 
 The checks cover the stated size, the end of the file, and the orientation. A file of some kilobytes can claim to be an
 image of gigabytes, and Mitsuba's reader fills missing data of a JPEG with grey. For compressed formats, the checks also
-detect files that were truncated and padded. An exception are the last lines of an EXR, which has no checksums. Cameras
-and phones store pixels as the sensor has them, and the rotation to an upright image as metadata (EXIF, in JPEG and
-PNG). Mitsuba's reader ignores this metadata.
+detect files that were truncated and padded. The checks do not detect damage in the last lines of an EXR file, because
+EXR has no checksums. Cameras and phones store pixels in the sensor's orientation. JPEG and PNG files store the rotation
+to an upright image as EXIF metadata. Mitsuba's reader ignores this metadata.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ TURNS = {
 
 
 class DamagedImage(ConfigError):
-    """Image for which Mitsuba's reader, or a user of the image, would access memory out of bounds."""
+    """Image for which Mitsuba's reader, or another user of the image, would access memory out of bounds."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,9 @@ def orientation_of(path: Path) -> int:
 
 
 def image_size(path: Path) -> Size:
-    """Return the stored (width, height) of an image. Raises ConfigError, located in the file, if it is no image."""
+    """Return the stored (width, height) of an image. Raises ConfigError, located in the file, if the file is not an
+    image.
+    """
     width, height = _examine(path).size
     if min(width, height) < 1:
         raise DamagedImage(path, "", f"claims {width}x{height} pixels; save it again")
@@ -132,8 +134,8 @@ def image_size(path: Path) -> Size:
 def _examine(path: Path) -> _Header:
     """Return the header of an image.
 
-    Raises ConfigError, located in the file, if it is no image. Also raises it for a PNG or JPEG without its end; for
-    other formats, readers detect this.
+    Raises ConfigError, located in the file, if the file is not an image. Raises ConfigError also for a PNG or JPEG file
+    that lacks its end. For other formats, readers detect a missing end.
     """
     header: _Header | None = None
     with open_file(path) as file:
@@ -248,8 +250,8 @@ def _hdr(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
 def _are_whole(data: bytes, width: int, height: int) -> bool:
     """Whether the lines of a Radiance image fit its header.
 
-    The four parts of a line must be filled exactly by runs, in all lines or in none. Mitsuba's reader does not check
-    the lines, and would write out of bounds.
+    Runs must fill each of a line's four parts exactly. Either all lines consist of runs, or none. Mitsuba's reader does
+    not check the lines, and would write out of bounds.
     """
     start = bytes((2, 2, width >> 8, width & 255)) if 8 <= width <= 0x7FFF else b""
     if not start or data[:2] != start[:2] or data[2:3] >= b"\x80":
@@ -297,7 +299,7 @@ _READERS: dict[bytes, Callable[[Path, bytes, BinaryIO], _Header | None]] = {
 def _heard(lines: list[str]) -> Iterator[None]:
     """Append the process's standard error to `lines` instead of printing it.
 
-    This is the only way in which libjpeg, inside Mitsuba, reports missing data of a complete-looking file.
+    Standard error is the only channel on which libjpeg, inside Mitsuba, reports missing data if a file looks complete.
     """
     try:
         before = os.dup(2)
@@ -337,8 +339,8 @@ class Photo:
 
 
 def turned_line(path: Path, upright: bool = True) -> str | None:
-    """Return a line for the user about an image with an EXIF orientation, which is read `upright` or not. For other
-    images, return None.
+    """Return a line for the user about an image with an EXIF orientation. `upright` tells whether the image is read
+    upright or as stored. For other images, return None.
     """
     turned = TURNS.get(orientation_of(path))
     if turned is None or upright:
@@ -350,11 +352,11 @@ def read_image(path: Path, color_space: str = "auto", size: Size | None = None, 
     """Read an EXR, PNG, JPG, HDR, PFM, PPM or BMP file as linear Rec. 709: (H, W, 3) float32.
 
     `color_space` is the encoding of the file's values: `linear`, `srgb`, or `auto` (integers srgb, floats linear).
-    Alpha is dropped, and one channel becomes three. `size` is the required (width, height). Pixels are as stored, as in
-    Mitsuba's textures. If EXIF would rotate them, a warning is printed.
+    Alpha is dropped. A single channel is copied into three channels. `size` is the required (width, height). Pixels are
+    as stored, as in Mitsuba's textures. If EXIF metadata would rotate the pixels, the function prints a warning.
 
     Raises ConfigError, located in the file, if it is missing, no image, damaged, truncated, too large or of another
-    size. Also raises it for values that are not finite and, unless `signed`, for negative values.
+    size. Raises ConfigError also for non-finite values, and for negative values unless `signed` is true.
     """
     image = read_photo(path, color_space, size, upright=False, signed=signed).image
     orientation = orientation_of(path)
@@ -405,7 +407,8 @@ def read_photo(
 
 
 def read_weights(path: Path, size: Size, upright: bool = True) -> Image:
-    """Read an image of weights, float32 (H, W): the values in the file, or the mean of several channels.
+    """Read an image of weights as float32 (H, W). A weight is the value in the file, or the mean if there are several
+    channels.
 
     Values of 8 and 16 bits are divided by their maximum. Alpha is dropped. `upright` rotates the image by its own EXIF
     orientation. Raises ConfigError, located in the file, like `read_image`.

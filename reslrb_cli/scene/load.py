@@ -50,11 +50,12 @@ def load_scene(
     Shapes are not merged, so all parameters keep their names. An object without an id is named by its kind and its
     number among all objects of this kind in the file, such as `Sphere_3`. Elements of other versions or exporters that
     Mitsuba's parser would refuse are repaired or left out, with a warning in the log. Mitsuba must use every remaining
-    element. The scene's integrator is not loaded, because an experiment has its own. Plugins are loaded only from
-    Mitsuba's own folder.
+    element. The function does not load the scene's integrator, because an experiment has its own integrator. Plugins
+    are loaded only from Mitsuba's own folder.
 
-    Raises ConfigError, located in the scene file, if it is missing or wrong, or without shapes or light. Warns of a
-    scene that is too far from the origin or too small, of glass that is too thin, and of coincident faces.
+    Raises ConfigError, located in the scene file, if the file is missing or wrong. Raises ConfigError also for a scene
+    without shapes or light. Warns of a scene that is too far from the origin or too small, of glass that is too thin,
+    and of coincident faces.
     """
     file = Path(file)
     description = read_description(file, option_texts(options or {}))
@@ -95,13 +96,14 @@ def load_scene(
 def load_for_script(file: str | os.PathLike[str], keys: Iterable[str] = (), /, **options: Any) -> mi.Scene:
     """Load a Mitsuba scene file as the command line does: its parameters have the names that `reslrb inspect` lists.
 
-    It replaces `mi.load_file(file, optimize=False, **options)`, which refuses files of other versions and exporters,
-    and names objects without an id differently. `options` are the values of the file's `$name` variables, which
-    messages call `scene.options.NAME`. `keys` are parameters, or globs, that need gradients: their textures of 8 or 16
-    bits are read as floating point. A variant must be set; the scene's own integrator is not loaded.
+    `load_for_script` replaces `mi.load_file(file, optimize=False, **options)`. `mi.load_file` refuses files of other
+    versions and exporters, and names objects without an id differently. `options` are the values of the file's `$name`
+    variables, which messages call `scene.options.NAME`. `keys` are parameters, or globs, that need gradients: their
+    textures of 8 or 16 bits are read as floating point. A variant must be set; the scene's own integrator is not
+    loaded.
 
-    Raises `reslrb_cli.errors.ConfigError`, one located line, for a file that is missing or wrong, and BackendError
-    under an unsupported variant.
+    Raises `reslrb_cli.errors.ConfigError`, in one line with a location, if a file is missing or wrong. Raises
+    BackendError under an unsupported variant.
     """
     check_variant(mi.variant())
     path = as_path(file, "file", "the path of a scene file")
@@ -109,19 +111,19 @@ def load_for_script(file: str | os.PathLike[str], keys: Iterable[str] = (), /, *
 
 
 def read_as_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> mi.Scene:
-    """Return the scene with bitmaps of 8 or 16 bits among `keys`, which may be globs, read as floating point.
+    """Return the scene, with 8-bit and 16-bit bitmaps among `keys` read as floating point. `keys` may contain globs.
 
-    If there are no such bitmaps, this is `scene` itself. Otherwise the scene is built again from `description`, which
-    is modified.
+    If `keys` name no such bitmaps, the result is `scene` itself. Otherwise the scene is built again from `description`,
+    which is modified.
     """
     return build(description)[0] if _mark_floats(scene, description, keys) else scene
 
 
 def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> bool:
-    """Mark these bitmaps as floats in the description. Returns whether there are any.
+    """Mark 8-bit and 16-bit bitmaps among `keys` as floats in the description. Returns whether there are any.
 
-    Other bitmaps keep their format, because floats take four times the memory of bytes. The values stay the same. They
-    are decoded from sRGB when they are read instead of when they are looked up.
+    Other bitmaps keep their format, because floats take four times the memory of bytes. The values stay the same. The
+    bitmaps are decoded from sRGB when they are read, instead of at each lookup.
     """
     keys = list(keys)
     if not keys or not any(element.type == "bitmap" for element in description.root.walk()):
@@ -142,7 +144,9 @@ def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str])
 
 
 def _check_meshes(file: Path, scene: mi.Scene) -> None:
-    """Raise ConfigError for a mesh whose faces refer to missing vertices, for which Mitsuba reads out of bounds."""
+    """Raise ConfigError for a mesh whose faces refer to missing vertices. Mitsuba would read out of bounds for such a
+    mesh.
+    """
     for shape in scene.shapes():
         if shape.is_mesh() and shape.face_count() and shape.vertex_count():
             last = int(np.array(shape.faces_buffer()).max())

@@ -64,7 +64,8 @@ class SceneNeeds:
 
     `emitters` holds class names in the order of `scene.emitters()`. `environment` is the index of the surrounding
     emitter, or None. `near_clip` tells whether an object may be between the sensor and its near clip plane. `lens_clip`
-    tells whether a thin lens may see objects outside of its clip planes, or has a focus at which Mitsuba sees nothing.
+    is true if a thin lens may see objects outside of its clip planes. `lens_clip` is also true if the lens has a focus
+    at which Mitsuba sees nothing.
     """
 
     emitters: tuple[str, ...]
@@ -89,11 +90,12 @@ class SceneNeeds:
 
 @dataclass(frozen=True)
 class PrimaryHits:
-    """Surfaces that primary rays meet behind see-through surfaces, as fractions of the film that sum to 1.
+    """Surfaces that primary rays meet behind see-through surfaces. `smooth`, `specular` and `nothing` are fractions of
+    the film that sum to 1.
 
     `smooth` surfaces can be connected to the sensor by light paths. `specular` surfaces are only smooth specular
-    (glass, mirrors), and stay black. `nothing` is no surface. `emission` is the fraction with a directly visible
-    emitter, which overlaps with the others.
+    (glass, mirrors), and stay black. `nothing` is no surface. `emission` is the fraction of the film with a directly
+    visible emitter. `emission` overlaps with the other fractions.
     """
 
     smooth: float
@@ -184,10 +186,12 @@ def paths_obstacle(scene: Any, sensor: Any, paths: str, hide_emitters: bool = Fa
 
 
 def scaled_emitter(scene: Any) -> str | None:
-    """Return in words why both kinds of paths do not render the same light, or None if they do.
+    """Return the reason, as text, why light paths and camera paths render different light, or None if they render the
+    same light.
 
-    A `directional` or `projector` emitter may have a scale in `to_world`. Its directions then do not have length 1, and
-    Mitsuba's `sample_ray` and `sample_direction` treat them differently.
+    A `directional` or `projector` emitter may have a scale in `to_world`. With a scale in `to_world`, the directions of
+    a `directional` or `projector` emitter do not have length 1. Mitsuba's `sample_ray` and `sample_direction` treat
+    such directions differently.
     """
     plugins = {"DirectionalEmitter": "directional", "Projector": "projector"}
     for emitter in scene.emitters():
@@ -207,8 +211,8 @@ DIRECT = 2
 def camera_finds_all(scene: Any, max_depth: int) -> bool:
     """Whether camera paths of up to `max_depth` segments (-1: any number) find all light with good probability.
 
-    They do if no surface is specular or glossy, or if all light comes straight from the emitters. No emitter may emit
-    only along its normal.
+    Camera paths find all light if no surface is specular or glossy, or if all light comes straight from the emitters.
+    No emitter may emit only along its normal.
     """
     if any(emitter.class_name() == "DirectionalArea" for emitter in scene.emitters()):
         return False
@@ -267,8 +271,8 @@ def _film_obstacle(sensor: Any) -> str | None:
 
 
 def stock_clip(needs: SceneNeeds) -> str | None:
-    """Return the error of Mitsuba's own light tracing with a sensor's clip planes in words, or None if there is
-    none.
+    """Return the error that Mitsuba's own light tracing makes with a sensor's clip planes, as text. Return None if
+    there is no error.
     """
     if needs.lens_clip:
         return "does not clip the view of a `thinlens`, and loses light if it focuses on a clip plane or beyond"
@@ -280,7 +284,7 @@ def stock_clip(needs: SceneNeeds) -> str | None:
 def _camera_obstacle(scene: Any, sensor: Any, beside_light: bool = False) -> str | None:
     """Return the reason why camera paths cannot render `scene` for `sensor`, or None if they can. Traces no ray.
 
-    With `beside_light`, light paths add the light that camera paths cannot find.
+    With `beside_light`, light paths are traced as well, and add the light that camera paths cannot find.
     """
     graph = SceneGraph.of(scene)
     if (obstacle := _unknown_part(scene, sensor, graph)) is not None:
@@ -343,7 +347,7 @@ def _unknown_part(scene: Any, sensor: Any, graph: SceneGraph) -> str | None:
 
 
 def _first_failure(calls: Iterable[tuple[str, Callable[[], object]]]) -> str | None:
-    """Return the purpose of the first of `calls` that Mitsuba refuses, and the reason."""
+    """Return the purpose of the first call in `calls` that Mitsuba refuses, with the reason for the refusal."""
     found = ((what, failure(call)) for what, call in calls)
     return next((f"Mitsuba cannot {what}: {reason}" for what, reason in found if reason is not None), None)
 
@@ -437,7 +441,7 @@ def surfaces_met(scene: Any, ray: Any, active: Any, random: Any = None) -> Itera
 
 
 def _read_geometry(graph: SceneGraph) -> bool:
-    """Whether any BSDF, or texture of a BSDF, may read more of a surface than texture coordinates and local
+    """True if any BSDF, or any texture of a BSDF, may read surface data other than texture coordinates and local
     directions.
     """
     textures = [texture.class_name() for texture in graph.of_type(mi.Texture) if graph.owning_bsdfs(texture)]

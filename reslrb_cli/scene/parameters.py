@@ -27,10 +27,10 @@ from reslrb_cli.scene.values import ParameterValue, Place, check_bounds, check_t
 class Selection:
     """Recovered parameters, by the keys of their records.
 
-    `params` is all of the scene's `mi.traverse`. `specs` holds the settings of each key, in the order of the
-    configuration and, for a glob, of the scene. A key is one of `params`, or a value of `deformation`: a motion's
-    `ID.translation`, or a heightmap. `tied` maps such a key to other keys of `params` with the same value. `factors`
-    are values outside of the scene that multiply its images (`add_factor`).
+    `params` is all of the scene's `mi.traverse`. `specs` maps each key to its settings. Keys follow the order of the
+    configuration. Keys that match one glob follow the order of the scene. A key is one of `params`, or a value of
+    `deformation`: a motion's `ID.translation`, or a heightmap. `tied` maps a key of `params` to the other keys of
+    `params` that share its value. `factors` are values outside of the scene that multiply its images (`add_factor`).
     """
 
     params: mi.SceneParameters
@@ -84,7 +84,7 @@ class Selection:
                 self._check_opposite(key, each.opposite, place, f"regularizers[{number}].opposite")
 
     def _check_opposite(self, key: str, mesh: str, place: Place, at: str) -> None:
-        """Raise ConfigError if no heightmap of `mesh` faces away from that of `key`."""
+        """Raise ConfigError if no heightmap of the mesh `mesh` faces away from the heightmap `key`."""
         name = f"{mesh}.{HEIGHTMAP}"
         maps = [each for each in self.deformation.values if each.endswith(f".{HEIGHTMAP}") and each != key]
         if name not in maps:
@@ -116,7 +116,7 @@ class Selection:
     def hand_over(self, values: Mapping[str, Any]) -> None:
         """Write values by key, as Dr.Jit values, to the scene, so that the gradients of a step reach them.
 
-        Everything is evaluated, so that a step's kernels are the same from the first one on.
+        The method evaluates all values, so that the first step and all later steps use the same kernels.
         """
         own: list[str] = []
         for key, value in values.items():
@@ -326,7 +326,7 @@ def _check_effect(items: list[Movable], word: str, pivot: bool, place: Place) ->
 
 
 def _tied_keys(params: mi.SceneParameters, keys: list[str], place: Place) -> list[str]:
-    """Return keys that share one value. Each names one parameter, and all have one shape."""
+    """Return keys that share one value. Each key names one parameter, and all these parameters have one shape."""
     found: list[str] = []
     for number, key in enumerate(keys):
         at = Place(place.source, f"{place.key}.key[{number}]", lambda _: "")
@@ -370,7 +370,9 @@ def _matching(params: mi.SceneParameters, pattern: str, place: Place, names: Seq
 
 
 def _obstacle(info: ParameterInfo) -> str | None:
-    """Return why a parameter cannot be recovered, including textures of few bits that loading has not converted."""
+    """Return the reason why a parameter cannot be recovered. One reason is a texture with few bits per channel that
+    loading has not converted.
+    """
     if info.bits is None:
         return info.obstacle
     return (

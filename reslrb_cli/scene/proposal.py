@@ -1,6 +1,7 @@
-"""Proposals for recovering a scene from a photograph: likely parameters, those large in view first.
+"""Proposals of likely parameters for recovering a scene from a photograph. Parameters that are large in view come
+first.
 
-Also the photograph: its properties, and a copy with fewer pixels.
+The module also reads the photograph's properties, and writes a copy with fewer pixels.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ Image = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class Photograph:
-    """Image file: its (width, height) in pixels, upright by EXIF, and whether it holds integers, which clip bright
-    parts.
+    """Image file with its (width, height) in pixels, upright by EXIF. `is_integer` is true if the file holds integers,
+    which clip bright parts.
     """
 
     path: Path
@@ -40,17 +41,19 @@ class Photograph:
 
 
 def open_photograph(path: Path) -> Photograph:
-    """Read an image file. Raises ConfigError, located in it, if it is no image."""
+    """Read an image file. Raises ConfigError, located in the file, if the file is not an image."""
     bitmap = read_bitmap(path, upright=True)
     width, height = (int(n) for n in bitmap.size())
     return Photograph(path, (width, height), np.array(bitmap).dtype.kind in "ui", bitmap)
 
 
 def write_smaller(photo: Photograph, size: tuple[int, int], path: Path) -> None:
-    """Write the photograph with fewer pixels, `size` (width, height), to `path`, as means of linear values.
+    """Write the photograph to `path` with fewer pixels. `size` is the new (width, height). Each new pixel is a mean of
+    linear values.
 
-    Integers become a PNG of 16 bits. A pixel of the PNG is clipped (at the maximum) or transparent (alpha 0) if any of
-    its parts is. Floats become an EXR, which keeps non-finite values. Raises OSError.
+    Integers become a PNG of 16 bits. A PNG pixel is clipped (at the maximum) if any photograph pixel within its area is
+    clipped. A PNG pixel is transparent (alpha 0) if any photograph pixel within its area is transparent. Floats become
+    an EXR, which keeps non-finite values. Raises OSError.
     """
     raw = np.array(photo.bitmap)
     raw = raw.reshape(*raw.shape[:2], -1)
@@ -114,10 +117,11 @@ TEXELS = 64
 
 @dataclass(frozen=True)
 class Proposal:
-    """Parameter that could be recovered. `share` is the part of the picture that it colours, or 0 if it is not visible.
+    """Parameter that could be recovered. `share` is the share of the picture that the parameter colours, or 0 if the
+    parameter is not visible.
 
-    `bounds` are YAML, or None. `resolution` is the (width, height) of a texture with many texels, or None. `first`
-    tells whether it is recovered by default.
+    `bounds` are YAML, or None. `resolution` is the (width, height) of a texture with many texels, or None. `first` is
+    true if the parameter is recovered by default.
     """
 
     info: ParameterInfo
@@ -133,12 +137,13 @@ class Proposal:
 
 
 def propose(scene: mi.Scene, sensor: int, lamps: bool = False, wanted: Sequence[str] = ()) -> list[Proposal]:
-    """Return the recoverable parameters of `scene` through the sensor of this index, without vertices of meshes.
+    """Return the recoverable parameters of `scene`, seen through the sensor with this index. Mesh vertices are
+    excluded.
 
     They are sorted by their shares. `wanted` has globs that select the parameters recovered by default. Without globs,
-    these are the parameters that are large in view. They include lamps if the photograph shows their brightness
-    (`lamps`). At least one parameter is selected if there are any. Raises LookupError, with the glob, if a glob matches
-    nothing.
+    the parameters recovered by default are those that are large in view. Lamps are among the parameters recovered by
+    default if the photograph shows the lamps' brightness (`lamps`). At least one parameter is recovered by default if
+    the scene has any recoverable parameter. Raises LookupError, with the glob, if a glob matches nothing.
     """
     params = mi.traverse(scene)
     shares = _shares(scene, sensor)
@@ -190,7 +195,7 @@ def _is_left_out(params: mi.SceneParameters, info: ParameterInfo) -> bool:
 
 
 def _above(params: mi.SceneParameters, key: str) -> list[Any]:
-    """Return the object that has a parameter, and those above it, without the scene."""
+    """Return the object that has the parameter `key`, and the objects above this object, without the scene."""
     node: Any = params.properties[key][2]
     chain: list[Any] = []
     kinds = (mi.BSDF, mi.Emitter)
@@ -203,9 +208,10 @@ def _above(params: mi.SceneParameters, key: str) -> list[Any]:
 
 
 def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
-    """Return the share of the picture of each BSDF, shape and emitter.
+    """Return the visible share of the picture for each BSDF, shape and emitter.
 
-    It is the share of rays from the sensor that meet it first. Rays also pass mirrors and clear glass.
+    An object's share is the fraction of the sensor's rays that meet this object first. Rays also pass mirrors and clear
+    glass.
     """
     sensor = scene.sensors()[index]
     # One for each ray: an irradiance meter would give one direction for a single ray, which Dr.Jit fails to compile.

@@ -22,14 +22,14 @@ Array = np.ndarray[Any, Any]
 class Place:
     """Place of a value in the configuration, for errors of `fail`.
 
-    `at` is the name of one of its options there, or "" if it has none.
+    `at` maps the name of an option to its name in the configuration, or to "" if the value has no options there.
     """
 
     def __init__(self, source: object, key: str, at: Callable[[str], str] = str) -> None:
         self.source, self.key, self.at = source, key, at
 
     def fail(self, option: str, message: str) -> ConfigError:
-        """Return the error for an `option` of the value at this place."""
+        """Return the ConfigError for one `option` of the configuration value at this place."""
         option = self.at(option)
         return ConfigError(self.source, f"{self.key}.{option}" if option else self.key, message)
 
@@ -59,7 +59,7 @@ class ParameterValue:
         return self.shown(self.holder[self.key])
 
     def shown(self, value: Any) -> Array:
-        """Convert another value for the same place from a Dr.Jit value to the shape of `get`."""
+        """Convert another value of this parameter from a Dr.Jit value to an array with the shape of `get`."""
         array = np.array(dr.detach(value), dtype=np.float32)
         if not self.is_tensor and array.ndim and array.shape[-1] == 1:
             array = array[..., 0]
@@ -214,8 +214,8 @@ def settle(params: mi.SceneParameters, keys: Iterable[str]) -> list[Any]:
     """Compute data that depend on newly set parameters now. Returns the arrays to evaluate.
 
     A texture pads its storage at its first lookup, and unpads it when it is read. The normals of a mesh depend on its
-    vertices. If a step computed these data, its kernels would be split, and differently in the first and the second
-    step.
+    vertices. If a step computed derived data of textures or meshes, Dr.Jit would split the step's kernels. The split
+    would differ between the first and the second step.
     """
     normals = []
     for key in keys:

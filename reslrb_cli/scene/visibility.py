@@ -1,9 +1,9 @@
 """View of sensors: useful pixels and texels for light tracing, and the necessary length of paths.
 
-Light tracing lacks light at the film's border (`interior`). It also lacks light where the sensor sees glass, mirrors,
-or coats (`sees_specular`), because smooth lobes cannot be connected to the sensor. A photograph contains light of any
-number of bounces. An image of paths of at most d segments is darker, and an exposure or a colour would compensate for
-this (`find_depth`).
+Light tracing lacks light at the film's border (`interior`). Light tracing also lacks light where the sensor sees glass,
+mirrors, or coats (`sees_specular`), because smooth specular lobes cannot be connected to the sensor. A photograph
+contains light of any number of bounces. An image of paths of at most d segments is darker, and an exposure or a colour
+would compensate for this (`find_depth`).
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ _APERTURE = ((0.5, 0.5), (0.05, 0.5), (0.95, 0.5), (0.5, 0.05), (0.5, 0.95))
 
 
 def _margin(sensor: mi.Sensor) -> int:
-    """Return the maximum distance in pixels of a sample within the filter's radius of a pixel's centre."""
+    """Return how many pixels the reconstruction filter extends beyond the pixel at its centre, rounded up."""
     return int(np.ceil(float(sensor.film().rfilter().radius()) - 0.5))
 
 
 def interior(shape: tuple[int, ...], sensor: mi.Sensor) -> np.ndarray:
-    """Return where light tracing loses nothing at the film's border: boolean (H, W), for a sensor with such a film.
+    """Return the pixels, boolean (H, W), that lose no light at the film's border under light tracing. `shape` starts
+    with the (H, W) of the film of `sensor`.
 
     Samples just outside of the film are lost, so pixels within the filter's radius of its border are too dark. Camera
     paths do not lose light there.
@@ -44,8 +45,8 @@ def interior(shape: tuple[int, ...], sensor: mi.Sensor) -> np.ndarray:
 
 
 def spread(pixels: np.ndarray, sensor: mi.Sensor) -> np.ndarray:
-    """Return the pixels whose reconstruction filter reaches some of `pixels`, including these. Masks are boolean (H,
-    W).
+    """Return `pixels` together with all pixels whose reconstruction filter reaches some of `pixels`. Masks are boolean
+    (H, W).
     """
     from scipy.ndimage import maximum_filter  # here, because some runs do not need it
 
@@ -56,8 +57,9 @@ def spread(pixels: np.ndarray, sensor: mi.Sensor) -> np.ndarray:
 class SeenSpecular:
     """Pixels (H, W) of a sensor's crop window that smooth specular lobes reach, including the reconstruction filter.
 
-    `alone` marks surfaces without other lobes (glass, mirrors), which stay black under light tracing. `mixed` marks
-    surfaces with other lobes, too (coats, blends, thin panes), for which light tracing lacks a part of the light.
+    `alone` marks surfaces that have only smooth specular lobes (glass, mirrors). Surfaces without other lobes stay
+    black under light tracing. `mixed` marks surfaces that have smooth specular lobes and other lobes (coats, blends,
+    thin panes). Light tracing lacks a part of the light of these surfaces.
     """
 
     alone: np.ndarray
@@ -92,8 +94,8 @@ def sees_specular(scene: mi.Scene, sensor: mi.Sensor) -> SeenSpecular:
 def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
     """Return the pixels (H, W) of a sensor's crop window that see an emitter directly.
 
-    They include pixels that the reconstruction filter reaches. The function may miss a lamp smaller than the cells of a
-    grid of LOOK^2.
+    The result includes the neighbouring pixels that the reconstruction filter reaches. The function may miss a lamp
+    smaller than the cells of a grid of LOOK^2.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     cells = np.zeros((LOOK, LOOK), dtype=bool)
@@ -136,13 +138,13 @@ def visible_texels(
 ) -> np.ndarray[Any, Any]:  # fmt: skip
     """Return the texels of the texture `key` that some sensor sees: boolean (H, W).
 
-    `pixels` (H, W) selects the pixels of each sensor that count, or is None if all do. With `mirrored`, views through
-    mirrors and clear glass count, which camera paths find.
+    `pixels` (H, W) selects the pixels of each sensor that count, or is None if all do. With `mirrored`, texels seen
+    through mirrors and clear glass count as well. Camera paths find these texels.
 
     A texel counts if a primary ray hits the inner quarter of its cell. Rays pass see-through surfaces (masks). Without
-    `mirrored`, they do not pass glass or mirrors, because light paths cannot connect to the sensor through these. For a
-    texture that is on no surface (an environment map, emission), every texel counts. Texture coordinates outside of [0,
-    1] are assumed to repeat.
+    `mirrored`, rays do not pass glass or mirrors, because light paths cannot connect to the sensor through glass or
+    mirrors. For a texture that is on no surface (an environment map, emission), every texel counts. Texture coordinates
+    outside of [0, 1] are assumed to repeat.
     """
     params = mi.traverse(scene)
     node = params.properties[key][2]
@@ -220,7 +222,7 @@ _RAYS, _PATHS = 48, 32
 class Depth:
     """Path depth in segments, and the mean share of a pixel's light that longer paths would add.
 
-    For the greatest depth the share is None, because it was not compared with a greater one.
+    For the greatest depth, `missing` is None, because the greatest depth was not compared with a greater one.
     """
 
     segments: int
@@ -228,10 +230,11 @@ class Depth:
 
 
 def find_depth(scene: mi.Scene, sensor: int) -> Depth:
-    """Return the smallest of `DEPTHS` whose image lacks at most `LOST` of the light, for the sensor with this index.
+    """Return the smallest depth in `DEPTHS` whose image lacks at most the share `LOST` of the light. `sensor` is the
+    index of the sensor.
 
-    The function uses camera paths with equal random numbers and without roulette. The paths of one depth are then the
-    beginnings of those of the next depth.
+    The function uses camera paths with equal random numbers and without roulette. With equal random numbers and no
+    roulette, the paths of one depth are the first parts of the next depth's paths.
     """
     whole = _pixels(scene, sensor, DEPTHS[-1])
     lit = np.isfinite(whole) & (whole > 0)

@@ -1,25 +1,27 @@
 """Scattering towards visible points, mixed with the directions of the BSDF.
 
-A glossy surface reflects light to the sensor from few directions. Few paths come from these directions, but with such
-large weights that they dominate the noise. At each surface, a share SHARE of the paths is therefore aimed at a point
-that the sensor sees. A position on the film is sampled, the first surface there is found, and the path continues to it.
-Both ways to find the next vertex z form a mixture (Veach's thesis, ch. 9; one-sample model, balance heuristic). The
+A glossy surface reflects light to the sensor from few directions. Few paths arrive from the directions that a glossy
+surface reflects to the sensor. The weights of these few paths are so large that they dominate the noise. At each
+surface, a share SHARE of the paths is therefore aimed at a point that the sensor sees. A position on the film is
+sampled, the first surface there is found, and the path continues to it. The next vertex z can be found by BSDF sampling
+or by aiming. Both ways form a mixture (Veach's thesis, ch. 9) with the one-sample model and the balance heuristic. The
 following weight replaces f cos / p_b.
 
     f cos / ((1 - SHARE) p_b + SHARE p_a)        p_a = p_film |cos_z| W / d^2 * |x - z|^2 / |cos|
 
 p_b is the density of the BSDF's directions at x. W / d^2 is the sensor's importance and geometry at z, cos_z the cosine
-at z towards the sensor, and cos the cosine at z towards x. If the sensor does not see z, p_a is 0, which is known only
-at z. A path therefore leaves x with the weight f cos / p_b in both cases. At z, its weight is multiplied by r, which is
-at most 1 / (1 - SHARE).
+at z towards the sensor, and cos the cosine at z towards x. If the sensor does not see z, p_a is 0. The visibility of z
+is known only when the path reaches z. A path therefore leaves x with the weight f cos / p_b, whether the sensor sees z
+or not. At z, the path's weight is multiplied by r, which is at most 1 / (1 - SHARE).
 
     r = 1 / ((1 - SHARE) + SHARE p_a / p_b)
 
 An aimed path ends if it meets another surface on its way, or a point that the sensor does not see. Like the weight of
 roulette, r has no derivative.
 
-Positions on the film are sampled by blocks of pixels (`Aim`). A share AIM_UNIFORM is uniform. The rest follows the
-contributions found in earlier steps, and the step's own dL/dI if it is known before the samples are drawn.
+Positions on the film are sampled by blocks of pixels (`Aim`). A share AIM_UNIFORM is uniform. The remaining share of
+film positions follows the contributions found in earlier steps. The remaining share also follows the step's own dL/dI
+if dL/dI is known before the samples are drawn.
 """
 
 from __future__ import annotations
@@ -47,7 +49,8 @@ REACHED = 1 - 1e-3  # part of the distance to a point that must be free, as for 
 class Aim:
     """Sampling of positions on the film.
 
-    It has the block of each slot (SLOTS), and the density of each block's positions relative to a uniform density.
+    `slots` holds the block of each slot (AIM_SLOTS). `density` holds the density of film positions in each block,
+    relative to a uniform density.
     """
 
     slots: mi.UInt32
@@ -55,8 +58,8 @@ class Aim:
 
     @staticmethod
     def of(blocks: Blocks, wanted: NDArray[np.float64]) -> Aim:
-        """Return blocks with a density proportional to `wanted` (rows * columns, nonnegative), and a uniform share
-        UNIFORM.
+        """Return an `Aim` whose blocks have a density proportional to `wanted` (rows * columns, nonnegative). A share
+        AIM_UNIFORM of the density is uniform.
         """
         even = blocks.areas() / blocks.areas().sum()
         total = wanted.sum()
@@ -76,8 +79,9 @@ class Aim:
 class Pending:
     """Loop state: the data of the last scattering event that the next vertex needs.
 
-    `share` is the share of aimed paths at the event. `pdf` is p_b, and infinite for discrete directions, which aimed
-    paths never take. `distance` is the distance to the point that the path is aimed at, or negative if it is not aimed.
+    `share` is the share of aimed paths at the last scattering event. `pdf` is p_b, and infinite for discrete
+    directions, which aimed paths never take. `distance` is the distance to the point that the path is aimed at, or
+    negative if it is not aimed.
     """
 
     share: mi.Float
@@ -91,7 +95,9 @@ class Pending:
 
     @staticmethod
     def of(aimed: Aimed, si: mi.SurfaceInteraction3f, pdf: mi.Float, discrete: mi.Bool) -> Pending:
-        """Return the state after an event at `si`. `pdf` is the density of its direction, which may be `discrete`."""
+        """Return the state after an event at `si`. `pdf` is the density of the event's direction. `discrete` marks the
+        lanes in which the direction is discrete.
+        """
         distance = dr.select(aimed.active, dr.norm(aimed.point - si.p), -1)
         return Pending(aimed.share, dr.select(discrete, dr.inf, dr.detach(pdf)), dr.detach(distance))
 
@@ -124,7 +130,7 @@ def worthwhile(needs: SceneNeeds, max_depth: int) -> bool:
 
 
 def aims_from(bsdf: mi.BSDFPtr) -> mi.Bool:
-    """Return the lanes whose BSDF allows aiming. No path is aimed at the other surfaces either."""
+    """Return the lanes whose BSDF allows aiming. Paths are also aimed only at surfaces whose BSDF allows aiming."""
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
 
@@ -132,10 +138,11 @@ def choose(
     scene: mi.Scene, sensor: mi.Sensor, aim: Aim, time: mi.Float, bsdf_1d: mi.Float, bsdf_2d: mi.Point2f,
     slot: mi.Float, able: mi.Bool,
 ) -> tuple[Aimed, mi.Float]:  # fmt: skip
-    """Choose the aimed lanes among the `able` ones, and their points.
+    """Choose which of the `able` lanes are aimed, and choose their target points.
 
-    The 1D number of the BSDF selects the lanes. The function also returns this number, rescaled for the other lanes.
-    `slot`, in [0, 1), and the two other numbers of the BSDF give the position on the film.
+    The BSDF's 1D random number `bsdf_1d` selects the aimed lanes. The function also returns `bsdf_1d`, rescaled for the
+    lanes that are not aimed. `slot`, in [0, 1), selects the block of film pixels. The BSDF's two other random numbers,
+    `bsdf_2d`, give the position within the block.
     """
     share, below = dr.select(able, mi.Float(SHARE), 0), dr.one_minus_epsilon(mi.Float)
     active = bsdf_1d < share

@@ -11,7 +11,7 @@ directions and densities do not depend on the parameters. A factor is f / pdf, w
 A scattering event (`scatter`) is a direction sampled from the BSDF, and its weight.
 
 Bump and normal maps perturb the shading frame inside the BSDF, so Veach's correction does not include this change. In
-scenes with such maps, a smooth lobe is evaluated as a camera path would, with exchanged directions.
+scenes with bump or normal maps, a smooth lobe is evaluated as on a camera path, with the two directions exchanged.
 
     f = bsdf(wo -> wi) * cos_p wi * |n . wo| / |n . wi|        n: geometric normal, p: perturbed one
 
@@ -54,7 +54,8 @@ def tracked_factors(
     plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, connection_wo: mi.Vector3f, connected: mi.Bool,
     scattering: Scattering, scattered: mi.Bool,
 ) -> tuple[mi.Spectrum, mi.Spectrum]:  # fmt: skip
-    """Return f (C,) towards the sensor and f (C,) along the path, both with derivatives, from one indirect call.
+    """Return the BSDF factors f (C,) towards the sensor and f (C,) along the path. One indirect call evaluates both
+    factors, and both have derivatives.
 
     Call under `dr.resume_grad()`.
     """
@@ -112,7 +113,9 @@ class Sample:
 
 @dataclass
 class Aimed:
-    """Aimed lanes of an event, their target `point`, whether this point exists, and the `share` of aimed paths."""
+    """Aimed lanes of a scattering event. `point` is the target, `found` is true if the target exists, and `share` is
+    the share of aimed paths.
+    """
 
     active: mi.Bool
     point: mi.Point3f
@@ -153,9 +156,10 @@ class Scattering:
 class Ways:
     """Densities of directions at a vertex per solid angle, for the weights of combined paths (`weights.py`).
 
-    `p` is the density of the sampled direction, and `back` the density of the reverse direction in the walk from the
-    other side. `ahead` and `ahead_back` are the same for the connection or next event. Densities that are not requested
-    are 0. `valid` and `ahead_valid` tell whether both directions lie on consistent sides, as light paths require.
+    `p` is the density of the sampled direction. `back` is the density of the reverse direction in the walk from the
+    path's other end. `ahead` and `ahead_back` are the corresponding densities for the direction of the connection or of
+    the next event. Densities that are not requested are 0. `valid` and `ahead_valid` tell whether both directions lie
+    on consistent sides, as light paths require.
     """
 
     p: mi.Float
@@ -167,7 +171,9 @@ class Ways:
 
 
 def mixes(plan: Plan) -> bool:
-    """Whether directions are sampled from a mixture. Light paths do this at perturbed normals."""
+    """Whether directions are sampled from a mixture. Light paths sample directions from a mixture at perturbed
+    normals.
+    """
     return plan.needs.has_perturbed_normals and not plan.camera
 
 
@@ -187,7 +193,9 @@ def density(
 def _back(
     plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr | mi.BSDF, wo: mi.Vector3f, active: mi.Bool
 ) -> mi.Float:
-    """Return the density of the reverse direction, along `wo` and `si.wi`, in the walk from the other side."""
+    """Return the density of the reverse direction. In the walk from the path's other end, a path arrives along `wo` and
+    continues along `si.wi`.
+    """
     turned = type(si)(si)
     turned.wi = wo
     return density(plan, turned, bsdf, si.wi, active, not plan.camera)
@@ -215,10 +223,10 @@ def shading_correction(
 ) -> tuple[mi.Float, mi.Bool]:
     """Return Veach's factor for shading normals (thesis, p. 155), and whether both directions are on consistent sides.
 
-    Without shading normals the factor is 1 and the sides are always consistent, so neither is computed. With perturbed
-    normals the factor is |n . wo| / |n . wi|. The exchanged BSDF contains the rest. n is taken on the side of the
-    shading normal. A transform that mirrors a mesh reverses the winding of its faces, but camera paths use only the
-    shading normal and do not notice this.
+    Without shading normals, the factor is 1 and the sides are always consistent. The function then computes neither the
+    factor nor the sides. With perturbed normals the factor is |n . wo| / |n . wi|. The exchanged BSDF contains the rest
+    of the correction. The geometric normal n is taken on the side of the shading normal. A transform that mirrors a
+    mesh reverses the winding of its faces, but camera paths use only the shading normal and do not notice this.
     """
     if not (plan.needs.has_shading_normals or plan.needs.has_perturbed_normals):
         return mi.Float(1), mi.Bool(True)
@@ -243,9 +251,9 @@ def scatter(
 ) -> tuple[Scattering, mi.Spectrum | None]:  # fmt: skip
     """Sample the next direction, and evaluate f (C,) towards `connection_wo` in `connected` lanes (None: in no lane).
 
-    The results are detached, unless `attached`. Both queries share one indirect call, and common work such as the
-    lookup of textures. Lanes that are `aimed` use the direction of their point, and the density of the BSDF for it.
-    `weighed` lanes also compute the densities of `Ways`.
+    The results are detached, unless `attached`. Sampling and evaluation share one indirect call and common work, for
+    example texture lookups. `aimed` lanes use the direction to their target point. Their density is the BSDF's density
+    of this direction. In `weighed` lanes, the function also computes the densities of `Ways` for `connection_wo`.
     """
     si, bsdf, context, drawn = hit.si, hit.bsdf, context_of(plan), sample_1
     ways_asked = plan.camera or plan.weighs
@@ -318,13 +326,14 @@ def scatter(
 
 
 def following(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool, sample: Sample) -> Sample:
-    """Return a sample whose derivative is that of the integral that it estimates.
+    """Return a sample whose derivative is the derivative of the integral that the sample estimates.
 
-    For some BSDFs, this is the derivative of the sample itself, and the direction follows the surface and the
+    For some BSDFs, the sample's own derivative is correct. The sampled direction then follows the surface and the
     roughness. The sampling of these BSDFs is smooth, or the choice of a lobe is weighted accordingly, as in Mitsuba's
     dielectrics. Other BSDFs choose a lobe by a probability that depends on their parameters and on the incident
-    direction. The derivative of a sample ignores this choice. Their smooth lobes therefore keep their direction in the
-    local frame, and f / pdf is differentiated through f alone. Their delta lobes keep the probability.
+    direction. The derivative of a sample ignores this choice. Smooth lobes of BSDFs in `plan.needs.unfollowed`
+    therefore keep their direction in the local frame. The derivative of f / pdf then comes from f alone. Their delta
+    lobes keep the probability.
     """
     if not plan.needs.unfollowed:
         return sample
@@ -342,9 +351,10 @@ def following(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active:
 
 
 def stays_behind(plan: Plan, bsdf: mi.BSDFPtr, is_delta: mi.Bool) -> mi.Bool:
-    """Return the lanes in which the vertex behind a scattering event stays at its place on its surface.
+    """Return the lanes in which the vertex after a scattering event keeps its place on its surface.
 
-    If glossy BSDFs follow, a BSDF with both a glossy and a diffuse lobe follows with both lobes.
+    With `plan.glossy_follows`, directions at BSDFs with glossy lobes rotate with the surface. At a BSDF with a glossy
+    and a diffuse lobe, directions of both lobes rotate.
     """
     if not plan.glossy_follows:
         return ~is_delta
@@ -352,8 +362,8 @@ def stays_behind(plan: Plan, bsdf: mi.BSDFPtr, is_delta: mi.Bool) -> mi.Bool:
 
 
 def staying(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool, sample: Sample) -> Sample:
-    """Return the sample of `following`, but with directions of smooth lobes towards a point that does not move with
-    this vertex.
+    """Return the sample of `following`, with other directions for smooth lobes. Smooth lobes are directed towards a
+    point that does not move with this vertex.
 
     The vertex at the far end accounts for the change of direction (`estimators.attached`). Here the direction is
     constant in world space, and f / pdf changes only through f. Delta lobes are as in `following`.
@@ -369,8 +379,8 @@ def staying(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: m
 
 
 def _defensive(sample_1: mi.Float) -> tuple[mi.Bool, mi.Float]:
-    """Return the lanes in which a perturbed BSDF does not sample itself. Also returns the number, rescaled for the
-    other lanes.
+    """Return the lanes in which a perturbed BSDF does not sample itself. Also returns the random number `sample_1`,
+    rescaled for the lanes in which the BSDF samples itself.
     """
     defensive = sample_1 < DEFENSIVE
     return defensive, dr.select(defensive, sample_1 / DEFENSIVE, (sample_1 - DEFENSIVE) / (1 - DEFENSIVE))
@@ -380,10 +390,12 @@ def _mixed(
     plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, sample_2: mi.Point2f, defensive: mi.Bool,
     active: mi.Bool, sample: Sample,
 ) -> Sample:  # fmt: skip
-    """Return a BSDF's sample with the density of the mixture. In `defensive` lanes, it is a cosine-weighted direction.
+    """Return a BSDF's sample with the density of the mixture. In `defensive` lanes, the sample is a cosine-weighted
+    direction.
 
-    A BSDF with a perturbed normal samples around the normal that faces wi, and its exchanged evaluation uses the normal
-    that faces wo. Some directions therefore have a nonzero value, although the BSDF never samples them.
+    A BSDF with a perturbed normal samples directions around the normal that faces wi. The exchanged evaluation of this
+    BSDF uses the normal that faces wo. Some directions therefore have a nonzero value, although the BSDF never samples
+    them.
     """
     hemisphere = mi.warp.square_to_cosine_hemisphere(sample_2)
     hemisphere.z = dr.mulsign(hemisphere.z, mi.Frame3f.cos_theta(si.wi))
@@ -397,7 +409,7 @@ def _mixed(
 
 
 def _to_point(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, aimed: Aimed, sample: Sample) -> Sample:
-    """Return a BSDF's sample. In aimed lanes, it is the direction to the point.
+    """Return a BSDF's sample. In aimed lanes, the sample is the direction to the target point.
 
     The density is 0 if there is no point, or if the BSDF itself never samples this direction.
     """

@@ -75,8 +75,8 @@ def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
 def _within_pixel(samples: Samples, number: mi.UInt32, pixel: mi.UInt32, per_pixel: mi.Float) -> mi.Point2f:
     """Return positions in [0, 1)^2 within pixels, distributed evenly over the numbered samples of each pixel.
 
-    They are Hammersley points, shifted by a random offset for each pixel. Independent positions would add noise through
-    the filter.
+    They are Hammersley points, shifted by a random offset for each pixel. Independent positions within a pixel would
+    add noise through the reconstruction filter.
     """
     x, y = (mi.Float(word) * 2**-32 for word in mi.sample_tea_32(pixel, samples.seed))
     inverse = mi.Float(dr.brev(number)) * 2**-32
@@ -93,7 +93,8 @@ def axis_of(sensor: mi.Sensor) -> mi.Vector3f:
 class MetLight:
     """Emission of an emitter that a camera path hits.
 
-    `Le` (C,) is the detached radiance, and `weight` is w_H, or 0 if it does not count.
+    `Le` (C,) is the detached radiance. `weight` is w_H, the weight of hitting an emitter, or 0 if the hit does not
+    count.
     """
 
     Le: mi.Spectrum
@@ -136,7 +137,8 @@ class NextEvent(Connection):
 
 
 class CameraHooks:
-    """Hooks of a camera path. They are pure, except for the derivatives that they add, and draw no random numbers.
+    """Hooks of a camera path. The hooks are pure functions, except for the derivatives that they add. Hooks draw no
+    random numbers.
 
     `tracked` hooks keep derivatives of the factors in the loop state. The loop is then evaluated vertex by vertex
     (naive AD).
@@ -157,7 +159,7 @@ class CameraHooks:
     ) -> Any:  # fmt: skip
         """Return the state after a vertex, or after a ray has left the scene.
 
-        `met` and `event` are None if the path hits or samples no emitter.
+        `met` is None if camera paths hit no emitter. `event` is None if camera paths sample no emitter.
         """
         return state
 
@@ -170,8 +172,9 @@ class CameraHooks:
 class CameraPath:
     """Loop state of one camera path.
 
-    `before` is the last vertex that is no null event, and `events` counts such vertices. If no light paths compete, `M`
-    is 1 / p of the last of these events, or 0 for the sensor or a delta event.
+    `before` is the last vertex that is not a null event. `events` counts the vertices that are not null events. If no
+    light paths compete, `M` is 1 / p of the last event that is not a null event. After the sensor or a delta event, `M`
+    is 0.
     """
 
     active: mi.Bool

@@ -20,8 +20,8 @@ def forward_derivatives(*values: mi.Spectrum) -> list[mi.Spectrum]:
     """Return the derivatives of `values` along the parameters' tangents. Values that depend on no parameter have zero
     derivatives.
 
-    One propagation handles all values, because a second one would meet the edges of the first. The tangents of the
-    parameters remain for the next vertex.
+    One propagation handles all values. A second propagation would meet the graph edges of the first propagation. The
+    tangents of the parameters remain for the next vertex.
     """
     tracked = [value for value in values if dr.grad_enabled(value)]
     if tracked:
@@ -52,9 +52,10 @@ def transmittance(
     """Follow the segment from the interaction `start` to the point `target` through at most `limit` null surfaces.
 
     Each crossing counts as a vertex, as for `path`. `on_crossing(transmission, active)` is called at each crossing with
-    its transmission (C,), which is tracked if gradients are enabled. It can therefore be differentiated there. With
-    `tangents`, the derivative along the parameters' tangents is computed (forward mode). Gradients must then be
-    suspended, because the loop itself must not track any. With `past_lamps`, lamps do not block the way.
+    its transmission (C,), which is tracked if gradients are enabled. `on_crossing` can therefore differentiate the
+    transmission. With `tangents`, the derivative along the parameters' tangents is computed (forward mode). With
+    `tangents`, gradients must be suspended, because the loop itself must not track any gradients. With `past_lamps`,
+    lamps do not block the way.
     """
 
     def body(passage: Passage, ray: mi.Ray3f) -> tuple[Passage, mi.Ray3f]:
@@ -126,7 +127,7 @@ def connect(
 ) -> Connection:  # fmt: skip
     """Find the film position of the vertex `si`. If `attached`, it moves with the vertex.
 
-    `ray` is the ray that reaches the vertex. It is None if light starts there, on an emitter.
+    `ray` is the ray that reaches the vertex. `ray` is None if the vertex lies on an emitter and light starts there.
     """
     with dr.suspend_grad(when=not attached):
         ds, importance = sensor.sample_direction(si, sample, active)
@@ -165,8 +166,8 @@ def _clip(plan: Plan, sensor: mi.Sensor, ds: mi.DirectionSample3f) -> tuple[mi.B
 def _importance(sensor: mi.Sensor, ds: mi.DirectionSample3f, sees: mi.Bool) -> mi.Spectrum:
     """Return importance and geometry of a camera if it sees the point.
 
-    Mitsuba's own importance is zero outside of a film whose principal point is not shifted, and if a thin lens focuses
-    outside of the clip planes.
+    Mitsuba's own importance ignores a shift of the principal point, and is zero outside of the unshifted film.
+    Mitsuba's own importance is also zero if a thin lens focuses outside of the clip planes.
     """
     pixels = int(dr.prod(sensor.film().crop_size()))
     cos = -dr.dot(ds.d, dr.normalize(ds.n))
@@ -174,7 +175,9 @@ def _importance(sensor: mi.Sensor, ds: mi.DirectionSample3f, sees: mi.Bool) -> m
 
 
 def film_density(sensor: mi.Sensor, cos: mi.Float) -> mi.Float:
-    """Return the density of directions of camera rays through one pixel, at this cosine to the axis."""
+    """Return the density of directions of camera rays through one pixel. `cos` is the cosine between the direction and
+    the sensor's axis.
+    """
     size = sensor.film().size()
     half = dr.tan(dr.deg2rad(mi.Float(mi.traverse(sensor)["x_fov"])) / 2)
     pixel = 4 * half**2 * (int(size.y) / int(size.x)) / int(dr.prod(size))

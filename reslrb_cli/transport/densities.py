@@ -1,7 +1,8 @@
-"""Densities of the rays that a scene's emitters send out, for any ray instead of only sampled ones.
+"""Densities of the rays that a scene's emitters send out. The densities are defined for any ray, not only for sampled
+rays.
 
-Mitsuba does not provide these densities. They are the densities of its `sample_ray`, and of the rays that `emission.py`
-and `lamps.py` sample.
+Mitsuba does not provide these densities. The densities describe the rays of Mitsuba's `sample_ray`, and the rays that
+`emission.py` and `lamps.py` sample.
 
     lamp                 choice / area * cos / pi;  textured, in proportion to its texture
     constant, map, sky   choice p(d) / (pi r^2)         r: of the sphere around the scene
@@ -98,10 +99,11 @@ def _projected_area(projector: mi.Emitter) -> float:
 
 @dataclass
 class Place:
-    """Place where light leaves an emitter, for the density.
+    """Place where light leaves an emitter, as input for `density_of_rays`.
 
-    `own` is the density of this place (for a lamp, per area) or direction (for environments) in next event estimation,
-    without the choice of the emitter. `uv` are texture coordinates, and `d` is the direction of the light.
+    `own` is the density of the place or direction in next event estimation. For a lamp, `own` is the density of the
+    place per area. For environments, `own` is the density of the direction. The choice of the emitter is not included.
+    `uv` are texture coordinates, and `d` is the direction of the light.
     """
 
     emitter: mi.EmitterPtr
@@ -111,7 +113,9 @@ class Place:
 
 
 def density_of_rays(plan: Plan, table: EmitterDensities, at: Place, active: mi.Bool) -> mi.Float:
-    """Return e of the rays that leave these places."""
+    """Return e, the density of the rays that leave these places, divided by the cosine at the emitter's surface if the
+    emitter has one.
+    """
     number = dr.reinterpret_array(mi.UInt32, at.emitter)
     e = dr.gather(mi.Float, table.emitted, number, active)
     textured = any(lamp.texture is not None for lamp in plan.needs.lamps)
@@ -150,8 +154,8 @@ def _evened(lamp: Lamp, at: Place, active: mi.Bool) -> mi.Float:
 
 
 def _projected(at: Place, active: mi.Bool) -> mi.Float:
-    """Return the density of a projector's directions without the area of its picture. `at.uv` are coordinates of the
-    picture.
+    """Return the density of a projector's directions, without the factor 1 / A. A is the picture's area at a distance
+    of 1. `at.uv` are coordinates of the picture.
     """
 
     def density(self: mi.Emitter, uv: mi.Point2f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:

@@ -19,7 +19,7 @@ PROBES = 1024  # light paths for the check
 
 
 def used_numbers(samples: Samples) -> list[bool]:
-    """Return which of the four numbers (place, direction) the emission of any emitter depends on."""
+    """Return which of the four random numbers (place, direction) affect the emission of any emitter."""
     random = np.random.default_rng(1)
     first, other = (random.random((4, PROBES), np.float32) for _ in range(2))
     choice = random.random(PROBES, np.float32)
@@ -42,9 +42,9 @@ def used_numbers(samples: Samples) -> list[bool]:
 class Emission:
     """Ray that leaves an emitter, with the weight E (C,), which is radiance divided by the density of the ray.
 
-    If derivatives are enabled, `weight` tracks those of emission. If emitters move, ray and density track derivatives
-    as well. `guided` is the factor of `weight` from a guide, or None without a guide. `position` contains the random
-    numbers of the place.
+    If derivatives are enabled, `weight` tracks the derivatives of emission. If emitters move, ray and density track
+    derivatives as well. `guided` is the factor of `weight` from a guide, or None without a guide. `position` contains
+    the random numbers of the place.
     """
 
     ray: mi.Ray3f
@@ -130,11 +130,12 @@ def _emitter_ray(
 def _environment_ray(
     plan: Plan, environment: mi.Emitter, time: mi.Float, disk: mi.Point2f, direction: mi.Point2f
 ) -> tuple[mi.Ray3f, mi.Spectrum]:
-    """Return a ray from an environment map, through a disk perpendicular to it that covers the scene's bounding sphere.
+    """Return a ray from an environment map. The ray passes through a disk that is perpendicular to the ray and covers
+    the scene's bounding sphere.
 
     Mitsuba's `envmap.sample_ray` places the disk in the local frame of the map, which is wrong if `to_world` rotates
-    it. Directions are sampled in proportion to the map's radiance. If the map is differentiated, a part of them is
-    uniform, because black texels beside a sun have derivatives as large as any.
+    it. Directions are sampled in proportion to the map's radiance. If the map is differentiated, a part of the
+    directions is sampled uniformly. Black texels beside a sun have derivatives as large as those of any other texel.
     """
     assert plan.horizon is not None
     center, radius = mi.Point3f(*plan.horizon.center), plan.horizon.radius * (1 + 1e-4)

@@ -1,14 +1,15 @@
 """Products of path factors that count zeros, so that the derivative at a zero factor is not lost.
 
-The contribution of a path is a product of factors, f_0 f_1 ... f_k, per channel. Its derivative with respect to f_j is
-the product of all others. Dividing the product by f_j fails if f_j = 0. Therefore the product of the nonzero factors is
-stored with the index of the zero factor.
+The contribution of a path is a product of factors, f_0 f_1 ... f_k, per channel. The derivative of the contribution
+with respect to factor f_j is the product of all other factors. Dividing the product by f_j fails if f_j = 0. Therefore
+the product of the nonzero factors is stored with the index of the zero factor.
 
     one zero factor, f_j:  d(f_0 ... f_k) = (product of the others) df_j       nothing for any other factor
     two or more:           d(f_0 ... f_k) = 0
 
-A tiny factor must not end a path, or prevent the selection of a connection, because its derivative is as large as any.
-Roulette and selection therefore use `weight`, in which no factor is below DIM.
+A tiny factor must not end a path, or prevent the selection of a connection. The derivative with respect to a tiny
+factor is as large as any other derivative. Roulette and selection therefore use `weight`, in which no factor is below
+DIM.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ DIM = 0.1  # minimum value of a factor in a weight, as a fraction of its stand-i
 def showing(value: mi.Float | mi.Spectrum) -> mi.Float | mi.Spectrum:
     """Return `value` with infinity in place of NaN if the backend's atomic sums would drop NaN.
 
-    On a CPU they ignore a NaN unless it shares its address with other numbers of the same packet (Dr.Jit 1.5). Images
-    and gradients would then be finite, and wrong.
+    On a CPU, atomic sums ignore a NaN unless the NaN shares its address with other numbers of the same packet (Dr.Jit
+    1.5). If NaN were dropped, images and gradients would be finite, but wrong.
     """
     return dr.select(dr.isnan(value), dr.inf, value) if dr.backend_v(value) == dr.JitBackend.LLVM else value
 
@@ -36,11 +37,11 @@ def showing(value: mi.Float | mi.Spectrum) -> mi.Float | mi.Spectrum:
 class Product:
     """Product of factors, one value per channel, as part of the loop state.
 
-    `nonzero` is the product of all factors (untracked), or of the nonzero factors with replacements for the others
-    (tracked). `zero` is, per channel, the index of the zero factor, NO_ZERO or MANY_ZEROS. `tracked` is the plain
-    product with derivatives, for naive AD only. `raised` is the product of the factors, each raised to at least DIM
-    times its replacement. `zero` and `raised` are empty if zeros are not tracked, and `tracked` is empty without naive
-    AD.
+    If zeros are not tracked, `nonzero` is the product of all factors. If zeros are tracked, replacements take the place
+    of zero factors in `nonzero`. `zero` is, per channel, the index of the zero factor, NO_ZERO or MANY_ZEROS. `tracked`
+    is the plain product with derivatives, for naive AD only. `raised` is the product of the factors after each factor
+    is raised to at least DIM times its replacement. `zero` and `raised` are empty if zeros are not tracked, and
+    `tracked` is empty without naive AD.
     """
 
     nonzero: mi.Spectrum
@@ -56,13 +57,13 @@ class Product:
 
     @staticmethod
     def none(track_zeros: bool) -> Product:
-        """Return the product of a connection that does not exist. Its value and derivative are zero."""
+        """Return the product for a connection that does not exist. Its value and derivative are zero."""
         return Product(mi.Spectrum(0), [mi.Int32(MANY_ZEROS) for _ in Product.one(track_zeros).zero])
 
     def times(self, factor: mi.Spectrum, index: mi.UInt32 | mi.Int32, stand_in: mi.Spectrum | float = 1) -> Product:
         """Return the product with one more factor, (C,) per lane, at position `index` of the path.
 
-        If the factor is zero, `stand_in` replaces it in `nonzero`. This is a positive number of the size of the
+        If the factor is zero, `stand_in` replaces it in `nonzero`. `stand_in` is a positive number with the size of the
         factor's derivative.
         """
         tracked = [self.tracked[0] * factor] if self.tracked else []
@@ -89,12 +90,14 @@ class Product:
         return self.tracked[0] if self.tracked else self._where(self.nonzero, [z == NO_ZERO for z in self.zero])
 
     def differentiable(self) -> mi.Spectrum:
-        """Return the product of the nonzero factors. In channels whose value and derivative vanish, return zero."""
+        """Return the product of the nonzero factors. Return zero in channels with two or more zero factors, because
+        value and derivative vanish there.
+        """
         return self._where(self.nonzero, [z != MANY_ZEROS for z in self.zero])
 
     def weight(self) -> mi.Spectrum:
-        """Return the weight (C,) for roulette and selection, which estimates value and derivative behind this
-        product.
+        """Return the weight (C,) of this product for roulette and selection. The weight estimates the value and the
+        derivative of the contribution.
         """
         return self._where(self.raised[0] if self.raised else self.nonzero, [z != MANY_ZEROS for z in self.zero])
 

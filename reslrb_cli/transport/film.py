@@ -53,8 +53,9 @@ class Film:
     ) -> None:
         """Add `value` (C,) at film position `u` (pixels, relative to the crop window) through the filter.
 
-        Under naive AD, the weights of the pixels move with `u`. Mitsuba divides them by their sum, and detaches this
-        sum. With `normalization`, the sum is differentiated as well. A `whole` film does not divide by the sum.
+        Under naive AD, the weights of the pixels move with `u`. Mitsuba divides the filter weights by their sum, and
+        detaches this sum. With `normalization`, the sum is differentiated as well. If the film is `whole`, the filter
+        weights are not divided by their sum.
         """
         if normalization and not self.whole:
             total = filter_weights(self.film.rfilter(), u)[2]
@@ -182,7 +183,9 @@ STEPS = 256  # for a filter's integral, in each pixel
 
 @functools.lru_cache(maxsize=64)
 def _integrals(rfilter: mi.ReconstructionFilter) -> list[tuple[int, float]]:
-    """Return the integral of a pixel's filter over each pixel that it reaches, along one axis, by offset."""
+    """Return the integral of a pixel's filter over each pixel that the filter reaches, along one axis. Each integral
+    comes with the offset of the reached pixel.
+    """
     taps = int(np.ceil(float(rfilter.radius()) - 0.5))
     x = (np.arange((2 * taps + 1) * STEPS) + 0.5) / STEPS - taps - 0.5
     values = np.array(rfilter.eval(mi.Float(x.astype(np.float32))), np.float64)
@@ -221,7 +224,7 @@ class Blocks:
 
     @staticmethod
     def of(size: tuple[int, int]) -> Blocks:
-        """Return the smallest blocks with a total number of at most BLOCKS."""
+        """Return the smallest blocks that cover the film with at most BLOCKS blocks."""
         side = 1
         while -(-size[0] // side) * -(-size[1] // side) > BLOCKS:
             side += 1
@@ -283,10 +286,10 @@ MOST_SLOTS = 4  # per pixel
 class PixelShares:
     """Distribution of the camera paths of a pass over the n pixels of a film. Each pixel has some paths.
 
-    The first `even` paths (width 1) are distributed evenly, with at most one more in some pixels. The other paths go
-    `rounds` times (width 1) through all `slots` (S,), which hold the pixels in order. Pixel i has `each[i]` (n,) slots
-    from number `first[i]` (n,) on. The number of paths of a pixel is therefore not random, and dividing by it adds no
-    noise.
+    The first `even` paths (width 1) are distributed evenly, with at most one more in some pixels. The paths after the
+    first `even` paths go through all `slots` (S,) `rounds` times (width 1). `slots` holds the pixels in order. Pixel i
+    has `each[i]` (n,) consecutive slots. Slot number `first[i]` (n,) is the first of them. The number of paths of a
+    pixel is therefore not random, and dividing by it adds no noise.
     """
 
     slots: mi.UInt32
@@ -300,7 +303,7 @@ class PixelShares:
         """Return the distribution of `paths` paths in proportion to `wanted` (n,). A share of EVEN is distributed
         evenly.
 
-        Returns None if there are not more paths than pixels.
+        Returns None if the number of paths does not exceed the number of pixels.
         """
         n = wanted.size
         spare = min(int((1 - EVEN) * paths), paths - n)  # one per pixel: without it, light would be lost

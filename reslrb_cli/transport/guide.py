@@ -1,10 +1,11 @@
 """Guided emission: light paths start where earlier paths contributed.
 
-The start of a path is a point of the unit cube in four dimensions (two numbers for a place or a disk, two for a
-direction) and a number that selects an emitter. The cube is divided into cells, separately for each emitter. A cell k
-with measure v_k is sampled with probability p_k. Numbers are uniform within it, and the path's weight is multiplied by
-v_k / p_k. The expected contribution of a path does not change if every cell can be sampled and p does not depend on the
-numbers that it is used with.
+The start of a path is a point of the four-dimensional unit cube, and a number that selects an emitter. Two coordinates
+of the point give a place or a position on a disk. The two other coordinates give a direction. The cube is divided into
+cells, separately for each emitter. A cell k with measure v_k is sampled with probability p_k. Random numbers are
+uniform within the cell k, and the path's weight is multiplied by v_k / p_k. Guiding does not change the expected
+contribution of a path under two conditions. Every cell can be sampled, and p does not depend on the random numbers with
+which p is used.
 
 Sampling takes one lookup. Of M slots, cell k owns m_k, and p_k = m_k / M exactly. Lanes are stratified: the slots are
 divided into n equal parts for n lanes, and lane i samples from part i. Only the noise within cells remains, and similar
@@ -50,8 +51,8 @@ def make_grid(used: Sequence[bool], weights: Sequence[float], cell_bits: int = C
 
 
 def apportion(grid: Grid, density: Array) -> Array:
-    """Return the slots of each cell (int64). Each has at least UNIFORM of its measure; the rest is proportional to
-    `density`.
+    """Return the slots of each cell (int64). Each cell has at least the slots that correspond to GUIDE_UNIFORM times
+    its measure. The remaining slots are proportional to `density`.
     """
     least = least_slots(grid)
     # Rounded along the order of the cells, so that neighbours balance.
@@ -69,7 +70,8 @@ def apportion(grid: Grid, density: Array) -> Array:
 class Table:
     """Table for sampling.
 
-    It has the cell of each slot, v / p of each cell, the edges of the grid, and data for roulette and aiming.
+    `slots` holds the cell of each slot, `weights` holds v / p of each cell, and `edges` holds the edges of the grid.
+    `survival` and `aim` hold data for roulette and aiming.
     """
 
     slots: mi.UInt32
@@ -94,7 +96,9 @@ class Table:
 
 @dataclass
 class Drawn:
-    """Random numbers of emission from a guide, with their cell and its v / p."""
+    """Random numbers of emission that a guide has drawn. `cell` is the cell of these numbers, and `weight` is the
+    cell's v / p.
+    """
 
     choice: mi.Float
     position: mi.Point2f

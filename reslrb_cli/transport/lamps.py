@@ -28,10 +28,11 @@ def lamp_ray(
     lamp: Lamp, areas: mi.Float | None, time: mi.Float, wavelength_sample: mi.Float, position: mi.Point2f,
     direction: mi.Point2f, active: mi.Bool, evened: bool = False,
 ) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
-    """Return a ray that leaves the lamp, and radiance / density (C,), from the same random numbers as Mitsuba.
+    """Return a ray that leaves the lamp, and radiance / density (C,). The function uses the same random numbers as
+    Mitsuba.
 
-    `areas` are the sums of `sums_of_areas` for a mesh whose faces move, otherwise None. With `evened`, black texels are
-    sampled, too.
+    `areas` are the sums of `sums_of_areas` for a mesh whose faces move, otherwise None. With `evened`, black texels of
+    a lamp's texture are sampled, too.
     """
     si, weight = lamp_point(lamp, areas, time, position, active, evened)
     _, radiance = lamp.emitter.sample_wavelengths(si, wavelength_sample, active)
@@ -70,8 +71,8 @@ def lamp_point(
 def _textured_point(
     mesh: mi.Mesh, texture: mi.Texture, sample: mi.Point2f, active: mi.Bool, evened: bool
 ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
-    """Return a point that Mitsuba samples from a texture, or uniformly. The point keeps its place in its moving
-    face.
+    """Return a point that Mitsuba samples from a texture, or uniformly. If a mesh face moves, the point keeps its place
+    in the face.
     """
     uv, density = _any_uv(texture, sample, active) if evened else texture.sample_position(sample, active)
     active = active & (density != 0)
@@ -92,12 +93,14 @@ def _any_point(
 
 
 def _weight(there: mi.SurfaceInteraction3f, density: mi.Float, active: mi.Bool) -> mi.Float:
-    """Return the inverse of a point's density per area. `density` is its density in texture coordinates."""
+    """Return the inverse of a point's density per area. `density` is the point's density in texture coordinates."""
     return dr.select(active & there.is_valid(), dr.norm(dr.cross(there.dp_du, there.dp_dv)) / density, 0)
 
 
 def _any_uv(texture: mi.Texture, sample: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Float]:
-    """Return texture coordinates from a mixture of the texture's density and the uniform one, and their density."""
+    """Return texture coordinates and their density. The coordinates are sampled from a mixture of the texture's density
+    and the uniform density.
+    """
     with dr.suspend_grad():
         even = sample.x < DEFENSIVE
         x = dr.select(even, sample.x / DEFENSIVE, (sample.x - DEFENSIVE) / (1 - DEFENSIVE))

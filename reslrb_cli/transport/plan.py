@@ -22,10 +22,11 @@ SLOTS_OF_SEVERAL = 8  # if emitters have unequal shares, which are rounded up to
 
 @dataclass(frozen=True)
 class Grid:
-    """Grid of the cells: the cube is divided into 2^bits parts along each of its four numbers, those of the place
-    first.
+    """Grid of cells in the four-dimensional unit cube. Each of the four coordinates is divided into 2^bits parts. The
+    coordinates of the place come first.
 
-    `edges` (E + 1) divide the range of the selecting number among emitters, or groups of emitters.
+    `edges` (E + 1) divide the range of the number that selects an emitter. Each part belongs to one emitter or one
+    group of emitters.
     """
 
     bits: tuple[int, int, int, int]
@@ -49,7 +50,8 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of an array of all cells: the emitter, then the four numbers in reverse order.
+        """Shape of an array with one entry for each cell. The emitter is the first axis, and the four coordinates
+        follow in reverse order.
 
         The order is reversed because the first number varies fastest in a cell's index.
         """
@@ -60,8 +62,8 @@ class Grid:
         return _measures(self)
 
     def coarser(self, cells: float) -> Grid:
-        """Return a coarser grid with at most this number of cells, or one per emitter. Each is a union of cells of this
-        grid.
+        """Return a coarser grid with at most `cells` cells, but at least one cell for each emitter. Each is a union of
+        cells of this grid.
         """
         bits = list(self.bits)
         while sum(bits) > 0 and self.emitters << sum(bits) > cells:
@@ -69,7 +71,9 @@ class Grid:
         return Grid((bits[0], bits[1], bits[2], bits[3]), self.edges)
 
     def summed(self, values: Array, coarser: Grid) -> Array:
-        """Return the sums of values (cells,) over the cells of each coarser cell, with the same type."""
+        """Return the sums of `values` (cells,) over the cells in each coarser cell. The sums have the type of
+        `values`.
+        """
         result = values.reshape(self.shape)
         for axis, few in enumerate(coarser.shape):
             while result.shape[axis] > few:
@@ -95,7 +99,9 @@ def _measures(grid: Grid) -> Array:
 
 @functools.lru_cache(maxsize=4)
 def least_slots(grid: Grid) -> Array:
-    """Return the minimum number of slots of each cell as float64, which is UNIFORM of its measure."""
+    """Return the minimum number of slots of each cell as float64. The minimum corresponds to GUIDE_UNIFORM times the
+    cell's measure.
+    """
     measures = grid.measures()
     result = np.where(measures > 0, np.maximum(np.ceil(GUIDE_UNIFORM * grid.slots * measures - 1e-6), 1), 0)
     result.setflags(write=False)
@@ -162,7 +168,7 @@ class Plan:
 
     @property
     def weighs(self) -> bool:
-        """Whether contributions are weighted against paths from the other side."""
+        """True if contributions of light paths and camera paths are weighted against each other."""
         return self.paths == "both"
 
     @property
@@ -202,9 +208,10 @@ class Plan:
 
     @property
     def small_lamps(self) -> tuple[Lamp, ...]:
-        """Lamps smaller than a pixel. Points on the lamps show them, instead of rays through the pixels.
+        """Lamps smaller than a pixel. For lamps smaller than a pixel, points on the lamps show the light, instead of
+        rays through the pixels.
 
-        The tuple is empty if masks have derivatives, which need primary rays.
+        The tuple is empty if masks have derivatives, because derivatives of masks need primary rays.
         """
         return self.needs.small_lamps if self.visible_emission and not self.differentiate_null else ()
 
@@ -230,12 +237,12 @@ class Plan:
 
     @property
     def reshaped_lamps(self) -> tuple[Lamp, ...]:
-        """Meshes among the placed lamps with moving faces that are sampled in proportion to their areas."""
+        """Placed lamps that are meshes with moving faces. The faces are sampled in proportion to their areas."""
         return tuple(lamp for lamp in self.needs.lamps if lamp.faces_by_area and lamp.shape in self.moving_shapes)
 
     @property
     def visible_moving_lamps(self) -> tuple[Lamp, ...]:
-        """Shapes that move, emit in all directions, and may be directly visible."""
+        """Moving shapes that emit in all directions and may be directly visible."""
         if not (self.visible_emission and self.moving_emission):
             return ()
         return tuple(lamp for lamp in self.needs.lamps if lamp.shape in self.moving_shapes and not lamp.parallel)
@@ -244,13 +251,13 @@ class Plan:
     def passage_in_gradient(self) -> bool:
         """Whether a gradient needs the masks between a vertex and the sensor.
 
-        It needs their derivative or, beside a zero factor, their transmittance.
+        The gradient needs the masks' derivative, or the masks' transmittance if another factor is zero.
         """
         return self.needs.has_null and (self.differentiate_null or self.track_zeros)
 
     @property
     def keep_geometry(self) -> bool:
-        """Whether a stored vertex must contain the data to find it again on its surface."""
+        """True if a stored vertex must contain the data with which the vertex is found again on its surface."""
         return self.attached or self.needs.bsdfs_read_geometry or self.passage_in_gradient
 
     @property
@@ -284,8 +291,8 @@ class Plan:
     def differentiating(
         self, bsdfs: bool, emission: bool, track_zeros: bool, only_bsdfs: tuple[mi.BSDF, ...] = ()
     ) -> Plan:
-        """Return the same plan for a step that differentiates these. With `track_zeros`, some of their factors may be
-        zero.
+        """Return a copy of this plan for a step that differentiates BSDFs (`bsdfs`), emission (`emission`), or both.
+        With `track_zeros`, some differentiated factors may be zero.
         """
         delta, null = self.needs.has_delta_lobes, self.needs.has_null
         if only_bsdfs:
@@ -304,5 +311,5 @@ class Plan:
 
 
 def make_plan(needs: SceneNeeds, max_depth: int, rr_depth: int, hide_emitters: bool) -> Plan:
-    """Return the plan of a walk through a scene with these needs. `max_depth` may be -1."""
+    """Return the plan of a walk through a scene with the features in `needs`. `max_depth` may be -1."""
     return Plan(needs, UNBOUNDED if max_depth < 0 else max_depth, rr_depth, hide_emitters)

@@ -1,4 +1,5 @@
-"""Russian roulette on throughput, as in `ptracer`, and learned roulette, by the direction of a path.
+"""Russian roulette on throughput, as in `ptracer`, and learned roulette. Learned roulette depends on the direction of a
+path.
 
 The learned roulette ends paths in directions where earlier paths contributed little. The bounding box of the scene is
 divided into cubes, and the directions in each cube into octants. A path that leaves a vertex with throughput w survives
@@ -7,7 +8,7 @@ is the value of the cell of the vertex and the new direction.
 
     q = min(1, max(LEAST, w s))
 
-The expected value does not change for any s that does not depend on the random numbers that it is used with.
+Roulette does not change the expected value if s does not depend on the random numbers with which s is used.
 `guiding/collect.py` explains how s is learned.
 
 Paths with larger weights have a larger w, and so a larger q. If q is below 1, it is at least w s. Therefore no
@@ -91,11 +92,11 @@ def box_of(scene: mi.Scene) -> Array:
 
 
 def first_eta(light: mi.Float, guided: mi.Float | None) -> mi.Float:
-    """Return the initial index of refraction of a path for roulette, which is larger for dim emission `light`.
+    """Return a path's initial index of refraction for roulette. The index is larger if the emission `light` is dim.
 
     With an initial index of 1, roulette would end paths of small lamps at once, or all paths if the unit of light is
-    large. `guided` is the weight of a guide, and is excluded. Otherwise roulette would end paths that the guide samples
-    often.
+    large. `guided` is the weight of a guide, and is excluded. If the guide's weight were included, roulette would end
+    paths that the guide samples often.
     """
     if guided is None:
         return dr.rsqrt(dr.clip(light, DIMMEST, 1))
@@ -106,7 +107,9 @@ def play(
     plan: Plan, survival: Survival | None, depth: mi.UInt32, throughput: mi.Float, eta: mi.Float, o: mi.Point3f,
     d: mi.Vector3f, number: mi.Float,
 ) -> tuple[mi.Bool, mi.Float]:  # fmt: skip
-    """Return whether a path survives at vertex `depth`, and its weight. It leaves the vertex with the ray (o, d)."""
+    """Return whether a path survives at vertex `depth`, and its weight. The path leaves the vertex with the ray
+    (o, d).
+    """
     q, playing = mi.Float(1), mi.Bool(False)
     if plan.roulette:
         q = dr.minimum(throughput * dr.square(eta), LIMIT)

@@ -1,10 +1,12 @@
 """Samples of an image in passes: random numbers, number of paths, and film.
 
 Images and gradients of several passes are added. In single precision, a sum over very many samples would lose the last
-terms. With 1e8 samples, it would lose a quarter of a pixel. Each pass therefore has its own block and gradients.
+terms. With 1e8 samples, a sum in single precision would lose a quarter of a pixel. Each pass therefore has its own
+block and gradients.
 
-Random numbers are drawn in the order of Mitsuba's `ptracer`, used or not, so that both trace the same paths from one
-seed. Low-discrepancy numbers (`sobol.py`) replace the first ones.
+Random numbers are drawn in the order of Mitsuba's `ptracer`, even if they are not used. This package and `ptracer`
+therefore trace the same paths from one seed. Low-discrepancy numbers (`sobol.py`) replace the first random numbers of
+each path.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ def in_passes(
     samples: list[Samples], work: Callable[[Samples, mi.ImageBlock | None], None], block: mi.ImageBlock | None,
     params: mi.SceneParameters | None = None,
 ) -> None:  # fmt: skip
-    """Call `work(part, block)` for each pass. It splats into the block and adds gradients of `params`.
+    """Call `work(part, block)` for each pass. `work` splats into the block and adds gradients of `params`.
 
     `block` is None if nothing is splatted, and `params` is None if nothing is differentiated.
     """
@@ -75,7 +77,9 @@ class GradientSum:
 
 
 def _arrays(value: dr.ArrayBase | mi.AffineTransform4f) -> list[dr.ArrayBase]:
-    """Return the arrays of a parameter that have gradients. A transform cannot be added, so it has two arrays."""
+    """Return the arrays of a parameter that have gradients. Transforms cannot be added, so the function returns the two
+    arrays of a transform.
+    """
     return [value.matrix, value.inverse_transpose] if isinstance(value, mi.AffineTransform4f) else [value]
 
 
@@ -98,7 +102,9 @@ NET_STREAM = 0x5EC0E  # scrambles of low-discrepancy numbers
 
 @dataclass
 class Numbers:
-    """Random numbers of one segment: a point on the sensor's aperture, then two numbers and one for the BSDF."""
+    """Random numbers of one path segment. `aperture` is a point on the sensor's aperture. `bsdf_2d` and `bsdf_1d` are
+    two numbers and one number for the BSDF.
+    """
 
     aperture: mi.Point2f
     bsdf_2d: mi.Point2f
@@ -106,12 +112,12 @@ class Numbers:
 
     @staticmethod
     def draw(sampler: mi.Sampler, active: mi.Bool) -> Numbers:
-        """Draw the numbers of the next segment. Afterwards, the walk draws the number of roulette."""
+        """Draw the numbers of the next segment. After this call, the walk draws the random number for roulette."""
         return Numbers(sampler.next_2d(active), sampler.next_2d(active), sampler.next_1d(active))
 
     def of_early(self, early: list[Early], depth: mi.UInt32) -> Numbers:
-        """Return these numbers, with `early` numbers for the BSDFs of the first vertices. The first vertex has
-        depth 1.
+        """Return a copy of these numbers. At the first vertices, the `early` numbers replace the numbers for the BSDF.
+        The first vertex has depth 1.
         """
         bsdf = Early(self.bsdf_2d, self.bsdf_1d)
         for bounce, own in enumerate(early):
@@ -121,7 +127,9 @@ class Numbers:
 
 @dataclass
 class Early:
-    """Random numbers of the BSDF of one of the first vertices, known before the path is traced."""
+    """Random numbers for the BSDF at one of a path's first vertices. The random numbers are known before the path is
+    traced.
+    """
 
     bsdf_2d: mi.Point2f
     bsdf_1d: mi.Float
@@ -168,9 +176,10 @@ class Samples:
         return self._areas[reshaped.index(lamp)] if lamp in reshaped else None
 
     def ratio_at(self, u: mi.Point2f) -> mi.Float:
-        """Return the number of all light paths divided by that of the camera paths of the pixel at film position `u`.
+        """Return the number of all light paths divided by one pixel's number of camera paths. The film position `u`
+        selects the pixel.
 
-        Off the film, the mean number of camera paths per pixel is used.
+        For positions off the film, the mean number of camera paths per pixel replaces the pixel's number.
         """
         assert self.ratio is not None
         if self.shares is None:
@@ -182,7 +191,7 @@ class Samples:
         return self.ratio * dr.select(inside, mean / self.shares.count(pixel, inside), 1)
 
     def sampler(self) -> mi.Sampler:
-        """Return a sampler at the beginning of the stream of these samples."""
+        """Return a sampler at the beginning of these samples' random number stream."""
         if self.plan.paths != "light":  # any number of paths works; the sensor's sampler may require a number per pixel
             sampler = mi.load_dict({"type": "independent"})
         else:
@@ -207,8 +216,8 @@ class Samples:
         return mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))
 
     def emission_numbers(self, sampler: mi.Sampler) -> tuple[mi.Float, mi.Point2f, mi.Point2f]:
-        """Return the numbers of emission in the order of `ptracer`: the choice of an emitter, the place, and the
-        direction.
+        """Return the random numbers of emission in the order of `ptracer`. The order is the choice of an emitter, the
+        place, and the direction.
         """
         choice, place, direction = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
         if self.net is None:
@@ -229,9 +238,10 @@ class Samples:
     def _points(
         self, choice: mi.Float, place: mi.Point2f, direction: mi.Point2f
     ) -> tuple[Points, tuple[mi.Float, mi.Point2f, mi.Point2f]]:
-        """Return the points of the net after drawing the numbers of emission, and these numbers.
+        """Return the net's points and the random numbers of emission. The numbers of emission have already been drawn
+        from the points.
 
-        The arguments are the corresponding independent numbers.
+        `choice`, `place` and `direction` are the corresponding independent random numbers.
         """
         which = self.plan.sequence
         assert which is not None
@@ -247,7 +257,9 @@ class Samples:
         return points, (choice, place, direction)
 
     def drawn(self, choice: mi.Float, position: mi.Point2f, direction: mi.Point2f) -> Drawn | None:
-        """Return the start of each path from the guide, given emission's own numbers, or None without a guide."""
+        """Return the start of each path from the guide, or None without a guide. The arguments are emission's own
+        random numbers.
+        """
         if self.guide is None:
             return None
         assert self.plan.grid is not None
@@ -331,7 +343,7 @@ def _camera_samples(
     plan: Plan, scene: mi.Scene, sensor: mi.Sensor, film: Film, spp: int, width: int, fraction: mi.Float,
     shares: Callable[[int], PixelShares | None] | None,
 ) -> Samples:  # fmt: skip
-    """Return `width` camera paths, which are this `fraction` of an image's samples."""
+    """Return `width` camera paths. `fraction` is the share of these paths in the image's samples."""
     if width > PASS_PATHS:
         raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {spp}")
     scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / width) * fraction

@@ -1,12 +1,12 @@
 """Low-discrepancy numbers: scrambled Sobol points.
 
-They distribute the starts of light paths, and their first scattering events, evenly over all paths. The first number is
-stratified: [0, 1) is divided into n equal intervals for n lanes, and the number of lane i lies in interval i. n does
-not need to be a power of two, and similar paths are traced side by side.
+The Sobol points distribute the starts of light paths, and the first scattering events of light paths, evenly over all
+paths. The first number is stratified over n lanes. [0, 1) is divided into n equal intervals, and the number of lane i
+lies in interval i. n does not need to be a power of two. Similar paths are traced side by side.
 
 The other numbers are Sobol points with the lane number as index. Take 2^k consecutive lanes that start at a multiple of
-2^k, and boxes of area 2^-k along the first two of these numbers, with sides [a, a + 1) times powers of two. Every such
-box contains exactly one point. Boxes along more numbers contain few points each.
+2^k. Take boxes of area 2^-k along the first two Sobol numbers. The sides of the boxes are [a, a + 1) times powers of
+two. Every such box contains exactly one point. Boxes along more than two numbers contain few points each.
 
 Points are scrambled for every pass (Owen 1995). Each binary digit is permuted by a permutation that depends on the
 digits before it, which preserves the boxes. The permutations are hashes, as in Laine and Karras (2011), Burley (2020)
@@ -14,7 +14,8 @@ and Vegdahl (2022). A random number is added to each coordinate, so each point i
 sum over the lanes is therefore unbiased, and sums of different seeds are independent. Direction numbers are those of
 Joe and Kuo (2008).
 
-Digits are stored in reverse order, with the first one lowest. Sums and products then carry only to later digits.
+Digits are stored in reverse order, with the first one lowest. Carries in sums and products then affect only later
+digits.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ BOUNCES = 2
 def directions(coordinate: int) -> tuple[int, ...]:
     """Return a direction number for each binary digit of an index, from the lowest digit on.
 
-    It is added (modulo 2) to the 32 digits of the point.
+    Each direction number is added (modulo 2) to the 32 digits of the point.
     """
     if coordinate == 0:
         return tuple(1 << k for k in range(DIGITS))
@@ -92,8 +93,8 @@ def scrambled(point: mi.UInt32, shift: mi.UInt32, key: mi.UInt32) -> mi.UInt32:
 class Coordinates:
     """Random numbers of a path that are coordinates of its Sobol point.
 
-    These are the numbers that emitters use (the choice, the place and the direction), and three numbers for each of the
-    first `bounces` scattering events.
+    The coordinates are the numbers that emitters use (choice, place and direction), and numbers for scattering. Each of
+    the first `bounces` scattering events has three numbers.
     """
 
     choice: bool
@@ -103,8 +104,8 @@ class Coordinates:
 
 
 def make_coordinates(used: Sequence[bool], emitters: int, max_depth: int) -> Coordinates:
-    """Return the coordinates for this number of emitters. `used` tells which numbers of place and direction they
-    use.
+    """Return the coordinates for this number of emitters. `used` tells which numbers of place and direction the
+    emitters use.
     """
     bounces = min(max(max_depth - 2, 0), BOUNCES)
     return Coordinates(emitters > 1, (used[0], used[1]), (used[2], used[3]), bounces)
@@ -122,15 +123,17 @@ class Net:
         return Net(dr.opaque(mi.UInt64, min(2**64 // width, 2**64 - 1)))
 
     def stratified(self, lane: mi.UInt32, jitter: mi.Float) -> mi.Float:
-        """Return the first coordinate. `jitter` in [0, 1) is the position in its interval."""
+        """Return the first coordinate. `jitter`, in [0, 1), is the position of the coordinate within its interval."""
         within = mi.UInt64(mi.UInt32(jitter * 2.0**24)) * (self.step >> 24)
         return _float(mi.UInt32((mi.UInt64(lane) * self.step + within) >> 32))
 
 
 class Points:
-    """Coordinates of the lanes' points, returned in order, from `used` on. `seed` is opaque.
+    """Coordinates of the lanes' Sobol points, returned in order. `used` is the index of the first returned coordinate.
+    `seed` is opaque.
 
-    With `net`, the first requested coordinate is stratified. Without a net, a guide has stratified the lanes already.
+    With `net`, the first requested coordinate is stratified. Without a net, no coordinate is stratified, because a
+    guide has already stratified the lanes.
     """
 
     def __init__(self, seed: mi.UInt32, width: int, net: Net | None, used: int = 0) -> None:
@@ -139,8 +142,8 @@ class Points:
         self.digits = 24 if width <= 2**24 else DIGITS
 
     def next_1d(self, independent: mi.Float | None = None) -> mi.Float:
-        """Return the next coordinate, in [0, 1). It replaces the random number `independent`, which is used within
-        intervals.
+        """Return the next coordinate, in [0, 1). The coordinate replaces the random number `independent`. Stratified
+        coordinates use `independent` as the position within the interval.
         """
         if self.net is not None:
             assert independent is not None
@@ -152,7 +155,7 @@ class Points:
         return _float(dr.brev(scrambled(digits, shift, key)))
 
     def next_2d(self, independent: mi.Point2f | None = None, used: tuple[bool, bool] = (True, True)) -> mi.Point2f:
-        """Return the next two coordinates. They replace the random numbers that are `used`."""
+        """Return the next two coordinates. The coordinates replace the random numbers for which `used` is true."""
         own = mi.Point2f(0.5) if independent is None else independent
         return mi.Point2f(*(self.next_1d(u) if used[k] else u for k, u in enumerate((own.x, own.y))))
 

@@ -1,14 +1,16 @@
-"""Directly visible emitters: C_0, by points on lamps that move or are small, and by primary rays.
+"""Light C_0 of directly visible emitters. C_0 is sampled by points on lamps that move or are small, and by primary
+rays.
 
-Points on lamps have this contribution at film position u(x).
+A point x on a lamp has the following contribution at its film position u(x).
 
     C_0 = Le(x) |n . w| W(x) / p(x)
 
-For moving lamps, this form has the derivative with respect to their position, because film position, normal and density
-move with the lamp. The outline of the lamp is included, because points at its rim move, too. Occlusion of and by the
-lamp is missing. Primary rays give the light itself, and its derivative with respect to radiance.
+For a moving lamp, the formula for C_0 has the derivative with respect to the lamp's position. Film position, normal and
+density move with the lamp. The outline of the lamp is included, because points at its rim move, too. Occlusion of and
+by the lamp is missing. Primary rays give the light itself, and its derivative with respect to radiance.
 
-Primary rays rarely hit lamps smaller than a pixel. For these lamps, points give the light itself.
+Primary rays rarely hit lamps smaller than a pixel. For lamps smaller than a pixel, points on the lamps give the light
+itself.
 
 There is one primary ray per light path, with its own samples. The rays are distributed evenly over the pixels, so a
 constant background has no noise. `ptracer` connects random points of the emitters to the sensor, which has more noise
@@ -162,7 +164,7 @@ class _Look:
 def visible_radiance(plan: Plan, scene: mi.Scene, primary: PrimaryRay, loop_mode: str = "symbolic") -> mi.Spectrum:
     """Return the radiance (C,) that arrives along the primary ray, through null surfaces if the scene has any.
 
-    With an evaluated `loop_mode`, it has derivatives if they are enabled, for naive AD.
+    If `loop_mode` is evaluated and derivatives are enabled, the radiance has derivatives for naive AD.
     """
     return _look(plan, scene, primary, None, loop_mode).radiance
 

@@ -5,11 +5,11 @@ repeats the loop.
 
 One segment of a light path starts with the ray that reaches a vertex. It consists of the vertex's connection, the
 scattering event, and the next ray. It depends only on the ray, the intersection, the random numbers of the segment, and
-the scene. It can therefore be evaluated again from these.
+the scene. A segment can therefore be evaluated again from its ray, its intersection, its random numbers and the scene.
 
-Random numbers are drawn in the order of Mitsuba's `ptracer`, so that both trace the same paths from the same seed.
-Numbers for selections by hooks come from a separate stream. A replay that selects nothing therefore visits the same
-vertices.
+Random numbers are drawn in the order of Mitsuba's `ptracer`. This walk and `ptracer` therefore trace the same paths
+from the same seed. Numbers for selections by hooks come from a separate stream. A replay that selects nothing therefore
+visits the same vertices.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ class Vertex(Hit):
 
 
 class Hooks:
-    """Hooks of an estimator along a walk. All are pure (state in, state out), and none draws a random number.
+    """Hooks of an estimator along a walk. All hooks are pure functions (state in, state out). No hook draws a random
+    number.
 
     - `numbers` is the number of random numbers that `vertex` gets at each vertex.
     - Without `connects`, no connection is evaluated, and `vertex` gets only its geometry.
@@ -77,7 +78,9 @@ class Hooks:
         return mi.Bool(True)
 
     def is_followed(self, state: Any, vertex: Vertex) -> mi.Bool:
-        """Return, in a replay, the lanes that scatter by `goes_on` and also need their next vertex."""
+        """Return, in a replay, the lanes that need their next vertex, among the lanes that scatter because of
+        `goes_on`.
+        """
         return mi.Bool(True)
 
     def vertex(
@@ -85,7 +88,7 @@ class Hooks:
     ) -> Any:  # fmt: skip
         """Return the state after a vertex, given its connection to the sensor and the sampled scattering event.
 
-        Also called in lanes that `goes_on` has ended.
+        The walk also calls `vertex` in lanes that `goes_on` has ended.
         """
         return state
 
@@ -96,7 +99,7 @@ class Hooks:
         return state
 
     def aimed(self, state: Any, factor: mi.Float) -> Any:
-        """Return the state after aiming (`aim.py`) has multiplied the path's product by the factor r."""
+        """Return the state after aiming (`aim.py`). Aiming multiplies the path's product by the factor r."""
         return self.survived(state, factor)
 
 
@@ -145,9 +148,10 @@ def find_following_vertex(
     """Return the surface interaction of a vertex that stays at its place on its surface, and moves only with the
     surface.
 
-    Also returns the ray that reaches the vertex, and a factor. The direction of the ray changes with both ends. The
-    factor has the value 1 and a derivative. It converts a measure of directions at the ray's origin to a measure on the
-    surface, and is |cos| / distance^2 times the stretching of the surface.
+    Also returns the ray that reaches the vertex, and a factor. The direction of the ray changes if either end of the
+    ray moves. The factor has the value 1, but also has a derivative. The factor converts a measure of directions at the
+    ray's origin to a measure on the surface. Apart from its normalisation to 1, the factor is |cos| / distance^2 times
+    the stretching of the surface.
     """
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
     there = si.p - ray.o
@@ -167,9 +171,9 @@ def segment(
     """Return the segment from a vertex, with `connected` and `scattered` lanes.
 
     Without `evaluates`, the BSDF is not evaluated towards the sensor. With `tracked`, the scattering weight has
-    derivatives of the scene's parameters if gradients are enabled. The connection is then evaluated later, if it is
-    visible. Directions, densities and film positions have no derivatives. With `attached`, everything has derivatives.
-    `aimed` lanes scatter to their points.
+    derivatives of the scene's parameters if gradients are enabled. With `tracked`, the connection is evaluated later,
+    if the connection is visible. Directions, densities and film positions have no derivatives. With `attached`,
+    everything has derivatives. `aimed` lanes scatter to their points.
     """
     plan, si = samples.plan, hit.si
     connection = connect(plan, samples.sensor, si, hit.ray, numbers.aperture, connected, attached)

@@ -1,12 +1,13 @@
-"""Weights of paths that both sides can find: the balance heuristic.
+"""Balance heuristic weights of paths that both light paths and camera paths can find.
 
 A path z_0 (sensor), z_1 .. z_{K-1} (surfaces), z_K (on an emitter) can be found in three ways. A camera path hits the
-emitter (H), its last vertex z_{K-1} samples the emitter (N, next event), or a light path's last vertex z_1 connects to
-the sensor (L). The weight of each way is its density divided by the sum of all three, so w_H + w_N + w_L = 1. The
-weights depend only on the path, and have no derivative.
+emitter (H), or its last vertex z_{K-1} samples the emitter by next event estimation (N). A light path connects its last
+vertex z_1 to the sensor (L). The weight of each way is its density divided by the sum of the densities of all three
+ways. Therefore, w_H + w_N + w_L = 1. The weights depend only on the path, and have no derivative.
 
-Each walk carries two numbers. M is the density of the other walk that joins at the newest vertex, relative to its own
-density. V is the density of the other ways from earlier vertices. These symbols are used below.
+Each walk carries two numbers. M is the density of the way in which the other walk joins at the newest vertex. M is
+relative to this walk's own density. V is the density of the ways in which the other walk joins at earlier vertices.
+These symbols are used below.
 
 - p and p~ are the BSDF's densities of the direction taken, and of the reverse direction in the other walk.
 - c is the |cosine| of the direction taken, and d the length of the segment.
@@ -26,9 +27,9 @@ Both e and p_D include the choice of the emitter.
       connection      w_L = 1 / (1 + p_camA / N (M + V p~))        p_camA: p_cam as a density of area at the vertex
       smooth event    V = (c / p) (M + V p~), then M = 0 for good  delta event   V *= c,  M = 0
 
-A null event is no vertex: M and V stay the same, and d continues. The weights do not include roulette, guiding and
-aiming, but still sum to 1. Source: Georgiev 2012, "Implementing Vertex Connection and Merging". Its recursion weights
-all connections. This is the restriction to three ways.
+A null event is not a vertex. At a null event, M and V do not change, and the length d continues. The weights do not
+include roulette, guiding and aiming, but still sum to 1. Source: Georgiev 2012, "Implementing Vertex Connection and
+Merging". Its recursion weights all connections. This is the restriction to three ways.
 """
 
 from __future__ import annotations
@@ -51,8 +52,8 @@ FROM_INFINITY = -1e30  # the length so far of a path that comes from infinity
 class Rivals:
     """Loop state: M and V of a walk before the arrival at its current vertex, and d since the last vertex.
 
-    Null events are no vertices. p_D of a sphere depends on the vertex. If any lamp is a sphere, `sphere` is therefore
-    the number of the shape that the path comes from, or 0 for other shapes.
+    Null events are not vertices. The density p_D of a spherical lamp depends on the vertex. If any lamp is a sphere,
+    `sphere` is therefore the number of the shape that the path comes from, or 0 for other shapes.
     """
 
     M: mi.Float
@@ -74,11 +75,11 @@ class Rivals:
         return Rivals(M, self.V / cos, d, self.sphere)
 
     def after_null(self, arrived: Rivals) -> Rivals:
-        """Return M and V after a null event. `arrived` has their values at the vertex."""
+        """Return M and V after a null event. `arrived` holds the values of M and V at the vertex."""
         return replace(self, distance=arrived.distance)
 
     def after(self, renewed: mi.Float, joined: mi.Float, scattering: Scattering, cos: mi.Float) -> Rivals:
-        """Return M and V after an event. A smooth event replaces M by `renewed`, and V is computed from `joined`."""
+        """Return M and V after an event. A smooth event sets M to `renewed`, and computes V from `joined`."""
         p, is_delta = scattering.ways.p, scattering.is_delta
         V = dr.select(is_delta, self.V * cos, dr.select(joined > 0, cos / p * joined, 0))
         sphere = [mi.UInt32(0) for _ in self.sphere]
@@ -94,7 +95,7 @@ def cosine(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Float:
 
 
 def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission: Emission) -> Rivals:
-    """Return M and V of a light path on its way to its first vertex."""
+    """Return M and V of a light path that has left an emitter and has not yet reached its first vertex."""
     ray, emitter = emission.ray, emission.emitter
     choice = dr.gather(mi.Float, table.choice, dr.reinterpret_array(mi.UInt32, emitter))
     lamps = {lamp.emitter: lamp for lamp in plan.needs.lamps}
@@ -103,8 +104,8 @@ def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission
     def leave(
         self: mi.Emitter, time: mi.Float, position: mi.Point2f, o: mi.Point3f, d: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float, mi.Point2f, mi.Float, mi.Float]:  # fmt: skip
-        """Return five numbers: the density of places or directions, the cosine, texture coordinates, 1 if there is a V,
-        and d.
+        """Return five values for each emitted ray. The values are the density of places or directions, the cosine, the
+        texture coordinates, 1 if there is a V, and d.
         """
         one, zero = mi.Float(1), mi.Float(0)
         lamp = lamps.get(self)

@@ -68,7 +68,9 @@ class Judgement:
         return self._slices | {ALL: slice(None)}
 
     def _rows(self, member: Member, place: slice) -> np.ndarray:
-        """Return independent estimates by a reference. Steps with the same of several dL/dI are combined."""
+        """Return independent estimates by a reference. If there are several dL/dI, steps with the same dL/dI are
+        combined.
+        """
         several = self._session.plan.objective == "loss" and len(set(member.turns)) > IMAGES
         return member.means(place, IMAGES if several else None)
 
@@ -122,7 +124,7 @@ class Judgement:
         return None if member is reference else reference
 
     def _biases(self, member: Member) -> dict[str, _Bias]:
-        """Return the biases by parameter, and of all together."""
+        """Return the bias for each parameter, and the worst bias of all parameters together."""
         found = {key: self._bias(member, key) for key in self._slices}
         if "image" in found:
             return found
@@ -220,7 +222,7 @@ _UNSEEN = "nothing exceeds the reference's noise"
 
 
 def _kin(member: Member) -> str:
-    """Return whose code traces a member's paths: `reslrb`, or a stock integrator."""
+    """Return the source of the code that traces a member's paths: `reslrb` or a stock integrator."""
     name = member.method.integrator
     return name if name in ("ptracer", "prb") else "ours"
 

@@ -68,7 +68,8 @@ class Session(Arena[Plan, Member]):
     def kept(self) -> Kept | None:
         """Return the data for a later session, or None if nothing has been sampled.
 
-        The data leave out methods that were left out or never took a step, so that a later session tries them again.
+        The data do not record that a method was left out or never took a step. A later session therefore tries the
+        method again.
         """
         if not self.rounds or not any(member.rows for member in self.members):
             return None
@@ -210,7 +211,7 @@ class Session(Arena[Plan, Member]):
         return sum(member.count * member.step_s for member in self._alive())
 
     def _say_what_it_takes(self) -> None:
-        """Print the budget that would suffice for figures, or for slopes, if the actual budget did not suffice."""
+        """Print a sufficient budget if the actual budget did not suffice for figures or for slopes."""
         late = [member for member in self.members if member.late]
         taken = self.rounds - self._before
         if taken >= self._fewest and not late:

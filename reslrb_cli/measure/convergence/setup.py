@@ -1,4 +1,5 @@
-"""Members of a `convergence`, the facts that precede the measurement (`survey`), and the steps of a member (`Sampler`).
+"""Members of a `convergence` measurement, the facts that precede the measurement (`survey`), and the steps of a member
+(`Sampler`).
 
 Survey and sampler run in separate processes (`workers.py`), which `begin_survey` and `begin_sampling` start.
 """
@@ -64,7 +65,7 @@ class Role(str, enum.Enum):
 
 @dataclass(kw_only=True)
 class Member(Stepping):
-    """Process with its steps so far and its steps per turn.
+    """Process of one member, with its steps so far and its number of steps per turn.
 
     `rows` are samples (P,), `turns` are their rounds, and `seconds` has the time of one step in each turn. `count` is
     the number of steps in a turn. `taken` is the number of all requested steps, which determines the seeds.
@@ -117,7 +118,7 @@ class Member(Stepping):
     def kept(self, rounds: int) -> tuple[dict[str, Any], np.ndarray]:
         """Return the data of the first `rounds` rounds for a later session: a JSON object, and the samples (N, P).
 
-        An interrupted round is left out. The next session repeats it with other seeds.
+        An interrupted round is left out. The next session repeats the interrupted round with other seeds.
         """
         turns = [turn for turn in self.turns if turn < rounds]
         entry = {"name": self.name, "config": dump(self.config), "taken": self.taken, "turns": turns,
@@ -144,7 +145,7 @@ class Member(Stepping):
 def share_turns(members: list[Member], fixed: bool) -> None:
     """Set the number of steps per turn of each member so that turns take about equal times.
 
-    With `fixed`, every member takes this number.
+    With `fixed`, each member takes the `FIXED` number of steps for its role.
     """
     for member in members if fixed else ():
         member.count = FIXED[member.role.value]
@@ -182,8 +183,8 @@ _PURPOSE = "convergence, dL/dI"
 
 
 def begin_survey(first: dict[str, Any]) -> Begun:
-    """Start the process. Its only request has the name of the file for arrays, `out`. The answer has the facts of
-    `survey`.
+    """Start the process. The process gets only one request. The request's `out` is the name of the file for arrays. The
+    answer has the facts of `survey`.
     """
     problem = assemble_scene(told(first).with_exposures_fixed())
 
@@ -209,10 +210,10 @@ def survey(
     - `masked`: whether pixels along the border are left out. `pixels`: the number of pixels.
     - `pictures`: a description of the rendered images.
 
-    The arrays are `mask` (H, W, 1) and, unless the image is the objective, the first view's `target_arrays` and
-    `adjoints` (B, H, W, C). `camera` is true if camera paths take part, if they are valid or `named`; they have no dark
-    film border. `light` is true if methods with a dark film border take part. `budget_s` is the time of the whole
-    measurement, if it is limited.
+    The arrays are `mask` (H, W, 1), the first view's `target_arrays`, and `adjoints` (B, H, W, C). If the image is the
+    objective, `mask` is the only array. `camera` is true if camera paths take part. Camera paths take part if they are
+    valid or `named`. Camera paths have no dark film border. `light` is true if methods with a dark film border take
+    part. `budget_s` is the time of the whole measurement, if it is limited.
     """
     film = problem.scene.sensors()[problem.sensors[0]].film()
     width, height = (int(n) for n in film.crop_size())
@@ -279,7 +280,7 @@ def find_references(problem: Problem, objective: str) -> dict[str, Any]:
 
 
 def _unlike(config: Config) -> str | None:
-    """Return why naive AD has other derivatives of moving parameters than the experiment requests, or None."""
+    """Return why naive AD computes other derivatives of moving parameters than the experiment requests, or None."""
     options, alike = config.integrator.options(), ALIKE[Reference.PTRACER]
     if all(options.get(name, value) == value for name, value in alike.items()):
         return None
@@ -287,8 +288,8 @@ def _unlike(config: Config) -> str | None:
 
 
 def affordable_paths(problem: Problem, pixels: int, seconds: float) -> int:
-    """Return the number of light paths for this time. It is a power of 2, so that similar machines have the same
-    images.
+    """Return the number of light paths that can be traced in `seconds` seconds. The number of paths is a power of 2, so
+    similar machines have the same images.
     """
     spp = multiple_of(TRIAL // pixels, problem.samples_per_pass)
     for _ in range(2):  # the first one compiles kernels
@@ -316,8 +317,8 @@ def shorten_target(problem: Problem, most: int) -> tuple[Problem, str]:
 class Sampler(Steps):
     """Steps of `convergence`.
 
-    `mode` is the sampled quantity. `known` is the gradient with dL/dI fixed at one of `adjoints`, `loss` is the
-    gradient of the experiment's loss with its `run.adjoint`, and `image` is the image. `arrays` are the arrays of the
+    `mode` is the sampled quantity. `known` is the gradient with dL/dI fixed at one of `adjoints`. `loss` is the
+    gradient of the experiment's loss with its `run.adjoint`. `image` is the image. `arrays` are the arrays of the
     survey.
     """
 

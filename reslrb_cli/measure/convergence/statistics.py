@@ -1,8 +1,8 @@
 """Statistics of convergence: the error of averages of n steps, its slope, efficiency, and the time for a given error.
 
-Samples x are (R, P): R steps, P entries. The reference r is the mean of K rows (K, P). Each row is an independent
-estimate of the same mean from other steps. tr is the trace of a covariance, which is the sum of the variances of all
-entries.
+Samples x are (R, P): R steps, P entries. The reference r is the mean of K rows (K, P). The rows are independent
+estimates of the same mean, from other steps. tr is the trace of a covariance, which is the sum of all entries'
+variances.
 
     noise   = tr Var(r)                                  the reference's own squared standard error
     signal  = |r|^2 - noise                              the squared size of the estimated quantity
@@ -10,8 +10,9 @@ entries.
     RMSE(n) = sqrt(MSE(n) / signal)                      relative
     bias^2  = |mean(x) - r|^2 - tr Var(x) / R - noise
 
-All these estimates are unbiased, so single values may be negative. Intervals come from the jackknife. It leaves out one
-turn of steps at a time from the samples, and one row at a time from the reference. The two variances are added.
+All these estimates are unbiased, so single values may be negative. Intervals come from the jackknife. The jackknife
+leaves out one turn of steps at a time from the samples. For the reference, the jackknife leaves out one row at a time.
+The two variances are added.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ class JackknifeEstimate:
         return Range(self.value, self.value - half, self.value + half)
 
     def exponential(self, confidence: float = CONFIDENCE) -> Range:
-        """Return the interval of the exponential of this estimate, which is a logarithm."""
+        """Return the interval of exp(value). The value of this estimate is a logarithm."""
         own = self.interval(confidence)
         low, value, high = np.exp(np.clip([own.low, own.value, own.high], -700, 700))
         return Range(float(value), float(low), float(high))
@@ -63,8 +64,8 @@ class JackknifeEstimate:
 
 @dataclass(frozen=True)
 class Point:
-    """The error of averages of `steps` steps, over `repeats` averages. It is None if the reference's own error is
-    larger.
+    """Error of averages of `steps` steps, computed from `repeats` averages. The error is None if the reference's own
+    error is larger.
     """
 
     steps: int
@@ -89,7 +90,7 @@ class ReferenceMean:
 
     @cached_property
     def without(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The effect of leaving out one row at a time on the mean (K, P), the noise (K,) and the signal (K,)."""
+        """Leave-one-out results: the change of the mean (K, P), the noise (K,) and the signal (K,) without each row."""
         count, deviations = len(self.rows), self.rows - self.mean
         moved = -deviations / (count - 1)
         squares = np.square(deviations).sum(1)
@@ -114,7 +115,7 @@ class MethodSamples:
 
     @property
     def step_s(self) -> float:
-        """Seconds of a step, as the mean over turns."""
+        """Seconds per step, averaged over turns."""
         return float(self.seconds.mean())
 
     @cached_property
@@ -142,7 +143,8 @@ class MethodSamples:
         """Return d log RMSE / d log time, or None if there are too few steps. It is -1/2 for independent, unbiased
         steps.
 
-        Averages are over steps of one group. Their errors are weighted by the number of averages of each length.
+        Averages are over steps of one group. The fit weights the error for each average length by the number of
+        averages of that length.
         """
         groups = next((groups for steps, groups in GROUPS.items() if self.count >= steps), None)
         if groups is None:
@@ -169,8 +171,8 @@ class MethodSamples:
         return _joined(float(corrected), left, right)
 
     def efficiency(self, biased: bool = False) -> JackknifeEstimate | None:
-        """Return the logarithm of 1 / (relative variance * seconds of a step), or None without noise or with too few
-        turns.
+        """Return the logarithm of 1 / (relative variance * seconds of a step). Without noise or with too few turns,
+        return None.
 
         If `biased`, the squared bias is added to the variance.
         """
@@ -202,9 +204,10 @@ class MethodSamples:
         return _joined(float(value), left, right)
 
     def seconds_to(self, error: float, biased: bool) -> tuple[float | None, bool]:
-        """Return the seconds until the relative error is `error`, and whether this takes more steps than were measured.
+        """Return the seconds until the relative error is `error`. Also return true if more steps are needed than were
+        measured.
 
-        The seconds are None if a bias prevents this error. At least one step is needed.
+        The seconds are None if a bias keeps the error above `error`. At least one step is needed.
         """
         room = error**2 - (self.squared_bias if biased else 0.0)
         if room <= 0:
@@ -242,7 +245,9 @@ def _error(squares: np.ndarray, sums: np.ndarray, counts: np.ndarray | int, nois
 
 
 def _joined(value: float, left: np.ndarray, right: np.ndarray) -> JackknifeEstimate:
-    """Return an estimate with the jackknife's variances of both sides, combined by Welch and Satterthwaite."""
+    """Return an estimate with the jackknife variances of the samples and of the reference. Welch and Satterthwaite's
+    rule combines the two.
+    """
     sides = [side for side in (left, right) if len(side) > 1]
     variances = [float(jackknife_variance(side)) for side in sides]
     total = sum(variances)

@@ -39,5 +39,5 @@ def run_suite(
 def case_records(
     stop: Callable[[], bool], name: str, estimators: Iterable[str] | None, seeds: int | None
 ) -> list[GradcheckRecord]:
-    """Return the records of one case. Some are missing if `stop()` became true."""
+    """Return the records of one case. Some records are missing if `stop()` became true."""
     return list(takewhile(lambda _: not stop(), run_suite([name], estimators, seeds)))

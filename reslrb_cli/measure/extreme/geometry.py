@@ -51,7 +51,7 @@ def veiled(opacity: Any, **changes: Any) -> dict:
 
 
 def nested() -> dict:
-    """A glass ball in a ball of water, outside of the camera's view of the floor below."""
+    """A glass ball inside a ball of water. The camera sees the floor below, but not the balls."""
     water = glass(1.33, specular_transmittance=rgb(0.9, 0.8, 0.7))
     inner = glass(1.5, 1.33, specular_transmittance=rgb(0.7, 0.8, 0.9), specular_reflectance=rgb(0.9, 0.6, 0.8))
     return {
@@ -143,7 +143,7 @@ def pool(
     """A receiver in glass with a wavy surface. With a `thickness`, the glass is a slab above the receiver.
 
     `slope` is the slope of the waves in units of 0.1, and `scale` the size of everything. The surface has `cells` flat
-    faces per side. Their error falls with the square of `cells` (docs/method.md).
+    faces per side. The error of the flat faces falls as the inverse square of `cells` (docs/method.md).
     """
     seen = pinhole([0, scale, 0], [0, 0, 0], [0, 0, -1], 90, SIZE, rfilter=FILTER)
     positions, faces, uv = grid(cells, lambda x, z: height + slope * waves(x, z), 2.5)
@@ -161,7 +161,7 @@ def pool(
 
 
 def bending(size: float = 1, scale: float = 1) -> Moves:
-    """Three smooth displacements of the surface, of this size."""
+    """Three smooth displacements of the surface, multiplied by `size`."""
 
     def moves(scene: Any) -> Sequence[Move]:
         fields = size * scale * smooth_fields(vertices(scene, "top") / scale, 3, 1.0)
@@ -190,7 +190,7 @@ def surface(ior: float = 1.5, slope: float = 1, **rough: Any) -> Callable[[], di
 
 
 def grazing(degrees: float) -> dict:
-    """Light at this angle from the surface's normal."""
+    """Light that meets the surface at `degrees` from its normal."""
     theta = float(np.deg2rad(degrees))
     at = -1.2 * float(np.tan(np.arcsin(np.sin(theta) / 1.5)))
     start = (at - 2 * float(np.sin(theta)), 1.2 + 2 * float(np.cos(theta)))
@@ -273,7 +273,9 @@ def normal_map() -> dict:
 
 
 def vertical_light() -> dict:
-    """A lamp that stands upright on the floor's edge. Nearly all its light arrives on the floor at grazing angles."""
+    """A lamp that stands upright on the floor's edge. Nearly all of the lamp's light arrives on the floor at grazing
+    angles.
+    """
     place = transform(translate=[0, -0.99, 0.999], rotate=([0, 1, 0], 180), scale=[1, 0.01, 1])
     return room(lamp=lit_square(rgb(9, 8, 7), place))
 
@@ -305,7 +307,7 @@ RECEIVER = "floor.bsdf.reflectance.value"
 
 
 def reflected(bsdf: dict) -> dict:
-    """A lamp whose light an upright plate reflects to the floor."""
+    """A lamp and an upright plate. The plate reflects the lamp's light to the floor."""
     return {
         "type": "scene",
         "camera": pinhole([0, 0.9, 0], [0, 0, 0], [0, 0, -1], 60),
@@ -342,7 +344,7 @@ KINDS: dict[str, tuple[Callable[[dict], dict], dict, str, str, bool]] = {
 
 
 def plate(kind: str, roughness: str) -> dict:
-    """Light that passes a plate with a BSDF of this kind."""
+    """A plate with a BSDF of this `kind`. The plate reflects or transmits a lamp's light."""
     around, options, colour, own, _ = KINDS[kind]
     return around({"type": kind, own: float(roughness), colour: rgb(0.9, 0.7, 0.5), **options})
 
@@ -355,7 +357,7 @@ NOISE = "the noise of a roughness's derivative grows as 1 / roughness: equal see
 
 
 def followed(kind: str, roughness: str) -> str:
-    """Return the name of the case in which roughness moves light."""
+    """Return the name of the case in which the roughness parameter moves light."""
     return f"{kind}_{roughness}_followed"
 
 

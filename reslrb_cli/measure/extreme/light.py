@@ -38,7 +38,7 @@ LAMP = "lamp.emitter.radiance.value"
 
 
 def columns(*texels: tuple[float, ...]) -> dict:
-    """A texture of these columns, two rows high, the minimum in Mitsuba."""
+    """A texture with the columns `texels` and two rows. Mitsuba needs at least two rows."""
     row = np.array(texels, float).reshape(1, len(texels), -1)
     return bitmap(np.repeat(row, 2, 0))
 
@@ -150,14 +150,14 @@ def sun() -> dict:
 
 
 def skimming() -> dict:
-    """Parallel light at half a degree to the floor."""
+    """Parallel light that meets the floor at half a degree from the floor's plane."""
     height = float(np.tan(np.deg2rad(0.5)))
     light = {"type": "directional", "direction": [-0.9, -height, -0.43], "irradiance": rgb(90, 80, 70)}
     return room(lamp=None, wall_shape=None, side_shape=None, light=light)
 
 
 def speck() -> dict:
-    """A hall lit by a beam on a speck close to the camera, at 1e-4 of the walls' distance."""
+    """A hall lit by a beam that hits a speck. The speck is close to the camera, at 1e-4 of the walls' distance."""
 
     def facing(origin: list, target: list, half: float) -> Any:
         return look_at(origin, target, [0, 1, 0]) @ transform(scale=half)
@@ -235,7 +235,7 @@ LIT_FLOOR = "floor.brdf_0.reflectance.value"
 
 
 def mixed(weights: np.ndarray) -> np.ndarray:
-    """Weights of either sign by channel and pixel, with a mean that is not zero."""
+    """Weights for each channel and pixel, with either sign. The mean weight is not zero."""
     return weights * np.random.default_rng(4).choice([-1.0, 1.0], weights.shape, p=[0.35, 0.65]).astype(np.float32)
 
 

@@ -1,7 +1,7 @@
 """The extreme suite: `ExtremeCase` describes a case, and `run_case` compares its estimators with references.
 
-Each case is run with light paths and with camera paths (`WAYS`). Camera paths have the same references, except at the
-film's border (`_seen_by`), and are also compared with naive AD of the same paths.
+Each case is run with light paths and with camera paths (`WAYS`). Camera paths have the references of light paths,
+except at the film's border (`_seen_by`). Camera paths are also compared with naive AD of the same paths.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ Scene = Callable[[], dict]
 class ReferenceGradients:
     """Gradients of a reference.
 
-    They are (N, P) at other seeds, (N, P) at the estimator's seeds (`paired`), or exact values (P,). `along` (K, P) are
-    the directions along which the derivative is known, or None for all entries. `bias` bounds the error of the
-    reference itself.
+    The gradients are (N, P) at other seeds, (N, P) at the estimator's seeds (`paired`), or exact values (P,). `along`
+    (K, P) are the directions along which the derivative is known, or None for all entries. `bias` bounds the error of
+    the reference itself.
     """
 
     values: np.ndarray
@@ -66,7 +66,7 @@ class Stock:
 
 @dataclass(frozen=True)
 class Twin:
-    """`ptracer` in another scene, whose gradients are known multiples of this scene's gradients.
+    """`ptracer` in another scene. The case's gradients are known multiples of the other scene's gradients.
 
     `factors` are the multiples by parameter; the default is 1.
     """
@@ -85,10 +85,11 @@ class Twin:
 
 @dataclass(frozen=True)
 class Differences:
-    """Finite differences of our own image, without Russian roulette, along random directions into the domain.
+    """Finite differences of the image by `reslrb`, without Russian roulette. The differences are along random
+    directions into the domain.
 
-    They use the random numbers of the gradient. They are exact up to rounding if paths do not depend on the parameters
-    and the image is a polynomial of degree 2.
+    The finite differences use the gradient's random numbers. The differences are exact up to rounding in one case.
+    Paths do not depend on the parameters, and the image is a polynomial of degree 2.
     """
 
     step: float
@@ -107,11 +108,12 @@ class Differences:
 
 @dataclass(frozen=True)
 class Extrapolated:
-    """Finite differences of the image by each amplitude of a motion, with the random numbers of the gradient.
+    """Finite differences of the image for each amplitude of a motion. The differences use the gradient's random
+    numbers.
 
     Differences with a step are corrected by differences with twice the step (`extrapolated`). The assumed error has two
-    parts: a tenth of the correction, and the fraction `left` of the root mean square of the differences. The latter
-    covers the faces of a mesh and higher powers of the step.
+    parts: a tenth of the correction, and the fraction `left` of the root mean square of the differences. The `left`
+    part covers the faces of a mesh and higher powers of the step.
     """
 
     step: float
@@ -227,8 +229,8 @@ def exact(
     name: str, about: str, known: Callable[[], KnownScene], keys: Mapping[str, str], max_depth: int,
     rr_depth: int | None = None, **more: Any,
 ) -> ExtremeCase:  # fmt: skip
-    """Return a case whose image is known in closed form. `keys` are its parameters, and `more` sets other fields of the
-    case.
+    """Return a case whose image is known in closed form. `keys` are the case's parameters. `more` sets other fields of
+    the case.
     """
     options = {"max_depth": max_depth} | ({} if rr_depth is None else {"rr_depth": rr_depth})
     shared: dict[str, Any] = {"options": options, **more}
@@ -236,7 +238,9 @@ def exact(
 
 
 def without_roulette(case: ExtremeCase) -> dict[str, Any]:
-    """Return the options of a case for integrators whose gradients Russian roulette would bias."""
+    """Return a case's options for integrators whose gradients Russian roulette would bias. The options have no
+    `rr_depth`.
+    """
     return {key: value for key, value in case.options.items() if key != "rr_depth"}
 
 
@@ -248,7 +252,7 @@ KIND = "gradcheck --suite"
 
 
 def settings(estimators: Sequence[str] | None, seeds: int | None, variant: str, device: str) -> dict[str, Any]:
-    """Return the settings that must be the same in all sessions. None stands for values that each case sets."""
+    """Return the settings that must be the same in all sessions. If a setting is None, each case sets its own value."""
     return {
         "--estimators": "all" if estimators is None else list(estimators),
         "--seeds": "as the cases have it" if seeds is None else seeds,
@@ -322,12 +326,14 @@ def split(label: str) -> tuple[str, dict[str, Any]]:
 
 
 def _loses_border(case: ExtremeCase, setup: Case) -> bool:
-    """Whether light paths lose light along the film's border that camera paths have."""
+    """True if light paths lose light along the film's border that camera paths keep."""
     return bool(setup.scene.sensors()[0].film().rfilter().radius() > BOX)
 
 
 def _hidden_from(case: ExtremeCase, setup: Case) -> str | None:
-    """Return the reason to leave out camera paths, or None: they find no light, or find it too rarely for a z-test."""
+    """Return the reason to leave out camera paths, or None. Camera paths may find no light, or find light too rarely
+    for a z-test.
+    """
     depth, hidden = case.options["max_depth"], bool(case.options.get("hide_emitters", False))
     at = Situation.of(setup.scene, setup.scene.sensors()[0], setup.params, depth, hidden, paths="both")
     reason = prb_image(at)
@@ -387,7 +393,7 @@ def _record(
 
 
 def _steps(case: ExtremeCase, setup: Case, name: str) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Return gradients (N, P), images (N, H, W, 3), and numbers (N,) of refused entries of dL/dI of an estimator."""
+    """Return an estimator's gradients (N, P), images (N, H, W, 3), and numbers (N,) of refused dL/dI entries."""
     images, refused = [], []
 
     def step(*arguments: Any, **options: Any) -> None:
@@ -403,7 +409,7 @@ def _steps(case: ExtremeCase, setup: Case, name: str) -> tuple[np.ndarray, np.nd
 
 
 def _refusals(weights: np.ndarray, refused: list[int]) -> Comparison:
-    """Compare the numbers of refused entries of dL/dI with the numbers of entries that are not finite."""
+    """Compare the numbers of refused dL/dI entries with the number of entries that are not finite."""
     expected, counts = int(np.count_nonzero(~np.isfinite(weights))), sorted(set(refused))
     message = f"refused {', '.join(map(str, counts))} entries of dL/dI, of {expected} not finite"
     return Comparison(Verdict.HOLDS if counts == [expected] else Verdict.FAILS, message=message)
@@ -443,8 +449,8 @@ def _parameters(setup: Case) -> Iterator[tuple[str, slice, tuple[int, ...]]]:
 
 
 def _settled(case: ExtremeCase, parameter: str | None, found: Comparison, ours: np.ndarray) -> Comparison:
-    """Return the comparison after the case's other conditions. No comparison of the suite stays open without a
-    reason.
+    """Return the comparison `found`, changed where the case has other conditions. A comparison of the suite stays
+    undecided only if the case gives a reason.
     """
     if found.verdict is Verdict.UNREACHED and (isinstance(case.source, Zero) or parameter in case.open_ended):
         message = "exactly zero" if isinstance(case.source, Zero) else "exactly zero, like the reference"

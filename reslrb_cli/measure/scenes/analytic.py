@@ -1,7 +1,7 @@
 """Scenes with images in closed form, and with the derivatives of every pixel.
 
-Images are those of a box filter: the mean radiance over each pixel. All parameters are colours. A channel of the image
-depends only on the same channel of a parameter.
+The images assume a box filter. Each pixel is the mean radiance over its area. All parameters are colours. A channel of
+the image depends only on the same channel of a parameter.
 """
 
 from __future__ import annotations
@@ -164,7 +164,8 @@ def texels_over_plane(texels: ArrayLike) -> KnownScene:
 
         L(x) = rho / pi * sum_t Le_t int_t h^2 / d^4 dA
 
-    Lambert's law for horizontal surfaces at distance h, with Gauss-Legendre nodes in pixels and in texels.
+    The formula is Lambert's law for horizontal surfaces at distance h. Gauss-Legendre quadrature integrates over pixels
+    and texels.
     """
     radiance = np.asarray(texels, np.float64)
     count = len(radiance)
@@ -228,13 +229,14 @@ def point_through_surface(
 
     A camera in the medium, straight above the origin, sees the light on the diffuse bottom, y = 0, after one
     refraction. Light that leaves at an angle theta_1 from the vertical meets the bottom at a distance x from the point
-    below the light, with x = h tan(theta_1) + depth tan(theta_2) and sin(theta_1) = ior sin(theta_2). Light through a
-    ring of directions lands in a ring.
+    below the light, with x = h tan(theta_1) + depth tan(theta_2) and sin(theta_1) = ior sin(theta_2). Light emitted
+    into a ring of directions lands in a ring on the bottom.
 
         E = I (1 - R(theta_1)) tau sin(theta_1) / (x dx/dtheta_1),   L = rho / pi * E
 
-    This follows from Snell's law, Fresnel's equations and conservation of flux (Born and Wolf, Principles of Optics,
-    Sections 1.5 and 3.1). Light that the surface reflects back to the bottom is left out, as with max_depth 3.
+    The formula for E follows from Snell's law, Fresnel's equations and conservation of flux. See Born and Wolf,
+    Principles of Optics, Sections 1.5 and 3.1. Light that the surface reflects back to the bottom is left out, as with
+    max_depth 3.
     """
     points, weights = plane_points(camera_height, fov, size)
     light = np.asarray(light, np.float64)

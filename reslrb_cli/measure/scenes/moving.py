@@ -47,7 +47,8 @@ def grid(cells: int, height: Callable[[Array, Array], Array], half: float = 1.0,
          ) -> tuple[Array, Array, Array]:  # fmt: skip
     """A sheet over [-half, half]^2 in x and z that faces up. Returns vertices, triangles and texture coordinates.
 
-    With `wide`, cells grow from the middle to the rim. Their coordinates are hyperbolic sines of values up to `wide`.
+    With `wide`, cells grow from the middle to the rim. The coordinates of the cells are proportional to hyperbolic
+    sines of values between -`wide` and `wide`.
     """
     at = np.linspace(-1, 1, cells + 1)
     axis = half * (np.sinh(wide * at) / np.sinh(wide) if wide else at)
@@ -62,7 +63,8 @@ def grid(cells: int, height: Callable[[Array, Array], Array], half: float = 1.0,
 def smooth_fields(positions: Array, count: int, span: float, seed: int = 5) -> Array:
     """Return random smooth displacements of unit size in all three directions, (count, V, 3).
 
-    Each is a wave along a random direction, with a few wavelengths within `span`.
+    Each field is a cosine wave with a random wave vector and a random direction of displacement. The wave's phase
+    changes by 1.5 to 5 radians over the length `span`.
     """
     random = np.random.default_rng(seed)
     found = []
@@ -144,7 +146,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Number:
-    """Adds its only amplitude to a number, such as a roughness."""
+    """Adds its single amplitude to a number, such as a roughness."""
 
     key: str
     size: int = 1
@@ -160,7 +162,9 @@ Move = Displacement | Pose | Number
 
 @dataclass
 class Displaced:
-    """The `measure.values.Values` of a scene that `moves` change. AMPLITUDES has the amplitudes of all moves."""
+    """The values of a scene that `moves` change, with the interface `measure.gradients.Values`. AMPLITUDES has the
+    amplitudes of all moves.
+    """
 
     scene: mi.Scene
     moves: Sequence[Move]
@@ -196,7 +200,9 @@ class Displaced:
 
 
 def moving_case(description: dict, moves: Callable[[Any], Sequence[Move]]) -> Case:
-    """Return a loaded scene with the amplitudes of its `moves` as the only parameter. dL/dI is smooth."""
+    """Return a case with a loaded scene and a smooth dL/dI. The only parameter is the array of amplitudes of the
+    scene's `moves`.
+    """
     scene = load(description)
     case = Case(scene, [AMPLITUDES], values=Displaced(scene, moves(scene)))
     case.weigh(smooth_weights(*case.weights.shape))

@@ -1,7 +1,7 @@
 """Small scenes for measurements and gradient checks: a Cornell box, and a corner of a room.
 
-`build` returns the Cornell box with a texture on its white surfaces. Measurements without a configuration use it.
-`room` returns the corner of a room as a dictionary for `mi.load_dict`. Gradient checks add objects to it.
+`build` returns the Cornell box with a texture on its white surfaces. Measurements without a configuration use the
+Cornell box. `room` returns the corner of a room as a dictionary for `mi.load_dict`. Gradient checks add objects to it.
 """
 
 from __future__ import annotations

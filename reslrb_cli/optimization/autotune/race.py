@@ -8,15 +8,15 @@ The gain compares variance times time.
 
     gain = (variance * time of the one) / (variance * time of the other)
 
-The variance is summed over the parameters, each divided by the mean square of its gradient. The interval is that of the
-logarithm of the quotient of variances, by the jackknife over the steps. The error of single times is added. Times are
-those of kernels plus, equally for both, the other work of a run, which matters if iterations take milliseconds. A table
-that steps sample from is learned first, from other paths, and then kept.
+The variance is a sum over the parameters. Each parameter's variance is divided by the mean square of its gradient. The
+jackknife over the steps gives the interval for the logarithm of the ratio of variances. The error of single times is
+added. Times include kernels and the run's other work. The other work counts equally for both options, and matters if
+iterations take milliseconds. A table that steps sample from learns first, from other paths. The table then stays fixed.
 
-An option with two alternatives needs four parts: a record in `records/decisions.py` (a `PaidRecord`), a row in `LATER`,
-a `Turns` in `sampling.py` that makes the record (like `SequencePilot`), and a function like `_sequence` that calls
-`Tuner.decide`. `settle_sampling` calls this function. If an option has more than two values, each competes with the
-best so far.
+A new option with two alternatives needs a record in `records/decisions.py` (a `PaidRecord`) and a row in `LATER`. The
+option also needs a `Turns` in `sampling.py` that makes the record (like `SequencePilot`). The fourth part is a function
+like `_sequence` that calls `Tuner.decide`. `settle_sampling` calls this function. If an option has more than two
+values, each value competes with the best value so far.
 """
 
 from __future__ import annotations
@@ -122,11 +122,13 @@ class Tuner:
         fits: Callable[[Record], bool] = lambda record: True,
         later: Sequence[Need] = (),
     ) -> Record:
-        """Return the decision of an earlier run if it `fits`. Otherwise measure it now with `measure`, and store it.
+        """Return the decision of an earlier run if it `fits`. Without a stored decision that fits, measure now with
+        `measure`, and store the result.
 
-        `of` has the conditions of the decision besides the situation. `needs` are the minimum costs of a useful
-        measurement by steps of `integrator` and others (`Allowance.affords`). `unmeasured` returns the decision without
-        measuring, given a note. Time for `later` measurements is reserved if there is enough for both.
+        `of` has the conditions of the decision that `situation` does not contain. `needs` are the minimum costs of
+        useful measurements with steps of `integrator` and of its alternatives (`Allowance.affords`). `unmeasured` takes
+        a note, and returns the decision without a measurement. Time for `later` measurements is reserved if the time
+        suffices for the present and the `later` measurements.
         """
         key = ""
         if self._cache is not None:
@@ -150,8 +152,8 @@ class Tuner:
         return record
 
     def allowance(self, integrator: Tracer) -> Allowance:
-        """Return the time limit of all measurements. If it is unknown, two first steps of `integrator` with few samples
-        determine it.
+        """Return the time limit of all measurements. If the time limit is not yet available, two first steps of
+        `integrator` with few samples determine the limit.
         """
         problem, run = self.problem, self.problem.config.run
         if problem.allowance is not None:
@@ -208,7 +210,7 @@ def situation(problem: Problem) -> dict[str, Any]:
 
 @dataclass
 class Step:
-    """Step or learning walk, with its gradients, its image by view, and times in milliseconds.
+    """A gradient step or a learning walk, with its gradients, its image for each view, and times in milliseconds.
 
     `kernel_ms` is the time of the kernels, and `image_ms` that of an image with its own samples. `compile_ms` is the
     time to generate and compile kernels. `wall_ms` is everything else.
@@ -228,8 +230,8 @@ class Step:
 
 
 def timed(times: StepTimes, wall_ms: float | None = None) -> Step:
-    """Return a step with these times. If the process waited for other work, `wall_ms` replaces the time of the
-    clock.
+    """Return a step with these times. If the process waited for other work, `wall_ms` replaces the clock's wall
+    time.
     """
     # Kernels are compiled in parallel: their times can add up to more than the wait.
     waited_ms = max((times.wall_ms if wall_ms is None else wall_ms) - times.codegen_ms, times.kernel_ms)
@@ -253,7 +255,7 @@ def compare(
     other_ms: Sequence[float],
     confidence: float = CONFIDENCE,
 ) -> Gain:
-    """Return the efficiency of the other way divided by that of the own way, with its interval.
+    """Return the efficiency of `other` divided by the efficiency of `own`, with the confidence interval of the ratio.
 
     `own` and `other` have the gradients of at least three steps, by parameter. `own_ms` and `other_ms` have the times
     of steps in any unit. Returns NOTHING if one way has no noise.
@@ -280,7 +282,9 @@ def scales(gradients: Sequence[Gradients]) -> dict[str, float]:
 
 
 def _log_variances(gradients: Sequence[Gradients], scales: dict[str, float]) -> tuple[float, Array] | None:
-    """Return the logarithm of the variance of all parameters, and the same with each round left out in turn."""
+    """Return the logarithm of the total variance of all parameters. Also return the logarithms with each round left out
+    in turn.
+    """
     rows = np.array([
         np.concatenate([g[key].astype(np.float64) / math.sqrt(scale) for key, scale in scales.items()])
         for g in gradients
@@ -322,12 +326,12 @@ def lessons(problem: Problem) -> float:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Samples per pixel: of a step of the run (`step`), of each set with one dL/dI (`call`), and of a pass of a set
-    (`part`).
+    """Samples per pixel. `step` is for a step of the run, `call` for each set with one dL/dI, and `part` for one pass
+    of a set.
 
     `alone` tells whether images have their own samples. `rounds` is the planned number of rounds. `lessons` is how
-    often tables of guided emission learn for each set, as the mean over the run. A step of the other kind may take
-    `longer` times as long. `planned` is at most PLANNED.
+    often tables of guided emission learn for each set, averaged over the run. A step with the option may take `longer`
+    times as long as a plain step. `planned` is at most PLANNED.
     """
 
     step: int
@@ -358,10 +362,11 @@ Learn = Callable[[int, int], Step]
 
 
 class Turns(Generic[Record]):
-    """One decision, by steps of `take` and learning walks of `learn` if a table must learn.
+    """A decision based on steps that `take` returns. If a table must learn, `learn` provides the learning walks.
 
-    `views` is the number of views of an iteration divided by that of a step here. `share` is the part of ITERATIONS
-    that the decision may cost. `most` is the part that the minimum number of rounds may cost, if that is more.
+    `views` is the number of views in an iteration, divided by the number of views in a step here. The decision may cost
+    `share` times the time of ITERATIONS iterations. If `most` exceeds `share`, the minimum number of rounds may cost
+    `most` times the time of ITERATIONS iterations.
     """
 
     LEAST, LOOKS = LEAST_ROUNDS, LOOKS
@@ -402,8 +407,8 @@ class Turns(Generic[Record]):
         return self._decided()
 
     def _learned(self, round_ms: float) -> bool:
-        """Let the table learn if it must. Returns False if there is no time for this and for rounds of this
-        duration.
+        """Let the table learn if it must. Returns False if the time does not suffice for learning and for the minimum
+        number of rounds of `round_ms` each.
         """
         if self._learn is None:
             return self._affords(self.LEAST * round_ms)
@@ -421,8 +426,8 @@ class Turns(Generic[Record]):
 
     @property
     def _iteration_ms(self) -> float:
-        """Time of an iteration of the run in milliseconds: kernels of all its samples, and the other work for
-        each set.
+        """Time of an iteration of the run in milliseconds. The time includes the kernels for all samples, and the other
+        work for each set.
         """
         kernels = statistics.median(step.kernel_ms + step.image_ms for step in self._plain)
         return self._views * (kernels + self._python_ms) * self._sizes.step / self._sizes.trial
@@ -438,8 +443,8 @@ class Turns(Generic[Record]):
         return self._spent_ms + more_ms <= share * ITERATIONS * self._iteration_ms
 
     def _more_ms(self) -> float:
-        """Return the additional time outside of its kernels that a step of the other kind takes in a run, for `trial`
-        samples.
+        """Return the additional time outside of kernels that a step with the option takes in a run. The time is for
+        `trial` samples.
         """
         return 0.0
 
@@ -448,8 +453,8 @@ class Turns(Generic[Record]):
         raise NotImplementedError
 
     def _times(self, other: bool, images: bool) -> list[float]:
-        """Return the times of steps of one kind. `images` tells whether images with their own samples are drawn the
-        other way.
+        """Return the times of steps of one kind. `images` is True if images with their own samples use the option as
+        well.
         """
         beside = self._python_ms + (self._more_ms() if other else 0.0)
         if self._sizes.alone:
@@ -457,13 +462,13 @@ class Turns(Generic[Record]):
         return [step.kernel_ms + beside for step in self._steps[other]]
 
     def _gain(self, images: bool, confidence: float = CONFIDENCE) -> Gain:
-        """Return the gain of the gradient. `images` tells whether images are drawn the other way."""
+        """Return the gain of the gradient. `images` is True if images use the option as well."""
         own, other = ([step.gradients for step in steps] for steps in self._steps)
         return compare(own, self._times(False, images), other, self._times(True, images), confidence)
 
     def _image_gain(self) -> Gain:
-        """Return the gain of the image, from its own samples if it has them, otherwise from the samples that also serve
-        the gradient.
+        """Return the gain in efficiency for the image. Images with their own samples use these samples. Otherwise, the
+        gradient's samples also give the image.
         """
         own, other = ([step.images for step in steps] for steps in self._steps)
         times = [self._times(each, False) for each in (False, True)]
@@ -477,8 +482,8 @@ class Turns(Generic[Record]):
         return low is None or high is None or low > 1 or high < 1
 
     def _images(self, gain: Gain) -> bool:
-        """Whether images use the alternative as well. If this is not decided separately, whether it does not harm
-        images.
+        """True if images also use the alternative. If images have no separate decision, True if the alternative does
+        not harm images.
         """
         if self._apart:
             return gain[1] is not None and gain[1] > 1
@@ -507,7 +512,7 @@ class Turns(Generic[Record]):
         return self._decide(other, images, found | {"share": self._spent_ms / (ITERATIONS * self._iteration_ms)})
 
     def _found(self, note: str) -> dict[str, Any]:
-        """Return the fields that all records of such decisions have."""
+        """Return the fields that the records of all decisions by `Turns` have."""
         cost = {"measure_s": self._spent_ms / 1e3, "compile_s": self._compile_ms / 1e3}
         return {"rounds": len(self._steps[True]), "spp": self._sizes.trial, "note": note, **cost}
 

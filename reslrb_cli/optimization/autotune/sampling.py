@@ -1,8 +1,8 @@
 """Sampling of a run, decided before its first iteration: paths, pixels, guided emission, and the sequence of numbers.
 
-Open settings are decided in this order: paths, distribution of camera paths over the pixels (without steps,
-`guiding/pixels.py`), guiding, sequence. Alternating steps (`race.Turns`) compare two ways of sampling, with dL/dI fixed
-at one image (`StepTrial`).
+Open settings are decided in the order paths, pixels, guiding, sequence. The setting `pixels` distributes the camera
+paths over the pixels, and needs no steps (`guiding/pixels.py`). Alternating steps (`race.Turns`) compare two ways of
+sampling, with dL/dI fixed at one image (`StepTrial`).
 
 - `PathsPilot` tries another share of light paths, or one kind of paths alone if it finds all light, unguided. The first
     share is one half. Other shares compete with the best so far, towards the better side, as long as they win. Camera
@@ -69,8 +69,8 @@ IMAGE_SHARE = 0.25
 def settle(problem: Problem, say: race.Say, cache: PilotCache | None = None) -> Problem:
     """Return `problem` with an integrator whose open sampling options have been decided.
 
-    The problem needs its targets. Fields of the result hold the measurements. `say` is called with lines about them,
-    and `cache` has the measurements of earlier runs.
+    The problem needs its targets. Fields of the result hold the measurements. `say` receives lines about the
+    measurements. `cache` has the measurements of earlier runs.
     """
     tuner = race.Tuner(problem, say, cache)
     settle_paths(tuner)
@@ -81,7 +81,9 @@ def settle(problem: Problem, say: race.Say, cache: PilotCache | None = None) -> 
 
 
 def settle_paths(tuner: race.Tuner) -> None:
-    """Decide the paths of the integrator, if they are open and both kinds can render the scene."""
+    """Decide the integrator's kinds of paths, if the configuration leaves the kinds open and both kinds can render the
+    scene.
+    """
     problem = tuner.problem
     if not race.is_auto(problem.config, "paths") or problem.paths != "both":
         return
@@ -93,8 +95,8 @@ def settle_pixels(tuner: race.Tuner) -> None:
     """Distribute the camera paths of the problem's integrator over the pixels, for the initial values of the
     parameters.
 
-    This happens if the configuration asks for it, or if `_whether_pixels` decides so. The kinds of paths must be
-    decided first.
+    The camera paths are distributed if the configuration asks for the distribution, or if `_whether_pixels` decides so.
+    The kinds of paths must be decided first.
     """
     problem = tuner.problem
     tracer, asked = problem.integrator, problem.config.integrator.options().get("pixels", "even")
@@ -118,8 +120,8 @@ def settle_pixels(tuner: race.Tuner) -> None:
 def _whether_pixels(problem: Problem) -> PixelsRecord:
     """Decide whether `auto` distributes camera paths over the pixels.
 
-    It does so only with the loss l2, and if the measurement is a small part of the run. With relative_l2, a mirror room
-    had twice the variance in some colours (docs/notes/method.md).
+    `auto` distributes camera paths only if the loss is l2 and the measurement is a small part of the run. With
+    relative_l2, a mirror room had twice the variance in some colours (docs/notes/method.md).
     """
     if any(loss.type != "l2" for loss in problem.config.losses):
         return PixelsRecord(measured=False, note="unchanged, because not every loss is l2")
@@ -137,8 +139,8 @@ def with_sides(integrator: Any, sides: PathsRecord | None) -> Any:
 
 
 def settle_sampling(tuner: race.Tuner) -> None:
-    """Decide the open options of sampling: first guiding, then the sequence, which may replace guiding or be added to
-    it.
+    """Decide the open options of sampling. Guiding comes first. The sequence comes second, and may replace guiding or
+    be added to guiding.
     """
     config, plain, memory = tuner.problem.config, tuner.problem.integrator, tuner.problem.memory
     trials: list[StepTrial] = []  # trials so far
@@ -162,7 +164,7 @@ def settle_sampling(tuner: race.Tuner) -> None:
 
 
 def as_decided(integrator: Any, guided: GuidedRecord | None, sequence: SequenceRecord | None) -> Any:
-    """Return `integrator` with the decided ways of sampling."""
+    """Return `integrator` with the decided guiding and the decided sequence."""
     if guided is not None and guided.guided:
         integrator = integrator.afresh(guided=True, images=guided.images)
     if sequence is not None and sequence.low_discrepancy:
@@ -171,7 +173,7 @@ def as_decided(integrator: Any, guided: GuidedRecord | None, sequence: SequenceR
 
 
 def table_bytes(problem: Problem) -> int:
-    """Return the bytes of the tables of all sensors if `problem.integrator` is, or would be, guided."""
+    """Return the size of all sensors' tables in bytes, for `problem.integrator` with guiding."""
     made = problem.integrator.afresh(guided=True, light_share=1.0 if guides_light_alone(problem) else None)
     if made.paths == "camera":
         return 0
@@ -180,7 +182,7 @@ def table_bytes(problem: Problem) -> int:
 
 
 def guides_light_alone(problem: Problem) -> bool:
-    """Whether guiding is tried with light paths alone, instead of the measured share of camera paths."""
+    """True if guiding is tried with light paths only, instead of with the measured share of camera paths."""
     return problem.sides is not None and problem.sides.light_share < 1 and _light_finds_all(problem)
 
 
@@ -190,7 +192,7 @@ def _light_finds_all(problem: Problem) -> bool:
 
 
 def _light_alone(sides: PathsRecord | None, guided: GuidedRecord) -> PathsRecord:
-    """Return `sides` for guided light paths alone, if they are better."""
+    """Return `sides`, changed to light paths only. The caller has found that guided light paths are better."""
     assert sides is not None
     note = f"guided, they have {guided.gain:.2g} times the efficiency of {100 * sides.light_share:g} %"
     return replace(sides, paths="both", light_share=1.0, gain=None, low=None, high=None, note=note)
@@ -225,7 +227,7 @@ def planned(share: float) -> float:
 
 
 def share_left(problem: Problem, allowance: Allowance, reserved: float = 0.0, kernels: float = 0.0) -> float:
-    """Return the remaining share of 200 iterations that measurements may cost.
+    """Return the remaining time for measurements, as a share of the time of 200 iterations.
 
     `reserved` is kept for other measurements. A short run may have less time left. `kernels` is the number of kernels
     to compile.
@@ -260,17 +262,18 @@ class SequencePilot(race.Turns[SequenceRecord]):
 
 
 class PathsPilot(race.Turns[PathsRecord]):
-    """Decision: other paths, or the current ones."""
+    """Decision between other paths and the current paths."""
 
     def _decide(self, other: bool, images: bool, found: dict[str, Any]) -> PathsRecord:
         return PathsRecord(paths="other" if other else "both", **found)
 
 
 class CameraPilot(PathsPilot):
-    """Decision for or against camera paths alone, in a run of any length.
+    """Decision for or against the use of camera paths only. Runs of any length can make this decision.
 
-    It takes the planned rounds, or as many as the samples allow at the minimum cost. The time of Python code is
-    ignored. If steps take milliseconds, times must not decide whether anything is measured.
+    The minimum number of rounds is the planned number. If the samples at the minimum cost allow fewer rounds, the
+    smaller number applies. The time of Python code is ignored. If steps take milliseconds, times must not decide
+    whether anything is measured.
     """
 
     def __init__(self, take: race.Take, sizes: race.Sizes, *rest: Any, **more: Any) -> None:
@@ -293,7 +296,7 @@ def _paths(tuner: race.Tuner) -> PathsRecord:
         left = min(race.PATHS_SHARE, allowance.iterations_left(needs[0]) / race.ITERATIONS)
 
         def climb(shares: Sequence[float]) -> None:
-            """Try these shares in turn, as long as each is better than the best so far."""
+            """Try the given shares in turn. Stop when a share is not better than the best share so far."""
             nonlocal best
             for share in shares:
                 part = (left - sum(record.share for record in records)) / 2
@@ -384,7 +387,7 @@ def _sides(problem: Problem) -> dict[str, Any]:
 
 
 def _sequence(tuner: race.Tuner, trials: list[StepTrial]) -> SequenceRecord:
-    """Decide the sequence of the problem's integrator. `trials` are those of the decision on guiding."""
+    """Decide the sequence of the problem's integrator. `trials` has the trials of the decision on guiding."""
     problem, found = tuner.problem, tuner.problem.guided
     plain, is_guided = problem.integrator, problem.integrator.preparation.guiding is not None
 
@@ -421,11 +424,12 @@ def _sequence(tuner: race.Tuner, trials: list[StepTrial]) -> SequenceRecord:
 
 
 class StepTrial:
-    """Steps of a problem by `plain`, or by `other`. They leave neither a gradient nor a change.
+    """Steps of a problem, taken by the integrator `plain` or by the integrator `other`. The steps leave no gradients,
+    and do not change the problem.
 
-    `views` are the used views. If either integrator is guided, both sample from one table. This is the table of
-    `earlier` if it has learned, otherwise a new one. `what` is the current decision, and `earlier` the trial of the
-    previous one with the same estimator. Both trials have the same fixed dL/dI.
+    `views` are the used views. If either integrator is guided, both sample from one table. The shared table is the
+    table of `earlier` if that trial has a table, otherwise a new table. `what` is the name of the current decision.
+    `earlier` is the trial of the previous decision with the same estimator. Both trials have the same fixed dL/dI.
     """
 
     def __init__(
@@ -474,8 +478,8 @@ class StepTrial:
     def learn(self, round: int, spp: int) -> race.Step:
         """Let the table learn, and prepare it for sampling. It stays unchanged from then on.
 
-        The first time, everything is done twice and the first result is dropped, so that compilation and recording do
-        not count.
+        In the first call, everything is done twice, and the first result is dropped. The learning time then excludes
+        compilation and recording.
         """
         jobs = [self._job(view, self._seed(round, view, "learned from"), spp) for view in self.views]
         compile_ms = 0.0

@@ -9,21 +9,23 @@ image, and W = d2L/dI2, by pixel.
     by entry            random signs v over the pixels: with p_s = J_s^T (sqrt(W) v), the mean of p_a p_b is the
                         diagonal of H (Hutchinson 1989; Bekas et al. 2007), again from two sets of samples
 
-Along directions, a standard error is subtracted from the sum over the pixels, because too much curvature would make
-results look too certain. By entry, single values are mostly noise. Entries whose gradients have similar noise have
-similar curvature, so they are averaged (`smooth`).
+Along directions, a standard error is subtracted from the sum over the pixels. Overestimated curvature would make
+results look too certain. In the estimate by entry, single values are mostly noise. Entries whose gradients have similar
+noise have similar curvature, so they are averaged (`smooth`).
 
-Regularizers have their own curvature, without noise. Differences of their gradient are added to both kinds.
+Regularizers have their own curvature, without noise. Differences of the regularizers' gradient are added to both kinds
+of curvature.
 
 Noise of a rendered target is the same in all gradients: b = J^T d, where d is its effect on dL/dI. Images of the
-target's own integrator sample it (`_noises`). `d_even` is the mean of d, which pulls all pixels in the same direction,
-because a relative loss gives darkened pixels more weight. `d_odd` is the rest, in blocks of pixels that the film's
-filter may have mixed. B is the second moment of b.
+target's own integrator sample the effect d of the target's noise (`_noises`). `d_even` is the mean of d. A relative
+loss gives darkened pixels more weight, so `d_even` pulls all pixels in the same direction. `d_odd` is the remainder of
+d. `d_odd` is split into blocks of pixels that the film's filter may have mixed. B is the second moment of b.
 
     B = sum over blocks (J_a^T d_odd) (J_b^T d_odd)^T + (J^T d_even) (J^T d_even)^T
 
-By entry, the diagonal of B is probed and averaged like that of H, and a standard error is added. For few entries, the
-average may be almost zero by chance. Too little noise would make results look too certain as well.
+In the estimate by entry, the diagonal of B is probed and averaged like the diagonal of H. A standard error is then
+added. For few entries, the average may be almost zero by chance. Underestimated target noise would also make results
+look too certain.
 """
 
 from __future__ import annotations
@@ -70,8 +72,8 @@ PROBED = 2
 class Direction:
     """One coordinate. `vector` is the change of the parameter `key` per unit, in the layout of a flat gradient.
 
-    `channel` is the only channel of images that it changes, or None. `entry` is the entry of a small parameter. It is
-    None if all entries of a texture's channel change together, in proportion to their values.
+    `channel` is the only image channel that the direction changes, or None. `entry` is the entry of a small parameter.
+    It is None if all entries of a texture's channel change together, in proportion to their values.
     """
 
     key: str
@@ -82,8 +84,8 @@ class Direction:
 
 @dataclass(frozen=True)
 class Change:
-    """Rendering of `values` (by key, in the form of `Selection.array`), changed by `amount` along each of these
-    directions.
+    """Rendering with changed parameter values. `values` has the changed values for each key, in the form of
+    `Selection.array`. The change is `amount` along each of the directions.
     """
 
     values: dict[str, Array]
@@ -113,7 +115,8 @@ def separates(problem: Problem, key: str) -> bool:
 def plan_changes(problem: Problem, scales: Mapping[str, float], share: float, most: int) -> list[Change]:
     """Return the renderings for the directions of all parameters. Small parameters come first.
 
-    Steps are `share` of the scale. There are at most `most` renderings. The remaining parameters have no directions.
+    Steps are `share` of the scale. There are at most `most` renderings. All parameters without a rendering have no
+    directions.
     """
     small = [key for key in problem.selection.keys if problem.selection.array(key).size <= MOST_ENTRIES]
     textures = [key for key in problem.selection.keys if problem.selection.array(key).ndim == 3]
@@ -163,7 +166,9 @@ class TargetNoise:
     side: int
 
     def in_blocks(self, slope: Array) -> Array:
-        """Return the flat sums over each block of an image's derivative (H, W, C) times the odd part."""
+        """Return the product of an image's derivative (H, W, C) and the odd part, summed over each block, as a flat
+        array.
+        """
         product = np.sum(slope * self.odd, axis=2)
         rows, columns = (np.arange(0, size, self.side) for size in product.shape)
         return np.asarray(np.add.reduceat(np.add.reduceat(product, rows, axis=0), columns, axis=1).ravel())
@@ -199,8 +204,8 @@ class Curvature:
         self.noises = self._target_noises()
 
     def along(self, changes: Sequence[Change], go_on: Callable[[], bool]) -> tuple[list[Direction], Array, Array]:
-        """Return the directions of the rendered changes, and their H and B (M, M). Rendering ends when `go_on` returns
-        false.
+        """Return the directions of the rendered changes, and the matrices H and B (M, M) along the directions.
+        Rendering ends when `go_on` returns false.
         """
         directions: list[Direction] = []
         columns: list[list[Array]] = [[], []]
@@ -248,8 +253,8 @@ class Curvature:
         ]))  # fmt: skip
 
     def by_entry(self, probes: int, go_on: Callable[[], bool]) -> dict[str, Array]:
-        """Return the diagonal of H for each parameter as a flat array, unsmoothed. It is empty if `go_on` returned
-        false at once.
+        """Return the diagonal of H for each parameter as a flat array, unsmoothed. The result is empty if the first
+        call of `go_on` returns false.
         """
         total: dict[str, Array] = {}
         random = np.random.default_rng(self._seed(0, probes))
@@ -264,8 +269,8 @@ class Curvature:
         return {key: value / self.probes for key, value in total.items()}
 
     def by_entry_of_target(self, first: int, go_on: Callable[[], bool]) -> dict[str, Array]:
-        """Return the diagonal of B in the same way, by probes from number `first` on. It is empty without a rendered
-        target.
+        """Return the diagonal of B for each parameter as a flat array, unsmoothed. The probes are numbered from `first`
+        on. It is empty without a rendered target.
         """
         odd: dict[str, Array] = {}
         even: dict[str, Array] = {}
@@ -299,11 +304,12 @@ class Curvature:
         return [list(sample) for sample in zip(*by_view, strict=True)]
 
     def _noises(self, view: View, integrator: Any, spp: int, multiple: int | None) -> list[TargetNoise]:
-        """Return samples of the effect of the noise of a view's target on dL/dI. The list is empty for a file.
+        """Return samples of the effect that the noise of a view's target has on dL/dI. The list is empty for a file.
 
-        The target has `spp` samples. Each of several images with as many samples takes the role of the target, and the
-        mean of the others is its expected value. If this would cost too much, and noise is small, differences of images
-        with few samples are added to the target. All sample counts are multiples of `multiple`.
+        The target has `spp` samples. Several images have as many samples as the target. Each image takes the role of
+        the target in turn. The mean of the other images serves as the target's expected value. If this would cost too
+        much, and noise is small, differences of images with few samples are added to the target. All sample counts are
+        multiples of `multiple`.
         """
         true = np.array(view.target, dtype=np.float64)
         if view.wanted.file is not None:
@@ -335,7 +341,7 @@ class Curvature:
         return [TargetNoise(each, even, side) for each in odd]
 
     def _slope(self, view: View, target: Array, image: Array) -> Array:
-        """Return dL/dI of an exposed image with another target, both (H, W, C)."""
+        """Return dL/dI of an exposed image that is compared with another target, both (H, W, C)."""
         return np.nan_to_num(slope(replace(view, made=to_tensor(target)).judge, image)) * view.share
 
     def _in_a_row(self, images: Sequence[Array]) -> Array:
@@ -343,8 +349,8 @@ class Curvature:
         return row if self._picked is None else row[self._picked]
 
     def _probe(self, gradients: Sequence[Array], number: int) -> dict[str, Array]:
-        """Return the gradient of the parameters for dL/dI of the views' exposed images (H, W, C), by one set of
-        samples.
+        """Return the gradient of the parameters, given dL/dI of the views' exposed images (H, W, C). The gradient uses
+        one set of samples.
         """
         problem = self.problem
         for place, view in enumerate(problem.trained):
@@ -360,10 +366,11 @@ class Curvature:
         return take_gradient(problem)
 
     def _weight(self, place: int, view: View) -> Array:
-        """Return d2L/dI2 of a view's exposed image, for its pixels (H, W, C), by differences of dL/dI.
+        """Return d2L/dI2 for the pixels (H, W, C) of a view's exposed image. The second derivative is computed from
+        differences of dL/dI.
 
-        The differences span the size of the residual. If L has a kink (`l1`), the result is its curvature at the scale
-        of the noise.
+        The differences of dL/dI use steps as large as the residual between image and target. If L has a kink (`l1`),
+        the result is its curvature at the scale of the noise.
         """
         image = 0.5 * (self._base[0][place] + self._base[1][place])
         true = view.kept(np.array(view.target, dtype=np.float64))
@@ -378,7 +385,7 @@ class Curvature:
 def smooth(diagonal: Array, noise: Array, sure: float = 0.0) -> Array:
     """Return `diagonal` (N,) averaged over groups of at least GROUP entries whose gradients have similar `noise`.
 
-    The function adds `sure` standard errors to each average.
+    The function adds `sure` standard errors to each group's average.
     """
     order = np.argsort(noise, kind="stable")
     result = np.empty_like(diagonal)
@@ -401,7 +408,7 @@ def _of_channel(image: Array, channel: int | None) -> Array:
 def _sure_share(terms: Array) -> Array:
     """Return the part (M,) of sums of (M, N) terms that remains after subtracting MARGIN standard errors.
 
-    A few bright pixels may make up all of a curvature by chance.
+    By chance, a few bright pixels may contribute all of a curvature.
     """
     sums, errors = terms.sum(axis=1), np.sqrt(np.square(terms).sum(axis=1))
     return np.asarray(np.clip(1 - MARGIN * errors / np.maximum(sums, 1e-300), 0, 1))

@@ -47,8 +47,9 @@ SHARE, MOST_STEPS = 0.25, 50
 class Noted:
     """Iterations at which data were recorded.
 
-    These are squares of gradients (0: not yet) and their parameters, the number of steps of small parameters since
-    then, and the movement of each parameter per unit of gradient after some iterations.
+    `seen` is the iteration at which squared gradients were recorded (0: not yet). `keys` are the parameters with
+    recorded squares. `steps` is the number of later steps recorded for each small parameter. `paces` is the movement of
+    each parameter per unit of gradient after some iterations.
     """
 
     seen: int
@@ -58,7 +59,9 @@ class Noted:
 
 
 class Certainty:
-    """Certainty of one run of `problem`. Make it before the first iteration, and call `measure` after the last."""
+    """Certainty of one run of `problem`. Make the `Certainty` before the first iteration, and call `measure` after the
+    last iteration.
+    """
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
@@ -126,7 +129,9 @@ class Certainty:
         )
 
     def _pace(self, key: str) -> float:
-        """Return the current movement of a parameter by a step, per unit of gradient, for its steepest entries."""
+        """Return the current movement of a parameter by a step, per unit of gradient. The parameter's steepest entries
+        dominate the value.
+        """
         with np.errstate(divide="ignore"):  # of parameters that have not moved yet
             steepness = rms(1 / self.problem.optimizer.response(key))
         return 1 / max(steepness, 1e-300)
@@ -144,8 +149,8 @@ class Certainty:
         return np.asarray(squares / np.maximum(self.problem.optimizer.slope(key) ** 2, 1e-300))
 
     def measure(self, iterations: int, elapsed_s: float, stop: Callable[[], bool]) -> CertaintyRecord | None:
-        """Measure after `iterations` iterations of `elapsed_s` seconds. Returns None after too few, or if `stop()`
-        returns true.
+        """Measure after `iterations` iterations of `elapsed_s` seconds. Returns None after fewer than
+        `LEAST_ITERATIONS` iterations, or if `stop()` returns true.
 
         Parameters and optimiser are not changed.
         """
@@ -231,8 +236,9 @@ class Certainty:
     def scale(self, key: str) -> float:
         """Return the scale of a parameter, in its unit.
 
-        It is the largest root mean square of its initial values, its final values, and their difference. For parameters
-        without a unit of light, it is at least half of the range. If all are 0, it is 1.
+        The scale is the largest root mean square among three arrays. The arrays are the initial values, the final
+        values, and the difference of both. For parameters without a unit of light, the scale is at least half of the
+        range between the bounds. If all are 0, it is 1.
         """
         first, last = self._initial[key], row_of(self.problem, key)
         sizes = [rms(first), rms(last), rms(last - first)]
@@ -292,7 +298,9 @@ class Certainty:
 
 
 def hides(directions: Sequence[Direction], curvature: Array, gradients: Gradients) -> bool:
-    """Whether noise hides all curvature (M, M) along the direction of some entry with gradients."""
+    """True if, for some entry with gradients, noise hides all curvature along the entry's direction. The curvature is
+    (M, M).
+    """
     flat = [d for d, h in zip(directions, np.diag(curvature), strict=True) if d.entry is not None and h <= 0]
     return any(np.any(gradients[d.key][:, d.entry]) for d in flat)
 

@@ -1,51 +1,54 @@
-"""Distance of final values from the optimum: the remainder after the run's steps, corrected by gradients at the end.
+"""Distance of the final values from the optimum. The estimate is the remainder after the run's steps, corrected by
+gradients at the end.
 
 A `Measured` has the measurements of one parameter at the end of a run. A `Posterior` is the result: for entries
 together (`joint`), or for each entry as if all others were known (`alone`).
 
 Near the optimum, the loss is quadratic with curvature H. The offset of the values from the optimum is d = x - x*. P is
-the movement of an entry by a step per unit of gradient (`Optimizer.response`).
+an entry's movement by one step per unit of gradient (`Optimizer.response`).
 
     d <- d - eta_t P (H d + noise)
 
-C is the covariance of the offset. It starts with the square of each entry's scale, because nothing is known about the
-optimum, and changes with each step.
+C is the covariance of the offset. C starts with the square of each entry's scale, because nothing is known about the
+optimum. Each step changes C.
 
     C <- (1 - eta_t P H) C (1 - eta_t P H)^T + eta_t^2 P Sigma P
 
 C contains three parts: the remainder of the start after too few iterations, the directions that the view does not
-determine, and the noise of the steps. In undetermined directions, H has no curvature, and the start remains. K
-gradients at the final values, with mean g, then measure H d (Kalman).
+determine, and the noise of the steps. In undetermined directions, H has no curvature, so C keeps its initial value.
+After the steps, K gradients at the final values, with mean g, measure H d. The measurement updates C as in a Kalman
+filter.
 
     gain = C H (H C H + Sigma / K)^-1,   to go = gain g,   C <- C - gain H C
 
-The last iterations measure H d as well (`LastSteps`). Their noise is part of C, but their total movement m is known. C
-is then the covariance of the values before them, and d has the mean m in place of 0. The gradient of a step is H (d +
-y) and noise, where y is the offset of its values from the final ones. After subtracting H y, it is one more gradient at
-the end.
+The last iterations measure H d as well (`LastSteps`). The noise of the last iterations is part of C, but the total
+movement m of the last iterations is known. C is then the covariance of the values before the last iterations. The
+offset d has the mean m in place of 0. The gradient of a step is H (d + y) plus noise. Here y is the offset of the
+step's values from the final values. After subtracting H y, a step's gradient counts as one more gradient at the end.
 
     to go = m + gain (g - H m)
 
-C is only as good as the model. Other parameters with wrong values may have driven these in the wrong direction at
-first, or the curvature may have been smaller on the way. C may then be too small by any factor, because the remainder
-of the start falls exponentially. Gradients at the end show this. Along an eigenvector u of H with curvature h, the
-model predicts the variance h^2 c + s for u (g - H m), where c comes from C and s from noise. If the observed value
-exceeds `SURPRISE` standard deviations, c is replaced.
+C is only as good as the model. At first, other parameters with wrong values may have driven the parameters of C in the
+wrong direction. The curvature may also have been smaller during the run. C may then be too small by any factor, because
+the remainder of the initial offset falls exponentially. Gradients at the end show this. Let u be an eigenvector of H
+with curvature h. For u (g - H m), the model predicts the variance h^2 c + s. The term c comes from C, and s comes from
+noise. If the observed u (g - H m) exceeds `SURPRISE` standard deviations, c is replaced.
 
     c <- ((u (g - H m))^2 - s) / h^2      at most that of the start
 
-Noise of the target is the same in every gradient, H d + b + noise. Here d is the offset from the optimum for a target
-without noise, B the second moment of b, and D the movement of the steps by a constant gradient. E, cov(d, g) and cov(g)
-replace C, C H and H C H + Sigma / K.
+Noise of the target adds the same b to every gradient. A gradient is then H d + b + noise. Here d is the offset from the
+optimum for a target without noise. B is the second moment of b. D is the total movement of the steps by a constant
+gradient. E, cov(d, g) and cov(g) replace C, C H and H C H + Sigma / K.
 
     D <- (1 - eta_t P H) D + eta_t P
     E = C + D B D^T,   cov(d, g) = E H - D B,   cov(g) = H E H - H D B - B D^T H + B + Sigma / K
 
-If the run has converged, D = H^-1. No gradient then shows the effect of b, and H^-1 B H^-1 remains.
+If the run has converged, D = H^-1. In a converged run, no gradient shows the effect of b. The covariance H^-1 B H^-1
+remains.
 
-Momentum is left out, because over many steps the movement is the same. P is that of the end. eta_t contains the ratio
-of earlier step lengths, which for Adam are shorter until the large gradients of the start are forgotten
-(`Measured.pace`).
+The model omits momentum, because over many steps the movement is the same with and without momentum. P is measured at
+the end of the run. eta_t contains the ratio of earlier step lengths to the final step length (`Measured.pace`). For
+Adam, earlier steps are shorter until the large gradients of the start are forgotten.
 """
 
 from __future__ import annotations
@@ -69,8 +72,8 @@ STEPS_OFF = 3.0
 
 @dataclass(frozen=True)
 class LastSteps:
-    """Last n iterations of a parameter of N entries: their gradients, and the values that they belong to, both
-    (n, N).
+    """Last n iterations of a parameter with N entries. The gradients, and the values at which the gradients were
+    computed, are both (n, N).
     """
 
     gradients: Array
@@ -121,15 +124,15 @@ class Measured:
 
     @property
     def prior(self) -> float:
-        """Standard deviation of the offset of an entry at the start. Between bounds, it is at most that of a uniform
-        distribution.
+        """Standard deviation of the offset of an entry at the start. For a parameter with bounds, the standard
+        deviation is at most that of a uniform distribution between the bounds.
         """
         low, high = self.bounds
         return min(self.scale, (high - low) / np.sqrt(12))
 
     @property
     def steps(self) -> Array:
-        """The eta of all iterations: the schedule's factors times the pace."""
+        """Step factor eta of each iteration, which is the schedule's factor times the pace."""
         rates = np.asarray(self.rates, dtype=np.float64)
         return rates if self.pace is None else rates * self.pace
 
@@ -140,7 +143,8 @@ class Measured:
 
     @property
     def at_bound(self) -> Array:
-        """Entries (N,) at a bound. They are within a step of it, and the gradient does not pull them back.
+        """Entries (N,) at a bound. Entries at a bound are within a step of the bound, and the gradient does not pull
+        the entries back.
 
         The gradient of the loss points upwards: at the lower bound, a positive gradient holds the value there.
         """
@@ -154,7 +158,9 @@ class Measured:
 
     @property
     def driven(self) -> Array:
-        """Entries (N,) that the run has moved to a bound. They had gradients on the way, but may have none there."""
+        """Entries (N,) that the run has moved to a bound. Entries that the run moves to a bound have gradients on the
+        way, but may have no gradients at the bound.
+        """
         return np.asarray(self.at_bound & (False if self.start is None else self.value != self.start))
 
     def within(self, to_go: Array) -> Array:
@@ -167,8 +173,8 @@ class Measured:
 class Posterior:
     """Estimated offset of each of M entries from the optimum.
 
-    It has the mean (`to_go`, M), the `variance` (M,), and the part of the spread from the target (`of_target`, M). If
-    entries were judged together, it also has the covariance (M, M).
+    A posterior has the mean offset `to_go` (M,) and its `variance` (M,). `of_target` (M,) is the part of the spread
+    that comes from the target. If the entries were judged together, the posterior also has the covariance (M, M).
     """
 
     to_go: Array
@@ -194,11 +200,12 @@ def joint(
     """Return the joint offset of M entries.
 
     `curvature` is H (M, M), and `noise` the covariance of one gradient (M, M). `gradient` is the mean of `samples`
-    gradients. `samples` is one number for all entries, or one for each of the M entries, where the fewer samples are
-    among the more. These arrays are (M,): `response`, the diagonal of P; `scale`, the standard deviation of the offset
-    at the start; `came`, the known movement after these iterations. `rates` are the eta of all iterations. `fixed` is
-    the B (M, M) of the noise that all gradients share, or None. Each entry is in units of its scale, so matrices of
-    different units are well-conditioned.
+    gradients. `samples` is one count for all entries, or one count for each of the M entries. If the counts differ, the
+    smaller sample set is part of the larger sample set. Three arguments are (M,). `response` is the diagonal of P.
+    `scale` is the standard deviation of the offset at the start. `came` is the known movement after the iterations of
+    `rates`. `rates` are the eta of all iterations. `fixed` is the matrix B (M, M) of the noise that all gradients have
+    in common, or None. The computation expresses each entry in units of the entry's scale. Matrices of entries with
+    different units are therefore well-conditioned.
     """
     units = np.outer(scale, scale)
     H, Sigma = _positive(curvature * units), _positive(noise * units)
@@ -220,10 +227,11 @@ def joint(
 
 
 def _unforeseen(H: Array, E: Array, beside: Array, surprise: Array) -> Array:
-    """Return the addition to the covariance E of offsets, in units of the start, if gradients contradict it.
+    """Return an addition to the covariance E of the offsets, for gradients that contradict E. Both are in units of the
+    standard deviations at the start.
 
-    `surprise` is the difference from the expected gradients. `beside` is the part of its covariance that does not come
-    from E.
+    `surprise` is the difference from the expected gradients. `beside` is the part of the covariance of `surprise` that
+    does not come from E.
     """
     values, vectors = np.linalg.eigh(H)
     c, s = (np.einsum("me,mn,ne->e", vectors, each, vectors) for each in (E, beside))
@@ -237,8 +245,8 @@ def alone(
     curvature: Array, response: Array, scale: Array, noise: Array, gradient: Array, samples: int | Array,
     rates: Sequence[float] | Array, fixed: Array | float = 0.0, came: Array | float = 0.0,
 ) -> Posterior:  # fmt: skip
-    """Return the offset of each entry as if all others were known. All arrays are (M,), as in `joint`, and C is the
-    model's.
+    """Return the offset of each entry, as if all other entries were known. All arrays are (M,), with the meanings in
+    `joint`. C is the model's covariance, even if gradients contradict the model.
     """
     h = np.maximum(curvature, 0.0)
     C, D = scale**2, np.zeros_like(h)
@@ -254,14 +262,15 @@ def alone(
 
 
 def _driven(step: Array, curvature: Array) -> Array:
-    """Return the movement by one step per unit of a constant gradient. Curvature limits it where it compensates for the
-    gradient.
+    """Return the movement by one step per unit of a constant gradient. Curvature limits the movement at the point where
+    the curvature compensates for the gradient.
     """
     return np.asarray(np.minimum(step, 1 / np.maximum(curvature, 1e-300)))
 
 
 def _after(H: Array, response: Array, noise: Array, rates: Sequence[float] | Array) -> tuple[Array, Array]:
-    """Return the covariance after all steps from a start of unit variances, and the movement by a constant gradient.
+    """Return the covariance after all steps, for a start with unit variances. Also return the total movement by a
+    constant gradient.
 
     An entry that no step moves stays unchanged.
     """

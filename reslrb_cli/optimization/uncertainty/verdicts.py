@@ -5,8 +5,9 @@
 - `Verdict`, `judge` and `summarise` apply the rules below.
 
 The first rule that applies to an entry decides. `spread` is the standard deviation of its final value around the
-optimum. `alone` is the same if all other parameters are known. `to_go` is the estimated distance to the optimum. tau is
-`TOLERANCE` of the entry's scale. Except for `spread`, they refer to the optimum of the loss with the noisy target.
+optimum. `alone` is the spread that remains if all other parameters are known. `to_go` is the estimated distance to the
+optimum. tau is `TOLERANCE` of the entry's scale. `to_go` refers to the optimum of the loss with the noisy target, but
+`spread` does not.
 
 | verdict          | condition |
 |---|---|
@@ -25,7 +26,8 @@ If the derivative of a parameter lacks a significant share, its verdict is `deri
 before its first iteration (`measure/missing.py`).
 
 A parameter of several entries is `settled` if the share `SETTLED_SHARE` of its visible entries with an effect is
-settled. Otherwise its verdict is that of most of the other entries.
+settled. Otherwise the parameter's verdict is the most frequent verdict among the remaining visible entries with an
+effect.
 """
 
 from __future__ import annotations
@@ -57,7 +59,9 @@ Values = list[float | None] | None
 
 
 class Verdict(str, enum.Enum):
-    """Verdict on a final value. If several verdicts have equally many entries, the first one here counts."""
+    """Verdict on a final value. If several verdicts are equally frequent among the entries, the first verdict in the
+    order of this enum counts.
+    """
 
     STILL_MOVING = "still moving"
     AT_BOUND = "at its bound"
@@ -108,11 +112,11 @@ def summarise(found: Mapping[Verdict, float]) -> Verdict:
 class ParameterCertainty:
     """Verdict on one parameter, and the share of its entries with each verdict.
 
-    `spread` is one standard deviation of the final value around the optimum, and `of_target` the part of it from the
-    noise of rendered targets. `to_go` is the estimated distance. All are in the parameter's unit. A small parameter has
-    one number for each entry, another one the root mean square over the entries with an effect. They are None if
-    nothing was measured, and for entries at their bounds. `partner` is the parameter that compensates for this one, if
-    any.
+    `spread` is one standard deviation of the final value around the optimum. `of_target` is the part of `spread` that
+    comes from the noise of rendered targets. `to_go` is the estimated distance. All are in the parameter's unit. A
+    small parameter has one number for each entry. A large parameter has the root mean square over the entries with an
+    effect. The numbers are None if nothing was measured, and for entries at their bounds. `partner` is the parameter
+    that compensates for this one, if any.
 
     `moved` is the root mean square movement of the entries since the start. `reach` is the distance of all steps in one
     direction, or None if the step length depends on the gradient (`sgd`). `rate` is the learning rate. `seen` is the
@@ -135,11 +139,11 @@ class ParameterCertainty:
 class CertaintyRecord(Jsonable):
     """Certainty of all parameters, by key, and the costs of the estimate.
 
-    The costs are the numbers of gradients, renderings along directions and random probes. `measure_s` is the time in
-    seconds without compilation (`compile_s`), and `share` its ratio to the time of the run's iterations. `iterations`,
-    `scale`, `learning_rate` (of `optimizer`) and `target_spp` are the run's. `target_noise` tells whether the spreads
-    include the noise of the targets: `measured` if all targets were rendered, `in part` if some were, otherwise `left
-    out`.
+    The costs are the numbers of gradients, renderings along directions and random probes. `measure_s` is the measuring
+    time in seconds without compilation. `compile_s` is the compilation time. `share` is `measure_s` divided by the time
+    of the run's iterations. `iterations`, `scale`, `learning_rate` and `target_spp` repeat the run's settings.
+    `learning_rate` is that of `optimizer`. `target_noise` tells whether the spreads include the noise of the targets:
+    `measured` if all targets were rendered, `in part` if some were, otherwise `left out`.
     """
 
     parameters: dict[str, ParameterCertainty]
@@ -167,8 +171,9 @@ class CertaintyRecord(Jsonable):
 class Coordinates:
     """Joint posterior of all free directions, by position.
 
-    It has the spread and its part from the target, the distance to go and its error without the target's noise, and
-    partners.
+    `spread` is the standard deviation, and `of_target` is the part of `spread` that the target's noise causes. `to_go`
+    is the distance to the optimum, and `error` is its standard error. `to_go` and `error` exclude the target's noise.
+    `partners` are the parameters that compensate.
     """
 
     spread: Array
@@ -182,7 +187,7 @@ class Coordinates:
 def judge_together(
     measured: Mapping[str, Measured], directions: Sequence[Direction], curvature: Array, fixed: Array
 ) -> Coordinates:
-    """Judge all directions, with curvature H and target noise B (M, M), in one posterior.
+    """Judge all directions in one joint posterior. `curvature` is H (M, M), and `fixed` is the target noise B (M, M).
 
     Entries at their bounds, or without effect, count as known.
     """
@@ -228,18 +233,21 @@ def judge_together(
 
 
 def _eta(measured: Mapping[str, Measured], keys: Collection[str]) -> Array:
-    """Return the common eta of these parameters for all iterations, which is the geometric mean of theirs."""
+    """Return the common eta of the parameters `keys` for all iterations. The common eta is the geometric mean of the
+    parameters' own eta.
+    """
     first, paces = next(iter(measured.values())), [measured[key].pace for key in keys]
     found = [np.log(np.maximum(pace, 1e-300)) for pace in paces if pace is not None]
     return np.asarray(first.rates, dtype=np.float64) * np.exp(np.sum(found, axis=0) / len(paces) if found else 0.0)
 
 
 def noise_covariance(samples: Array, variance: Array, curvature: Array) -> Array:
-    """Return the covariance (M, M) of the noise of one gradient, from (M, K) samples, M variances, and H (M, M).
+    """Return the covariance (M, M) of the noise of one gradient. `samples` (M, K) are gradients, `variance` (M,) their
+    variances, and `curvature` is H (M, M).
 
-    With far fewer samples than entries, the samples do not determine a covariance. But noise of dL/dI reaches the
-    parameters through the same J as the curvature. Its correlations are therefore those of H times one factor in [0,
-    LIKE], which is fitted to the samples.
+    With far fewer samples than entries, the samples do not determine a covariance. However, noise of dL/dI reaches the
+    parameters through the same Jacobian J that determines the curvature. The noise correlations are therefore the
+    correlations of H times one factor in [0, `LIKE`]. The function fits the factor to the samples.
     """
     size = np.sqrt(np.maximum(np.diag(curvature), 0.0))
     alike = np.clip(curvature / np.maximum(np.outer(size, size), 1e-300), -1, 1) * np.outer(size > 0, size > 0)
@@ -253,7 +261,9 @@ def noise_covariance(samples: Array, variance: Array, curvature: Array) -> Array
 
 
 def _partner(row: Array, place: int, chosen: Array, directions: Sequence[Direction]) -> str | None:
-    """Return the parameter whose offset is most correlated with the offset at `place`, if there is another one."""
+    """Return the parameter whose offset has the highest correlation with the offset at `place`. Return None if no other
+    offset has a sufficient correlation.
+    """
     others = {other: value for other, value in zip(chosen.tolist(), row, strict=True) if other != place}
     likely = {other: value for other, value in others.items() if value >= LEAST_CORRELATION}
     foreign = {other: value for other, value in likely.items() if directions[other].key != directions[place].key}
@@ -273,7 +283,8 @@ def weigh(
     """Return the certainty of each parameter, from the curvature along directions and, for large parameters, by entry.
 
     `pixels` is the number of image values that show a texture, if known. They determine at most as many entries.
-    `fixed` and `fixed_diagonal` describe the noise of the targets as `curvature` and `diagonal` describe the loss.
+    `fixed` is the counterpart of `curvature` for the noise of the targets. `fixed_diagonal` is the counterpart of
+    `diagonal`.
     """
     found, result = judge_together(measured, directions, curvature, fixed), {}
     for key, own in measured.items():
@@ -310,8 +321,8 @@ def _large(
     own: Measured, diagonal: Array | None, fixed: Array | None, at: Sequence[int], found: Coordinates,
     pixels: int | None,
 ) -> ParameterCertainty:  # fmt: skip
-    """Judge a large parameter by entry as if all others were known. Another parameter may still compensate for all of
-    it.
+    """Judge each entry of a large parameter as if all other entries and parameters were known. Another parameter may
+    still compensate for the whole offset.
     """
     touched, shape = own.touched, own.value.shape
     prior = np.full(shape, own.prior)

@@ -70,7 +70,7 @@ def show(values: Array, alt: str, *caption: str) -> Picture:
 def show_map(values: Array, end: float, alt: str, *caption: str, signed: bool = False) -> Picture:
     """Return values (H, W, 1) as a picture in colours, with a scale below the caption.
 
-    The scale runs from 0 to `end`. If the values are `signed`, it starts at -`end`.
+    The scale runs from 0 to `end`. With `signed`, the scale starts at -`end` instead.
     """
     grey = fit(values)[:, :, 0]
     last = number(end)
@@ -124,7 +124,7 @@ def gradient_maps(paths: Sequence[Path]) -> Markup:
 def view_table(views: Sequence[Mapping[str, Any]] | None, results: Mapping[str, Any]) -> Markup:
     """Return a table of the views, and the loss of those that are held out.
 
-    Empty for a single view with the default settings, in which every pixel has the same weight.
+    The result is empty for a single view with default settings. All pixels of such a view have equal weights.
     """
     if not views or (len(views) == 1 and not _is_special(views[0])):
         return Markup()
@@ -146,7 +146,7 @@ def _recovered(exposure: object, results: Mapping[str, Any]) -> list[float]:
 
 
 def seen_tables(runs: Sequence[Run]) -> Markup:
-    """Return tables of the perceptual errors of images and colours of runs, at the start and at the end."""
+    """Return tables of the perceptual errors of the runs' images and colours, at the start and at the end."""
     images: list[dict[str, Any]] = []
     colors: list[dict[str, Any]] = []
     for run in runs:

@@ -36,7 +36,9 @@ def soft(line: str) -> Markup:
 
 
 def lay_out(piece: str, *values: object) -> Markup:
-    """Render a piece: `FILE.MACRO` is a macro in the template `FILE.html.j2`, `MACRO` one in `pieces.html.j2`."""
+    """Render the template macro `piece` with `values`. `FILE.MACRO` names a macro in `FILE.html.j2`, and `MACRO` a
+    macro in `pieces.html.j2`.
+    """
     file, _, macro = piece.rpartition(".")
     made = getattr(_environment().get_template(f"{file or 'pieces'}.html.j2").module, macro)(*values)
     return Markup(made).strip()

@@ -28,7 +28,7 @@ SWEPT = {"max_depth": "path depth", "spp": "samples per pixel", "pixels": "pixel
 
 
 def bench(objects: Sequence[Entry]) -> tuple[Markup, int]:
-    """Return diagrams and a table of a bench, and the number of other lines."""
+    """Return diagrams and a table of a bench. Also return the number of lines that are not results of a bench."""
     entries = [_with_sizes(entry) for entry in objects if "integrator" in entry and "status" in entry]
     labels = list(dict.fromkeys(map(label, entries)))
     values = {name: [entry[name] for entry in entries if entry.get(name)] for name in SWEPT}
@@ -121,8 +121,8 @@ def quantity(entry: Entry) -> str:
 
 
 def method_label(entry: Entry, with_spp: bool = False) -> str:
-    """Return a method's name as the user wrote it. Without such a name, return integrator and estimator, with their
-    sampling if known.
+    """Return a method's name as the user wrote it. If the entry has no such name, return the integrator and the
+    estimator, and their sampling if known.
     """
     parts = [str(entry.get("label") or label(entry)), str(entry.get("adjoint") or "")]
     parts += [f"{entry['spp']} spp"] if with_spp and entry.get("spp") else []
@@ -163,7 +163,7 @@ def several_parts(sources: Sequence[Source]) -> tuple[str, Markup, Parts]:
 
 
 def run_comparison(runs: Sequence[Run]) -> Parts:
-    """Return the parts that show runs side by side."""
+    """Return the parts of the page that show several runs side by side."""
     made: dict[str, Callable[[], Markup]] = {
         "Runs": lambda: overview(runs),
         "Convergence": lambda: convergence_of_all(runs),
@@ -205,7 +205,7 @@ def _final_error(run: Run) -> str:
 
 
 def _each(runs: Sequence[Run], make: Callable[[Run], Markup]) -> Markup:
-    """Return the result of `make` for each run below its name. If its data are damaged, a line says so."""
+    """Return the results of `make` for all runs, each below the run's name. If its data are damaged, a line says so."""
     made = [(run, guarded(partial(make, run))) for run in runs]
     return Markup().join(lay_out("heading", key(run.name)) + markup for run, markup in made if markup)
 

@@ -81,7 +81,7 @@ DAMAGED = "This part cannot be shown: what was recorded of it is damaged."
 
 
 def fabrication(run: Run) -> Markup:
-    """Return the sheet for the workshop of the run's solid. The result is empty without one."""
+    """Return the workshop sheet for the run's solid. The result is empty without one."""
     text = _read(run.path / FABRICATION_FILE)
     if not text:
         return Markup()
@@ -140,7 +140,9 @@ def run_parts(run: Run) -> dict[str, Markup]:
 
 
 def record_parts(run: Run) -> dict[str, Markup]:
-    """Return the parts about the execution of a run, by title; they are not shown side by side with other runs."""
+    """Return the parts about the execution of one run, by title. A comparison with other runs leaves these parts
+    out.
+    """
     results, manifest = run.results, run.manifest
     parts: dict[str, Callable[[], Markup]] = {
         "Not finite": lambda: lay_out("run.not_finite", results.get("nonfinite") or {}),
@@ -165,7 +167,7 @@ def record_parts(run: Run) -> dict[str, Markup]:
 def guarded(make: Callable[[], Markup]) -> Markup:
     """Return the result of `make`. If `make` raises an exception, return a line that says that data are damaged.
 
-    A manifest can be damaged or of another version. One such part must not prevent the other parts.
+    A manifest can be damaged or of another version. One damaged part must not prevent the display of the other parts.
     """
     try:
         return make()

@@ -114,7 +114,8 @@ def _by_iteration(runs: Sequence[Run], name: str) -> tuple[Array, Array]:
 def _by_time(runs: Sequence[Run], name: str) -> tuple[Array, Array]:
     """Return times in seconds (N,), and the values of each run (runs, N) after its last iteration before each time.
 
-    The times start when all runs have an iteration. A run that has ended keeps its last value.
+    The first time is the earliest one at which all runs have completed an iteration. A run that has ended keeps its
+    last value.
     """
     ends = [np.array(_column(run, "elapsed_s"), dtype=np.float64) for run in runs]
     times = np.unique(np.concatenate(ends))

@@ -93,7 +93,9 @@ def visible(arrays: Mapping[str, Array], heights: bool) -> tuple[dict[str, Array
 
 
 def _swatches(key: str, about: Mapping[str, Any]) -> dict[str, str]:
-    """Return the CSS colours of a parameter by moment, with one scale that maps emission and values above 1 to 1."""
+    """Return a parameter's CSS colours by moment. All moments share one scale. For emission and values above 1, the
+    scale maps the brightest value to 1.
+    """
     moments = {moment: about.get(moment) or {} for _, moment in MOMENTS}
     values = {moment: found.get("mean", found.get("value")) for moment, found in moments.items()}
     colors = {
@@ -139,7 +141,9 @@ def convergence(run: Run) -> Markup:
 
 
 def convergence_of_all(runs: Sequence[Run]) -> Markup:
-    """Return diagrams of the loss and error of several runs, and one for each parameter that several runs share."""
+    """Return diagrams of the loss and the error of several runs. Add one diagram for each parameter that several runs
+    share.
+    """
     begun = [(place, run) for place, run in enumerate(runs) if run.records]
     if not begun:
         return lay_out("paragraph", "No iteration was completed.")

@@ -41,7 +41,7 @@ def sheet(numbers: Mapping[str, Any], pictures: Mapping[str, Array], name: str) 
 
 
 def workshop(numbers: Mapping[str, Any], pictures: Mapping[str, Array]) -> Markup:
-    """Return the sheet as a part of the page of a run.
+    """Return the workshop sheet as a part of the run's page.
 
     `numbers` is the content of fabrication.json. `pictures` are linear images (H, W, C) by name: `CAPTIONS`, `VIEWS`,
     and the names of deviations. Pictures and numbers that are missing are left out.

@@ -27,8 +27,8 @@ class Owners:
     def place(self, params: mi.SceneParameters, key: str) -> tuple[Element, list[str]] | None:
         """Return the element of the nearest object above the parameter `key`, and the remaining names of the key.
 
-        Returns None if no object above the parameter has an element. `params` are those of a scene built from the
-        description.
+        Returns None if no object above the parameter has an element. `params` are the parameters of a scene that was
+        built from the description.
         """
         chain = [params.properties[key][2]]
         while chain[-1].id() not in self._elements:
@@ -48,7 +48,8 @@ class Owners:
     def _nested(self, owner: Element, name: str, node: mi.Object) -> Element | None:
         """Return the child element of `owner` for the object `node`, which Mitsuba calls `name` there.
 
-        This works without ids: some objects, such as bitmaps, lose them, and objects in a group have none.
+        The search does not use ids. Some objects, for example bitmaps, lose their ids, and objects in a group have no
+        ids.
         """
         tag = next((tag for tag, kind in _KINDS.items() if isinstance(node, getattr(mi, kind))), None)
         unnamed: list[Element] = []
@@ -78,8 +79,8 @@ _HINTS = 30
 def _place_textures(root: Element) -> None:
     """Move each texture directly below `root` to the place of the first reference to it. Other references stay.
 
-    Otherwise Mitsuba would list its parameters as the scene's own, by the texture's id, which some textures lose.
-    Nothing would show that they belong to a material or a light.
+    Without this move, Mitsuba would list a texture's parameters as the scene's own, under the texture's id. Some
+    textures lose their id. Nothing would show that the texture's parameters belong to a material or a light.
     """
     textures = {child.id: child for child in root.children if child.tag == "texture" and child.id}
     for alias in root.walk("alias"):
@@ -98,7 +99,7 @@ def _place_textures(root: Element) -> None:
 
 
 def build(description: Description) -> tuple[Any, list[Note]]:
-    """Build the Mitsuba object of a description. Return it with notes on parameters that no plugin uses.
+    """Build the Mitsuba object of a description. Return the object, with notes on parameters that no plugin uses.
 
     Nothing is merged, so all parameters keep their names. Raises ConfigError, located, if Mitsuba refuses the scene.
     """

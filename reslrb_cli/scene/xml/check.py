@@ -1,6 +1,6 @@
 """Checks of a scene's description before Mitsuba parses it.
 
-They refuse plugins that are not Mitsuba's own, files that never end, and sizes that exceed the memory.
+The checks refuse plugins that are not Mitsuba's own, files that never end, and sizes that exceed the memory.
 """
 
 from __future__ import annotations
@@ -69,7 +69,9 @@ def check(description: Description) -> None:
 
 
 def _check_plugin(root: Element, element: Element) -> None:
-    """Refuse plugins that are not Mitsuba's, and objects without a part that Mitsuba would read out of bounds."""
+    """Refuse plugins that are not Mitsuba's own. Also refuse objects that lack a required part, because Mitsuba would
+    then read memory out of bounds.
+    """
     tag, type = element.tag, element.type
     if (refused := REFUSED_PLUGINS.get((tag, type))) is not None:
         raise element.fail("", f"{tag} `{type}` {refused}")

@@ -1,11 +1,13 @@
 """Conversion of scene files of other Mitsuba versions and exporters to Mitsuba 3, and stable ids.
 
-Mitsuba names an object without an id by its address in memory, which differs at each load. `mend` gives it an id made
-of its kind and its number among all objects of this kind. The notes that it returns say what was mended or left out.
+Mitsuba names an object without an id by its address in memory, which differs at each load. `mend` gives an object
+without an id a new id. The new id consists of the object's kind and its number among all objects of this kind. The
+notes that it returns say what was mended or left out.
 
-The plugins `regular`, `irregular` and `blackbody` need wavelengths, which RGB variants lack. `mend` writes them as
-`<spectrum value="400:0.1, 700:0.9"/>`, for which Mitsuba computes a colour with the CIE matching functions: the colour
-of light for emitters, and otherwise the colour of a surface under D65.
+The plugins `regular`, `irregular` and `blackbody` need wavelengths, which RGB variants lack. `mend` replaces `regular`,
+`irregular` and `blackbody` plugins by elements such as `<spectrum value="400:0.1, 700:0.9"/>`. Mitsuba converts a
+`<spectrum>` element to a colour with the CIE matching functions. For emitters, the result is the colour of light.
+Otherwise, the result is the colour of a surface under D65.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ _LINES, _WARNINGS = 5, 30
 
 @dataclass(frozen=True)
 class Note:
-    """A part of a scene's files that Mitsuba would refuse. `wrong` is the problem, and `done` the repair.
+    """A part of a scene's files that Mitsuba would refuse. `wrong` describes the problem, and `done` describes the
+    repair.
 
     If a plugin does not use an element, `owner` is the parent of the element. For other notes, it is None.
     """
@@ -137,7 +140,7 @@ _FIRST, _SECOND = 2 * 6.62607004e-34 * 2.99792458e8**2, 6.62607004e-34 * 2.99792
 
 
 def _floats(text: str) -> list[float]:
-    """Parse a list of numbers. Returns an empty list if any is not a number."""
+    """Parse a list of numbers. Returns an empty list if any word of the text is not a number."""
     try:
         return [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
@@ -200,7 +203,9 @@ def _black_body(spectrum: Element) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _range(spectrum: Element, default: Sequence[float]) -> tuple[float, float]:
-    """Return the range of wavelengths in nm. Missing ends come from `default`, if there is one."""
+    """Return the range of wavelengths in nm. A missing `wavelength_min` or `wavelength_max` comes from `default`,
+    unless `default` is empty.
+    """
     names = ("wavelength_min", "wavelength_max")
     low, high = (
         default[place] if default and spectrum.find(name) is None else _numbers(spectrum, name)[0]
@@ -212,7 +217,9 @@ def _range(spectrum: Element, default: Sequence[float]) -> tuple[float, float]:
 
 
 def _numbers(spectrum: Element, name: str) -> np.ndarray:
-    """Return the numbers of a parameter. Raises ConfigError if there are none, or any is negative or not finite."""
+    """Return the numbers of a parameter. Raises ConfigError if the parameter has no numbers, or if any number is
+    negative or not finite.
+    """
     if (parameter := spectrum.find(name)) is None:
         raise spectrum.fail("", f"{spectrum.type} needs a parameter `{name}`")
     numbers = np.array(_floats(parameter.value))
@@ -248,9 +255,10 @@ _LONGEST = 120
 def _name_objects(root: Element) -> list[Note]:
     """Give every object below `root` an id that is the same at every load. Return notes on changed ids.
 
-    The third `sphere` of the files becomes `Sphere_3`, whether or not the first two have ids. Ids that cannot be used
-    in a key are replaced: empty, very long or unprintable ones, those that start with `_unnamed_`, and those of an
-    earlier object. References are updated. Raises ConfigError if a reference names the id of two objects that differ.
+    The third `sphere` of the files becomes `Sphere_3`, whether or not the first two have ids. Some ids cannot be used
+    in a key and are replaced. Ids to be replaced are empty, very long or unprintable, start with `_unnamed_`, or belong
+    to an earlier object. References are updated. Raises ConfigError if a reference names the id of two objects that
+    differ.
     """
     root.attributes.pop("id", None)
     objects = root.objects()[1:]
@@ -309,11 +317,12 @@ CURRENT_VERSION = "3.0.0"
 
 
 def mend(description: Description) -> list[Note]:
-    """Convert the elements of a scene to Mitsuba 3 in place. Return notes on parts that its parser would refuse.
+    """Convert the elements of a scene to Mitsuba 3 in place. Return notes on the parts of the scene that Mitsuba 3's
+    parser would refuse.
 
-    Conversions that Mitsuba itself makes for files from before version 2 have no notes. Materials, lights and shapes
-    keep their meaning: those that Mitsuba 3 does not have stay as they are, and are refused later. Unused parameters
-    are found only when the scene is built.
+    Notes omit the conversions that Mitsuba itself makes for files from before version 2. Materials, lights and shapes
+    keep their meaning. Materials, lights and shapes that Mitsuba 3 lacks stay unchanged, and a later check refuses
+    them. Unused parameters are found only when the scene is built.
     """
     mender, root = _Mender(description), description.root
     mender.notes += _name_objects(root)
@@ -452,7 +461,7 @@ class _Mender:
         return True
 
     def _repetitions(self, owner: Element) -> None:
-        """Keep only the last of parameters that are given more than once, as in Mitsuba 0.6."""
+        """If a parameter is given more than once, keep only the last one, as in Mitsuba 0.6."""
         last: dict[str, Element] = {}
         dropped: set[Element] = set()
         for child in owner.children:

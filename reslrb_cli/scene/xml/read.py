@@ -54,7 +54,7 @@ class Source:
 class Element:
     """An XML element with its attributes and children in their order.
 
-    `written` is its name in the file if mending has changed the name.
+    `written` is the element's name in the file if mending has changed the name.
     """
 
     tag: str
@@ -98,7 +98,7 @@ class Element:
 
     @property
     def id(self) -> str:
-        """The element's id, or the id that it refers to, or ""."""
+        """The element's own id, or the id to which the element refers, or "" if there is no id."""
         return self.attributes.get("id", "")
 
     @property
@@ -220,8 +220,8 @@ class Description:
     def named_files(self) -> Iterator[tuple[Element, Element, str]]:
         """Yield the object, the element and the file name for each file that Mitsuba opens for the scene.
 
-        The `material` of a metal names two of Mitsuba's own tables. They are included if files in `folders` replace
-        them.
+        The `material` of a metal names two of Mitsuba's own tables. The two tables of a metal's `material` are included
+        if files in `folders` replace Mitsuba's own tables.
         """
         for owner in self.root.walk():
             for element in owner.children:
@@ -365,7 +365,7 @@ def _folder(element: Element, folders: list[Path]) -> Path:
 
 
 def tag_lines(element: Element, depth: int = 0) -> Iterator[tuple[str, Element]]:
-    """Yield the XML of `element` and all below it, one tag per line, each with its element."""
+    """Yield the XML of `element` and of all elements below it, one tag per line. Each line comes with its element."""
     # Escape `$`, which starts a variable in Mitsuba's parser. All variables are resolved already.
     attributes = "".join(f" {key}={quoteattr(value)}" for key, value in element.attributes.items())
     indent, end = "    " * depth, "" if element.children else "/"
