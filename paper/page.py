@@ -99,10 +99,11 @@ def _figure6(lines: Sequence[Row]) -> str:
     cells += [[name, *(measured(name, depth) for depth in depths)] for name in names]
     ratios = [["published", *map(ratio, depths)]]
     ratios += [[name, *(over(name, depth) for depth in depths)] for name in names[1:]]
-    head, film = ["depth", *map(str, depths)], "{width}x{height}, {spp} spp".format_map(rows[0])
+    head, film = ["depth", *map(str, depths)], "{width}x{height} pixels with {spp} samples each".format_map(rows[0])
     origins = dict.fromkeys(_origin(line) for line in lines if line.get("kind") == "origin")
     about = (
-        f"The table shows the milliseconds of a step, and the peak of the arrays in MiB, with {film}, without roulette."
+        f"The table shows the milliseconds of a step, and the peak of the arrays in MiB. The film has {film}.\n"
+        "Paths end without roulette."
     )
     over_naive = f"The next table shows the time of a step, divided by a step of naive AD ({names[0]})."
     parts = [about, tables.table(head, cells), over_naive, tables.table(head, ratios)]

@@ -419,10 +419,10 @@ This page lists every plugin of Mitsuba 3.9.1, and whether `reslrb` supports it.
 through `inspect`, `init`, three iterations of `optimize`, and `export`.
 
 - **light paths**: the integrators `reslrb`, `ptracer`, `walk_ad` and `trajectory`. **`prb`**: paths from the sensor.
-  `init` uses light paths if they work, and paths from the sensor otherwise.
+    `init` uses light paths if they work, and paths from the sensor otherwise.
 - **works**: supported, with the restriction in brackets. `reslrb inspect` lists the parameters that can be recovered.
 - **refused**: every command prints the reason in one line and ends with exit code 2. If both columns refuse a plugin,
-  or loading refuses it, change the scene file.
+    or loading refuses it, change the scene file.
 - **converted**: read as an RGB colour, with a warning, because RGB variants of Mitsuba do not have this spectrum.
 
 `python tests/cli/every_plugin.py` writes this page. `pytest -m long tests/cli/test_every_plugin.py` runs all rows;
