@@ -103,7 +103,7 @@ def _figure6(lines: Sequence[Row]) -> str:
     origins = dict.fromkeys(_origin(line) for line in lines if line.get("kind") == "origin")
     about = (
         f"The table shows the milliseconds of a step, and the peak of the arrays in MiB. The film has {film}.\n"
-        "Paths end without roulette."
+        "The steps use no Russian roulette."
     )
     over_naive = f"The next table shows the time of a step, divided by a step of naive AD ({names[0]})."
     parts = [about, tables.table(head, cells), over_naive, tables.table(head, ratios)]
