@@ -68,7 +68,7 @@ def test_a_failing_command_is_named_and_the_others_run(tmp_path: Path) -> None:
 
 def test_a_named_variant_is_tested_or_fails() -> None:
     """Tests that are skipped for want of a GPU would look like tests that pass on it."""
-    test = "tests/conformance/test_replay.py::test_no_light_no_replay"
+    test = "tests/conformance/test_replay.py::test_without_light_there_is_no_replay"
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", test]
     environment = os.environ | {"RESLRB_TEST_VARIANT": "cuda_ad_rgb", "DRJIT_LIBCUDA_PATH": "/nonexistent.so"}
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=environment)

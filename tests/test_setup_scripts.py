@@ -157,7 +157,7 @@ def test_without_chromium_the_tests_say_so_in_one_line() -> None:
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.count("no Chromium: tests that look at pages in a browser are left out") == 1
     assert "::test_nothing_scrolls_sideways" not in done.stdout
-    assert "::test_what_went_wrong_stands_first" in done.stdout
+    assert "::test_faults_come_first" in done.stdout
 
 
 @pytest.mark.skipif(

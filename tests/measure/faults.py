@@ -204,7 +204,7 @@ FAULTS = [
     Fault("w_of_previous_step", "cornell_reservoir", "estimators.reservoir:ReservoirSelection.vertex",
           "chosen_by(numbers, w, W,", "chosen_by(numbers, w, state.W,", by("reservoir", *GRADIENT, "ptracer")),
     Fault("replay_one_number_too_many", "delta_lobes", WALK,
-          "sampler.next_1d(active)  # roulette's", "sampler.next_1d(active), sampler.next_1d(active)",
+          "sampler.next_1d(active)  # the number of roulette", "sampler.next_1d(active), sampler.next_1d(active)",
           by("reservoir", "walk_ad")),
     Fault("replay_ends_a_vertex_early", "cornell_reservoir", "estimators.selection:SlotReplay.is_followed",
           "vertex.depth < self.last", "vertex.depth + 1 < self.last", by("reservoir", *GRADIENT, "ptracer")),
