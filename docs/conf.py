@@ -21,8 +21,9 @@ myst_heading_anchors = 4
 myst_dmath_allow_space = False
 myst_dmath_double_inline = True
 
-# The notebooks are stored without output; `scripts/docs` runs them
+# The notebooks are stored without output; `scripts/docs` runs them in a temporary folder
 nb_execution_mode = "auto"
+nb_execution_in_temp = True
 nb_execution_timeout = 600
 nb_execution_raise_on_error = True
 
